@@ -1,0 +1,52 @@
+"""Errors that a user can cause, and the sentence each of them ends with.
+
+Every class is also the builtin that fits, so library callers may catch either. The command lines print the message
+of a `UserError` as one sentence and exit with code 2; anything else is a defect and keeps its traceback.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class UserError(Exception):
+    """A mistake in what was given: arguments, files, selections. Never a defect of the program."""
+
+    def __str__(self) -> str:
+        # KeyError and FileNotFoundError format their arguments in their own ways; ours is always the plain sentence.
+        return str(self.args[0]) if self.args else type(self).__name__
+
+
+class BadArgument(UserError, ValueError):
+    """An argument has a value outside what is accepted."""
+
+
+class UnknownName(UserError, LookupError):
+    """A name (suite, group, selector, camera, word, object ...) that does not exist here."""
+
+
+class MissingDependency(UserError, ImportError):
+    """An optional part of the installation is needed and absent."""
+
+
+def listing(names: Iterable[object], limit: int = 12) -> str:
+    """Join names for a message: at most `limit` of them, then how many more there are."""
+    items = [str(name) for name in names]
+    if not items:
+        return "none"
+    shown = ", ".join(items[:limit])
+    return shown if len(items) <= limit else f"{shown} and {len(items) - limit} more"
+
+
+def did_you_mean(given: str, existing: Iterable[str]) -> str:
+    """Return " Did you mean 'x'?" for the nearest existing name, or an empty string when nothing is near."""
+    by_folded = {name.casefold(): name for name in existing}
+    near = difflib.get_close_matches(given.casefold(), list(by_folded), n=1, cutoff=0.6)
+    return f" Did you mean '{by_folded[near[0]]}'?" if near else ""
+
+
+def unknown_name(kind: str, given: str, existing: Iterable[str]) -> UnknownName:
+    """Build the error for a name that does not exist: what was given, the nearest name, and what exists."""
+    names = list(existing)
+    return UnknownName(f"Unknown {kind} '{given}'.{did_you_mean(given, names)} Existing: {listing(names)}.")
