@@ -96,7 +96,9 @@ def _decode(declared: Any, data: Any, where: str) -> Any:
             return tuple(_decode(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(items))
         if len(items) != len(arguments):
             raise MalformedDocument(f"{where} has {len(items)} items; expected {len(arguments)}.")
-        return tuple(_decode(kind, item, f"{where}[{i}]") for i, (kind, item) in enumerate(zip(arguments, items, strict=True)))
+        return tuple(
+            _decode(kind, item, f"{where}[{i}]") for i, (kind, item) in enumerate(zip(arguments, items, strict=True))
+        )
     if origin is list:
         return [_decode(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(_expect(list, data, where))]
     if origin is dict:

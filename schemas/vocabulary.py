@@ -1,0 +1,100 @@
+"""What selectors can name: the tokens of one episode, and the union of names over a selection of episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.layout import INVALID_ROLES, Prompt, Role, SiteLayout
+from schemas.words import Word, words_of
+
+ObjectKind = Literal["object", "fixture", "robot", "background"]
+
+
+@dataclass(frozen=True)
+class SceneObject:
+    """One thing that segmentation tells apart. `of_interest`: the task names it as something to act on."""
+
+    name: str
+    kind: ObjectKind
+    of_interest: bool
+
+
+@dataclass(frozen=True)
+class EpisodeTokens:
+    """Everything about one episode's keys at one site that a selector may ask for.
+
+    Attributes:
+        layout: the site's spans.
+        key_role: role codes, shape (replan, key) uint8.
+        prompts: the different prompts of the episode.
+        prompt_index: which prompt each replan had, shape (replan,).
+        objects: the scene's objects, in the order of the coverage's last axis.
+        coverage: per camera the area of each patch that each object covers, shape (replan, patch, object), 0..1.
+    """
+
+    layout: SiteLayout
+    key_role: NDArray[np.uint8]
+    prompts: tuple[Prompt, ...] = ()
+    prompt_index: NDArray[np.integer] | None = None
+    objects: tuple[SceneObject, ...] = ()
+    coverage: Mapping[str, NDArray[np.float32]] | None = None
+
+    @property
+    def num_replans(self) -> int:
+        """Number of replans."""
+        return int(self.key_role.shape[0])
+
+    @cached_property
+    def static_roles(self) -> NDArray[np.uint8]:
+        """`key_role` as (1, key) when it never changes in the episode, else as stored."""
+        return self.key_role[:1] if (self.key_role == self.key_role[:1]).all() else self.key_role
+
+    @cached_property
+    def words(self) -> tuple[tuple[Word, ...], ...]:
+        """The instruction's words for each of `prompts`."""
+        return tuple(words_of(prompt) for prompt in self.prompts)
+
+    @cached_property
+    def valid(self) -> NDArray[np.bool_]:
+        """Keys that can hold information, shape (replan or 1, key)."""
+        return ~np.isin(self.static_roles, [int(role) for role in INVALID_ROLES])
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """The names that selectors may use over a selection of episodes, for validation and for "did you mean"."""
+
+    cameras: tuple[str, ...]
+    spans: tuple[str, ...]
+    frames: tuple[str, ...]
+    roles: tuple[str, ...]
+    words: tuple[str, ...]
+    objects: tuple[str, ...]
+
+
+def collect_vocabulary(episodes: Iterable[EpisodeTokens]) -> Vocabulary:
+    """Union of the names in the given episodes, in order of first appearance. Cameras that are always masked are left out."""
+    cameras: dict[str, None] = {}
+    spans: dict[str, None] = {}
+    frames: dict[str, None] = {}
+    roles: dict[str, None] = {}
+    words: dict[str, None] = {}
+    objects: dict[str, None] = {}
+    for tokens in episodes:
+        for span in tokens.layout.spans:
+            spans[span.name] = None
+            if span.kind == "latent":
+                frames[span.name] = None
+            if span.camera is not None and (tokens.static_roles[:, span.start : span.stop] != Role.MASKED_IMAGE).any():
+                cameras[span.camera] = None
+        roles.update({Role(code).label: None for code in np.unique(tokens.static_roles)})
+        for line in tokens.words:
+            words.update({word.text.casefold(): None for word in line})
+        objects.update({thing.name: None for thing in tokens.objects})
+    return Vocabulary(*(tuple(names) for names in (cameras, spans, frames, roles, words, objects)))
