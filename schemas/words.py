@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from schemas.layout import Piece, Prompt
 
-_WORD = re.compile(r"\w+(?:['’-]\w+)*")
+_WORD = re.compile(r"\w+(?:['\u2019-]\w+)*")
 
 
 @dataclass(frozen=True)
