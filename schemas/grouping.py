@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -13,6 +14,11 @@ from schemas.selectors import SelectorError, parse_selector
 
 #: The selector that, alone, means: whatever no other group of the grouping takes.
 REST = "*"
+
+
+#: Column names of tables begin with group names; these two are taken by the ratio.
+_RESERVED_NAMES = ("numerator", "denominator")
+_GROUP_NAME = re.compile(r"[A-Za-z0-9_][\w.@-]*$")
 
 
 class GroupingError(UserError, ValueError):
@@ -63,6 +69,11 @@ class Grouping:
         if not self.groups:
             raise GroupingError(f"Grouping '{self.name}' has no groups; expected at least one NAME = SELECTOR.")
         for group, selectors in self.groups.items():
+            if group in _RESERVED_NAMES or not _GROUP_NAME.match(group):
+                raise GroupingError(
+                    f"'{group}' cannot name a group: expected letters, digits, '_', '.', '-', and neither of "
+                    f"{listing(_RESERVED_NAMES)}."
+                )
             if not selectors:
                 raise GroupingError(f"Group '{group}' of grouping '{self.name}' has no selector.")
             for selector in selectors:

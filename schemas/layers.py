@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 from schemas.errors import BadArgument, listing
 
+#: Policy families whose published scripts number attention calls instead of blocks.
+CALL_NUMBERED_FAMILIES = ("pi0", "pi05")
+
 
 @dataclass(frozen=True)
 class LayerSelection:
@@ -17,16 +20,17 @@ class LayerSelection:
     note: str | None = None
 
 
-def select_layers(numbers: Sequence[int] | None, num_layers: int, accepts_call_numbers: bool) -> LayerSelection:
+def select_layers(numbers: Sequence[int] | None, num_layers: int, family: str) -> LayerSelection:
     """Translate `--layers` into block indices.
 
     The published pi0 scripts number attention *calls* of one inference: 0..n-1 are the prefix pass (without action queries), n..2n-1
-    the first denoise step. Their numbers n..2n-1 are accepted where `accepts_call_numbers`, and mean block number - n.
+    the first denoise step. Their numbers n..2n-1 are accepted for the families above, and mean block number - n.
 
     Raises `BadArgument` for any other number, or when two numbers mean the same block.
     """
     if numbers is None:
         return LayerSelection(tuple(range(num_layers)), tuple(range(num_layers)))
+    accepts_call_numbers = family in CALL_NUMBERED_FAMILIES
     last = 2 * num_layers - 1 if accepts_call_numbers else num_layers - 1
     for number in numbers:
         if not 0 <= number <= last:

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from schemas.errors import BadArgument, UserError
 from schemas.layout import Prompt, SiteLayout
@@ -97,14 +97,15 @@ class Protocol:
 class PolicyCameraView:
     """How a policy camera's picture came from the simulator's.
 
-    `rotated_180`: the model sees the simulator's image turned by 180 degrees. `upright` says whether row 0 of the stored
-    frame is the top of the scene.
+    `rotated_180`: the model sees the simulator's image turned by 180 degrees. `upright`: row 0 of the stored frame is the
+    top of the scene. `mirrored`: column 0 of the stored frame is the scene's right edge.
     """
 
     name: str
     source: str
     rotated_180: bool
     upright: bool
+    mirrored: bool
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,7 @@ class PolicyIdentity:
     num_denoise_steps: int
     action_horizon: int
     cameras: tuple[PolicyCameraView, ...]
-    config: dict[str, str | int | float | bool | None]
+    config: dict[str, Any]
 
 
 @dataclass(frozen=True)

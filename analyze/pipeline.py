@@ -1,0 +1,142 @@
+"""The whole default analysis: stores in, tables, results files, summary and pictures out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import polars as pl
+
+from analyze.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
+from analyze.atomic_file import replacing
+from analyze.reader import Store
+from analyze.results_file import write_results_of_suites
+from analyze.selection import Selection, check_combinable, select, select_episodes
+from analyze.summary import AnalysedRun, summary_text, write_summary
+from analyze.tables import load_tokens, steps_table, vocabulary_of
+from analyze.terminal import progress_bar
+from schemas.builtin_groupings import find_grouping
+from schemas.errors import BadArgument, listing
+from schemas.grouping import Grouping, parse_group_argument, parse_ratio_argument, with_groups
+from schemas.vocabulary import Vocabulary
+
+DEFAULT_GROUPING = "default"
+
+
+@dataclass(frozen=True)
+class AnalysisSettings:
+    """What a user asks for; None means the default (see `analyze.arguments`)."""
+
+    grouping: str | None = None
+    groups: tuple[str, ...] = ()
+    ratio: str | None = None
+    layers: tuple[int, ...] | None = None
+    denoise: tuple[str, ...] | None = None
+    heads: tuple[int, ...] | None = None
+    per_head: bool = False
+    tasks: tuple[int, ...] | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """The tables of one grouping over one selection of episodes.
+
+    `steps` is described in `analyze.tables`; `replans`, `episodes` and `tasks` in `analyze.aggregate`.
+    """
+
+    stores: tuple[Store, ...]
+    grouping: Grouping
+    selection: Selection
+    steps: pl.DataFrame
+    replans: pl.DataFrame
+    episodes: pl.DataFrame
+    tasks: pl.DataFrame
+    summary: str
+
+
+@dataclass
+class WrittenFiles:
+    """Where results went."""
+
+    folder: Path
+    files: list[Path] = field(default_factory=list)
+
+
+def choose_grouping(settings: AnalysisSettings, vocabulary: Vocabulary) -> Grouping:
+    """The grouping that the settings name, with command-line groups added and the ratio replaced if asked."""
+    base = None
+    if settings.grouping is not None or not settings.groups:
+        base = find_grouping(settings.grouping or DEFAULT_GROUPING, vocabulary)
+    grouping = base
+    if settings.groups:
+        grouping = with_groups(base, [parse_group_argument(text) for text in settings.groups])
+    assert grouping is not None
+    if settings.ratio is None:
+        return grouping
+    return Grouping(
+        name=grouping.name,
+        groups=grouping.groups,
+        ratio=parse_ratio_argument(settings.ratio),
+        overlap=grouping.overlap,
+        allow_empty=grouping.allow_empty,
+        description=grouping.description,
+    )
+
+
+def analyse(stores: Sequence[Store], settings: AnalysisSettings) -> Analysis:
+    """Compute all tables. Shows progress at a terminal when it takes longer than a moment."""
+    check_combinable(stores)
+    root = stores[0].attributes
+    selection = select(root, settings.layers, settings.denoise, settings.heads, settings.per_head)
+    chosen = [(store, episode) for store in stores for episode in select_episodes(store, settings.tasks)]
+    site = root.sites[0].name
+    selected = load_tokens(chosen, site)
+    grouping = choose_grouping(settings, vocabulary_of(selected))
+    with progress_bar(len(selected), "episodes") as advance:
+        steps = steps_table(selected, grouping, selection, site, advance)
+    replans = add_layers_avg(per_replan(steps, grouping), grouping)
+    episodes = episodes_table(replans, grouping)
+    tasks = tasks_table(episodes, grouping, seed=settings.seed)
+    policy = root.policy
+    run = AnalysedRun(
+        stores=[str(store.path) for store in stores],
+        policy=f"{policy.name} ({policy.checkpoint_format}: {policy.checkpoint})",
+        untrained=policy.untrained,
+        denoise_steps=selection.denoise_steps,
+        heads=_describe_heads(selection, root.policy.num_heads),
+        notes=[selection.note] if selection.note else [],
+    )
+    text = summary_text(run, grouping, episodes, tasks)
+    return Analysis(tuple(stores), grouping, selection, steps, replans, episodes, tasks, text)
+
+
+def write_tables(analysis: Analysis, folder: Path) -> WrittenFiles:
+    """Write the results JSON (when the grouping has a ratio), the tables and the summary; each file appears whole."""
+    written = WrittenFiles(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(13, "Permission denied")
+        for name in ("steps", "episodes", "tasks"):
+            path = folder / f"{name}.parquet"
+            with replacing(path) as temporary:
+                getattr(analysis, name).write_parquet(temporary)
+            written.files.append(path)
+        if analysis.grouping.ratio is not None:
+            written.files += write_results_of_suites(folder, analysis.replans, analysis.grouping)
+        path = folder / "summary.txt"
+        write_summary(path, analysis.summary)
+        written.files.append(path)
+    except OSError as error:
+        raise BadArgument(
+            f"Cannot write results to {folder}: {error.strerror or error}; give another --output."
+        ) from None
+    return written
+
+
+def _describe_heads(selection: Selection, num_heads: int) -> str:
+    which = "all heads" if len(selection.heads) == num_heads else f"heads {listing(selection.head_numbers, 40)}"
+    return f"mean over {which}" + (" (kept apart in the steps table)" if selection.per_head else "")

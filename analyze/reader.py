@@ -1,0 +1,165 @@
+"""Reading stores: what episodes there are, what their keys are, and their rows. The only module that touches Zarr."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from schemas.errors import did_you_mean, listing
+from schemas.jsonable import MalformedDocument, from_json
+from schemas.store import (
+    EPISODES_GROUP,
+    CorruptEpisode,
+    EpisodeAttributes,
+    RootAttributes,
+    StoreError,
+    StoreNotFound,
+    check_format,
+    parse_episode_name,
+)
+from schemas.vocabulary import EpisodeTokens
+
+
+@dataclass(frozen=True)
+class StoredEpisode:
+    """One committed episode. Nothing is read before it is asked for."""
+
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """The episode's group name."""
+        return self.folder.name
+
+    @cached_property
+    def attributes(self) -> EpisodeAttributes:
+        """What the episode says of itself."""
+        try:
+            return from_json(EpisodeAttributes, _read_attributes(self.folder))
+        except (OSError, ValueError, KeyError) as error:
+            raise CorruptEpisode(f"Episode {self.name} cannot be read: its attributes are damaged ({error}).") from None
+
+    @cached_property
+    def group(self) -> zarr.Group:
+        """The episode's Zarr group."""
+        return zarr.open_group(self.folder, mode="r", use_consolidated=False)
+
+    def array(self, name: str) -> zarr.Array:
+        """One array of the episode; raises `CorruptEpisode` when it is missing or has another shape than promised."""
+        promised = self.attributes.arrays.get(name)
+        try:
+            array = self.group[name]
+        except (KeyError, OSError, ValueError) as error:
+            raise CorruptEpisode(f"Episode {self.name} lacks the array {name} ({error}).") from None
+        if not isinstance(array, zarr.Array) or promised is None or tuple(array.shape) != promised.shape:
+            raise CorruptEpisode(f"Array {name} of episode {self.name} has not the shape that its attributes promise.")
+        return array
+
+    def read(self, name: str, index: Any = ...) -> NDArray[Any]:
+        """Values of one array; a chunk that is missing or fails its checksum raises `CorruptEpisode`."""
+        array = self.array(name)
+        try:
+            values = np.asarray(array[index])
+        except (OSError, ValueError, RuntimeError) as error:
+            raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {error}.") from None
+        lost = {"f": np.isnan, "i": lambda numbers: numbers == -1}.get(values.dtype.kind)
+        if (lost is not None and lost(values).any()) or (name.endswith("/key_role") and not values.all()):
+            raise CorruptEpisode(f"Array {name} of episode {self.name} has missing values: a chunk is lost.")
+        return values
+
+    def tokens(self, root: RootAttributes, site: str) -> EpisodeTokens:
+        """What every key of a site is in this episode."""
+        layout = next(layout for layout in root.sites if layout.name == site)
+        cameras = [name.removeprefix("objects/") for name in self.attributes.arrays if name.startswith("objects/")]
+        return EpisodeTokens(
+            layout=layout,
+            key_role=self.read(f"{site}/key_role"),
+            prompts=self.attributes.prompts,
+            prompt_index=self.read("prompt_index"),
+            objects=self.attributes.objects,
+            coverage=_StoredCoverage(self, cameras),
+        )
+
+
+class _StoredCoverage(Mapping[str, NDArray[np.float32]]):
+    """Object coverage by camera, read when a grouping needs it."""
+
+    def __init__(self, episode: StoredEpisode, cameras: Sequence[str]) -> None:
+        self._episode = episode
+        self._cameras = cameras
+
+    def __getitem__(self, camera: str) -> NDArray[np.float32]:
+        return self._episode.read(f"objects/{camera}")
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._cameras)
+
+    def __len__(self) -> int:
+        return len(self._cameras)
+
+
+@dataclass(frozen=True)
+class Store:
+    """A store opened for reading: its run, and the episodes that were committed when it was opened."""
+
+    path: Path
+    attributes: RootAttributes
+    episodes: tuple[StoredEpisode, ...]
+
+    @property
+    def suite(self) -> str:
+        """The task suite of the run."""
+        return self.attributes.protocol.suite
+
+    @property
+    def task_ids(self) -> tuple[int, ...]:
+        """Ids of the tasks that have at least one episode."""
+        return tuple(sorted({parse_episode_name(episode.name)[0] for episode in self.episodes}))
+
+
+def open_store(path: Path) -> Store:
+    """Open a store for reading.
+
+    Raises:
+        StoreNotFound: nothing is there; stores nearby are named.
+        StoreError: something else is there, or its attributes cannot be read.
+        FormatTooNew: a later version wrote it.
+    """
+    if not path.exists():
+        nearby = sorted(str(found) for found in path.parent.glob("*.zarr")) if path.parent.is_dir() else []
+        raise StoreNotFound(
+            f"There is no store at {path}.{did_you_mean(str(path), nearby)} Stores in {path.parent}: {listing(nearby)}. "
+            "Make one with vla-capture."
+        )
+    try:
+        attributes = _read_attributes(path)
+    except FileNotFoundError:
+        raise StoreError(f"{path} is not a store: it has no zarr.json.") from None
+    except (OSError, ValueError, KeyError) as error:
+        raise StoreError(f"The store {path} cannot be read: {error}.") from None
+    check_format(attributes, path)
+    try:
+        root = from_json(RootAttributes, attributes)
+        names = sorted(entry.name for entry in (path / EPISODES_GROUP).iterdir() if entry.is_dir())
+        keyed = sorted((parse_episode_name(name), name) for name in names)
+    except (MalformedDocument, OSError, ValueError) as error:
+        raise StoreError(f"The store {path} cannot be read: {error}") from None
+    return Store(path, root, tuple(StoredEpisode(path / EPISODES_GROUP / name) for _, name in keyed))
+
+
+def _read_attributes(folder: Path) -> dict[str, Any]:
+    document = json.loads((folder / "zarr.json").read_text(encoding="utf-8"))
+    if not isinstance(document, dict) or document.get("node_type") != "group":
+        raise ValueError("zarr.json does not describe a group")
+    attributes = document.get("attributes", {})
+    if not isinstance(attributes, dict):
+        raise ValueError("zarr.json has no attributes")
+    return attributes

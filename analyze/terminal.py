@@ -1,0 +1,19 @@
+"""Progress at a terminal; quiet everywhere else."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from tqdm import tqdm
+
+
+@contextmanager
+def progress_bar(total: int, unit: str) -> Iterator[Callable[[int], object]]:
+    """Yield a function that advances a bar; the bar is only drawn at a terminal, and when the work lasts over a second."""
+    bar = tqdm(total=total, unit=f" {unit}", disable=not sys.stderr.isatty(), delay=1.0, leave=False)
+    try:
+        yield bar.update
+    finally:
+        bar.close()

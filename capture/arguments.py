@@ -1,0 +1,163 @@
+"""Command-line arguments of `vla-capture`, and their translation into settings."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from capture.environments.base import EnvironmentSettings
+from capture.environments.suites import SUITES, check_task_id, find_suite
+from capture.run import RecordingSettings, RunSettings
+from schemas.command_line import OneSentenceParser
+from schemas.errors import BadArgument
+from schemas.precision import DEFAULT_MANTISSA_BITS, parse_precision
+from schemas.store import STORE_SUFFIX
+
+EMBEDDED = "embedded"
+DUMMY = "dummy"
+
+_EXAMPLES = """examples:
+  vla-capture pi                                             embedded untrained policy, built-in tasks
+  vla-capture pi --checkpoint ~/.cache/openpi/openpi-assets/checkpoints/pi05_libero \\
+      --task-suite libero_10 --num-episodes 5 --output-dir results/attention_ratio
+  vla-capture pi --task-suite libero_10 --task-id 0 --num-episodes 1 --max-steps 40 --libero-assets PATH
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of `vla-capture`."""
+    parser = OneSentenceParser(
+        prog="vla-capture",
+        description="Run a policy in simulation and record the attention rows of its action queries.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    families = parser.add_subparsers(dest="policy", required=True, metavar="POLICY", parser_class=OneSentenceParser)
+    pi = families.add_parser(
+        "pi",
+        help="pi0 or pi0.5",
+        description="Record a pi0 or pi0.5 policy.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    _add_pi_arguments(pi)
+    _add_run_arguments(pi)
+    _add_recording_arguments(pi)
+    _add_store_arguments(pi)
+    return parser
+
+
+def _add_pi_arguments(parser: argparse.ArgumentParser) -> None:
+    model = parser.add_argument_group("model")
+    model.add_argument(
+        "--checkpoint",
+        default=EMBEDDED,
+        metavar="PATH",
+        help=f"checkpoint folder; '{EMBEDDED}' (default) is a small untrained policy that comes with the tool, "
+        f"'{DUMMY}' a smaller one for trying things out",
+    )
+    model.add_argument("--tokenizer", metavar="PATH", help="sentencepiece model of the policy's language model")
+    model.add_argument("--paligemma-variant", metavar="NAME", help="checked against the checkpoint (gemma_2b ...)")
+    model.add_argument(
+        "--action-expert-variant", metavar="NAME", help="checked against the checkpoint (gemma_300m ...)"
+    )
+    model.add_argument("--device", default="auto", help="auto (default: a GPU if there is one), cpu, cuda, cuda:1 ...")
+    model.add_argument("--num-image-tokens", type=int, metavar="N", help="checked against the policy's layout")
+
+
+def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
+    run = parser.add_argument_group("evaluation")
+    names = ", ".join(suite.name for suite in SUITES)
+    run.add_argument("--task-suite", default="robosuite", metavar="SUITE", help=f"one of {names} (default: robosuite)")
+    run.add_argument("--task-id", type=int, metavar="N", help="a single task (default: all tasks of the suite)")
+    run.add_argument("--num-episodes", type=int, default=5, metavar="N", help="episodes per task (default: 5)")
+    run.add_argument("--seed", type=int, default=7, help="seed of the simulator and of all noise (default: 7)")
+    run.add_argument(
+        "--replan-steps", type=int, default=5, metavar="N", help="actions executed per policy call (default: 5)"
+    )
+    run.add_argument(
+        "--max-steps", type=int, metavar="N", help="steps after waiting (default: the suite's published number)"
+    )
+    run.add_argument(
+        "--libero-assets", type=Path, metavar="PATH", help="LIBERO asset folder (or set VLA_LIBERO_ASSETS)"
+    )
+
+
+def _add_recording_arguments(parser: argparse.ArgumentParser) -> None:
+    attention = parser.add_argument_group("what is recorded")
+    attention.add_argument(
+        "--layers",
+        type=int,
+        nargs="+",
+        metavar="N",
+        help="block indices (default: all); for pi also the published scripts' numbers 18..35 (25 = block 7)",
+    )
+    attention.add_argument(
+        "--denoise-steps",
+        nargs="+",
+        default=["first", "last"],
+        metavar="STEP",
+        help="numbers, first, last or all (default: first last)",
+    )
+    attention.add_argument("--heads", type=int, nargs="+", metavar="N", help="attention heads (default: all)")
+    attention.add_argument("--queries", default="mean", help="mean over the action queries (default), or all of them")
+    attention.add_argument(
+        "--precision",
+        default=str(DEFAULT_MANTISSA_BITS),
+        metavar="BITS",
+        help=f"mantissa bits kept of each probability, or 'exact' (default: {DEFAULT_MANTISSA_BITS}, "
+        "which bounds the error of every ratio by 0.1 %%)",
+    )
+    attention.add_argument("--no-frames", action="store_true", help="do not store the model's input images")
+
+
+def _add_store_arguments(parser: argparse.ArgumentParser) -> None:
+    output = parser.add_argument_group("output")
+    output.add_argument("--store", type=Path, metavar="NAME.zarr", help="store to write (default: runs/SUITE.zarr)")
+    output.add_argument(
+        "--output-dir",
+        type=Path,
+        metavar="PATH",
+        help="folder for the store (unless --store is given) and for the results of an analysis that runs afterwards",
+    )
+    output.add_argument("--save-viz", action="store_true", help="analyse afterwards, with pictures of every episode")
+    existing = output.add_mutually_exclusive_group()
+    existing.add_argument("--resume", action="store_true", help="continue an existing store with what is missing")
+    existing.add_argument("--overwrite", action="store_true", help="delete an existing store first")
+
+
+def run_settings(arguments: argparse.Namespace) -> RunSettings:
+    """Check the arguments that need no policy and turn them into settings."""
+    suite = find_suite(arguments.task_suite)
+    if arguments.task_id is not None:
+        check_task_id(suite, arguments.task_id)
+    if arguments.num_episodes < 1:
+        raise BadArgument(f"Cannot use --num-episodes {arguments.num_episodes}; expected at least 1.")
+    if arguments.seed < 0:
+        raise BadArgument(f"Cannot use --seed {arguments.seed}; expected 0 or more.")
+    return RunSettings(
+        suite=suite,
+        task_id=arguments.task_id,
+        num_episodes=arguments.num_episodes,
+        seed=arguments.seed,
+        replan_steps=arguments.replan_steps,
+        max_steps=suite.max_steps if arguments.max_steps is None else arguments.max_steps,
+        store=store_path(arguments),
+        mode="resume" if arguments.resume else "overwrite" if arguments.overwrite else "new",
+        environment=EnvironmentSettings(libero_assets=arguments.libero_assets),
+        recording=RecordingSettings(
+            layers=None if arguments.layers is None else tuple(arguments.layers),
+            denoise_steps=tuple(arguments.denoise_steps),
+            heads=None if arguments.heads is None else tuple(arguments.heads),
+            queries=arguments.queries,
+            mantissa_bits=parse_precision(arguments.precision),
+            frames=not arguments.no_frames,
+        ),
+    )
+
+
+def store_path(arguments: argparse.Namespace) -> Path:
+    """Where the store goes: --store, else a name made of the suite in --output-dir or `runs`."""
+    if arguments.store is not None:
+        return Path(arguments.store)
+    return (arguments.output_dir or Path("runs")) / f"{arguments.task_suite}{STORE_SUFFIX}"

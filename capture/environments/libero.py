@@ -1,0 +1,107 @@
+"""LIBERO tasks, run the way the published evaluations of pi0, pi0.5 and Cosmos Policy run them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.environments.base import ROBOT, EnvironmentSettings, SceneObject, Task
+from capture.environments.libero_installation import find_assets, load_libero, package_folder
+from capture.environments.simulator import SimulatedEnvironment
+from capture.environments.suites import Suite
+from schemas.errors import BadArgument
+
+
+def load_initial_states(path: Path) -> NDArray[np.float64]:
+    """Read the stored initial states of a task: (states, 1 + positions + velocities), MuJoCo states made flat.
+
+    They are pickles written by torch.save with a numpy array inside. torch's restricted reader opens them once the few
+    numpy functions that rebuild an array are allowed by the names numpy 1 gave them, so nothing else can run.
+    """
+    import torch
+
+    rebuild = np.empty(0).__reduce__()[0]
+    allowed: list[Any] = [
+        (rebuild, "numpy.core.multiarray._reconstruct"),
+        rebuild,
+        np.ndarray,
+        np.dtype,
+        type(np.dtype(np.float64)),
+    ]
+    with torch.serialization.safe_globals(allowed):
+        states = torch.load(path, map_location="cpu", weights_only=True)
+    return np.asarray(states, dtype=np.float64)
+
+
+def parent_of_region(name: str, known: Sequence[str]) -> str | None:
+    """Return the object or fixture that `name` is or is a region of (`wine_rack_1_top_region`), None for the table."""
+    owners = [candidate for candidate in known if name == candidate or name.startswith(f"{candidate}_")]
+    return max(owners, key=len, default=None)
+
+
+class LiberoEnvironment(SimulatedEnvironment):
+    """One LIBERO task. An initial state is one of the 50 stored with the task; `seed` is the protocol's (7).
+
+    What the seed decides: a stored state holds joint positions and velocities, but cabinets, stoves and racks stand on
+    no joint; every reset places them at random in small regions of the table (measured: up to 15 mm and 3 degrees
+    apart). The protocol seeds once per task, so there they stand elsewhere in every episode, depending on how many ran
+    before in that process. Here every reset is seeded: they always stand where the protocol has them in its first
+    episode, and an episode is the same whether it runs alone, in a job array, or after others. The first episode of a
+    task is the protocol's bit for bit; later ones are those that the protocol would have after seeding anew.
+    """
+
+    def __init__(self, suite: Suite, task: Task, settings: EnvironmentSettings) -> None:
+        self._assets = find_assets(settings.libero_assets)
+        self._initial_states = load_initial_states(
+            package_folder() / "init_files" / suite.name / f"{task.name}.pruned_init"
+        )
+        if len(self._initial_states) != task.num_initial_states:
+            raise BadArgument(
+                f"The installed LIBERO stores {len(self._initial_states)} initial states for '{task.name}' "
+                f"instead of {task.num_initial_states}; run 'make setup'."
+            )
+        super().__init__(suite, task, settings)
+
+    def _build(self, options: dict[str, Any]) -> Any:
+        classes = load_libero(self._assets)
+        from libero.libero.envs.bddl_utils import get_problem_info
+
+        task_file = str(package_folder() / "bddl_files" / self.task.suite / f"{self.task.name}.bddl")
+        problem = get_problem_info(task_file)["problem_name"]
+        # No noise on the robot's joints: the stored state sets them.
+        return self._construct(classes[problem], task_file, initialization_noise=None, **options)
+
+    def _reset_seed(self, initial_state_index: int, seed: int) -> int:
+        return seed
+
+    def _set_initial_state(self, initial_state_index: int) -> None:
+        simulation = self._simulator.sim
+        state = self._initial_states[initial_state_index]
+        expected = 1 + simulation.model.nq + simulation.model.nv
+        if state.size != expected:
+            raise BadArgument(
+                f"The stored initial states of '{self.task.name}' have {state.size} numbers and its scene has {expected}; "
+                f"the LIBERO package and the assets in '{self._assets}' do not belong together."
+            )
+        simulation.set_state_from_flattened(state)
+        simulation.forward()
+        # From here on as the protocol does it: objects take note of the new state (a stove that is on shows it), and
+        # the forced update of the observables moves the cameras' timer.
+        self._simulator._check_success()
+        self._simulator._post_process()
+        self._simulator._update_observables(force=True)
+
+    def _describe_objects(self) -> tuple[tuple[SceneObject, ...], Mapping[str, Sequence[str]]]:
+        movable, fixed = self._simulator.objects_dict, self._simulator.fixtures_dict
+        names = [*movable, *fixed]
+        subjects = {parent_of_region(name, names) for name in self._simulator.obj_of_interest}
+        described = [
+            *(SceneObject(name, "object", name in subjects) for name in movable),
+            *(SceneObject(name, "fixture", name in subjects) for name in fixed),
+        ]
+        roots = {name: [thing.root_body] for name, thing in (movable | fixed).items()}
+        return self._with_robot_and_background(described), roots | {ROBOT: self._robot_bodies()}

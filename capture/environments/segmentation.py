@@ -1,0 +1,87 @@
+"""Which object every pixel shows, drawn by the same context, with the same options, as the picture itself.
+
+robosuite's own segmentation sensors fail with numpy 2, and a second renderer would bring a second OpenGL context, which
+robosuite (it never makes its own context current again) would then draw into. So the picture's context is asked to
+draw the scene once more in identity colours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+
+def owners_of_bodies(parents: NDArray[np.integer], roots: Mapping[int, int], background: int) -> NDArray[np.int32]:
+    """Return (bodies,) the object index of every body: that of its nearest ancestor-or-self in `roots`.
+
+    parents: (bodies,) parent of every body. MuJoCo numbers parents before their children, the world is its own parent.
+    roots: body -> object index. Bodies below none of them belong to `background`.
+    """
+    owners = np.full(len(parents), background, dtype=np.int32)
+    for body, parent in enumerate(parents):
+        owners[body] = roots.get(body, background if body == parent else owners[parent])
+    return owners
+
+
+def decode_identities(colours: NDArray[np.uint8], table: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Turn identity colours (height, width, 3) into `table` entries; colour k means table[k], and 0 is nothing drawn."""
+    wide = colours.astype(np.int32)
+    identity = wide[:, :, 0] + (wide[:, :, 1] << 8) + (wide[:, :, 2] << 16)
+    if identity.max() >= len(table):
+        # Would mean that the driver blended colours at edges (multisampling) although identities were asked for.
+        raise RuntimeError(f"The renderer returned identity {identity.max()}; only {len(table) - 1} things were drawn.")
+    return table[identity]
+
+
+def draw_object_indices(
+    context: Any, data: mujoco.MjData, camera_id: int, size: int, owners: NDArray[np.int32], background: int
+) -> NDArray[np.int32]:
+    """Draw (size, size) object indices of the state in `data` through robosuite's offscreen `context`.
+
+    The context must be current. Its options (LIBERO and robosuite show the visual geoms, group 1, and hide the
+    collision geoms, group 0) stay as they are, so exactly what is visible in the picture is labelled. The result has
+    the picture's orientation: OpenGL's, row 0 at the bottom.
+    """
+    model, scene = context.model._model, context.scn
+    context.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
+    context.cam.fixedcamid = camera_id
+    mujoco.mjv_updateScene(
+        model, data, context.vopt, context.pert, context.cam, mujoco.mjtCatBit.mjCAT_ALL.value, scene
+    )
+    table = identity_table(model, scene, owners, background)
+    colours = np.empty((size, size, 3), dtype=np.uint8)
+    viewport = mujoco.MjrRect(0, 0, size, size)
+    flags = (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR)
+    for flag in flags:
+        scene.flags[flag] = 1
+    try:
+        mujoco.mjr_render(viewport, scene, context.con)
+        mujoco.mjr_readPixels(colours, None, viewport, context.con)
+    finally:
+        for flag in flags:
+            scene.flags[flag] = 0
+    return decode_identities(colours, table)
+
+
+def identity_table(
+    model: mujoco.MjModel, scene: mujoco.MjvScene, owners: NDArray[np.int32], background: int
+) -> NDArray[np.int32]:
+    """Return the object index for every identity colour, and take what is invisible out of the scene's identities.
+
+    robosuite switches helper sites (such as a ray below the gripper) off by making their opacity negative, which leaves
+    them in the scene. Identity colours know no transparency, so they would cover what the picture shows there.
+    """
+    table = np.full(scene.ngeom + 1, background, dtype=np.int32)
+    bodies_of = {mujoco.mjtObj.mjOBJ_GEOM.value: model.geom_bodyid, mujoco.mjtObj.mjOBJ_SITE.value: model.site_bodyid}
+    for drawn in scene.geoms[: scene.ngeom]:
+        if drawn.rgba[3] <= 0:
+            drawn.segid = -1  # not drawn; the scene is made anew for every picture, so this lasts for one only
+            continue
+        bodies = bodies_of.get(drawn.objtype)
+        if drawn.segid >= 0 and bodies is not None:
+            table[drawn.segid + 1] = owners[bodies[drawn.objid]]
+    return table

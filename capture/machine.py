@@ -1,0 +1,45 @@
+"""Provenance: which code, libraries and hardware made an episode."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+from importlib import metadata
+from pathlib import Path
+
+#: Packages whose versions can change numbers or pictures.
+_LIBRARIES = ("torch", "numpy", "mujoco", "robosuite", "hf-libero", "zarr", "numcodecs", "sentencepiece")
+
+
+def describe_machine(device: str) -> dict[str, str]:
+    """Code version, library versions, processor and GPU, as plain strings; nothing that identifies a person or a host."""
+    import torch
+
+    facts = {"code": code_version(), "python": platform.python_version(), "processor": platform.machine()}
+    for name in _LIBRARIES:
+        try:
+            facts[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            facts[name] = "absent"
+    facts["device"] = torch.cuda.get_device_name(device) if device.startswith("cuda") else device
+    return facts
+
+
+def code_version() -> str:
+    """The installed version, and the commit when the code runs from a git checkout."""
+    version = metadata.version("vla-attention")
+    folder = Path(__file__).resolve().parent.parent
+    if not (folder / ".git").exists():
+        return version
+    try:
+        described = subprocess.run(
+            ["git", "describe", "--always", "--dirty"],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return version
+    return f"{version} ({described.stdout.strip()})"

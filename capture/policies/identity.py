@@ -1,0 +1,38 @@
+"""Which policy ran: the part of a policy's provenance that two episodes of one run must share."""
+
+from __future__ import annotations
+
+from capture.policies.base import Policy
+from schemas.store import PolicyCameraView, PolicyIdentity
+
+#: Named fields of `PolicyIdentity`, or facts of the machine and not of the policy.
+_NOT_CONFIG = ("policy", "family", "checkpoint", "checkpoint_format", "weights_digest", "untrained", "device")
+
+
+def identify(policy: Policy) -> PolicyIdentity:
+    """Describe a policy for the store's root attributes. Hashes all weights the first time."""
+    facts = policy.provenance()
+    return PolicyIdentity(
+        name=policy.name,
+        family=facts["family"],
+        checkpoint=facts["checkpoint"],
+        checkpoint_format=facts["checkpoint_format"],
+        digest=facts["weights_digest"],
+        untrained=facts["untrained"],
+        num_layers=policy.num_layers,
+        num_heads=policy.num_heads,
+        num_denoise_steps=policy.num_denoise_steps,
+        action_horizon=policy.action_horizon,
+        cameras=tuple(
+            PolicyCameraView(
+                name=camera.slot,
+                source=camera.environment_camera,
+                rotated_180=camera.rotate_180,
+                # The simulators deliver OpenGL's order, bottom row first: turning it by 180 degrees rights and mirrors it.
+                upright=camera.rotate_180,
+                mirrored=camera.rotate_180,
+            )
+            for camera in policy.cameras
+        ),
+        config={name: value for name, value in facts.items() if name not in _NOT_CONFIG},
+    )

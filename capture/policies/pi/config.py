@@ -1,0 +1,147 @@
+"""Sizes of the pi models: what a checkpoint does not say about itself, and the layout that follows from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from schemas.errors import BadArgument, unknown_name
+
+#: openpi's camera slots, in the order of their keys. Which camera fills which slot is the preprocessing's business.
+CAMERA_SLOTS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")
+
+#: Vocabulary of PaliGemma's tokenizer.
+PALIGEMMA_VOCABULARY = 257_152
+
+
+@dataclass(frozen=True)
+class GemmaConfig:
+    """Sizes of one Gemma transformer: the vision-language model or the action expert."""
+
+    width: int
+    depth: int
+    mlp_dim: int
+    num_heads: int = 8
+    num_kv_heads: int = 1
+    head_dim: int = 256
+
+
+@dataclass(frozen=True)
+class SiglipConfig:
+    """Sizes of the image encoder; the defaults are So400m/14."""
+
+    width: int = 1152
+    depth: int = 27
+    mlp_dim: int = 4304
+    num_heads: int = 16
+    patch_size: int = 14
+    image_size: int = 224
+
+    @property
+    def grid(self) -> int:
+        """Patches along one side of an image."""
+        return self.image_size // self.patch_size
+
+    @property
+    def num_tokens(self) -> int:
+        """Tokens of one camera."""
+        return self.grid**2
+
+
+GEMMA_VARIANTS: dict[str, GemmaConfig] = {
+    "gemma_2b": GemmaConfig(width=2048, depth=18, mlp_dim=16_384),
+    "gemma_300m": GemmaConfig(width=1024, depth=18, mlp_dim=4096),
+    # openpi's own test size
+    "dummy": GemmaConfig(width=64, depth=4, mlp_dim=128, head_dim=16),
+    # the policy that comes with this package: the reference's depth and heads, so that its layer numbers exist
+    "embedded": GemmaConfig(width=128, depth=18, mlp_dim=256, head_dim=32),
+    "embedded_expert": GemmaConfig(width=96, depth=18, mlp_dim=192, head_dim=32),
+}
+
+
+def find_variant(name: str) -> GemmaConfig:
+    """Return the sizes of a Gemma variant by openpi's name for it."""
+    if name not in GEMMA_VARIANTS:
+        raise unknown_name("Gemma variant", name, GEMMA_VARIANTS)
+    return GEMMA_VARIANTS[name]
+
+
+@dataclass(frozen=True)
+class PiConfig:
+    """Everything that fixes the shape of a pi0 (`pi05=False`) or pi0.5 model.
+
+    `discrete_state_input`: the prompt carries the robot's state as digits. openpi's released LIBERO policy does not do
+    so; a table of "which tokens are state" follows from this flag, not from the model family.
+    """
+
+    paligemma: GemmaConfig
+    action_expert: GemmaConfig
+    siglip: SiglipConfig
+    action_horizon: int
+    max_token_len: int
+    vocab_size: int = PALIGEMMA_VOCABULARY
+    action_dim: int = 32
+    pi05: bool = True
+    discrete_state_input: bool = False
+    num_denoise_steps: int = 10
+    cameras: tuple[str, ...] = CAMERA_SLOTS
+
+    def __post_init__(self) -> None:
+        vlm, expert = self.paligemma, self.action_expert
+        for name in ("depth", "num_heads", "num_kv_heads", "head_dim"):
+            if getattr(vlm, name) != getattr(expert, name):
+                raise BadArgument(
+                    f"The two transformers share their attention, so {name} must be equal, but it is "
+                    f"{getattr(vlm, name)} in the vision-language model and {getattr(expert, name)} in the expert."
+                )
+        if self.siglip.image_size % self.siglip.patch_size:
+            raise BadArgument(
+                f"An image of {self.siglip.image_size} pixels is not a whole number of {self.siglip.patch_size} "
+                "pixel patches."
+            )
+
+    @property
+    def prefix_len(self) -> int:
+        """Keys of images and text."""
+        return len(self.cameras) * self.siglip.num_tokens + self.max_token_len
+
+    @property
+    def first_action_query(self) -> int:
+        """Position of the first action on the query axis: pi0 has the state token before it."""
+        return 0 if self.pi05 else 1
+
+    @property
+    def suffix_len(self) -> int:
+        """Queries of a denoise step: [state token, pi0 only] and the actions."""
+        return self.first_action_query + self.action_horizon
+
+    @property
+    def key_len(self) -> int:
+        """Keys of a denoise step: prefix and suffix."""
+        return self.prefix_len + self.suffix_len
+
+
+#: Full-size models by openpi's names.
+NAMED_CONFIGS: dict[str, PiConfig] = {
+    "pi05_libero": PiConfig(
+        paligemma=GEMMA_VARIANTS["gemma_2b"],
+        action_expert=GEMMA_VARIANTS["gemma_300m"],
+        siglip=SiglipConfig(),
+        action_horizon=10,
+        max_token_len=200,
+    ),
+    "pi0_libero": PiConfig(
+        paligemma=GEMMA_VARIANTS["gemma_2b"],
+        action_expert=GEMMA_VARIANTS["gemma_300m"],
+        siglip=SiglipConfig(),
+        action_horizon=50,
+        max_token_len=48,
+        pi05=False,
+    ),
+}
+
+
+def find_config(name: str) -> PiConfig:
+    """Return a full-size model configuration by openpi's name for it."""
+    if name not in NAMED_CONFIGS:
+        raise unknown_name("pi configuration", name, NAMED_CONFIGS)
+    return NAMED_CONFIGS[name]

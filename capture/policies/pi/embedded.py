@@ -1,0 +1,150 @@
+"""The policy that comes with this package: a small pi0.5 with seeded random weights, so that everything runs anywhere.
+
+It was never trained and solves nothing. It has the reference's depth, heads and token layout, and weights scaled such that
+its attention has structure: rows are neither uniform nor on one key, and depend on picture, words, noise and time.
+"""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from capture.policies.pi.config import GemmaConfig, PiConfig, SiglipConfig, find_variant
+from capture.policies.pi.model import PiModel
+from capture.policies.pi.policy import PiPolicy, PiSource
+from capture.policies.pi.preprocess import NormStats, Statistics
+from capture.policies.pi.strict import Shapes, expected_shapes, model_from_state
+from capture.policies.pi.tokenizer import PromptTokenizer
+
+TOKENIZER_PATH = Path(__file__).parent / "embedded" / "tokenizer.model"
+
+#: Rows of the token table; the tokenizer has fewer.
+_VOCABULARY = 1024
+
+#: Same token layout as openpi's pi05_libero: 3 cameras of 256 keys, 200 text slots, 10 actions.
+EMBEDDED_CONFIG = PiConfig(
+    paligemma=find_variant("embedded"),
+    action_expert=find_variant("embedded_expert"),
+    siglip=SiglipConfig(width=64, depth=2, mlp_dim=128, num_heads=4),
+    vocab_size=_VOCABULARY,
+    action_horizon=10,
+    max_token_len=200,
+)
+
+#: The same code in milliseconds, for tests: 4 patches a camera. Prompts with the state, to exercise those too.
+DUMMY_CONFIG = PiConfig(
+    paligemma=GemmaConfig(width=32, depth=3, mlp_dim=48, head_dim=8),
+    action_expert=GemmaConfig(width=24, depth=3, mlp_dim=32, head_dim=8),
+    siglip=SiglipConfig(width=16, depth=1, mlp_dim=24, num_heads=2, image_size=28),
+    vocab_size=_VOCABULARY,
+    action_horizon=4,
+    max_token_len=96,
+    discrete_state_input=True,
+    num_denoise_steps=3,
+)
+
+#: Made-up ranges of LIBERO's state and actions (not statistics of any data set): the hand above a table in metres, hand
+#: pointing down (axis-angle around pi), finger joints; pose changes well inside the controller's -1..1, gripper from open
+#: (-1) to closed (1).
+BUILTIN_STATS = {
+    "state": {
+        "q01": [-0.4, -0.35, 0.0, 2.4, -1.5, -1.2, 0.0, -0.04],
+        "q99": [0.2, 0.35, 1.3, 3.7, 1.5, 0.8, 0.04, 0.0],
+    },
+    "actions": {
+        "q01": [-0.6, -0.6, -0.6, -0.12, -0.15, -0.15, -1.0],
+        "q99": [0.6, 0.6, 0.6, 0.12, 0.15, 0.15, 1.0],
+    },
+}
+
+#: Spread of the logits of the sharpest and the flattest head of a block, were keys and queries independent: exp(-σ²/2) of
+#: the keys would effectively be looked at.
+_SHARPEST, _FLATTEST = 2.6, 0.8
+
+
+def builtin_stats() -> NormStats:
+    """Return the made-up ranges as statistics; mean and spread are those of an even distribution over the range."""
+
+    def statistics(name: str) -> Statistics:
+        low, high = (np.array(BUILTIN_STATS[name][key]) for key in ("q01", "q99"))
+        return Statistics(mean=(low + high) / 2, std=(high - low) / np.sqrt(12), q01=low, q99=high)
+
+    return NormStats(state=statistics("state"), actions=statistics("actions"))
+
+
+def random_weights(config: PiConfig, seed: int) -> dict[str, Tensor]:
+    """Return float32 weights of a `PiModel(config)`, drawn from `seed` alone.
+
+    Every tensor has its own counter-based numpy stream, named by seed and tensor: torch's normal numbers differ in the
+    last bits between processors, and then so would the digest of "the same" weights.
+    """
+    shapes: Shapes = expected_shapes(config)
+    state = {}
+    for name, shape in shapes.items():
+        stream = np.random.Philox(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
+        normal = np.random.Generator(stream).standard_normal(shape, dtype=np.float32)
+        state[name] = torch.from_numpy(_scaled(name, normal, config))
+    return state
+
+
+def _scaled(name: str, normal: np.ndarray, config: PiConfig) -> np.ndarray:
+    """Turn standard normal numbers into one tensor of the model, by what the tensor is for."""
+    if name.endswith("embed_tokens.weight"):
+        return normal * np.float32(config.paligemma.width**-0.5)  # scaled up again by sqrt(width) when looked up
+    if name.endswith("position_embedding.weight"):
+        return normal * np.float32(0.5)
+    if "norm" in name and ".dense." not in name:
+        is_layer_norm_weight = "vision_tower" in name and name.endswith("weight")
+        return np.full_like(normal, 1.0 if is_layer_norm_weight else 0.0)
+    if name.endswith("bias"):
+        bias = normal * np.float32(0.02)
+        if ".dense." in name:
+            bias[2 * len(bias) // 3 :] += 0.5  # the gate: half open, so that every block adds something
+        return bias
+    fan_in = int(np.prod(normal.shape[1:]))
+    weight = normal * np.float32(fan_in**-0.5)
+    if name.endswith("patch_embedding.weight"):
+        # Pictures are smooth: without taking out a filter's mean, all patches would differ in brightness only.
+        weight = weight - np.float32(0.7) * weight.mean(axis=(1, 2, 3), keepdims=True)
+        return weight * np.float32(6.0)
+    if "vision_tower" not in name and name.endswith("q_proj.weight"):
+        heads = config.paligemma.num_heads
+        sharpness = np.geomspace(_FLATTEST, _SHARPEST, heads, dtype=np.float32)
+        return weight * np.repeat(sharpness, normal.shape[0] // heads)[:, None]
+    if ".dense." in name:
+        return weight * np.float32(0.6)
+    if name == "action_out_proj.weight":
+        return weight * np.float32(0.6)  # keeps actions within about twice the range of the statistics
+    return weight
+
+
+def build_random_model(config: PiConfig, seed: int, device: str | torch.device = "cpu") -> PiModel:
+    """Build a model with `random_weights`."""
+    return model_from_state(config, random_weights(config, seed), device=device)
+
+
+def _random_policy(name: str, config: PiConfig, seed: int, device: str | torch.device) -> PiPolicy:
+    source = PiSource(
+        name=name, checkpoint=f"random weights, seed {seed}", checkpoint_format="seeded", untrained=True
+    )
+    return PiPolicy(
+        build_random_model(config, seed, device),
+        PromptTokenizer(TOKENIZER_PATH),
+        builtin_stats(),
+        source,
+        normalisation="quantile",
+    )
+
+
+def embedded_policy(seed: int = 0, device: str | torch.device = "cpu") -> PiPolicy:
+    """Build the embedded policy; the seed draws its weights."""
+    return _random_policy("embedded", EMBEDDED_CONFIG, seed, device)
+
+
+def dummy_policy(seed: int = 0, device: str | torch.device = "cpu") -> PiPolicy:
+    """Build the policy of test size."""
+    return _random_policy("dummy", DUMMY_CONFIG, seed, device)

@@ -1,0 +1,258 @@
+"""pi0 and pi0.5: a vision-language model and an action expert that share their attention, sampled by flow matching.
+
+Sources: Black et al. 2024 (pi0), Physical Intelligence 2025 (pi0.5); the numbers follow openpi's JAX models. One replan is
+one prefix pass (images and text through the vision-language model, which leaves keys and values in a cache) and one
+suffix pass (state and noisy actions through the expert) for each denoise step. Only suffix passes have action queries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from capture.attention import RowCollector
+from capture.policies.pi.config import PiConfig
+from capture.policies.pi.gemma import GemmaModel, KeysValues, Rotation
+from capture.policies.pi.siglip import Projector, VisionTower
+
+#: Shortest and longest period of the time embedding.
+MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0
+
+
+def denoise_times(num_steps: int) -> np.ndarray:
+    """Return the flow times at which the network is evaluated, (denoise,) float32: 1 = noise, towards 0 = action.
+
+    Accumulated in float32 as the JAX reference does (1, 0.9, 0.79999995, ...): the fastest wave of the time embedding
+    turns these roundings into visible differences of attention.
+    """
+    step = np.float32(-1.0 / num_steps)
+    times = [np.float32(1.0)]
+    while len(times) < num_steps:
+        times.append(np.float32(times[-1] + step))
+    return np.array(times, dtype=np.float32)
+
+
+def embed_times(times: np.ndarray, width: int) -> Tensor:
+    """Return [sin, cos] waves of the times (denoise,) as (denoise, width) float32 on the CPU.
+
+    Periods are geometric from MIN_PERIOD to MAX_PERIOD. All in float32 like the JAX reference, and always on the CPU,
+    because angles reach 1571 rad, where another device's rounding of the periods would show.
+    """
+    fraction = torch.linspace(0.0, 1.0, width // 2, dtype=torch.float32)
+    period = MIN_PERIOD * (MAX_PERIOD / MIN_PERIOD) ** fraction
+    angle = torch.from_numpy(times)[:, None] * (1.0 / period * 2.0 * torch.pi)
+    return torch.cat([torch.sin(angle), torch.cos(angle)], dim=-1)
+
+
+@dataclass(frozen=True)
+class Prefix:
+    """What the suffix passes need of the prefix: one cache entry per block, and which keys are real.
+
+    cache: per block, keys and values (batch, kv_head, prefix key, dim). valid: (batch, prefix key) bool.
+    """
+
+    cache: tuple[KeysValues, ...]
+    valid: Tensor
+
+
+class PaliGemmaInner(nn.Module):
+    """Image encoder, projector and language model."""
+
+    def __init__(self, config: PiConfig):
+        super().__init__()
+        self.vision_tower = VisionTower(config.siglip)
+        self.multi_modal_projector = Projector(config.siglip.width, config.paligemma.width)
+        self.language_model = GemmaModel(config.paligemma, vocab_size=config.vocab_size)
+
+
+class PaliGemma(nn.Module):
+    """The level that checkpoints call `paligemma`."""
+
+    def __init__(self, config: PiConfig):
+        super().__init__()
+        self.model = PaliGemmaInner(config)
+
+
+class ActionExpert(nn.Module):
+    """The level that checkpoints call `gemma_expert`."""
+
+    def __init__(self, config: PiConfig):
+        super().__init__()
+        self.model = GemmaModel(
+            config.action_expert, condition_width=config.action_expert.width if config.pi05 else None
+        )
+
+
+class PaliGemmaWithExpert(nn.Module):
+    """Both transformers."""
+
+    def __init__(self, config: PiConfig):
+        super().__init__()
+        self.paligemma = PaliGemma(config)
+        self.gemma_expert = ActionExpert(config)
+
+
+class PiModel(nn.Module):
+    """A pi0 or pi0.5 model in float32 or bfloat16.
+
+    With `dtype=torch.bfloat16` these stay in float32, as in openpi's PyTorch model: patch and position embedding, all
+    Gemma norms with the dense layers of the adaptive ones, and the projections of state, action and time. Unlike there,
+    attention logits and the rotary embedding are float32 too (as in the JAX reference), so that recorded rows are not
+    made of logits with 8 bits.
+    """
+
+    def __init__(self, config: PiConfig, dtype: torch.dtype = torch.float32):
+        super().__init__()
+        self.config = config
+        self.dtype = dtype
+        expert = config.action_expert.width
+        self.paligemma_with_expert = PaliGemmaWithExpert(config)
+        self.action_in_proj = nn.Linear(config.action_dim, expert)
+        self.action_out_proj = nn.Linear(expert, config.action_dim)
+        if config.pi05:
+            self.time_mlp_in = nn.Linear(expert, expert)
+            self.time_mlp_out = nn.Linear(expert, expert)
+        else:
+            self.state_proj = nn.Linear(config.action_dim, expert)
+            self.action_time_mlp_in = nn.Linear(2 * expert, expert)
+            self.action_time_mlp_out = nn.Linear(expert, expert)
+        self._place_precision(dtype)
+        self.eval()
+
+    def _place_precision(self, dtype: torch.dtype) -> None:
+        if dtype not in (torch.float32, torch.bfloat16):
+            raise ValueError(f"pi models run in float32 or bfloat16, not in {dtype}")
+        self.paligemma_with_expert.to(dtype)
+        self._inner.vision_tower.vision_model.embeddings.float()
+        for gemma in (self._vlm, self._expert):
+            gemma.norm.float()
+            for block in gemma.layers:
+                block.input_layernorm.float()
+                block.post_attention_layernorm.float()
+
+    @property
+    def _inner(self) -> PaliGemmaInner:
+        return self.paligemma_with_expert.paligemma.model
+
+    @property
+    def _vlm(self) -> GemmaModel:
+        return self._inner.language_model
+
+    @property
+    def _expert(self) -> GemmaModel:
+        return self.paligemma_with_expert.gemma_expert.model
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return self.action_in_proj.weight.device
+
+    def embed_prefix(
+        self, images: Mapping[str, Tensor], image_masks: Mapping[str, Tensor], tokens: Tensor, token_mask: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the prefix (batch, prefix key, width) and which of its keys are real (batch, prefix key) bool.
+
+        A masked camera is still encoded and still owns its keys. Text is scaled by sqrt(width), images are not.
+        """
+        cameras = self.config.cameras
+        batch = tokens.shape[0]
+        # All cameras share the encoder: one pass over (camera · batch) images.
+        encoded = self._inner.vision_tower(torch.cat([images[camera] for camera in cameras]))
+        patches = self._inner.multi_modal_projector(encoded).unflatten(0, (len(cameras), batch))
+        text = self._vlm.embed(tokens)
+        valid = [image_masks[camera][:, None].expand(batch, self.config.siglip.num_tokens) for camera in cameras]
+        return torch.cat([*patches.unbind(0), text], dim=1), torch.cat([*valid, token_mask], dim=1)
+
+    def encode_prefix(self, embedded: Tensor, valid: Tensor) -> Prefix:
+        """Run images and text through the vision-language model once; every key is cached, the invalid ones too.
+
+        Positions count valid keys only. Nothing reads the prefix's outputs but its keys and values, so the last block
+        stops after those.
+        """
+        rotation = Rotation.at(valid.cumsum(dim=1) - 1, self.config.paligemma.head_dim)
+        mask = valid[:, None, :]
+        x = embedded
+        cache = []
+        blocks = list(self._vlm.layers)
+        for block in blocks[:-1]:
+            x, own = block(x, mask, rotation)
+            cache.append(own)
+        cache.append(blocks[-1].keys_values(x, rotation))
+        return Prefix(cache=tuple(cache), valid=valid)
+
+    def _embed_suffix(self, state: Tensor, actions: Tensor, waves: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Return the suffix tokens (batch, suffix query, width) float32 and the norms' condition (batch, width).
+
+        waves: time embedding (width,). pi0.5 feeds time to the norms and has no state token; pi0 mixes time into the
+        action tokens and puts a state token first.
+        """
+        tokens = self.action_in_proj(actions)
+        if self.config.pi05:
+            # The SiLU after the second layer is openpi's, not a slip.
+            condition = F.silu(self.time_mlp_out(F.silu(self.time_mlp_in(waves))))
+            return tokens, condition.expand(actions.shape[0], -1)
+        mixed = torch.cat([tokens, waves.expand_as(tokens)], dim=-1)
+        tokens = self.action_time_mlp_out(F.silu(self.action_time_mlp_in(mixed)))
+        return torch.cat([self.state_proj(state)[:, None], tokens], dim=1), None
+
+    def _suffix_mask(self, prefix_valid: Tensor) -> Tensor:
+        """Return (batch, suffix query, key) bool: all see the prefix, pi0's state token does not see the actions."""
+        batch, queries = prefix_valid.shape[0], self.config.suffix_len
+        among = torch.ones(queries, queries, dtype=torch.bool, device=prefix_valid.device)
+        among[: self.config.first_action_query, self.config.first_action_query :] = False
+        return torch.cat([prefix_valid[:, None].expand(-1, queries, -1), among.expand(batch, -1, -1)], dim=-1)
+
+    @torch.no_grad()
+    def sample_actions(
+        self,
+        images: Mapping[str, Tensor],
+        image_masks: Mapping[str, Tensor],
+        tokens: Tensor,
+        token_mask: Tensor,
+        state: Tensor,
+        noise: Tensor,
+        num_steps: int | None = None,
+        recorder: RowCollector | None = None,
+    ) -> Tensor:
+        """Integrate the flow from noise to actions by Euler steps x ← x − v(x, t)/num_steps.
+
+        Args:
+            images: per camera (batch, 3, height, width) float32 in [-1, 1].
+            image_masks: per camera (batch,) bool.
+            tokens: (batch, text) int. token_mask: (batch, text) bool.
+            state: (batch, action dim) float32, normalised and padded; pi0.5 does not read it.
+            noise: (batch, horizon, action dim) float32, the actions at t = 1.
+            num_steps: number of denoise steps; None takes the configuration's.
+            recorder: asked at every block and denoise step of the expert where its rows shall go; all suffix queries
+                come, and it is told which of them are actions.
+
+        Returns:
+            (batch, horizon, action dim) float32, still normalised.
+        """
+        config = self.config
+        prefix = self.encode_prefix(*self.embed_prefix(images, image_masks, tokens, token_mask))
+        suffix_positions = torch.arange(config.suffix_len, device=noise.device)
+        positions = prefix.valid.sum(dim=1, keepdim=True) + suffix_positions
+        rotation = Rotation.at(positions, config.action_expert.head_dim)
+        mask = self._suffix_mask(prefix.valid)
+        action_queries = slice(config.first_action_query, config.suffix_len)
+
+        steps = config.num_denoise_steps if num_steps is None else num_steps
+        all_waves = embed_times(denoise_times(steps), config.action_expert.width).to(noise.device)
+        x = noise
+        for step, waves in enumerate(all_waves):
+            tokens_now, condition = self._embed_suffix(state, x, waves)
+            hidden = tokens_now.to(self.dtype)
+            for layer, block in enumerate(self._expert.layers):
+                sink = None if recorder is None else recorder.sink(layer, step, action_queries)
+                hidden, _ = block(
+                    hidden, mask, rotation, before=prefix.cache[layer], condition=condition, rows_to=sink
+                )
+            normed, _ = self._expert.norm(hidden[:, action_queries], condition)
+            x = x + (-1.0 / steps) * self.action_out_proj(normed.float())
+        return x

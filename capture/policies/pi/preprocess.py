@@ -1,0 +1,203 @@
+"""openpi's LIBERO preprocessing: images, state, normalisation statistics, and actions back to the environment.
+
+Pure functions on arrays, and the reading of norm_stats.json. Formulas: openpi `examples/libero/main.py` (images, state)
+and `transforms.py` (normalisation); every one is checked against arrays that openpi computed.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from schemas.errors import UserError, listing
+
+NormalisationMode = Literal["quantile", "z-score"]
+
+#: Keeps constant dimensions from dividing by zero (openpi's value).
+NORMALISATION_EPS = 1e-6
+
+#: Action dimensions that a LIBERO or robosuite arm takes: translation, rotation, gripper.
+ENVIRONMENT_ACTION_DIM = 7
+
+
+class NormStatsNotFound(UserError, FileNotFoundError):
+    """The checkpoint brings no normalisation statistics."""
+
+
+class UnusableNormStats(UserError, ValueError):
+    """The normalisation statistics are damaged, or lack what the mode needs."""
+
+
+def model_image(frame: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
+    """Return the image the model sees, (size, size, 3), of a raw camera frame (height, width, 3).
+
+    Rotated by 180°, resized by PIL's bilinear filter with the aspect ratio kept, centred on black.
+    """
+    return resize_with_pad(np.ascontiguousarray(frame[::-1, ::-1]), size)
+
+
+def resize_with_pad(image: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
+    """Resize (height, width, 3) to fit (size, size, 3) with the aspect ratio kept, centred on black."""
+    height, width = image.shape[:2]
+    if (height, width) == (size, size):
+        return image
+    ratio = max(width / size, height / size)
+    fitted_width, fitted_height = int(width / ratio), int(height / ratio)
+    resized = Image.fromarray(image).resize((fitted_width, fitted_height), Image.Resampling.BILINEAR)
+    canvas = np.zeros((size, size, 3), dtype=np.uint8)
+    top, left = max(0, (size - fitted_height) // 2), max(0, (size - fitted_width) // 2)
+    canvas[top : top + fitted_height, left : left + fitted_width] = np.asarray(resized)
+    return canvas
+
+
+def axis_angle(quaternion: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return axis times angle (3,) of a unit quaternion xyzw (4,): xyz · 2 arccos(w) / sqrt(1 - w²).
+
+    The sign of the quaternion is left as it is, as in openpi (and robosuite): w < 0 gives angles above pi.
+    """
+    w = min(1.0, max(-1.0, float(quaternion[3])))
+    sine = math.sqrt(1.0 - w * w)
+    if math.isclose(sine, 0.0):
+        return np.zeros(3)
+    return np.asarray(quaternion[:3], dtype=np.float64) * 2.0 * math.acos(w) / sine
+
+
+def libero_state(
+    eef_pos: NDArray[np.floating], eef_quat: NDArray[np.floating], gripper_qpos: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Return the state (8,): gripper position (3), its axis-angle orientation (3), the two finger joints (2)."""
+    return np.concatenate([eef_pos, axis_angle(eef_quat), gripper_qpos]).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Statistics of one vector, each (dim,) float64; the quantiles are absent in some checkpoints."""
+
+    mean: NDArray[np.float64]
+    std: NDArray[np.float64]
+    q01: NDArray[np.float64] | None = None
+    q99: NDArray[np.float64] | None = None
+
+    def normalise(self, x: NDArray[np.floating], mode: NormalisationMode) -> NDArray[np.float64]:
+        """Map (..., dim) to the model's range: (x - mean)/(std + eps), or q01..q99 to -1..1 without clipping.
+
+        Statistics longer than the data are cut to it (older checkpoints hold padded ones).
+        """
+        dim = x.shape[-1]
+        if mode == "z-score":
+            return (x - self.mean[:dim]) / (self.std[:dim] + NORMALISATION_EPS)
+        low, high = self._quantiles()
+        return (x - low[:dim]) / (high[:dim] - low[:dim] + NORMALISATION_EPS) * 2.0 - 1.0
+
+    def unnormalise(self, x: NDArray[np.floating], mode: NormalisationMode) -> NDArray[np.float64]:
+        """Invert `normalise` on (..., dim); dimensions beyond the statistics pass through."""
+        dim = min(x.shape[-1], len(self.mean))
+        known = x[..., :dim]
+        if mode == "z-score":
+            known = known * (self.std[:dim] + NORMALISATION_EPS) + self.mean[:dim]
+        else:
+            low, high = self._quantiles()
+            known = (known + 1.0) / 2.0 * (high[:dim] - low[:dim] + NORMALISATION_EPS) + low[:dim]
+        return np.concatenate([known, x[..., dim:]], axis=-1, dtype=np.float64)
+
+    def _quantiles(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        if self.q01 is None or self.q99 is None:
+            raise UnusableNormStats("The normalisation statistics have no q01 and q99, which quantile mode needs.")
+        return self.q01, self.q99
+
+
+@dataclass(frozen=True)
+class NormStats:
+    """Statistics of state and actions."""
+
+    state: Statistics
+    actions: Statistics
+
+    def check(self, mode: NormalisationMode, state_dim: int) -> None:
+        """Raise `UnusableNormStats` unless they cover the state and the environment's actions in this mode."""
+        for name, statistics, needed in (
+            ("state", self.state, state_dim),
+            ("actions", self.actions, ENVIRONMENT_ACTION_DIM),
+        ):
+            if len(statistics.mean) < needed:
+                raise UnusableNormStats(
+                    f"The normalisation statistics of '{name}' have {len(statistics.mean)} numbers; {needed} are needed."
+                )
+            if mode == "quantile" and (statistics.q01 is None or statistics.q99 is None):
+                raise UnusableNormStats(f"The normalisation statistics of '{name}' lack q01 and q99 for quantile mode.")
+
+
+def pad_to(x: NDArray[np.floating], dim: int) -> NDArray[np.float64]:
+    """Return (..., dim) with zeros after the given dimensions."""
+    return np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, dim - x.shape[-1])])
+
+
+def environment_actions(
+    model_actions: NDArray[np.floating],
+    stats: NormStats,
+    mode: NormalisationMode,
+    *,
+    relative_to: NDArray[np.floating] | None = None,
+) -> NDArray[np.float64]:
+    """Return environment actions (..., horizon, 7) of model outputs (..., horizon, action dim).
+
+    `relative_to` (..., 8) is the unnormalised state for policies trained on differences to it (openpi's pi0_libero):
+    its first 6 numbers are added, the gripper is left alone.
+    """
+    actions = stats.actions.unnormalise(model_actions, mode)[..., :ENVIRONMENT_ACTION_DIM]
+    if relative_to is not None:
+        actions[..., :6] += relative_to[..., None, :6]
+    return actions
+
+
+def parse_norm_stats(content: object, where: str) -> NormStats:
+    """Build the statistics from the content of openpi's norm_stats.json; `where` names it in errors."""
+    groups = content.get("norm_stats") if isinstance(content, Mapping) else None
+    if not isinstance(groups, Mapping):
+        raise UnusableNormStats(f"{where} has no 'norm_stats' with statistics of 'state' and 'actions'.")
+    return NormStats(state=_statistics(groups, "state", where), actions=_statistics(groups, "actions", where))
+
+
+def _statistics(groups: Mapping[str, Any], name: str, where: str) -> Statistics:
+    numbers = groups.get(name)
+    if not isinstance(numbers, Mapping) or numbers.get("mean") is None or numbers.get("std") is None:
+        raise UnusableNormStats(f"{where} has no mean and std for '{name}'.")
+    arrays: dict[str, NDArray[np.float64] | None] = {}
+    for key in ("mean", "std", "q01", "q99"):
+        given = numbers.get(key)
+        try:
+            arrays[key] = None if given is None else np.asarray(given, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise UnusableNormStats(f"{where} has something else than numbers as '{key}' of '{name}'.") from error
+    lengths = {array.shape for array in arrays.values() if array is not None}
+    if len(lengths) != 1 or len(next(iter(lengths))) != 1:
+        raise UnusableNormStats(f"{where} has statistics of unequal lengths for '{name}': {listing(sorted(lengths))}.")
+    mean, std = arrays["mean"], arrays["std"]
+    assert mean is not None and std is not None  # checked above; tells the type checker
+    return Statistics(mean=mean, std=std, q01=arrays["q01"], q99=arrays["q99"])
+
+
+def read_norm_stats(checkpoint: str | Path) -> NormStats:
+    """Read the statistics that a checkpoint folder brings in assets/<asset id>/norm_stats.json.
+
+    The asset id may be several folders deep. None, or more than one, is an error: which to take is not guessed.
+    """
+    assets = Path(checkpoint) / "assets"
+    found = sorted(assets.rglob("norm_stats.json"))
+    if not found:
+        raise NormStatsNotFound(f"The checkpoint '{checkpoint}' has no norm_stats.json below '{assets}'.")
+    if len(found) > 1:
+        raise UnusableNormStats(f"The checkpoint '{checkpoint}' has more than one norm_stats.json: {listing(found)}.")
+    try:
+        content = json.loads(found[0].read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise UnusableNormStats(f"'{found[0]}' is not valid JSON ({error}).") from error
+    return parse_norm_stats(content, f"'{found[0]}'")

@@ -1,0 +1,204 @@
+"""Instruction (and state) to prompt tokens, with the role of every token and the characters it stands for.
+
+Prompt formats are openpi's, whose tokenizer is PaliGemma's sentencepiece model. Roles come from character offsets, never from
+searching token ids: an instruction may well contain the word "State".
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import sentencepiece
+from numpy.typing import NDArray
+
+from schemas.errors import BadArgument, UserError
+from schemas.layout import ROLE_DTYPE, Piece, Prompt, Role
+
+
+class TokenizerNotFound(UserError, FileNotFoundError):
+    """There is no tokenizer file where it should be."""
+
+
+class UnreadableTokenizer(UserError, ValueError):
+    """The file is no sentencepiece model, or not one for pi."""
+
+
+@dataclass(frozen=True)
+class TokenizedPrompt:
+    """A prompt as the model reads it, padded to its text slots.
+
+    ids: (text,) int64; mask: (text,) bool, True = a real token; roles: (text,) uint8 codes of `Role`; prompt: the text
+    given to the model, its pieces with their keys, and the range of the instruction.
+    """
+
+    ids: NDArray[np.int64]
+    mask: NDArray[np.bool_]
+    roles: NDArray[np.uint8]
+    prompt: Prompt
+
+
+@dataclass(frozen=True)
+class _Section:
+    """A part of the prompt with one role; `encode_alone` starts a new encoder call with it."""
+
+    text: str
+    role: Role
+    encode_alone: bool = False
+
+
+@dataclass(frozen=True)
+class _Token:
+    """One encoded token: id, vocabulary piece, and its characters [start, stop) of the prompt."""
+
+    id: int
+    piece: str
+    start: int
+    stop: int
+
+
+def clean_instruction(instruction: str) -> str:
+    """Return the instruction as openpi cleans it: strip, then "_" and newlines become spaces, nothing else changes."""
+    cleaned = instruction.strip().replace("_", " ").replace("\n", " ")
+    if not cleaned.strip():
+        raise BadArgument(f"The instruction {instruction!r} is empty: a policy needs at least one word.")
+    return cleaned
+
+
+def digitise_state(state: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Return the bin of each normalised state value, (state,): 0..255 over [-1, 1), 255 above, -1 below.
+
+    The -1 is what openpi's formula gives, so it occurs in the prompts that its policies were trained on.
+    """
+    return np.digitize(state, np.linspace(-1, 1, 256 + 1)[:-1]) - 1
+
+
+class PromptTokenizer:
+    """A sentencepiece model and openpi's prompt formats."""
+
+    def __init__(self, model_path: str | Path):
+        path = Path(model_path)
+        if not path.is_file():
+            raise TokenizerNotFound(
+                f"There is no tokenizer file at '{path}'; pi policies need PaliGemma's sentencepiece model "
+                "(paligemma_tokenizer.model)."
+            )
+        content = path.read_bytes()
+        #: SHA-256 (hex) of the file
+        self.digest = hashlib.sha256(content).hexdigest()
+        self._processor = sentencepiece.SentencePieceProcessor()
+        try:
+            self._processor.LoadFromSerializedProto(content)
+        except (RuntimeError, OSError) as error:
+            raise UnreadableTokenizer(f"'{path}' is not a sentencepiece model, or it is damaged.") from error
+        if self._processor.bos_id() < 0:
+            raise UnreadableTokenizer(f"The tokenizer '{path}' has no BOS token, which every pi prompt starts with.")
+
+    @property
+    def vocab_size(self) -> int:
+        """Number of ids; the model's table must have at least as many rows."""
+        return int(self._processor.get_piece_size())
+
+    def tokenize(
+        self, instruction: str, *, max_token_len: int, first_key: int = 0, state: NDArray[np.floating] | None = None
+    ) -> TokenizedPrompt:
+        """Tokenize an instruction, and the state too when one is given.
+
+        Formats (openpi): without state BOS, instruction, "\\n" (encoded on its own); with it, in one go,
+        "Task: {instruction}, State: {bins};\\nAction: ".
+
+        Args:
+            instruction: as the task says it; it is cleaned here.
+            max_token_len: text slots of the model. A longer prompt is a `BadArgument`, where openpi would cut it.
+            first_key: key of the first text slot, for the pieces.
+            state: (state,) normalised, unpadded.
+        """
+        sections = _sections(clean_instruction(instruction), state)
+        tokens = self._encode(sections)
+        length = 1 + len(tokens)
+        if length > max_token_len:
+            raise BadArgument(
+                f"The prompt of the instruction '{instruction}' has {length} tokens, but the model has room for "
+                f"{max_token_len}; shorten the instruction."
+            )
+        ids = np.zeros(max_token_len, dtype=np.int64)
+        mask = np.arange(max_token_len) < length
+        roles = np.full(max_token_len, Role.PADDING, dtype=ROLE_DTYPE)
+        ids[0], roles[0] = self._processor.bos_id(), Role.BOS
+        ids[1:length] = [token.id for token in tokens]
+        text = "".join(section.text for section in sections)
+        role_of_character = [section.role for section in sections for _ in section.text]
+        roles[1:length] = [_role(token, text, role_of_character) for token in tokens]
+        pieces = tuple(
+            Piece(key=first_key + slot, text=token.piece, start=token.start, stop=token.stop)
+            for slot, token in enumerate(tokens, start=1)
+        )
+        start = role_of_character.index(Role.INSTRUCTION)
+        prompt = Prompt(text, pieces, (start, start + role_of_character.count(Role.INSTRUCTION)))
+        return TokenizedPrompt(ids=ids, mask=mask, roles=roles, prompt=prompt)
+
+    def _encode(self, sections: Sequence[_Section]) -> list[_Token]:
+        """Encode the sections, joined except where one is to be encoded alone; offsets are into the whole text."""
+        calls: list[str] = []
+        for section in sections:
+            if section.encode_alone or not calls:
+                calls.append(section.text)
+            else:
+                calls[-1] += section.text
+        tokens: list[_Token] = []
+        offset = 0
+        for call in calls:
+            tokens += [_Token(t.id, t.piece, t.start + offset, t.stop + offset) for t in self._encode_one(call)]
+            offset += len(call)
+        return tokens
+
+    def _encode_one(self, text: str) -> list[_Token]:
+        """Encode one string without BOS; offsets count characters."""
+        # sentencepiece 0.2.3 replaced its proto objects, and its new ones want the protobuf package.
+        if hasattr(self._processor, "EncodeAsOffsetMapping"):
+            found = self._processor.EncodeAsOffsetMapping(text)
+            tokens = [
+                _Token(id_, piece, start, stop)
+                for id_, piece, (start, stop) in zip(found["ids"], found["pieces"], found["offsets"], strict=True)
+            ]
+        else:
+            pieces = self._processor.EncodeAsImmutableProto(text).pieces
+            tokens = [_Token(p.id, p.piece, p.begin, p.end) for p in pieces]
+        return _spread_bytes(tokens)
+
+
+def _sections(cleaned: str, state: NDArray[np.floating] | None) -> list[_Section]:
+    instruction = _Section(cleaned, Role.INSTRUCTION)
+    if state is None:
+        return [instruction, _Section("\n", Role.TEMPLATE, encode_alone=True)]
+    bins = " ".join(str(number) for number in digitise_state(state))
+    return [
+        _Section("Task: ", Role.TEMPLATE),
+        instruction,
+        _Section(", State: ", Role.TEMPLATE),
+        _Section(bins, Role.STATE),
+        _Section(";\nAction: ", Role.TEMPLATE),
+    ]
+
+
+def _spread_bytes(tokens: list[_Token]) -> list[_Token]:
+    """Give every byte of a character the whole character: sentencepiece gives it to the last byte only."""
+    spread: list[_Token] = []
+    for token in reversed(tokens):
+        empty = token.start == token.stop
+        following = spread[-1] if spread else None
+        if empty and following is not None and following.start == token.start:
+            token = _Token(token.id, token.piece, following.start, following.stop)
+        spread.append(token)
+    return spread[::-1]
+
+
+def _role(token: _Token, text: str, role_of_character: list[Role]) -> Role:
+    """Return the role that most of the token's visible characters have; one of spaces only goes by its first."""
+    characters = range(token.start, token.stop) or range(token.start, token.start + 1)
+    visible = [i for i in characters if i < len(text) and not text[i].isspace()]
+    found = [role_of_character[i] for i in visible] or [role_of_character[min(token.start, len(text) - 1)]]
+    return max(dict.fromkeys(found), key=found.count)

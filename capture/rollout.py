@@ -1,0 +1,159 @@
+"""Running a policy in an environment, episode by episode, and handing every replan to the store."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.attention import AttentionRecorder, RecordingPlan
+from capture.environments.base import Environment, Observation, Task
+from capture.environments.coverage import patch_coverage
+from capture.noise import noise_seed
+from capture.policies.base import Policy
+from capture.store_writer import EpisodeStart, EpisodeWriter, ReplanRecord, RunStore
+from schemas.errors import BadArgument
+from schemas.store import Protocol, Recording
+
+#: Called after each replan with (environment steps done, most steps of the episode).
+StepReport = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """How an episode ended and where it was stored."""
+
+    task_id: int
+    episode_index: int
+    success: bool
+    num_steps: int
+    num_replans: int
+    folder: Path
+
+
+def max_replans(protocol: Protocol) -> int:
+    """Largest number of policy calls that one episode can have."""
+    return math.ceil(protocol.max_steps / protocol.replan_steps)
+
+
+def check_protocol(protocol: Protocol, policy: Policy) -> None:
+    """Raise `BadArgument` when the policy cannot follow the protocol."""
+    if protocol.max_steps < 1:
+        raise BadArgument(f"Cannot use --max-steps {protocol.max_steps}; expected at least 1.")
+    if not 1 <= protocol.replan_steps <= policy.action_horizon:
+        raise BadArgument(
+            f"Cannot use --replan-steps {protocol.replan_steps}: the policy gives {policy.action_horizon} actions a call; "
+            f"expected 1 to {policy.action_horizon}."
+        )
+
+
+def run_episode(
+    environment: Environment,
+    policy: Policy,
+    store: RunStore,
+    task: Task,
+    episode_index: int,
+    provenance: dict[str, str],
+    report: StepReport | None = None,
+) -> EpisodeResult:
+    """Run one episode from the stored initial state of the same index, and commit it.
+
+    The protocol of the published evaluations: waiting steps, then a policy call every `replan_steps` executed actions until
+    the task is solved or `max_steps` actions have been executed.
+    """
+    protocol = store.attributes.protocol
+    environment.reset(episode_index, protocol.seed)
+    start = EpisodeStart(
+        task_id=task.task_id,
+        task_name=task.name,
+        instruction=task.instruction,
+        episode_index=episode_index,
+        initial_state_index=episode_index,
+        initial_state_digest=environment.initial_state_digest,
+        objects=tuple(environment.objects),
+        provenance=provenance,
+    )
+    denoise_times = policy.denoise_times()[list(store.attributes.recording.denoise_steps)]
+    with store.episode(start, denoise_times, max_replans(protocol)) as writer:
+        observation = _wait(environment, protocol.wait_steps)
+        success, step, replans = False, 0, 0
+        while step < protocol.max_steps and not success:
+            actions = _replan(environment, policy, store, writer, task, episode_index, observation, step)
+            replans += 1
+            chunk = min(protocol.replan_steps, protocol.max_steps - step)
+            for i in range(chunk):
+                # Pictures are drawn only where the policy will look: before the next replan.
+                look = i == chunk - 1 and step + 1 < protocol.max_steps
+                result = environment.step(actions[i], observe=look)
+                step += 1
+                success = result.success
+                if success:
+                    break
+                if result.observation is not None:
+                    observation = result.observation
+            if report is not None:
+                report(step, protocol.max_steps)
+        folder = writer.commit(success, step)
+    return EpisodeResult(task.task_id, episode_index, success, step, replans, folder)
+
+
+def recording_plans(recording: Recording, policy: Policy) -> Iterator[tuple[str, AttentionRecorder]]:
+    """Fresh recorders for one replan, one per site."""
+    for site in policy.sites:
+        plan = RecordingPlan(recording.layers, recording.denoise_steps, recording.heads, recording.queries, site.name)
+        yield site.name, AttentionRecorder(plan, site.num_keys)
+
+
+def _wait(environment: Environment, steps: int) -> Observation:
+    observation = None
+    for i in range(steps):
+        observation = environment.step(environment.wait_action, observe=i == steps - 1).observation
+    if observation is None:
+        raise ValueError("an episode needs at least one waiting step: the first picture is the one after it")
+    return observation
+
+
+def _replan(
+    environment: Environment,
+    policy: Policy,
+    store: RunStore,
+    writer: EpisodeWriter,
+    task: Task,
+    episode_index: int,
+    observation: Observation,
+    step: int,
+) -> NDArray[np.float64]:
+    protocol, recording = store.attributes.protocol, store.attributes.recording
+    policy_input = policy.prepare(observation, task.instruction)
+    seed = noise_seed(protocol.seed, task.task_id, episode_index, len(writer.records))
+    (site, recorder), *others = recording_plans(recording, policy)
+    assert not others, "pi has one site"
+    actions = policy.act(policy_input, seed, recorder)
+    coverage = {
+        camera.slot: patch_coverage(
+            environment.segmentation(camera.environment_camera),
+            len(environment.objects),
+            camera.grid.rows,
+            camera.grid.columns,
+            rotate_180=camera.rotate_180,
+        )
+        for camera in policy.cameras
+    }
+    writer.append(
+        ReplanRecord(
+            env_step=protocol.wait_steps + step,
+            noise_seed=seed,
+            rows={site: recorder.finish()},
+            key_role={site: policy_input.key_role},
+            prompt=policy_input.prompt,
+            state=policy_input.state,
+            actions=actions,
+            frames=policy_input.frames if recording.frames else {},
+            coverage=coverage,
+        )
+    )
+    return actions

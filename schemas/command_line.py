@@ -1,0 +1,30 @@
+"""What both command lines share: mistakes end with one sentence and exit code 2, never with a traceback."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from typing import NoReturn
+
+from schemas.errors import UserError
+
+
+class OneSentenceParser(argparse.ArgumentParser):
+    """An argument parser whose mistakes read like all the others."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the problem and where help is; exit code 2."""
+        self.exit(2, f"{self.prog}: {message}. See {self.prog} --help.\n")
+
+
+def run_command(program: str, command: Callable[[], int], if_stopped: str) -> int:
+    """Run a command and return its exit code; a `UserError` becomes one sentence and 2, Ctrl-C a sentence and 130."""
+    try:
+        return command()
+    except UserError as error:
+        print(f"{program}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"\n{program}: stopped; {if_stopped}", file=sys.stderr)
+        return 130

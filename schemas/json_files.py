@@ -1,0 +1,55 @@
+"""The JSON Schema files in `schemas/json/`, made from the dataclasses: `python -m schemas.json_files` writes them anew."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from schemas.grouping import GroupingFile
+from schemas.jsonable import json_schema
+from schemas.results import EpisodeResult
+from schemas.store import EpisodeAttributes, RootAttributes
+
+FOLDER = Path(__file__).parent / "json"
+
+
+def schema_documents() -> dict[str, dict[str, Any]]:
+    """File name to JSON Schema, for everything that the tool writes or reads as JSON or TOML."""
+    return {
+        "root_attributes.schema.json": json_schema(
+            RootAttributes,
+            "Store root attributes",
+            "Attributes of the root group of a NAME.zarr store: the run's identity.",
+        ),
+        "episode_attributes.schema.json": json_schema(
+            EpisodeAttributes, "Episode attributes", "Attributes of one group in episodes/ of a NAME.zarr store."
+        ),
+        "grouping.schema.json": json_schema(
+            GroupingFile, "Grouping file", "A TOML grouping file, after reading: group name to selector or selectors."
+        ),
+        "results.schema.json": json_schema(
+            list[EpisodeResult], "Results file", "attention_ratio_results_<suite>.json: a list of episodes."
+        ),
+    }
+
+
+def schema_text(document: dict[str, Any]) -> str:
+    """A schema as it stands in its file."""
+    return json.dumps(document, indent=2, ensure_ascii=False) + "\n"
+
+
+def write_schema_files(folder: Path = FOLDER) -> list[Path]:
+    """Write every schema file into a folder and return their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for name, document in schema_documents().items():
+        path = folder / name
+        path.write_text(schema_text(document), encoding="utf-8")
+        paths.append(path)
+    return paths
+
+
+if __name__ == "__main__":
+    for written in write_schema_files():
+        print(written)

@@ -1,0 +1,93 @@
+"""The results file `attention_ratio_results_<suite>.json`: a list of episodes, in the structure of the published scripts.
+
+Where this differs from the published scripts' files: a ratio that is not finite is null (they write Infinity, which is not JSON),
+summaries count such ratios in `num_nonfinite`, and a summary over no finite ratio is null (they write 0.0).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from schemas.errors import UserError
+
+RESULTS_PREFIX = "attention_ratio_results_"
+
+
+class ResultsError(UserError, ValueError):
+    """A results file that cannot be read or written."""
+
+
+class ResultsNotFound(ResultsError, FileNotFoundError):
+    """No results file at the given path."""
+
+
+@dataclass(frozen=True)
+class StepRatio:
+    """One replan. `step` is the environment step index, waiting steps included; masses and fractions are without unit."""
+
+    step: int
+    visual_linguistic_ratio: float | None
+    visual_mass: float
+    linguistic_mass: float
+    visual_fraction: float | None
+    linguistic_fraction: float | None
+    action_mass: float | None = None
+    action_fraction: float | None = None
+
+
+@dataclass(frozen=True)
+class RatioSummary:
+    """Ratio over the replans of an episode: finite ones only, ddof 0; `num_nonfinite` counts the others."""
+
+    mean: float | None
+    std: float | None
+    median: float | None
+    min: float | None
+    max: float | None
+    num_nonfinite: int
+
+
+@dataclass(frozen=True)
+class MeanStd:
+    """Mean and standard deviation (ddof 0) over the replans of an episode."""
+
+    mean: float | None
+    std: float | None
+
+
+@dataclass(frozen=True)
+class LayerSummary:
+    """One layer of one episode. `num_steps` is the number of replans that are summarized."""
+
+    visual_linguistic_ratio: RatioSummary
+    visual_mass: MeanStd
+    linguistic_mass: MeanStd
+    visual_fraction: MeanStd
+    linguistic_fraction: MeanStd
+    num_steps: int
+    action_mass: MeanStd | None = None
+    action_fraction: MeanStd | None = None
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """One episode. Keys of `summary` and `per_step_ratios`: `layer_N` for every layer, and `layers_avg`."""
+
+    task_id: int
+    episode_idx: int
+    task_description: str
+    success: bool
+    num_steps: int
+    summary: dict[str, LayerSummary]
+    per_step_ratios: dict[str, list[StepRatio]]
+
+
+def results_file_name(suite: str) -> str:
+    """File name of a suite's results."""
+    return f"{RESULTS_PREFIX}{suite}.json"
+
+
+def suite_of_results_file(path: Path) -> str:
+    """The suite that a results file is about: its name without prefix and ending."""
+    return path.stem.removeprefix(RESULTS_PREFIX)

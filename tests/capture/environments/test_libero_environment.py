@@ -1,0 +1,195 @@
+"""The real LIBERO: same pictures as the untouched protocol, same episodes in any order, true segmentation."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("libero")
+pytest.importorskip("robosuite")
+
+from capture.environments.base import EnvironmentSettings, Observation
+from capture.environments.libero import LiberoEnvironment, load_initial_states, parent_of_region
+from capture.environments.libero_installation import load_libero, package_folder
+from capture.environments.suites import find_suite, make_environment
+from schemas.errors import BadArgument, UnknownName
+
+SUITE, TASK_ID, SEED, INDEX = "libero_spatial", 7, 7, 3
+CAMERAS = ("agentview", "robot0_eye_in_hand")
+ACTIONS = np.random.default_rng(0).uniform(-1, 1, (7, 7))
+OBSERVED = (0, 4, 5)
+
+
+def stored_states() -> np.ndarray:
+    name = "pick_up_the_black_bowl_on_the_stove_and_place_it_on_the_plate"
+    return load_initial_states(package_folder() / "init_files" / SUITE / f"{name}.pruned_init")
+
+
+def identical(left: Observation, right: Observation) -> bool:
+    return all(np.array_equal(left.images[camera], right.images[camera]) for camera in CAMERAS) and all(
+        np.array_equal(getattr(left, name), getattr(right, name)) for name in ("eef_pos", "eef_quat", "gripper_qpos")
+    )
+
+
+def run_episode(environment: LiberoEnvironment, index: int, steps: int, observed: tuple[int, ...]) -> list[Observation]:
+    """Wait and act; return the observation of the last waiting step and those after the `observed` actions."""
+    environment.reset(index, SEED)
+    observations = [
+        environment.step(environment.wait_action, observe=step == environment.wait_steps - 1).observation
+        for step in range(environment.wait_steps)
+    ]
+    observations += [environment.step(ACTIONS[step], observe=step in observed).observation for step in range(steps)]
+    return [observation for observation in observations if observation is not None]
+
+
+@pytest.fixture(scope="module")
+def protocol(libero_assets: Path) -> list[dict[str, np.ndarray]]:
+    """What the untouched environment of the package returns in the same episode, drawing at every step."""
+    load_libero(libero_assets)
+    from libero.libero.envs import OffScreenRenderEnv
+
+    folder = package_folder() / "bddl_files" / SUITE
+    task = next(folder.glob("*on_the_stove_and_place_it_on_the_plate.bddl"))
+    environment = OffScreenRenderEnv(bddl_file_name=str(task), camera_heights=256, camera_widths=256)
+    environment.seed(SEED)
+    environment.reset()
+    environment.set_init_state(stored_states()[INDEX])
+    values = [environment.step([0.0] * 6 + [-1.0])[0] for _ in range(10)][-1:]
+    values += [environment.step(action)[0] for action in ACTIONS]
+    environment.close()
+    return [values[0], *(values[1 + step] for step in OBSERVED)]
+
+
+@pytest.fixture(scope="module")
+def environment(protocol: list[dict[str, np.ndarray]], libero_assets: Path) -> Iterator[LiberoEnvironment]:
+    # After `protocol`: the untouched environment must be gone, since it does not mind whose drawing context is current.
+    made = make_environment(find_suite(SUITE), TASK_ID, EnvironmentSettings(libero_assets=libero_assets))
+    assert isinstance(made, LiberoEnvironment)
+    yield made
+    made.close()
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def episode(environment: LiberoEnvironment) -> list[Observation]:
+    return run_episode(environment, INDEX, len(ACTIONS), OBSERVED)
+
+
+@pytest.mark.libero
+def test_stored_states_are_read_without_running_pickled_code() -> None:
+    states = stored_states()
+    assert states.dtype == np.float64
+    assert states.shape == (50, 92)
+    assert np.isfinite(states).all()
+
+
+def test_regions_belong_to_what_they_are_part_of() -> None:
+    known = ["wine_rack_1", "wooden_cabinet_1", "wooden_cabinet_10"]
+    assert parent_of_region("wine_rack_1_top_region", known) == "wine_rack_1"
+    assert parent_of_region("wooden_cabinet_10_top_side", known) == "wooden_cabinet_10"
+    assert parent_of_region("main_table_stove_front_region", known) is None
+
+
+@pytest.mark.simulator
+@pytest.mark.libero
+def test_pictures_are_those_of_the_untouched_protocol(
+    protocol: list[dict[str, np.ndarray]], episode: list[Observation]
+) -> None:
+    assert len(protocol) == len(episode) == 1 + len(OBSERVED)
+    for theirs, ours in zip(protocol, episode, strict=True):
+        for camera in CAMERAS:
+            assert ours.images[camera].shape == (256, 256, 3)
+            np.testing.assert_array_equal(ours.images[camera], theirs[f"{camera}_image"])
+        np.testing.assert_array_equal(ours.eef_pos, theirs["robot0_eef_pos"])
+        np.testing.assert_array_equal(ours.eef_quat, theirs["robot0_eef_quat"])
+        np.testing.assert_array_equal(ours.gripper_qpos, theirs["robot0_gripper_qpos"])
+
+
+@pytest.mark.simulator
+@pytest.mark.libero
+def test_the_segmentation_shows_the_moment_of_the_picture(
+    environment: LiberoEnvironment, episode: list[Observation]
+) -> None:
+    """Drawing the kept moment in colour gives the picture bit for bit; drawing the end of the step does not."""
+    last = run_episode(environment, INDEX, OBSERVED[-1] + 1, OBSERVED[-1:])[-1]
+    segmented = environment.segmentation("agentview")
+    simulation = environment._simulator.sim
+    end_of_step = simulation.render(camera_name="agentview", width=256, height=256)
+    context = simulation._render_context_offscreen
+    original, context.data = context.data, type("Kept", (), {"_data": environment._moment})
+    kept = simulation.render(camera_name="agentview", width=256, height=256)
+    context.data = original
+    np.testing.assert_array_equal(kept, last.images["agentview"])
+    assert not np.array_equal(end_of_step, last.images["agentview"])
+    environment.step(environment.wait_action, observe=False)  # the segmentation stays with the picture
+    np.testing.assert_array_equal(environment.segmentation("agentview"), segmented)
+
+
+@pytest.mark.simulator
+@pytest.mark.libero
+def test_episodes_do_not_depend_on_what_ran_before(environment: LiberoEnvironment, episode: list[Observation]) -> None:
+    caller_state = np.random.get_state(legacy=False)["state"]["key"].copy()  # noqa: NPY002
+    run_episode(environment, 11, 2, ())
+    other = environment.initial_state_digest
+    again = run_episode(environment, INDEX, len(ACTIONS), OBSERVED)
+    assert all(identical(left, right) for left, right in zip(again, episode, strict=True))
+    assert environment.initial_state_digest == hashlib.sha256(stored_states()[INDEX].tobytes()).hexdigest() != other
+    state = np.random.get_state(legacy=False)["state"]["key"]  # noqa: NPY002
+    np.testing.assert_array_equal(state, caller_state)
+
+
+@pytest.mark.simulator
+@pytest.mark.libero
+def test_objects_and_their_pixels(environment: LiberoEnvironment, episode: list[Observation]) -> None:
+    run_episode(environment, INDEX, 0, ())
+    kinds = {thing.name: (thing.kind, thing.of_interest) for thing in environment.objects}
+    assert kinds["akita_black_bowl_1"] == kinds["plate_1"] == ("object", True)
+    assert kinds["akita_black_bowl_2"] == ("object", False)
+    assert kinds["flat_stove_1"] == ("fixture", False)
+    assert kinds["robot"] == ("robot", False)
+    assert kinds["background"] == ("background", False)
+    names = [thing.name for thing in environment.objects]
+    for camera in CAMERAS:
+        segmentation = environment.segmentation(camera)
+        assert segmentation.dtype == np.int32
+        assert segmentation.shape == (256, 256)
+        shown = {
+            names[index]: int(count) for index, count in zip(*np.unique(segmentation, return_counts=True), strict=True)
+        }
+        for name in ("akita_black_bowl_1", "plate_1", "robot", "background"):
+            assert shown[name] > 300, (camera, name)
+    plate = environment.segmentation("agentview") == names.index("plate_1")
+    assert episode[0].images["agentview"][plate].mean() > 150  # the plate is the lightest thing on the table
+    with pytest.raises(UnknownName, match="Did you mean 'agentview'"):
+        environment.segmentation("agent_view")
+
+
+@pytest.mark.simulator
+@pytest.mark.libero
+def test_the_seed_places_the_fixtures(environment: LiberoEnvironment) -> None:
+    """They are in the model and not in the stored state; equal seeds put them in the same place in every episode."""
+    placed = []
+    for index, seed in ((0, SEED), (1, SEED), (0, SEED + 1)):
+        environment.reset(index, seed)
+        placed.append(environment._simulator.sim.model.body_pos.copy())
+    np.testing.assert_array_equal(placed[0], placed[1])
+    assert 0 < np.abs(placed[0] - placed[2]).max() < 0.05
+
+
+@pytest.mark.simulator
+@pytest.mark.libero
+def test_wrong_actions_and_indices_are_refused(environment: LiberoEnvironment) -> None:
+    with pytest.raises(BadArgument, match="Initial state 50"):
+        environment.reset(50, SEED)
+    with pytest.raises(BadArgument, match="seed is -1"):
+        environment.reset(0, -1)
+    environment.reset(0, SEED)
+    with pytest.raises(RuntimeError, match="No picture"):
+        environment.segmentation("agentview")
+    for action in (np.zeros(8), np.full(7, np.nan)):
+        with pytest.raises(BadArgument, match="7 finite numbers"):
+            environment.step(action, observe=False)

@@ -1,0 +1,133 @@
+"""Finding LIBERO and its assets without questions, downloads or traces at home."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from capture.environments import libero_installation
+from capture.environments.base import EnvironmentSettings
+from capture.environments.libero_installation import (
+    ASSET_SUBFOLDERS,
+    ASSETS_SOURCE,
+    ASSETS_VARIABLE,
+    LiberoAssetsMissing,
+    find_assets,
+    instruction_of,
+    list_libero_tasks,
+)
+from capture.environments.suites import SUITES, find_suite, list_tasks
+from schemas.errors import MissingDependency, UserError
+
+try:
+    libero_installation.package_folder()
+except MissingDependency:
+    pytest.skip("LIBERO is not installed", allow_module_level=True)
+
+
+@pytest.fixture
+def no_assets(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A machine without assets anywhere: no variable, an empty home, a package without its own."""
+    monkeypatch.delenv(ASSETS_VARIABLE, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr(libero_installation, "package_folder", lambda: tmp_path / "libero")
+    return tmp_path
+
+
+def asset_folder(folder: Path) -> Path:
+    for name in ASSET_SUBFOLDERS:
+        (folder / name).mkdir(parents=True)
+    return folder
+
+
+def test_missing_assets_say_what_to_do(no_assets: Path) -> None:
+    with pytest.raises(LiberoAssetsMissing) as caught:
+        find_assets(None)
+    assert isinstance(caught.value, UserError)
+    assert isinstance(caught.value, FileNotFoundError)
+    for hint in ("--libero-assets", ASSETS_VARIABLE, ASSETS_SOURCE, str(no_assets)):
+        assert hint in str(caught.value)
+
+
+def test_assets_are_looked_for_in_order(no_assets: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    downloaded = asset_folder(no_assets / ".cache" / "libero" / "assets")
+    assert find_assets(None) == downloaded
+    own = asset_folder(no_assets / "libero" / "assets")
+    assert find_assets(None) == own
+    from_variable = asset_folder(no_assets / "variable")
+    monkeypatch.setenv(ASSETS_VARIABLE, str(from_variable))
+    assert find_assets(None) == from_variable
+    configured = asset_folder(no_assets / "configured")
+    assert find_assets(configured) == configured
+
+
+def test_a_given_folder_must_be_one(no_assets: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asset_folder(no_assets / "libero" / "assets")  # would be found, but what is given is never passed over
+    with pytest.raises(LiberoAssetsMissing, match="does not exist"):
+        find_assets(no_assets / "nowhere")
+    (no_assets / "other" / "scenes").mkdir(parents=True)
+    monkeypatch.setenv(ASSETS_VARIABLE, str(no_assets / "other"))
+    with pytest.raises(LiberoAssetsMissing, match=f"{ASSETS_VARIABLE}.* lacks textures, articulated_objects"):
+        find_assets(None)
+
+
+def test_a_missing_package_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(MissingDependency, match="not installed.*make setup"):
+        libero_installation.package_folder.__wrapped__()
+
+
+def test_every_suite_lists_its_tasks() -> None:
+    for suite in SUITES:
+        tasks = list_tasks(suite, EnvironmentSettings())
+        assert [task.task_id for task in tasks] == list(range(suite.num_tasks))
+    first = list_libero_tasks(find_suite("libero_spatial"))[0]
+    assert first.instruction == "pick up the black bowl between the plate and the ramekin and place it on the plate"
+
+
+@pytest.mark.parametrize(
+    ("name", "instruction"),
+    [
+        ("KITCHEN_SCENE10_put_the_butter_in_the_drawer", "put the butter in the drawer"),
+        ("LIVING_ROOM_SCENE2_pick_up_the_ketchup", "pick up the ketchup"),
+        ("open_the_middle_drawer_of_the_cabinet", "open the middle drawer of the cabinet"),
+    ],
+)
+def test_instructions_come_from_names(name: str, instruction: str) -> None:
+    assert instruction_of(name) == instruction
+
+
+@pytest.mark.libero
+def test_nothing_is_asked_printed_or_left_at_home(tmp_path: Path, libero_assets: Path) -> None:
+    """A fresh process loads the real package; standard input is closed. Compares all names with the package's own."""
+    code = (
+        "import os, sys\n"
+        "from pathlib import Path\n"
+        "from capture.environments.libero_installation import list_libero_tasks, load_libero\n"
+        "from capture.environments.suites import SUITES\n"
+        "load_libero(Path(sys.argv[1]))\n"
+        "from libero.libero import get_assets_path\n"
+        "assert get_assets_path() == sys.argv[1]\n"
+        "assert 'LIBERO_CONFIG_PATH' not in os.environ\n"
+        "from libero.libero.benchmark import task_maps\n"
+        "for suite in SUITES:\n"
+        "    if suite.kind == 'libero':\n"
+        "        theirs = [(task.name, task.language) for task in task_maps[suite.name].values()]\n"
+        "        assert theirs == [(task.name, task.instruction) for task in list_libero_tasks(suite)]\n"
+        "assert not {'robomimic', 'torchvision', 'wandb', 'hydra'} & set(sys.modules)\n"
+    )
+    environment = {key: value for key, value in os.environ.items() if key != "LIBERO_CONFIG_PATH"}
+    environment |= {"HOME": str(tmp_path), "CUDA_VISIBLE_DEVICES": "GPU-0a1b2c3d"}
+    result = subprocess.run(
+        [sys.executable, "-c", code, str(libero_assets)],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        env=environment,
+    )
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+    assert not (tmp_path / ".libero").exists()

@@ -1,0 +1,84 @@
+"""Area fractions of objects in patches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from capture.environments.coverage import overlap_lengths, patch_coverage
+from schemas.errors import BadArgument
+
+NUM_OBJECTS = 4
+pictures = arrays.arrays(
+    np.int32, st.tuples(st.integers(1, 13), st.integers(1, 13)), elements=st.integers(0, NUM_OBJECTS - 1)
+)
+grids = st.tuples(st.integers(1, 9), st.integers(1, 9))
+
+
+def fine_grained(segmentation: np.ndarray, grid_rows: int, grid_columns: int) -> np.ndarray:
+    """Reference: enlarge every pixel until patches hold whole ones, then count."""
+    height, width = segmentation.shape
+    large = np.repeat(np.repeat(segmentation, grid_rows, axis=0), grid_columns, axis=1)
+    patches = large.reshape(grid_rows, height, grid_columns, width).transpose(0, 2, 1, 3).reshape(-1, height * width)
+    return np.stack([(patches == index).mean(axis=1) for index in range(NUM_OBJECTS)], axis=1)
+
+
+@given(pictures, grids)
+def test_equals_counting_in_an_enlarged_picture(segmentation: np.ndarray, grid: tuple[int, int]) -> None:
+    coverage = patch_coverage(segmentation, NUM_OBJECTS, *grid, rotate_180=False)
+    assert coverage.dtype == np.float32
+    assert coverage.shape == (grid[0] * grid[1], NUM_OBJECTS)
+    np.testing.assert_allclose(coverage, fine_grained(segmentation, *grid), atol=1e-6)
+
+
+@given(pictures, grids, st.booleans())
+def test_rows_sum_to_one_and_areas_are_kept(segmentation: np.ndarray, grid: tuple[int, int], rotate: bool) -> None:
+    coverage = patch_coverage(segmentation, NUM_OBJECTS, *grid, rotate_180=rotate)
+    np.testing.assert_allclose(coverage.sum(axis=1), 1, atol=1e-6)
+    areas = np.bincount(segmentation.ravel(), minlength=NUM_OBJECTS) / segmentation.size
+    np.testing.assert_allclose(coverage.mean(axis=0), areas, atol=1e-6)
+
+
+@given(pictures, grids)
+def test_rotation_reverses_the_order_of_the_patches(segmentation: np.ndarray, grid: tuple[int, int]) -> None:
+    straight = patch_coverage(segmentation, NUM_OBJECTS, *grid, rotate_180=False)
+    rotated = patch_coverage(segmentation, NUM_OBJECTS, *grid, rotate_180=True)
+    np.testing.assert_allclose(rotated, straight[::-1], atol=1e-6)
+    turned_picture = np.ascontiguousarray(segmentation[::-1, ::-1])
+    np.testing.assert_array_equal(rotated, patch_coverage(turned_picture, NUM_OBJECTS, *grid, rotate_180=False))
+
+
+@given(st.integers(1, 300), st.integers(1, 40))
+def test_overlaps_fill_cells_and_use_pixels_evenly(pixels: int, cells: int) -> None:
+    overlap = overlap_lengths(pixels, cells)
+    np.testing.assert_allclose(overlap.sum(axis=1), 1)
+    np.testing.assert_allclose(overlap.sum(axis=0), cells / pixels)
+
+
+def test_patches_run_row_by_row() -> None:
+    segmentation = np.array([[0, 1], [2, 3]])
+    np.testing.assert_array_equal(patch_coverage(segmentation, 4, 2, 2, rotate_180=False), np.eye(4))
+    np.testing.assert_array_equal(patch_coverage(segmentation, 4, 2, 2, rotate_180=True), np.eye(4)[::-1])
+
+
+def test_a_pixel_on_a_border_counts_by_its_parts() -> None:
+    coverage = patch_coverage(np.array([[0, 1, 0]]), 2, 1, 2, rotate_180=False)
+    np.testing.assert_allclose(coverage, [[2 / 3, 1 / 3], [2 / 3, 1 / 3]], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("segmentation", "rows", "columns", "says"),
+    [
+        (np.zeros((2, 2, 1), dtype=int), 1, 1, "two axes"),
+        (np.zeros((0, 2), dtype=int), 1, 1, "two axes"),
+        (np.zeros((2, 2), dtype=int), 0, 1, "at least one row"),
+        (np.array([[0, 5]]), 1, 1, "0 to 5; with 2 objects 0 to 1"),
+        (np.array([[-1, 0]]), 1, 1, "-1 to 0"),
+    ],
+)
+def test_wrong_input_is_refused(segmentation: np.ndarray, rows: int, columns: int, says: str) -> None:
+    with pytest.raises(BadArgument, match=says):
+        patch_coverage(segmentation, 2, rows, columns, rotate_180=False)

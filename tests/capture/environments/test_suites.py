@@ -1,0 +1,81 @@
+"""The suite registry and the errors of choosing from it; no simulator is built."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from capture.environments.base import EnvironmentSettings
+from capture.environments.suites import (
+    SUITES,
+    check_initial_state_index,
+    check_task_id,
+    find_suite,
+    list_tasks,
+    make_environment,
+)
+from schemas.errors import BadArgument, UnknownName
+
+SETTINGS = EnvironmentSettings()
+
+
+def test_published_protocol_numbers() -> None:
+    known = {suite.name: (suite.num_tasks, suite.max_steps) for suite in SUITES if suite.kind == "libero"}
+    assert known == {
+        "libero_spatial": (10, 220),
+        "libero_object": (10, 280),
+        "libero_goal": (10, 300),
+        "libero_10": (10, 520),
+        "libero_90": (90, 400),
+    }
+
+
+def test_unknown_suite_names_the_nearest() -> None:
+    with pytest.raises(UnknownName, match=r"Unknown task suite 'libero_spacial'. Did you mean 'libero_spatial'\?"):
+        find_suite("libero_spacial")
+
+
+def test_task_id_out_of_range_states_the_range() -> None:
+    suite = find_suite("libero_goal")
+    check_task_id(suite, 9)
+    for task_id in (-1, 10):
+        with pytest.raises(BadArgument, match=f"Task {task_id} does not exist in libero_goal; its tasks are 0 to 9"):
+            check_task_id(suite, task_id)
+    with pytest.raises(BadArgument, match="Task 8"):
+        make_environment(find_suite("robosuite"), 8, SETTINGS)
+
+
+def test_initial_state_out_of_range_states_the_range() -> None:
+    task = list_tasks(find_suite("robosuite"), SETTINGS)[1]
+    check_initial_state_index(task, 49)
+    for index in (-1, 50):
+        with pytest.raises(BadArgument, match=f"Initial state {index} does not exist .* are 0 to 49"):
+            check_initial_state_index(task, index)
+
+
+def test_image_size_must_be_positive() -> None:
+    with pytest.raises(BadArgument, match="image size is 0"):
+        make_environment(find_suite("robosuite"), 0, EnvironmentSettings(image_size=0))
+
+
+def test_builtin_tasks_are_numbered_and_described() -> None:
+    suite = find_suite("robosuite")
+    tasks = list_tasks(suite, SETTINGS)
+    assert [task.task_id for task in tasks] == list(range(suite.num_tasks))
+    assert len({task.name for task in tasks}) == len({task.instruction for task in tasks}) == suite.num_tasks
+    assert all(task.num_initial_states == 50 for task in tasks)
+
+
+def test_the_registry_imports_no_simulator() -> None:
+    code = (
+        "import sys\n"
+        "from capture.environments.suites import SUITES, list_tasks\n"
+        "from capture.environments.base import EnvironmentSettings\n"
+        "for suite in SUITES:\n"
+        "    if suite.kind == 'robosuite': list_tasks(suite, EnvironmentSettings())\n"
+        "print({'torch', 'mujoco', 'robosuite', 'libero'} & set(sys.modules))\n"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "set()"

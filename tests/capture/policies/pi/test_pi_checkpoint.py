@@ -1,0 +1,211 @@
+"""Reading checkpoints: what loads, and the one sentence that each thing that does not load ends with."""
+
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from pi_golden import GOLDEN, KeepAll, load_case
+from safetensors.torch import load_file, save_file
+
+from capture.policies.pi.checkpoint import (
+    CheckpointMismatch,
+    CheckpointNotFound,
+    UnreadableCheckpoint,
+    UnsupportedCheckpoint,
+    detect_format,
+    infer_config,
+    load_openpi_torch,
+)
+from capture.policies.pi.config import NAMED_CONFIGS, SiglipConfig, find_config, find_variant
+from capture.policies.pi.jax_weights import from_jax_flat
+from capture.policies.pi.strict import expected_shapes
+from schemas.errors import BadArgument, UnknownName, UserError
+
+STORED = GOLDEN / "pi05_batch2" / "checkpoint_openpi_torch"
+TABLE = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
+TIED = "paligemma_with_expert.paligemma.lm_head.weight"
+
+
+@pytest.fixture
+def checkpoint(tmp_path):
+    """A copy of openpi's small checkpoint that a test may damage."""
+    folder = tmp_path / "checkpoint"
+    shutil.copytree(STORED, folder)
+    return folder
+
+
+def rewrite(folder, change):
+    tensors = load_file(folder / "model.safetensors")
+    change(tensors)
+    save_file(tensors, folder / "model.safetensors")
+
+
+def test_openpi_s_file_holds_the_same_model_as_the_jax_leaves(pi05_case):
+    loaded = load_openpi_torch(STORED, config=pi05_case.config).state_dict()
+    converted = from_jax_flat(pi05_case.weights, pi05_case.config)
+    assert loaded.keys() == converted.keys()
+    for name, tensor in converted.items():
+        assert torch.equal(loaded[name], tensor), name
+
+
+def test_loaded_model_meets_the_reference(pi05_case):
+    keep = KeepAll()
+    pi05_case.sample(load_openpi_torch(STORED, config=pi05_case.config), keep)
+    np.testing.assert_allclose(keep.stacked(), pi05_case.expected["attn"], rtol=0, atol=5e-5)
+
+
+def test_bfloat16_file_loads_in_either_precision(checkpoint, pi05_case):
+    def to_bfloat16(tensors):
+        for name in tensors:
+            tensors[name] = tensors[name].bfloat16()
+
+    rewrite(checkpoint, to_bfloat16)
+    for dtype in (torch.float32, torch.bfloat16):
+        model = load_openpi_torch(checkpoint, config=pi05_case.config, dtype=dtype)
+        assert model.action_in_proj.weight.dtype == torch.float32
+        assert model.state_dict()[TABLE].dtype == dtype
+
+
+def test_embed_tokens_wins_over_the_tied_name(checkpoint, pi05_case):
+    def add_table(tensors):
+        tensors[TABLE] = torch.full_like(tensors[TIED], 7.0)
+
+    rewrite(checkpoint, add_table)
+    assert (load_openpi_torch(checkpoint, config=pi05_case.config).state_dict()[TABLE] == 7).all()
+
+
+@pytest.mark.parametrize("name", NAMED_CONFIGS)
+def test_sizes_are_read_from_the_tensors(name):
+    config = find_config(name)
+    config_json = {
+        "action_dim": 32,
+        "action_horizon": config.action_horizon,
+        "paligemma_variant": "gemma_2b",
+        "action_expert_variant": "gemma_300m",
+    }
+    assert infer_config(expected_shapes(config), config_json) == config
+
+
+def test_a_named_variant_of_other_sizes_is_refused():
+    config_json = {"action_dim": 32, "action_horizon": 10, "paligemma_variant": "gemma_300m"}
+    with pytest.raises(CheckpointMismatch, match="paligemma_variant 'gemma_300m'"):
+        infer_config(expected_shapes(find_config("pi05_libero")), config_json)
+
+
+def test_an_image_encoder_of_unknown_heads_needs_a_configuration():
+    with pytest.raises(CheckpointMismatch, match="32 wide.*explicit configuration"):
+        load_openpi_torch(STORED)
+
+
+def test_config_json_without_horizon_is_refused(checkpoint):
+    (checkpoint / "config.json").write_text(json.dumps({"action_dim": 32}))
+    with pytest.raises(CheckpointMismatch, match="'action_horizon' as a whole number, but has None"):
+        load_openpi_torch(checkpoint)
+
+
+def test_every_difference_is_listed_in_one_error(checkpoint, pi05_case):
+    def damage(tensors):
+        del tensors["time_mlp_out.bias"]
+        tensors["state_proj.weight"] = torch.zeros(48, 32)
+        tensors["action_in_proj.bias"] = torch.zeros(5)
+
+    rewrite(checkpoint, damage)
+    with pytest.raises(CheckpointMismatch) as caught:
+        load_openpi_torch(checkpoint, config=pi05_case.config)
+    text = str(caught.value)
+    assert "1 missing: time_mlp_out.bias" in text
+    assert "1 extra: state_proj.weight" in text
+    assert "1 of the wrong shape: action_in_proj.bias is (5,) instead of (48,)" in text
+    assert isinstance(caught.value, (UserError, ValueError))
+
+
+def test_a_checkpoint_that_is_no_pi_model(checkpoint):
+    rewrite(checkpoint, lambda tensors: tensors.pop("time_mlp_in.weight"))
+    with pytest.raises(CheckpointMismatch, match="no pi model"):
+        load_openpi_torch(checkpoint)
+
+
+def test_missing_folder(tmp_path):
+    with pytest.raises(CheckpointNotFound, match="no checkpoint folder"):
+        load_openpi_torch(tmp_path / "nowhere")
+
+
+def test_folder_that_is_no_checkpoint(tmp_path):
+    (tmp_path / "holiday.jpg").touch()
+    with pytest.raises(UnsupportedCheckpoint, match=r"expected openpi's PyTorch format.*found holiday\.jpg"):
+        load_openpi_torch(tmp_path)
+
+
+def test_jax_and_lerobot_checkpoints_are_named_and_refused(tmp_path):
+    jax = tmp_path / "jax"
+    (jax / "params").mkdir(parents=True)
+    (jax / "params" / "_METADATA").write_text("{}")
+    assert detect_format(jax) == "openpi_jax"
+    with pytest.raises(UnsupportedCheckpoint, match=r"openpi's JAX \(orbax\) format.*supported: openpi's PyTorch"):
+        load_openpi_torch(jax)
+    with pytest.raises(UnsupportedCheckpoint, match="give its parent"):
+        detect_format(jax / "params")
+    lerobot = tmp_path / "lerobot"
+    lerobot.mkdir()
+    (lerobot / "model.safetensors").touch()
+    (lerobot / "config.json").write_text('{"type": "pi05"}')
+    with pytest.raises(UnsupportedCheckpoint, match="LeRobot's format"):
+        load_openpi_torch(lerobot)
+    (lerobot / "config.json").write_text('{"type": "act"}')
+    with pytest.raises(UnsupportedCheckpoint, match="type 'act'"):
+        load_openpi_torch(lerobot)
+
+
+@pytest.mark.parametrize("kept", [0, 5, 2000, 0.5])
+def test_truncated_safetensors(checkpoint, pi05_case, kept):
+    file = checkpoint / "model.safetensors"
+    content = file.read_bytes()
+    file.write_bytes(content[: int(len(content) * kept) if isinstance(kept, float) else kept])
+    with pytest.raises(UnreadableCheckpoint, match="damaged or its copy incomplete"):
+        load_openpi_torch(checkpoint, config=pi05_case.config)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "\x00"])
+def test_damaged_config_json(checkpoint, text):
+    (checkpoint / "config.json").write_text(text)
+    with pytest.raises(UnreadableCheckpoint, match=r"config\.json"):
+        load_openpi_torch(checkpoint)
+
+
+def test_jax_leaves_are_checked_too(pi05_case):
+    leaves = dict(pi05_case.weights)
+    leaves["PaliGemma/llm/layers/attn/q_einsum/lora_a"] = np.zeros((3, 8, 64, 4))
+    with pytest.raises(CheckpointMismatch, match=r"1 leaves.*q_einsum/lora_a"):
+        from_jax_flat(leaves, pi05_case.config)
+    leaves = dict(pi05_case.weights)
+    del leaves["PaliGemma/llm/layers/mlp_1/gating_einsum"]
+    with pytest.raises(CheckpointMismatch, match="6 missing"):
+        from_jax_flat(leaves, pi05_case.config)
+
+
+def test_pi0_leaves_do_not_pass_for_pi05(pi05_case):
+    pi0 = load_case(GOLDEN / "pi0_batch2")
+    with pytest.raises(CheckpointMismatch, match="missing.*extra"):
+        from_jax_flat(pi0.weights, pi05_case.config)
+
+
+def test_names_are_looked_up_with_help():
+    assert find_variant("gemma_300m").width == 1024
+    with pytest.raises(UnknownName, match=r"Unknown Gemma variant 'gema_2b'\. Did you mean 'gemma_2b'\?"):
+        find_variant("gema_2b")
+    with pytest.raises(UnknownName, match=r"Did you mean 'pi05_libero'\?"):
+        find_config("pi05libero")
+
+
+def test_sizes_that_do_not_fit_are_refused():
+    full = find_config("pi05_libero")
+    with pytest.raises(BadArgument, match="depth must be equal"):
+        dataclasses.replace(full, action_expert=find_variant("dummy"))
+    with pytest.raises(BadArgument, match="whole number"):
+        dataclasses.replace(full, siglip=SiglipConfig(image_size=225))
+    assert (full.prefix_len, full.suffix_len, full.key_len) == (968, 10, 978)
+    pi0 = find_config("pi0_libero")
+    assert (pi0.prefix_len, pi0.suffix_len, pi0.key_len, pi0.first_action_query) == (816, 51, 867, 1)

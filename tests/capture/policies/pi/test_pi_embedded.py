@@ -1,0 +1,93 @@
+"""The embedded policy: reproducible, of the reference's layout, and with attention worth looking at."""
+
+import time
+
+import numpy as np
+import pytest
+import torch
+from pi_golden import make_observation
+
+from capture.attention import AttentionRecorder, RecordingPlan
+from capture.policies.base import weights_digest
+from capture.policies.pi.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, build_random_model, builtin_stats
+from capture.policies.pi.policy import site_layout
+from schemas.layout import Role
+
+INSTRUCTION = "put the black bowl on the plate"
+#: of EMBEDDED_CONFIG with seed 0; a change breaks comparisons with every store recorded before
+DIGEST = "52e970b88c6dc94d0d9dbf2bd2c15b2c836c48cbd384238e8482666954ed798b"
+
+
+def record(policy, observation, instruction=INSTRUCTION, seed=0):
+    """Rows (layer, denoise, head, query, key) of all layers at the first and last denoise step, and the key roles."""
+    plan = RecordingPlan(tuple(range(18)), (0, 9), tuple(range(8)), "all", "joint")
+    recorder = AttentionRecorder(plan, policy.sites[0].num_keys)
+    given = policy.prepare(observation, instruction)
+    policy.act(given, seed, recorder)
+    return recorder.finish().rows, given.key_role
+
+
+def distance(one, other):
+    """Mean total variation distance of two sets of rows."""
+    return 0.5 * np.abs(one - other).sum(-1).mean()
+
+
+def test_layout_is_that_of_pi05_libero(embedded):
+    assert (embedded.num_layers, embedded.num_heads, embedded.num_denoise_steps) == (18, 8, 10)
+    assert embedded.sites[0].num_keys == 978
+    assert embedded.action_horizon == 10
+    assert [span.num_keys for span in site_layout(EMBEDDED_CONFIG).spans] == [256, 256, 256, 200, 10]
+
+
+def test_weights_are_reproducible(embedded):
+    assert weights_digest(embedded.model) == DIGEST
+    assert embedded.provenance()["checkpoint"] == "random weights, seed 0"
+
+
+def test_weights_follow_the_seed_and_leave_the_global_generators_alone():
+    torch.manual_seed(1)
+    before = torch.get_rng_state()
+    one = weights_digest(build_random_model(DUMMY_CONFIG, 0))
+    assert torch.equal(torch.get_rng_state(), before)
+    torch.manual_seed(2)
+    assert weights_digest(build_random_model(DUMMY_CONFIG, 0)) == one
+    assert weights_digest(build_random_model(DUMMY_CONFIG, 1)) != one
+
+
+def test_rows_are_neither_uniform_nor_on_one_key(embedded, observation):
+    rows, roles = record(embedded, observation)
+    valid = int((~np.isin(roles, [Role.MASKED_IMAGE, Role.PADDING])).sum())
+    entropy = -(rows * np.log(np.maximum(rows, 1e-30))).sum(-1)
+    effective = np.exp(entropy)
+    assert 20 < effective.mean() < 0.6 * valid
+    per_head = effective.mean(axis=(0, 1, 3))
+    assert per_head.max() > 2 * per_head.min()
+    for role in (Role.IMAGE, Role.INSTRUCTION, Role.ACTION):
+        share = rows[..., roles == role].sum(-1).mean(axis=(1, 2, 3))
+        assert (share > 0.003).all()
+
+
+def test_rows_depend_on_picture_words_noise_and_time(embedded, observation):
+    rows, _ = record(embedded, observation)
+    assert distance(rows, record(embedded, make_observation(9))[0]) > 0.1
+    assert distance(rows, record(embedded, observation, "turn on the stove")[0]) > 0.1
+    assert distance(rows, record(embedded, observation, seed=1)[0]) > 0.1
+    assert distance(rows[:, 0], rows[:, 1]) > 0.1
+
+
+def test_actions_stay_near_the_built_in_ranges(embedded, observation):
+    stats = builtin_stats().actions
+    chunks = np.stack([embedded.act(embedded.prepare(observation, INSTRUCTION), seed) for seed in range(3)])
+    middle, half = stats.mean, (stats.q99 - stats.q01) / 2
+    assert np.abs((chunks - middle) / half).mean() < 1.5
+
+
+@pytest.mark.parametrize("name", ["embedded", "dummy"])
+def test_a_replan_is_quick(request, observation, name):
+    policy = request.getfixturevalue(name)
+    given = policy.prepare(observation, INSTRUCTION)
+    policy.act(given, 0)
+    start = time.perf_counter()
+    policy.act(given, 0)
+    # generous: 0.5 s and 15 ms on two quiet cores
+    assert time.perf_counter() - start < (5.0 if name == "embedded" else 0.5)

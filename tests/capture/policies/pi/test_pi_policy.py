@@ -1,0 +1,212 @@
+"""The adapter: layout, roles and tensors that agree with each other, and actions that recording does not touch."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from pi_golden import GOLDEN, make_observation
+from safetensors.torch import save_file
+
+from capture.attention import AttentionRecorder, RecordingPlan
+from capture.environments.base import Observation
+from capture.policies.base import Policy, initial_noise, weights_digest
+from capture.policies.pi.config import find_config
+from capture.policies.pi.embedded import DUMMY_CONFIG, TOKENIZER_PATH, build_random_model, builtin_stats
+from capture.policies.pi.policy import PiPolicy, PiSource, load_pi_policy, site_layout
+from capture.policies.pi.preprocess import model_image
+from capture.policies.pi.tokenizer import PromptTokenizer, TokenizerNotFound
+from schemas.errors import BadArgument, UnknownName
+from schemas.layout import Role
+
+INSTRUCTION = "put the black bowl on the plate"
+
+
+def typed(policy: PiPolicy) -> Policy:
+    """The type checker reads this: the adapter fulfils the protocol."""
+    return policy
+
+
+def plan_of(policy, queries="mean"):
+    return RecordingPlan(
+        layers=tuple(range(policy.num_layers)),
+        denoise_steps=tuple(range(policy.num_denoise_steps)),
+        heads=tuple(range(policy.num_heads)),
+        queries=queries,
+        site="joint",
+    )
+
+
+@pytest.fixture(scope="module")
+def dummy_pi0():
+    """pi0 of test size: a state token, z-scores, relative actions."""
+    config = dataclasses.replace(DUMMY_CONFIG, pi05=False, discrete_state_input=False, max_token_len=48)
+    return PiPolicy(
+        build_random_model(config, 0),
+        PromptTokenizer(TOKENIZER_PATH),
+        builtin_stats(),
+        PiSource("dummy-pi0", "random weights, seed 0", "seeded", untrained=True),
+        normalisation="z-score",
+        relative_actions=True,
+    )
+
+
+@pytest.fixture(params=["dummy", "dummy_pi0", "embedded"])
+def policy(request):
+    return request.getfixturevalue(request.param)
+
+
+def test_full_size_layouts():
+    layout = site_layout(find_config("pi05_libero"))
+    spans = [(span.name, span.kind, span.start, span.stop) for span in layout.spans]
+    assert spans == [
+        ("base_0_rgb", "image", 0, 256),
+        ("left_wrist_0_rgb", "image", 256, 512),
+        ("right_wrist_0_rgb", "image", 512, 768),
+        ("prompt", "text", 768, 968),
+        ("actions", "action", 968, 978),
+    ]
+    grid = layout.camera_span("left_wrist_0_rgb").grid
+    assert (grid.rows, grid.columns, grid.image_height, grid.image_width) == (16, 16, 224, 224)
+    pi0 = site_layout(find_config("pi0_libero"))
+    assert [(s.name, s.start, s.stop) for s in pi0.spans[3:]] == [
+        ("prompt", 768, 816),
+        ("state", 816, 817),
+        ("actions", 817, 867),
+    ]
+
+
+def test_frames_are_the_rotated_pictures_of_the_real_cameras(policy, observation):
+    given = policy.prepare(observation, INSTRUCTION)
+    size = policy.model.config.siglip.image_size
+    assert list(given.frames) == [camera.slot for camera in policy.cameras] == ["base_0_rgb", "left_wrist_0_rgb"]
+    for camera in policy.cameras:
+        assert camera.rotate_180
+        expected = model_image(observation.images[camera.environment_camera], size)
+        np.testing.assert_array_equal(given.frames[camera.slot], expected)
+        tensor = given.tensors[f"image:{camera.slot}"]
+        np.testing.assert_allclose((tensor[0].permute(1, 2, 0).numpy() + 1) * 127.5, expected, atol=1e-4)
+    assert (given.tensors["image:right_wrist_0_rgb"] == -1).all()
+    assert not given.tensors["image_mask:right_wrist_0_rgb"].any()
+
+
+def test_roles_agree_with_the_keys_that_get_attention(policy, observation):
+    given = policy.prepare(observation, INSTRUCTION)
+    [layout] = policy.sites
+    assert given.key_role.shape == (layout.num_keys,)
+    recorder = AttentionRecorder(plan_of(policy, "all"), layout.num_keys)
+    policy.act(given, 0, recorder)
+    rows = recorder.finish().rows
+    assert rows.shape[3] == policy.num_action_queries == policy.action_horizon
+    invalid = np.isin(given.key_role, [Role.MASKED_IMAGE, Role.PADDING])
+    assert (rows[..., invalid] == 0).all()
+    assert (rows[..., ~invalid].max(axis=(0, 1, 2, 3)) > 0).all()
+    np.testing.assert_allclose(recorder.finish().row_sum, 1, atol=1e-5)
+
+    role = dict(zip(*np.unique(given.key_role, return_counts=True), strict=True))
+    tokens = policy.model.config.siglip.num_tokens
+    assert role[Role.IMAGE] == 2 * tokens
+    assert role[Role.MASKED_IMAGE] == tokens
+    assert role[Role.BOS] == 1
+    assert role[Role.ACTION] == policy.action_horizon
+    for piece in given.prompt.pieces:
+        inside = given.prompt.instruction[0] <= piece.start < given.prompt.instruction[1]
+        assert (given.key_role[piece.key] == Role.INSTRUCTION) == inside or piece.text.startswith("▁")
+
+
+def test_pi0_has_one_state_key_and_pi05_states_it_in_the_prompt(dummy, dummy_pi0, embedded, observation):
+    pi0 = dummy_pi0.prepare(observation, INSTRUCTION)
+    span = dummy_pi0.sites[0].span("state")
+    assert np.flatnonzero(pi0.key_role == Role.STATE).tolist() == [span.start]
+    digits = dummy.prepare(observation, INSTRUCTION)
+    assert (digits.key_role == Role.STATE).sum() > 8
+    assert ", State: " in digits.prompt.text
+    assert not (embedded.prepare(observation, INSTRUCTION).key_role == Role.STATE).any()
+
+
+def test_recording_does_not_change_a_bit_of_the_actions(policy, observation):
+    given = policy.prepare(observation, INSTRUCTION)
+    plain = policy.act(given, 7)
+    recorder = AttentionRecorder(plan_of(policy), policy.sites[0].num_keys)
+    np.testing.assert_array_equal(policy.act(given, 7, recorder), plain)
+    assert plain.shape == (policy.action_horizon, 7)
+    assert plain.dtype == np.float64
+    assert np.isfinite(plain).all()
+
+
+def test_actions_depend_on_seed_picture_and_words_only(policy, observation):
+    base = policy.act(policy.prepare(observation, INSTRUCTION), 0)
+    np.testing.assert_array_equal(policy.act(policy.prepare(observation, INSTRUCTION), 0), base)
+    assert (policy.act(policy.prepare(observation, INSTRUCTION), 1) != base).any()
+    assert (policy.act(policy.prepare(observation, "turn on the stove"), 0) != base).any()
+    assert (policy.act(policy.prepare(make_observation(5), INSTRUCTION), 0) != base).any()
+
+
+def test_relative_actions_move_with_the_state(dummy_pi0, observation):
+    given = dummy_pi0.prepare(observation, INSTRUCTION)
+    moved = dataclasses.replace(given, state=given.state + 1.0)  # the model still sees the old state
+    difference = dummy_pi0.act(moved, 0) - dummy_pi0.act(given, 0)
+    np.testing.assert_allclose(difference, np.tile([1, 1, 1, 1, 1, 1, 0], (4, 1)), atol=1e-9)
+
+
+def test_noise_does_not_depend_on_torch():
+    noise = initial_noise(3, (1, 2, 3))
+    assert noise.dtype == np.float32
+    torch.manual_seed(99)
+    np.testing.assert_array_equal(noise, initial_noise(3, (1, 2, 3)))
+
+
+def test_denoise_times_start_at_noise(policy):
+    times = policy.denoise_times()
+    assert times.shape == (policy.num_denoise_steps,)
+    assert times[0] == 1
+    assert (np.diff(times) < 0).all()
+
+
+def test_provenance_is_json_and_names_the_weights(policy):
+    provenance = policy.provenance()
+    assert json.loads(json.dumps(provenance)) == provenance or "config" in provenance
+    assert provenance["weights_digest"] == weights_digest(policy.model)
+    assert provenance["untrained"] is True
+    assert provenance["dtype"] == "float32"
+
+
+def test_digest_sees_a_single_changed_weight_and_handles_bfloat16():
+    one = build_random_model(DUMMY_CONFIG, 0)
+    before = weights_digest(one)
+    one.action_in_proj.weight[0, 0] += 1e-6
+    assert weights_digest(one) != before
+    assert len(weights_digest(one.bfloat16())) == 64
+
+
+def test_a_missing_camera_is_named(dummy, observation):
+    blind = Observation({"agentvew": observation.images["agentview"]}, *[getattr(observation, n) for n in STATE_NAMES])
+    with pytest.raises(UnknownName, match=r"environment camera 'agentview'\. Did you mean 'agentvew'"):
+        dummy.prepare(blind, INSTRUCTION)
+
+
+STATE_NAMES = ("eef_pos", "eef_quat", "gripper_qpos")
+
+
+def test_a_tokenizer_larger_than_the_table_is_refused(dummy):
+    small = build_random_model(dataclasses.replace(DUMMY_CONFIG, vocab_size=300), 0)
+    with pytest.raises(BadArgument, match="another model's tokenizer"):
+        PiPolicy(small, dummy.tokenizer, dummy.norm_stats, dummy.source, normalisation="quantile")
+
+
+def test_policy_from_a_checkpoint_folder(tmp_path, observation):
+    config = dataclasses.replace(DUMMY_CONFIG, discrete_state_input=False)
+    model = build_random_model(config, 4)
+    save_file(dict(model.state_dict()), tmp_path / "model.safetensors")
+    (tmp_path / "config.json").write_text(json.dumps({"action_dim": 32, "action_horizon": 4}))
+    stats = tmp_path / "assets" / "physical-intelligence" / "libero" / "norm_stats.json"
+    stats.parent.mkdir(parents=True)
+    stats.write_text((GOLDEN / "libero_preproc" / "norm_stats.json").read_text())
+    policy = load_pi_policy(tmp_path, TOKENIZER_PATH, config=config)
+    assert policy.provenance()["weights_digest"] == weights_digest(model)
+    assert policy.provenance()["untrained"] is False
+    assert policy.name == "pi05"
+    assert np.isfinite(policy.act(policy.prepare(observation, INSTRUCTION), 0)).all()
+    with pytest.raises(TokenizerNotFound):
+        load_pi_policy(tmp_path, tmp_path / "none.model", config=config)

@@ -1,0 +1,174 @@
+"""openpi's LIBERO preprocessing, number by number against what openpi computed."""
+
+import json
+
+import numpy as np
+import pytest
+from pi_golden import GOLDEN
+from PIL import Image
+
+from capture.policies.pi.policy import image_tensor
+from capture.policies.pi.preprocess import (
+    NormStats,
+    NormStatsNotFound,
+    Statistics,
+    UnusableNormStats,
+    axis_angle,
+    environment_actions,
+    libero_state,
+    model_image,
+    pad_to,
+    parse_norm_stats,
+    read_norm_stats,
+    resize_with_pad,
+)
+from capture.policies.pi.tokenizer import digitise_state
+from schemas.errors import UserError
+
+FOLDER = GOLDEN / "libero_preproc"
+MODES = {"z-score": "z", "quantile": "q"}
+
+
+@pytest.fixture(scope="module")
+def inputs():
+    return dict(np.load(FOLDER / "inputs.npz"))
+
+
+@pytest.fixture(scope="module")
+def expected():
+    return dict(np.load(FOLDER / "expected.npz"))
+
+
+@pytest.fixture(scope="module")
+def stats():
+    return parse_norm_stats(json.loads((FOLDER / "norm_stats.json").read_text()), "golden")
+
+
+@pytest.mark.parametrize(("camera", "name"), [("agentview_image", "base"), ("robot0_eye_in_hand_image", "wrist")])
+def test_images_are_rotated_and_resized_within_one_grey_level(inputs, expected, camera, name):
+    for frame, wanted in zip(inputs[camera], expected[name], strict=True):
+        got = model_image(frame, 224)
+        assert got.dtype == np.uint8
+        assert np.abs(got.astype(int) - wanted.astype(int)).max() <= 1
+
+
+def states(inputs):
+    names = ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos")
+    return np.stack([libero_state(*values) for values in zip(*(inputs[name] for name in names), strict=True)])
+
+
+def test_states(inputs, expected, stats):
+    state = states(inputs)
+    np.testing.assert_allclose(state, expected["state8"], rtol=0, atol=1e-6)
+    for mode, name in MODES.items():
+        got = pad_to(stats.state.normalise(state, mode), 32)
+        np.testing.assert_allclose(got, expected[f"{name}_state32"], rtol=0, atol=1e-6)
+
+
+def test_digitised_states(inputs, expected, stats):
+    digits = digitise_state(stats.state.normalise(states(inputs), "quantile"))
+    np.testing.assert_array_equal(digits, expected["digitized"])
+    assert (digits == -1).any()
+    assert (digits == 255).any()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_actions(inputs, expected, stats, mode):
+    got = environment_actions(inputs["model_actions"], stats, mode)
+    assert got.shape == (3, 10, 7)
+    np.testing.assert_allclose(got, expected[f"{MODES[mode]}_actions7"], rtol=0, atol=1e-6)
+
+
+def test_actions_relative_to_the_state(inputs, expected, stats):
+    got = environment_actions(inputs["model_actions"], stats, "z-score", relative_to=states(inputs))
+    np.testing.assert_allclose(got, expected["z_actions7_extra_delta"], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_normalisation_goes_back_and_forth(stats, mode):
+    x = np.linspace(-2, 2, 8)
+    np.testing.assert_allclose(stats.state.unnormalise(stats.state.normalise(x, mode), mode), x, atol=1e-12)
+
+
+def test_longer_statistics_are_cut_and_longer_data_passes_through():
+    long = Statistics(mean=np.arange(32.0), std=np.ones(32))
+    assert long.normalise(np.arange(8.0), "z-score").tolist() == [0.0] * 8
+    short = Statistics(mean=np.zeros(2), std=np.ones(2), q01=np.zeros(2), q99=np.ones(2))
+    assert short.unnormalise(np.full((1, 4), 5.0), "quantile")[0, 2:].tolist() == [5.0, 5.0]
+
+
+def test_axis_angle_of_special_orientations():
+    assert axis_angle(np.array([0.0, 0, 0, 1])).tolist() == [0, 0, 0]
+    assert axis_angle(np.array([0.0, 0, 0, 1.0000001])).tolist() == [0, 0, 0]
+    np.testing.assert_allclose(axis_angle(np.array([1.0, 0, 0, 0])), [np.pi, 0, 0])
+    # the same orientation with the other sign gives an angle above pi: openpi's convention, not the shortest turn
+    np.testing.assert_allclose(axis_angle(-np.array([0.6, 0, 0, 0.8])), [-2 * np.arccos(-0.8), 0, 0])
+
+
+def test_wide_and_tall_images_are_padded_centrally():
+    wide = resize_with_pad(np.full((100, 200, 3), 255, dtype=np.uint8), 50)
+    assert (wide[:12] == 0).all()
+    assert (wide[12:37] == 255).all()
+    assert (wide[38:] == 0).all()
+    tall = resize_with_pad(np.full((200, 100, 3), 255, dtype=np.uint8), 50)
+    np.testing.assert_array_equal(tall, wide.transpose(1, 0, 2))
+    same = np.asarray(Image.new("RGB", (50, 50), (1, 2, 3)))
+    assert resize_with_pad(same, 50) is same
+
+
+def test_image_tensor_spans_minus_one_to_one():
+    picture = np.zeros((2, 3, 3), dtype=np.uint8)
+    picture[0, 2, 1] = 255
+    tensor = image_tensor(picture)
+    assert tensor.shape == (1, 3, 2, 3)
+    assert tensor[0, 1, 0, 2] == 1
+    assert tensor.min() == -1
+
+
+def test_statistics_come_from_the_checkpoint_s_assets(tmp_path, stats):
+    with pytest.raises(NormStatsNotFound, match=r"no norm_stats\.json below"):
+        read_norm_stats(tmp_path)
+    target = tmp_path / "assets" / "physical-intelligence" / "libero" / "norm_stats.json"
+    target.parent.mkdir(parents=True)
+    target.write_text((FOLDER / "norm_stats.json").read_text())
+    np.testing.assert_array_equal(read_norm_stats(tmp_path).actions.q99, stats.actions.q99)
+    second = tmp_path / "assets" / "droid" / "norm_stats.json"
+    second.parent.mkdir()
+    second.write_text("{}")
+    with pytest.raises(UnusableNormStats, match="more than one"):
+        read_norm_stats(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "not valid JSON"),
+        ("{}", "no 'norm_stats'"),
+        ("[]", "no 'norm_stats'"),
+        ('{"norm_stats": {"state": {"mean": [0], "std": [1]}}}', "no mean and std for 'actions'"),
+        ('{"norm_stats": {"state": {"mean": [0], "std": [1, 1]}}}', "unequal lengths for 'state'"),
+        ('{"norm_stats": {"state": {"mean": ["a"], "std": [1]}}}', "else than numbers as 'mean'"),
+    ],
+)
+def test_damaged_statistics(tmp_path, content, message):
+    target = tmp_path / "assets" / "x" / "norm_stats.json"
+    target.parent.mkdir(parents=True)
+    target.write_text(content)
+    with pytest.raises(UnusableNormStats, match=message) as caught:
+        read_norm_stats(tmp_path)
+    assert isinstance(caught.value, UserError)
+
+
+def test_quantile_mode_without_quantiles():
+    with pytest.raises(UnusableNormStats, match="no q01 and q99"):
+        Statistics(mean=np.zeros(1), std=np.ones(1)).normalise(np.zeros(1), "quantile")
+
+
+def test_statistics_must_cover_state_and_actions(stats):
+    stats.check("quantile", 8)
+    with pytest.raises(UnusableNormStats, match="'state' have 8 numbers; 9 are needed"):
+        stats.check("quantile", 9)
+    without = Statistics(mean=np.zeros(8), std=np.ones(8))
+    NormStats(without, without).check("z-score", 8)
+    with pytest.raises(UnusableNormStats, match="'state' lack q01"):
+        NormStats(without, without).check("quantile", 8)
