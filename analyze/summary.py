@@ -59,9 +59,12 @@ def summary_text(run: AnalysedRun, grouping: Grouping, episodes: pl.DataFrame, t
     if grouping.ratio:
         parts += [_ratio_section(run, grouping, tasks), _nonfinite_section(tasks)]
     parts += [_groups_section(grouping, tasks, "fraction"), _groups_section(grouping, tasks, "lift")]
-    if tasks["suite"].drop_nulls().n_unique() > 1:
+    suites = tasks["suite"].drop_nulls().unique().sort().to_list()
+    if len(suites) > 1:
         parts.append(_across_section(run, grouping, tasks, "all"))
-    parts.append(_across_section(run, grouping, tasks, "task"))
+    for suite in suites:
+        of = f" OF {suite}" if len(suites) > 1 else ""
+        parts.append(_across_section(run, grouping, tasks.filter(pl.col("suite") == suite), "task", of))
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -111,7 +114,7 @@ def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: pl.DataFrame) ->
     body = [
         [
             row["layer"],
-            f"{format_number(row['ratio_mean'])} ± {format_number(_spread(row))}",
+            _mean_and_spread(row),
             *(format_number(row[column]) for column in ("ratio_median", "ratio_of_means", "geometric_mean")),
             format_interval(row["ratio_mean_low"], row["ratio_mean_high"]),
             format_number(row["uniform_ratio"]),
@@ -220,11 +223,10 @@ def _groups_section(grouping: Grouping, tasks: pl.DataFrame, kind: str) -> str:
     return "\n".join([_title(title), "\n\n".join(tables)]) + note
 
 
-def _across_section(run: AnalysedRun, grouping: Grouping, tasks: pl.DataFrame, scope: str) -> str:
+def _across_section(run: AnalysedRun, grouping: Grouping, tasks: pl.DataFrame, scope: str, of: str = "") -> str:
     """A row per task (scope "task") or per suite (scope "all"), for the layer that speaks for the whole."""
     layer = overall_layer(tasks)
     rows = tasks.filter((pl.col("scope") == scope) & (pl.col("layer") == layer))
-    several = rows["suite"].n_unique() > 1
     name = "suite" if scope == "all" else "task"
     header = [name, "n", "success"]
     if grouping.ratio:
@@ -233,8 +235,7 @@ def _across_section(run: AnalysedRun, grouping: Grouping, tasks: pl.DataFrame, s
         header += [group if len(group) <= 12 else group[:11] + "…" for group in grouping.names[:5]]
     body = []
     for row in rows.iter_rows(named=True):
-        label = row["suite"] if scope == "all" else f"{row['suite'] + ' ' if several else ''}{row['task_id']}"
-        cells = [label, str(row["num_episodes"]), _percent(row["success_rate"])]
+        cells = [row["suite"] if scope == "all" else str(row["task_id"]), str(row["num_episodes"]), _percent(row["success_rate"])]
         if grouping.ratio:
             cells += [
                 format_number(row["ratio_mean"]),
@@ -249,22 +250,28 @@ def _across_section(run: AnalysedRun, grouping: Grouping, tasks: pl.DataFrame, s
     shown = layer if layer == LAYERS_AVG else f"layer {layer}"
     what = "ratio" if grouping.ratio else f"fractions of {listing(grouping.names[:5])}"
     table = text_table(header, body, left=(0,), last=last, texts=texts if last else None, width=WIDTH)
-    return "\n".join([_title(f"PER {name.upper()}  {what}, {shown}"), table])
+    return "\n".join([_title(f"PER {name.upper()}{of}  {what}, {shown}"), table])
 
 
 def _by_layer(rows: pl.DataFrame) -> list[dict]:
     return list(rows.sort("layer_number", nulls_last=True).iter_rows(named=True))
 
 
-def _spread(row: dict) -> float | None:
+def _mean_and_spread(row: dict) -> str:
     # One episode has no spread; its std of 0 would read as certainty.
-    return row["ratio_std"] if row["num_episodes"] - row["episodes_without_ratio"] > 1 else None
+    if row["num_episodes"] - row["episodes_without_ratio"] < 2:
+        return format_number(row["ratio_mean"])
+    return f"{format_number(row['ratio_mean'])} ± {format_number(row['ratio_std'])}"
 
 
 def _ratio_definition(grouping: Grouping) -> str:
     assert grouping.ratio is not None
-    above, below = (" + ".join(side) for side in (grouping.ratio.numerator, grouping.ratio.denominator))
-    return f"{above} / {below}"
+    sides = []
+    for names in (grouping.ratio.numerator, grouping.ratio.denominator):
+        # Sets of many objects are listed in full among the groups; here their names would hide the numbers.
+        shown = " + ".join(names[:4]) + (f" + {len(names) - 4} more" if len(names) > 4 else "")
+        sides.append(f"({shown})" if len(names) > 1 else shown)
+    return " / ".join(sides)
 
 
 def _percent(value: float | None) -> str:

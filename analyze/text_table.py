@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 
 def format_number(value: float | None) -> str:
-    """At most six characters for anything from 0.0001 to 999999: three to four significant digits; - for none."""
+    """At most five characters from 0.001 to 99999, with three to four significant digits, else as 1.2e-05; - for none."""
     if value is None or math.isnan(value):
         return "-"
     if math.isinf(value):

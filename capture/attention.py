@@ -51,7 +51,7 @@ def attend(
     stacked = (query.float() * scale).reshape(batch, kv_heads, heads // kv_heads * queries, dim)
     logits = torch.matmul(stacked, key.float().transpose(-1, -2)).view(batch, heads, queries, keys)
     if mask is not None:
-        logits = logits.masked_fill(~mask[:, None], MASKED_LOGIT)
+        logits.masked_fill_(~mask[:, None], MASKED_LOGIT)
     rows = torch.softmax(logits, dim=-1)
     if rows_to is not None:
         rows_to(rows)

@@ -18,7 +18,10 @@ ObjectKind = Literal["object", "fixture", "robot", "background"]
 
 @dataclass(frozen=True)
 class SceneObject:
-    """One thing that segmentation tells apart. `of_interest`: the task names it as something to act on."""
+    """One thing a pixel can belong to, named as in the task files (`akita_black_bowl_1`).
+
+    `of_interest`: whether the task itself names it as its subject.
+    """
 
     name: str
     kind: ObjectKind

@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-ObjectKind = Literal["object", "fixture", "robot", "background"]
+from schemas.vocabulary import SceneObject
 
 ROBOT = "robot"
 """Name of the one scene object that is the arm, its gripper and its mount."""
@@ -48,18 +48,6 @@ class Task:
     name: str
     instruction: str
     num_initial_states: int
-
-
-@dataclass(frozen=True)
-class SceneObject:
-    """One thing a pixel can belong to, named as in the task files (`akita_black_bowl_1`).
-
-    of_interest: whether the task itself names it as its subject.
-    """
-
-    name: str
-    kind: ObjectKind
-    of_interest: bool
 
 
 @dataclass(frozen=True)

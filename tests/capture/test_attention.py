@@ -77,7 +77,9 @@ def test_bfloat16_inputs_give_float32_rows_of_unrounded_logits():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_recording_does_not_change_a_bit(dtype):
     query, key, value, mask = random_inputs(dtype=dtype)
-    assert torch.equal(attend(query, key, value, mask, 0.3), attend(query, key, value, mask, 0.3, rows_to=lambda _: None))
+    assert torch.equal(
+        attend(query, key, value, mask, 0.3), attend(query, key, value, mask, 0.3, rows_to=lambda _: None)
+    )
 
 
 def test_heads_that_cannot_be_grouped_are_a_defect():

@@ -72,7 +72,9 @@ def detect_format(folder: str | Path) -> CheckpointFormat:
             return "lerobot"
         raise UnsupportedCheckpoint(f"'{folder}' is a LeRobot checkpoint of type '{kind}', not of pi0 or pi05.")
     if (folder / "_METADATA").is_file() and folder.name == "params":
-        raise UnsupportedCheckpoint(f"'{folder}' is the params folder of a checkpoint; give its parent '{folder.parent}'.")
+        raise UnsupportedCheckpoint(
+            f"'{folder}' is the params folder of a checkpoint; give its parent '{folder.parent}'."
+        )
     raise UnsupportedCheckpoint(
         f"'{folder}' is not a pi checkpoint: expected {_SUPPORTED}, found {listing(sorted(p.name for p in folder.iterdir()))}."
     )

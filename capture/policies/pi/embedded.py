@@ -128,9 +128,7 @@ def build_random_model(config: PiConfig, seed: int, device: str | torch.device =
 
 
 def _random_policy(name: str, config: PiConfig, seed: int, device: str | torch.device) -> PiPolicy:
-    source = PiSource(
-        name=name, checkpoint=f"random weights, seed {seed}", checkpoint_format="seeded", untrained=True
-    )
+    source = PiSource(name=name, checkpoint=f"random weights, seed {seed}", checkpoint_format="seeded", untrained=True)
     return PiPolicy(
         build_random_model(config, seed, device),
         PromptTokenizer(TOKENIZER_PATH),

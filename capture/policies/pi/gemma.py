@@ -8,6 +8,7 @@ checkpoints. Architecture: Gemma Team 2024; adaptive norm: Peebles & Xie 2023 (a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -30,6 +31,14 @@ class KeysValues:
     def then(self, later: KeysValues) -> KeysValues:
         """Return these keys followed by `later` ones."""
         return KeysValues(torch.cat([self.keys, later.keys], 2), torch.cat([self.values, later.values], 2))
+
+    def spread(self, positions: Tensor, length: int) -> KeysValues:
+        """Return `length` keys with these at `positions` (key,) and zeros elsewhere, for keys that a mask hides."""
+
+        def place(x: Tensor) -> Tensor:
+            return x.new_zeros(*x.shape[:2], length, x.shape[3]).index_copy(2, positions, x)
+
+        return KeysValues(place(self.keys), place(self.values))
 
 
 @dataclass(frozen=True)
@@ -111,7 +120,7 @@ class GemmaAttention(nn.Module):
         """Return this block's keys and values of the tokens (batch, token, width)."""
         return KeysValues(rotation.apply(self._heads(self.k_proj(x))), self._heads(self.v_proj(x)))
 
-    def forward(self, x: Tensor, seen: KeysValues, mask: Tensor, rotation: Rotation, rows_to: RowSink | None) -> Tensor:
+    def forward(self, x: Tensor, seen: KeysValues, mask: Tensor | None, rotation: Rotation, rows_to: RowSink | None) -> Tensor:
         """Attend from the tokens (batch, token, width) to all `seen` keys, mask (batch, token or 1, key)."""
         query = rotation.apply(self._heads(self.q_proj(x)))
         mixed = attend(query, seen.keys, seen.values, mask, self.scale, rows_to=rows_to)
@@ -155,7 +164,7 @@ class GemmaBlock(nn.Module):
     def forward(
         self,
         x: Tensor,
-        mask: Tensor,
+        mask: Tensor | None,
         rotation: Rotation,
         *,
         before: KeysValues | None = None,
@@ -164,7 +173,7 @@ class GemmaBlock(nn.Module):
     ) -> tuple[Tensor, KeysValues]:
         """Run the tokens x (batch, token, width) through the block.
 
-        The keys are `before` (a cached prefix) followed by those of x; mask is (batch, token or 1, all keys).
+        The keys are `before` (a cached prefix) followed by those of x; mask is (batch, token or 1, all keys) or None.
         Returns x after the block and the keys and values of x alone.
         """
         normed, gate = self.input_layernorm(x, condition)
@@ -185,6 +194,11 @@ class GemmaModel(nn.Module):
             self.embed_tokens = nn.Embedding(vocab_size, config.width)
         self.layers = nn.ModuleList(GemmaBlock(config, condition_width) for _ in range(config.depth))
         self.norm = make_norm(config.width, condition_width)
+
+    @property
+    def blocks(self) -> list[GemmaBlock]:
+        """The layers, as the type they are (a ModuleList only promises modules)."""
+        return [cast(GemmaBlock, layer) for layer in self.layers]
 
     def embed(self, tokens: Tensor) -> Tensor:
         """Look up tokens (batch, token) and scale by sqrt(width), as Gemma does with text and only with text."""

@@ -131,7 +131,7 @@ class PiModel(nn.Module):
         self._inner.vision_tower.vision_model.embeddings.float()
         for gemma in (self._vlm, self._expert):
             gemma.norm.float()
-            for block in gemma.layers:
+            for block in gemma.blocks:
                 block.input_layernorm.float()
                 block.post_attention_layernorm.float()
 
@@ -172,17 +172,22 @@ class PiModel(nn.Module):
         """Run images and text through the vision-language model once; every key is cached, the invalid ones too.
 
         Positions count valid keys only. Nothing reads the prefix's outputs but its keys and values, so the last block
-        stops after those.
+        stops after those. One sample alone leaves its invalid tokens out of the computation, which is nearly half of
+        it in LIBERO: nothing ever attends to them, so that their cached keys may as well be zeros.
         """
+        if embedded.shape[0] == 1 and not bool(valid.all()):
+            real = valid[0].nonzero()[:, 0]
+            dense = self.encode_prefix(embedded[:, real], valid[:, real])
+            return Prefix(tuple(entry.spread(real, valid.shape[1]) for entry in dense.cache), valid)
         rotation = Rotation.at(valid.cumsum(dim=1) - 1, self.config.paligemma.head_dim)
-        mask = valid[:, None, :]
+        mask = None if embedded.shape[0] == 1 else valid[:, None, :]
         x = embedded
         cache = []
-        blocks = list(self._vlm.layers)
-        for block in blocks[:-1]:
+        *earlier, last = self._vlm.blocks
+        for block in earlier:
             x, own = block(x, mask, rotation)
             cache.append(own)
-        cache.append(blocks[-1].keys_values(x, rotation))
+        cache.append(last.keys_values(x, rotation))
         return Prefix(cache=tuple(cache), valid=valid)
 
     def _embed_suffix(self, state: Tensor, actions: Tensor, waves: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -248,11 +253,9 @@ class PiModel(nn.Module):
         for step, waves in enumerate(all_waves):
             tokens_now, condition = self._embed_suffix(state, x, waves)
             hidden = tokens_now.to(self.dtype)
-            for layer, block in enumerate(self._expert.layers):
+            for layer, block in enumerate(self._expert.blocks):
                 sink = None if recorder is None else recorder.sink(layer, step, action_queries)
-                hidden, _ = block(
-                    hidden, mask, rotation, before=prefix.cache[layer], condition=condition, rows_to=sink
-                )
+                hidden, _ = block(hidden, mask, rotation, before=prefix.cache[layer], condition=condition, rows_to=sink)
             normed, _ = self._expert.norm(hidden[:, action_queries], condition)
             x = x + (-1.0 / steps) * self.action_out_proj(normed.float())
         return x

@@ -181,7 +181,9 @@ def _statistics(groups: Mapping[str, Any], name: str, where: str) -> Statistics:
     if len(lengths) != 1 or len(next(iter(lengths))) != 1:
         raise UnusableNormStats(f"{where} has statistics of unequal lengths for '{name}': {listing(sorted(lengths))}.")
     mean, std = arrays["mean"], arrays["std"]
-    assert mean is not None and std is not None  # checked above; tells the type checker
+    # checked above; this tells the type checker
+    assert mean is not None
+    assert std is not None
     return Statistics(mean=mean, std=std, q01=arrays["q01"], q99=arrays["q99"])
 
 

@@ -165,7 +165,8 @@ class PromptTokenizer:
                 for id_, piece, (start, stop) in zip(found["ids"], found["pieces"], found["offsets"], strict=True)
             ]
         else:
-            pieces = self._processor.EncodeAsImmutableProto(text).pieces
+            encode = getattr(self._processor, "EncodeAsImmutableProto")  # noqa: B009 - newer type stubs lack it
+            pieces = encode(text).pieces
             tokens = [_Token(p.id, p.piece, p.begin, p.end) for p in pieces]
         return _spread_bytes(tokens)
 

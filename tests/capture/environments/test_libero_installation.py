@@ -77,7 +77,7 @@ def test_a_given_folder_must_be_one(no_assets: Path, monkeypatch: pytest.MonkeyP
 
 def test_a_missing_package_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(MissingDependency, match="not installed.*make setup"):
+    with pytest.raises(MissingDependency, match=r"not installed.*make setup"):
         libero_installation.package_folder.__wrapped__()
 
 

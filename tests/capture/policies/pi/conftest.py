@@ -15,7 +15,9 @@ def golden_case(request) -> GoldenCase:
     if request.param == "pi05_full_layout":
         folder = LARGE_GOLDEN / request.param
         if not folder.is_dir():
-            pytest.skip("the golden case with the full token layout is not in the repository, and not beside this checkout")
+            pytest.skip(
+                "the golden case with the full token layout is not in the repository, and not beside this checkout"
+            )
     return load_case(folder)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +64,11 @@ class GoldenCase:
     inputs: dict[str, np.ndarray]
     expected: dict[str, np.ndarray]
     weights: dict[str, np.ndarray]
+
+    def single(self, entry: int) -> GoldenCase:
+        """The same case with one entry of the batch."""
+        inputs = {name: x[entry : entry + 1] if x.ndim else x for name, x in self.inputs.items()}
+        return replace(self, inputs=inputs)
 
     def sample(self, model: PiModel, recorder=None) -> np.ndarray:
         """Run the model on the case's inputs."""

@@ -96,7 +96,7 @@ def test_a_named_variant_of_other_sizes_is_refused():
 
 
 def test_an_image_encoder_of_unknown_heads_needs_a_configuration():
-    with pytest.raises(CheckpointMismatch, match="32 wide.*explicit configuration"):
+    with pytest.raises(CheckpointMismatch, match=r"32 wide.*explicit configuration"):
         load_openpi_torch(STORED)
 
 
@@ -188,7 +188,7 @@ def test_jax_leaves_are_checked_too(pi05_case):
 
 def test_pi0_leaves_do_not_pass_for_pi05(pi05_case):
     pi0 = load_case(GOLDEN / "pi0_batch2")
-    with pytest.raises(CheckpointMismatch, match="missing.*extra"):
+    with pytest.raises(CheckpointMismatch, match=r"missing.*extra"):
         from_jax_flat(pi0.weights, pi05_case.config)
 
 

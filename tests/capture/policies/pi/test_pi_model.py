@@ -5,13 +5,13 @@ import json
 import numpy as np
 import pytest
 import torch
+from pi_golden import GOLDEN, KeepAll
 
 from capture.attention import AttentionRecorder, RecordingPlan
 from capture.policies.pi.config import find_config
 from capture.policies.pi.jax_weights import from_jax_flat
-from capture.policies.pi.model import denoise_times
+from capture.policies.pi.model import PiModel, denoise_times
 from capture.policies.pi.strict import expected_shapes, model_from_state
-from pi_golden import GOLDEN, KeepAll
 
 LIMIT = 5e-5
 _JUNK = "paligemma_with_expert.gemma_expert.lm_head.weight"
@@ -31,6 +31,16 @@ def test_attention_and_actions_are_the_reference_s(golden_case):
     assert rows.shape == golden_case.expected["attn"].shape
     np.testing.assert_allclose(rows, golden_case.expected["attn"], rtol=0, atol=LIMIT)
     np.testing.assert_allclose(actions, golden_case.expected["actions"], rtol=0, atol=LIMIT)
+
+
+def test_a_sample_alone_is_the_same_as_in_a_batch(pi05_case):
+    """Alone, invalid prefix tokens are left out of the computation."""
+    for entry in range(2):
+        keep = KeepAll()
+        actions = pi05_case.single(entry).sample(model_of(pi05_case), keep)
+        wanted = pi05_case.expected["attn"][:, :, entry : entry + 1]
+        np.testing.assert_allclose(keep.stacked(), wanted, rtol=0, atol=LIMIT)
+        np.testing.assert_allclose(actions[0], pi05_case.expected["actions"][entry], rtol=0, atol=LIMIT)
 
 
 def test_masked_keys_get_exactly_nothing(golden_case):
@@ -69,13 +79,7 @@ def test_recorder_is_told_which_queries_are_actions(golden_case):
     """pi0's state token comes first and must not be taken for an action."""
     config = golden_case.config
     keep = KeepAll()
-    one = type(golden_case)(
-        golden_case.folder,
-        config,
-        {name: value[:1] if value.ndim else value for name, value in golden_case.inputs.items()},
-        golden_case.expected,
-        golden_case.weights,
-    )
+    one = golden_case.single(0)
     model = model_of(one)
     one.sample(model, keep)
     plan = RecordingPlan(layers=(1, 0), denoise_steps=(0, 2), heads=(5, 2), queries="all", site="joint")
@@ -101,8 +105,6 @@ def test_full_size_names_and_shapes_are_those_of_openpi(name, count):
 
 def test_bfloat16_placement_is_openpi_s():
     manifest = json.loads((GOLDEN / "key_manifests" / "openpi_torch_pi05_libero.json").read_text())
-    from capture.policies.pi.model import PiModel
-
     with torch.device("meta"):
         model = PiModel(find_config("pi05_libero"), torch.bfloat16)
     placed = {name: str(tensor.dtype).removeprefix("torch.") for name, tensor in model.state_dict().items()}

@@ -1,5 +1,6 @@
 """Prompts: the strings openpi encodes, and which token is what, for instructions that try to confuse."""
 
+import itertools
 import json
 
 import numpy as np
@@ -73,7 +74,7 @@ def test_pieces_cover_the_text_and_roles_follow_the_characters(tokenizer, instru
 
     # pieces are in order, never empty, and leave no character out
     covered = set()
-    for before, after in zip(pieces, pieces[1:], strict=False):
+    for before, after in itertools.pairwise(pieces):
         assert before.start <= after.start
     for piece in pieces:
         assert piece.start < piece.stop

@@ -1,0 +1,80 @@
+# Everything is made in .venv; each target installs what it needs by itself.
+#
+#   make capture     run a policy in simulation and record its attention (installs torch and the simulators)
+#   make analyze     masses, ratios, tables and pictures from a store (installs the laptop's small set only)
+#   make test        formatting, types and all tests
+#   make setup       the whole environment        make setup-analyze   the laptop's part of it
+#
+# Options, as in: make capture SUITE=libero_10 TASK_ID=0 CHECKPOINT=~/pi05_libero
+POLICY     ?= pi
+CHECKPOINT ?= embedded
+SUITE      ?= robosuite
+TASK_ID    ?=
+EPISODES   ?=
+LAYERS     ?=
+SEED       ?= 7
+STORE      ?= runs/$(SUITE).zarr
+GROUPING   ?= default
+OUTPUT     ?= results/$(basename $(notdir $(STORE)))/$(basename $(notdir $(GROUPING)))
+# Anything else that the command lines accept, as in: make capture ARGS="--max-steps 100 --resume"
+ARGS       ?=
+
+# The embedded policy is untrained and never solves a task: two episodes of four tasks, cut short, show everything in minutes.
+DEMO := $(and $(filter embedded,$(CHECKPOINT)),$(filter robosuite,$(SUITE)))
+ifneq ($(DEMO),)
+CAPTURE_ARGS := --num-episodes $(or $(EPISODES),2) --max-steps 50
+else
+CAPTURE_ARGS := --num-episodes $(or $(EPISODES),5)
+endif
+
+PYTHON ?= python3
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+SOURCES := schemas capture analyze tests benchmarks scripts
+
+.PHONY: capture analyze test check unit setup setup-analyze schemas clean
+
+capture: .venv/capture-installed
+	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --seed $(SEED) --store $(STORE) \
+	  $(CAPTURE_ARGS) $(if $(TASK_ID),--task-id $(TASK_ID)) $(if $(LAYERS),--layers $(LAYERS)) $(ARGS)
+
+analyze: .venv/analyze-installed
+	$(BIN)/vla-analyze $(STORE) --grouping $(GROUPING) --output $(OUTPUT) $(if $(LAYERS),--layers $(LAYERS)) $(ARGS)
+
+test: check unit
+
+check: .venv/capture-installed
+	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/mypy
+
+unit: .venv/capture-installed
+	$(BIN)/pytest $(ARGS)
+
+schemas: .venv/capture-installed
+	$(BIN)/python -m schemas.json_files
+
+setup: .venv/capture-installed
+
+setup-analyze: .venv/analyze-installed
+
+.venv/bin/python:
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or later is needed; name one with make PYTHON=...")'
+	$(PYTHON) -m venv .venv
+
+# The laptop: numpy, zarr, polars, matplotlib and what they need.
+.venv/analyze-installed: .venv/bin/python pyproject.toml constraints.txt
+	@echo "Installing the analysis environment into .venv ..."
+	$(PIP) -e .
+	@touch $@
+
+# The GPU node: torch and the simulators on top of it, and what the tests need.
+.venv/capture-installed: .venv/analyze-installed requirements-libero.txt
+	@echo "Installing the capture environment into .venv (torch, MuJoCo, robosuite, LIBERO; a minute or more) ..."
+	$(PIP) -e '.[capture,dev]'
+	$(PIP) --no-deps -r requirements-libero.txt
+	sh scripts/ensure_rendering.sh
+	@touch $@
+
+clean:
+	rm -rf .venv build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
