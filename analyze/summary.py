@@ -235,7 +235,11 @@ def _across_section(run: AnalysedRun, grouping: Grouping, tasks: pl.DataFrame, s
         header += [group if len(group) <= 12 else group[:11] + "…" for group in grouping.names[:5]]
     body = []
     for row in rows.iter_rows(named=True):
-        cells = [row["suite"] if scope == "all" else str(row["task_id"]), str(row["num_episodes"]), _percent(row["success_rate"])]
+        cells = [
+            row["suite"] if scope == "all" else str(row["task_id"]),
+            str(row["num_episodes"]),
+            _percent(row["success_rate"]),
+        ]
         if grouping.ratio:
             cells += [
                 format_number(row["ratio_mean"]),

@@ -146,7 +146,7 @@ def open_run(path: Path, attributes: RootAttributes, mode: WriteMode) -> RunStor
 def refuse_existing(path: Path) -> NoReturn:
     """Raise `StoreExists` for a store that is in the way (or `StoreError` when what is there is no store)."""
     _read_root(path)
-    count = sum(1 for _ in (path / EPISODES_GROUP).iterdir())
+    count = sum(entry.is_dir() for entry in (path / EPISODES_GROUP).iterdir())
     raise StoreExists(
         f"Store {path} exists already and holds {count} episodes; add --resume to continue it, "
         "--overwrite to delete it and begin again, or give another --store."

@@ -42,7 +42,10 @@ def listing(names: Iterable[object], limit: int = 12) -> str:
 def did_you_mean(given: str, existing: Iterable[str]) -> str:
     """Return " Did you mean 'x'?" for the nearest existing name, or an empty string when nothing is near."""
     by_folded = {name.casefold(): name for name in existing}
-    near = difflib.get_close_matches(given.casefold(), list(by_folded), n=1, cutoff=0.6)
+    folded = given.casefold()
+    # Half a name is the commonest slip ('base' for 'base_0_rgb'), and too short for the similarity measure.
+    near = [name for name in by_folded if len(folded) > 2 and name.startswith(folded)]
+    near = near or difflib.get_close_matches(folded, list(by_folded), n=1, cutoff=0.6)
     return f" Did you mean '{by_folded[near[0]]}'?" if near else ""
 
 

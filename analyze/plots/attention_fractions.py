@@ -25,9 +25,7 @@ def plot_attention_fractions(tasks: pl.DataFrame, grouping: Grouping, folder: Pa
     if len(layers) == 2 and LAYERS_AVG in layers:
         layers.remove(LAYERS_AVG)
     by_layer = {row["layer"]: row for row in rows.iter_rows(named=True)}
-    fractions = np.array(
-        [[by_layer[layer][f"{name}_fraction"] or 0.0 for name in grouping.names] for layer in layers]
-    )
+    fractions = np.array([[by_layer[layer][f"{name}_fraction"] or 0.0 for name in grouping.names] for layer in layers])
     positions = np.arange(len(layers), dtype=float)
     if layers[-1] == LAYERS_AVG:
         positions[-1] += 0.6  # apart from the single layers
@@ -36,7 +34,7 @@ def plot_attention_fractions(tasks: pl.DataFrame, grouping: Grouping, folder: Pa
     note = f"n = {plural(overall['num_episodes'], 'episode')} of {plural(overall['num_tasks'], 'task')}, means over episodes."
     if grouping.overlap:
         note += " Groups overlap: a fraction is the share in the sum of all groups' masses."
-    title(figure, f"Attention fractions, grouping '{grouping.name}'", note, width=max(60, int(11 * figure.get_figwidth())))
+    title(figure, f"Attention fractions, grouping '{grouping.name}'", note)
     axes = figure.subplots()
     styles = group_styles(grouping.names)
     bottom = np.zeros(len(layers))

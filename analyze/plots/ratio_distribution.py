@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from analyze.aggregate import LAYERS_AVG, layer_order, overall_layer
 from analyze.plots.style import (
@@ -19,9 +20,10 @@ from analyze.plots.style import (
     new_figure,
     plural,
     ratio_axis,
-    ratio_label,
+    ratio_name,
     save_figure,
     title,
+    whole_numbers,
 )
 from schemas.grouping import Grouping
 
@@ -51,7 +53,11 @@ def plot_ratio_distribution(replans: pl.DataFrame, grouping: Grouping, folder: P
     height = 2.9 + 0.24 * len(layers) + 0.9
     figure = new_figure(8, height)
     shown = rows.filter(_drawable())
-    title(figure, f"Ratio over replans, grouping '{grouping.name}'", _counts(overall, rows, chosen))
+    title(
+        figure,
+        f"Ratio over replans, grouping '{grouping.name}'",
+        _counts(overall, rows, chosen) if shown.height else "",
+    )
     if shown.is_empty():
         explain(figure.subplots(), _why_empty(rows))
         return save_figure(figure, folder, STEM, data)
@@ -65,7 +71,7 @@ def plot_ratio_distribution(replans: pl.DataFrame, grouping: Grouping, folder: P
         _baseline(axes, uniform)
         axes.grid(axis="x")
     top.legend(handles=_legend(bool(uniform.size)), loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    bottom.set_xlabel(ratio_label(grouping.ratio.numerator, grouping.ratio.denominator))
+    bottom.set_xlabel(f"ratio of masses, {ratio_name(grouping.ratio)} (logarithmic)")
     return save_figure(figure, folder, STEM, data)
 
 
@@ -78,25 +84,31 @@ def _histogram(axes: Axes, overall: pl.DataFrame, chosen: str) -> None:
     name = chosen if chosen == LAYERS_AVG else f"layer {chosen}"
     axes.set_title(f"{name}: {plural(len(values), 'replan')}", loc="left")
     axes.set_ylabel("replans")
-    axes.yaxis.get_major_locator().set_params(integer=True)
+    whole_numbers(axes.yaxis)
     if len(values) == 0:
         axes.text(0.5, 0.5, "no finite ratio in this layer", transform=axes.transAxes, ha="center", color=NOTE_COLOR)
         return
     low, high = axes.get_xlim()
     # Bins of equal width on the logarithmic axis, over the visible range so that few values do not fill the picture.
-    edges = np.geomspace(low, high, 41)
+    edges = np.geomspace(low, high, 41).tolist()
     axes.hist(values, bins=edges, color=DATA_COLOR, alpha=0.85, edgecolor="white", linewidth=0.5)
     axes.axvline(float(np.median(values)), color=_MEDIAN_COLOR, linewidth=1.4)
 
 
 def _boxes(axes: Axes, shown: pl.DataFrame, layers: list[str]) -> None:
-    positions = np.arange(len(layers))
+    positions = list(range(len(layers)))
     generator = np.random.default_rng(0)
     for position, layer in zip(positions, layers, strict=True):
         rows = shown.filter(pl.col("layer") == layer)
         if rows.is_empty():
             axes.text(
-                0.01, position, "no finite ratio", transform=axes.get_yaxis_transform(), va="center", size=7, color=NOTE_COLOR
+                0.01,
+                position,
+                "no finite ratio",
+                transform=axes.get_yaxis_transform(),
+                va="center",
+                size=7,
+                color=NOTE_COLOR,
             )
             continue
         axes.boxplot(
@@ -116,13 +128,15 @@ def _boxes(axes: Axes, shown: pl.DataFrame, layers: list[str]) -> None:
         )
         means = rows.group_by("suite", "task_id", "episode_index", maintain_order=True).agg(pl.col("ratio").mean())
         jitter = generator.uniform(-0.2, 0.2, means.height) if means.height > 1 else np.zeros(1)
-        axes.scatter(means["ratio"].to_numpy(), position + jitter, s=6, color=_DOT_COLOR, alpha=0.55, linewidths=0, zorder=3)
+        axes.scatter(
+            means["ratio"].to_numpy(), position + jitter, s=6, color=_DOT_COLOR, alpha=0.55, linewidths=0, zorder=3
+        )
     axes.set_yticks(positions, layers)
     axes.set_ylim(len(layers) - 0.4, -0.6)
     axes.set_ylabel("layer")
 
 
-def _baseline(axes: Axes, uniform: np.ndarray) -> None:
+def _baseline(axes: Axes, uniform: NDArray[np.float64]) -> None:
     if uniform.size == 0:
         return
     low, high = float(uniform.min()), float(uniform.max())
@@ -163,8 +177,14 @@ def _counts(overall: pl.DataFrame, rows: pl.DataFrame, chosen: str) -> str:
 
 
 def _why_empty(rows: pl.DataFrame) -> str:
+    if rows["layer"].n_unique() > 1:
+        rows = rows.filter(pl.col("layer") != LAYERS_AVG)  # whose ratio is only ever missing because theirs are
     infinite = int(rows["ratio"].is_infinite().fill_null(False).sum())
-    return (
-        f"No ratio can be drawn: of {rows.height} values, {infinite} are infinite (no denominator mass), "
-        f"{rows['ratio'].null_count()} undefined, the rest 0."
-    )
+    undefined = rows["ratio"].null_count()
+    counts = {
+        "infinite (no denominator mass)": infinite,
+        "undefined (no mass on either side)": undefined,
+        "0, which a logarithmic axis cannot show": rows.height - infinite - undefined,
+    }
+    parts = [f"{count} of {rows.height} are {what}" for what, count in counts.items() if count]
+    return f"No ratio can be drawn: {'; '.join(parts)}."

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from analyze.aggregate import LAYERS_AVG
 from analyze.plots.style import (
@@ -19,13 +21,15 @@ from analyze.plots.style import (
     explain,
     group_styles,
     new_figure,
+    plural,
     ratio_axis,
-    ratio_label,
+    ratio_name,
     save_figure,
     title,
+    whole_numbers,
     wrapped,
 )
-from analyze.statistics import geometric_mean, summarize
+from analyze.statistics import geometric_mean, ratio_of_means_over_episodes, summarize
 from analyze.text_table import format_number
 from schemas.grouping import Grouping
 
@@ -44,7 +48,9 @@ def evolution_stem(task_id: int, instruction: str, episode_index: int, layer: st
 
 
 @drawn_in_our_style
-def plot_ratio_evolution(episode: pl.DataFrame, grouping: Grouping, folder: Path) -> list[Path]:
+def plot_ratio_evolution(
+    episode: pl.DataFrame, grouping: Grouping, folder: Path, formats: Sequence[str] = ("png", "pdf")
+) -> list[Path]:
     """Draw one episode in one layer: the rows of the table of replans that belong to them. Returns png, pdf and csv.
 
     Groups without mass in this episode are left out of the legend.
@@ -55,9 +61,9 @@ def plot_ratio_evolution(episode: pl.DataFrame, grouping: Grouping, folder: Path
     figure = new_figure(10, 6.8)
     of_layer = "mean over layers" if layer == LAYERS_AVG else f"layer {layer} (block {first['block']})"
     outcome = "success" if first["success"] else "failure"
-    note = f"{of_layer}; {outcome} after {first['num_steps']} steps; {episode.height} replans; grouping '{grouping.name}'"
+    note = f"{of_layer}; {outcome} after {first['num_steps']} steps; {plural(episode.height, 'replan')}; grouping '{grouping.name}'"
     heading = f"{first['suite']} task {first['task_id']}, episode {first['episode_index']}: {first['instruction']}"
-    title(figure, heading, note, width=110)
+    title(figure, heading, note)
     ((ratio_axes, mass_axes), (fraction_axes, statistics_axes)) = figure.subplots(2, 2)
     steps = episode["env_step"].to_numpy()
     styles = group_styles(grouping.names)
@@ -72,25 +78,36 @@ def plot_ratio_evolution(episode: pl.DataFrame, grouping: Grouping, folder: Path
         if axes.spines["left"].get_visible():  # not those that hold an explanation
             axes.set_xlim(steps[0] - room, steps[-1] + room)
             axes.set_xlabel("environment step")
-            axes.xaxis.get_major_locator().set_params(integer=True)
+            whole_numbers(axes.xaxis)
     _group_legend(figure, drawn, styles)
     columns = ["suite", "task_id", "episode_index", "layer", "replan", "env_step"]
     columns += [f"{name}_{kind}" for name in grouping.names for kind in ("mass", "fraction", "lift")]
     columns += ["ratio", "uniform_ratio", "ratio_lift"] if grouping.ratio else []
     stem = evolution_stem(first["task_id"], first["instruction"], first["episode_index"], layer)
-    return save_figure(figure, folder, stem, episode.select(columns))
+    return save_figure(figure, folder, stem, episode.select(columns), formats)
 
 
-def plot_all_evolutions(replans: pl.DataFrame, grouping: Grouping, folder: Path) -> list[Path]:
-    """Draw every (episode, layer) of the table of replans; into a folder per suite when there are several."""
+def plot_all_evolutions(
+    replans: pl.DataFrame,
+    grouping: Grouping,
+    folder: Path,
+    formats: Sequence[str] = ("png", "pdf"),
+    progress: Callable[[int], object] | None = None,
+) -> list[Path]:
+    """Draw every (episode, layer) of the table of replans; into a folder per suite when there are several.
+
+    About a second each, half of it for the pdf; `progress` is called with 1 after each.
+    """
     paths = []
     several = replans["suite"].n_unique() > 1
     for part in replans.partition_by("suite", "task_id", "episode_index", "layer", maintain_order=True):
-        paths += plot_ratio_evolution(part, grouping, folder / part["suite"][0] if several else folder)
+        paths += plot_ratio_evolution(part, grouping, folder / part["suite"][0] if several else folder, formats)
+        if progress is not None:
+            progress(1)
     return paths
 
 
-def _ratio_panel(axes: Axes, episode: pl.DataFrame, steps: np.ndarray, grouping: Grouping) -> None:
+def _ratio_panel(axes: Axes, episode: pl.DataFrame, steps: NDArray[np.int64], grouping: Grouping) -> None:
     axes.set_title("ratio", loc="left")
     if grouping.ratio is None:
         explain(axes, f"Grouping '{grouping.name}' defines no ratio.")
@@ -100,7 +117,10 @@ def _ratio_panel(axes: Axes, episode: pl.DataFrame, steps: np.ndarray, grouping:
     drawable = np.isfinite(ratio) & (ratio > 0)
     if not drawable.any():
         infinite = int(np.isinf(ratio).sum())
-        explain(axes, f"No finite ratio: {infinite} of {len(ratio)} are infinite (no denominator mass), the others undefined or 0.")
+        explain(
+            axes,
+            f"No finite ratio: {infinite} of {len(ratio)} are infinite (no denominator mass), the others undefined or 0.",
+        )
         return
     ratio_axis(axes.yaxis, np.concatenate([ratio, uniform]))
     axes.plot(steps, np.where(drawable, ratio, np.nan), "o-", color=DATA_COLOR, markersize=3.5, label="ratio")
@@ -117,11 +137,11 @@ def _ratio_panel(axes: Axes, episode: pl.DataFrame, steps: np.ndarray, grouping:
             label="not finite or 0", clip_on=False,
         )  # fmt: skip
     axes.grid(axis="y")
-    axes.set_ylabel(ratio_label(grouping.ratio.numerator, grouping.ratio.denominator).replace(" (log", "\n(log"))
+    axes.set_ylabel(f"{ratio_name(grouping.ratio)} (log axis)")
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.1)
 
 
-def _mass_panel(axes: Axes, episode: pl.DataFrame, steps: np.ndarray, drawn: list[str], styles: dict) -> None:
+def _mass_panel(axes: Axes, episode: pl.DataFrame, steps: NDArray[np.int64], drawn: list[str], styles: dict) -> None:
     axes.set_title("mass", loc="left")
     dashes = {"": "-", "///": "--", "...": ":", "xxx": "-."}
     for name in drawn:
@@ -134,7 +154,9 @@ def _mass_panel(axes: Axes, episode: pl.DataFrame, steps: np.ndarray, drawn: lis
     axes.grid(axis="y")
 
 
-def _fraction_panel(axes: Axes, episode: pl.DataFrame, steps: np.ndarray, drawn: list[str], styles: dict) -> None:
+def _fraction_panel(
+    axes: Axes, episode: pl.DataFrame, steps: NDArray[np.int64], drawn: list[str], styles: dict
+) -> None:
     axes.set_title("fractions", loc="left")
     if not drawn:
         explain(axes, "No group has any mass in this episode.")
@@ -142,7 +164,12 @@ def _fraction_panel(axes: Axes, episode: pl.DataFrame, steps: np.ndarray, drawn:
     shares = [episode[f"{name}_fraction"].fill_null(0).to_numpy() for name in drawn]
     bottom = np.zeros(len(steps))
     for name, share in zip(drawn, shares, strict=True):
-        style = {"facecolor": styles[name]["color"], "hatch": styles[name]["hatch"], "edgecolor": "white", "linewidth": 0.3}
+        style = {
+            "facecolor": styles[name]["color"],
+            "hatch": styles[name]["hatch"],
+            "edgecolor": "white",
+            "linewidth": 0.3,
+        }
         if len(steps) == 1:
             axes.bar(steps, share, 2.0, bottom, **style)  # an area over one point would be invisible
         else:
@@ -161,13 +188,11 @@ def _statistics_panel(axes: Axes, episode: pl.DataFrame, grouping: Grouping, dra
         values = episode["ratio"].fill_null(float("nan")).to_numpy()
         summary = summarize(values)
         geometric, _ = geometric_mean(values)
-        below = episode["denominator_mass"].mean()
-        above = episode["numerator_mass"].mean()
-        of_means = above / below if below else (float("inf") if above else None)  # type: ignore[operator]
+        of_means = ratio_of_means_over_episodes(episode["numerator_mass"], episode["denominator_mass"]).value
         lines += [
-            ("ratio, mean ± std", f"{format_number(summary.mean)} ± {format_number(summary.std)}"),
+            ("ratio, mean ± std", _with_spread(format_number(summary.mean), format_number(summary.std), len(values))),
             ("ratio, median", format_number(summary.median)),
-            ("ratio, min to max", f"{format_number(summary.min)} to {format_number(summary.max)}"),
+            ("ratio, min / max", f"{format_number(summary.min)} / {format_number(summary.max)}"),
             ("ratio of mean masses", format_number(of_means)),
             ("geometric mean of ratios", format_number(geometric)),
             ("not finite, left out", f"{summary.num_nonfinite} of {len(values)}"),
@@ -179,7 +204,10 @@ def _statistics_panel(axes: Axes, episode: pl.DataFrame, grouping: Grouping, dra
     shown = [name for name in drawn if name in largest[: room - (len(drawn) > room)]]
     for name in shown:
         fraction = summarize(episode[f"{name}_fraction"].fill_null(float("nan")).to_numpy())
-        text = "-" if fraction.mean is None else f"{100 * fraction.mean:.1f} ± {100 * (fraction.std or 0):.1f} %"
+        text = "-"
+        if fraction.mean is not None:
+            spread = f"{100 * (fraction.std or 0):.1f}"
+            text = _with_spread(f"{100 * fraction.mean:.1f}", spread, episode.height) + " %"
         lines.append((f"{wrapped(name, 26, 1)}, fraction", text))
     if len(shown) < len(drawn):
         lines.append((f"and {len(drawn) - len(shown)} smaller groups", ""))
@@ -187,6 +215,11 @@ def _statistics_panel(axes: Axes, episode: pl.DataFrame, grouping: Grouping, dra
         height = 0.97 - number * 0.072
         axes.text(0.02, height, label, transform=axes.transAxes, va="top", size=8.5, color=NOTE_COLOR)
         axes.text(0.97, height, value, transform=axes.transAxes, va="top", ha="right", size=8.5)
+
+
+def _with_spread(mean: str, spread: str, count: int) -> str:
+    """A single replan has no spread, and nothing finite has neither."""
+    return mean if count < 2 or mean == "-" else f"{mean} ± {spread}"
 
 
 def _finite_mean(series: pl.Series) -> float | None:
@@ -199,7 +232,9 @@ def _group_legend(figure: Figure, drawn: list[str], styles: dict) -> None:
     if not drawn:
         return
     handles = [
-        Patch(facecolor=styles[name]["color"], hatch=styles[name]["hatch"], edgecolor="white", label=wrapped(name, 28, 1))
+        Patch(
+            facecolor=styles[name]["color"], hatch=styles[name]["hatch"], edgecolor="white", label=wrapped(name, 28, 1)
+        )
         for name in drawn
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 6 if len(handles) <= 6 else 5))

@@ -19,7 +19,7 @@ from analyze.plots.style import (
     new_figure,
     plural,
     ratio_axis,
-    ratio_label,
+    ratio_name,
     save_figure,
     title,
     wrapped,
@@ -30,7 +30,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 STEM = "ratio_per_task"
-_COLUMNS = ("ratio_mean", "ratio_mean_low", "ratio_mean_high", "uniform_ratio", "episodes_without_ratio", "num_nonfinite")
+_COLUMNS = (
+    "ratio_mean",
+    "ratio_mean_low",
+    "ratio_mean_high",
+    "uniform_ratio",
+    "episodes_without_ratio",
+    "num_nonfinite",
+)
 #: From this many tasks on, a row is one line high.
 _MANY = 24
 
@@ -65,10 +72,15 @@ def plot_ratio_per_task(
     name = layer if layer == LAYERS_AVG else f"layer {layer}"
     title(figure, f"Ratio per task, {name}, grouping '{grouping.name}'", _counts(rows, dots))
     axes = figure.subplots()
-    values = [data[column].drop_nulls().to_numpy() for column in _COLUMNS[:4]] + [dots["ratio_mean"].drop_nulls().to_numpy()]
+    values = [data[column].drop_nulls().to_numpy() for column in _COLUMNS[:4]] + [
+        dots["ratio_mean"].drop_nulls().to_numpy()
+    ]
     if not np.isfinite(np.concatenate(values[:3])).any():
         left_out = int(dots["num_nonfinite"].sum())
-        explain(axes, f"No episode has a finite ratio: all {left_out} ratios are infinite (no denominator mass) or undefined.")
+        explain(
+            axes,
+            f"No episode has a finite ratio: all {left_out} ratios are infinite (no denominator mass) or undefined.",
+        )
         return save_figure(figure, folder, STEM, data)
     ratio_axis(axes.xaxis, np.concatenate(values))
     _draw_rows(axes, shown, dots, few)
@@ -77,7 +89,7 @@ def plot_ratio_per_task(
     axes.set_ylim(shown.height - 0.4, -0.6)
     axes.tick_params(axis="y", length=0)
     axes.grid(axis="x")
-    axes.set_xlabel(ratio_label(grouping.ratio.numerator, grouping.ratio.denominator))
+    axes.set_xlabel(f"ratio of masses, {ratio_name(grouping.ratio)} (logarithmic)")
     _legend(axes, level, with_interval=shown["ratio_mean_low"].is_not_null().any())
     return save_figure(figure, folder, STEM, data)
 
@@ -93,19 +105,36 @@ def _draw_rows(axes: Axes, shown: pl.DataFrame, dots: pl.DataFrame, few: bool) -
             values = own["ratio_mean"].drop_nulls().to_numpy()
             values = values[values > 0]
             jitter = generator.uniform(-0.22, 0.22, len(values)) if len(values) > 1 else np.zeros(len(values))
-            axes.scatter(values, position + jitter, s=14 if few else 8, color="#56B4E9", alpha=0.8, linewidths=0, zorder=2)
+            axes.scatter(
+                values, position + jitter, s=14 if few else 8, color="#56B4E9", alpha=0.8, linewidths=0, zorder=2
+            )
         mean, low, high = row["ratio_mean"], row["ratio_mean_low"], row["ratio_mean_high"]
         if mean is not None and mean > 0:
             if low is not None and high is not None:
                 axes.plot([low, high], [position, position], color=DATA_COLOR, linewidth=2.0 if few else 1.4, zorder=3)
             size = 6.5 if few else 4.5
-            axes.plot(mean, position, "D" if total else "o", color=DATA_COLOR, markersize=size, zorder=4, markeredgecolor="white")
+            axes.plot(
+                mean,
+                position,
+                "D" if total else "o",
+                color=DATA_COLOR,
+                markersize=size,
+                zorder=4,
+                markeredgecolor="white",
+            )
         else:
             where = axes.get_yaxis_transform()
             axes.text(0.01, position, "no finite ratio", transform=where, va="center", size=7, color=NOTE_COLOR)
         uniform = row["uniform_ratio"]
         if uniform is not None and uniform > 0:
-            axes.plot([uniform, uniform], [position - 0.42, position + 0.42], "--", color=BASELINE_COLOR, linewidth=1.2, zorder=1)
+            axes.plot(
+                [uniform, uniform],
+                [position - 0.42, position + 0.42],
+                "--",
+                color=BASELINE_COLOR,
+                linewidth=1.2,
+                zorder=1,
+            )
         left_out = f" ({row['episodes_without_ratio']} without)" if row["episodes_without_ratio"] else ""
         text = f"n = {row['num_episodes']}{left_out}"
         axes.text(1.01, position, text, transform=axes.get_yaxis_transform(), va="center", size=7, color=NOTE_COLOR)
@@ -134,6 +163,6 @@ def _counts(rows: pl.DataFrame, dots: pl.DataFrame) -> str:
     left_out = int(dots["num_nonfinite"].sum())
     if left_out:
         text += f" {left_out} of {int(dots['num_replans'].sum())} ratios are not finite and not in any mean."
-    if rows["ratio_mean_low"].null_count():
+    if rows["ratio_mean_low"].null_count() and rows["ratio_mean"].is_not_null().any():
         text += " No interval where fewer than two episodes have a ratio."
     return text

@@ -13,15 +13,19 @@ import numpy as np
 import polars as pl
 
 from analyze.atomic_file import replacing
+from schemas.grouping import Ratio
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 DPI = 150
+#: Of running text at 9 points, on the safe side.
+_CHARACTERS_PER_INCH = 11
 #: Okabe & Ito's colours, which stay apart for colour-blind eyes, given once and for all to the groups that always exist.
 FIXED_COLORS = {
     "visual": "#0072B2",
@@ -65,7 +69,9 @@ _RC: dict[str, Any] = {
 def _our_settings() -> Iterator[None]:
     import matplotlib as mpl
 
-    with mpl.rc_context(_RC):
+    # A plain dict: matplotlib's stubs want literal names, which differ from one of its versions to the next.
+    settings: Any = _RC
+    with mpl.rc_context(settings):
         yield
 
 
@@ -140,7 +146,7 @@ def ratio_axis(axis: Any, values: Any) -> None:
     margin = max(0.06 * np.log(high / low), 0.5 * (np.log(2.0) - np.log(high / low)), 0.05)
     low, high = low * np.exp(-margin), high * np.exp(margin)
     decades = np.log10(high / low)
-    digits = tuple(range(1, 10)) if decades < 0.6 else (1.0, 2.0, 5.0) if decades < 3 else (1.0,)
+    digits = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0) if decades < 1.0 else (1.0, 2.0, 5.0) if decades < 3 else (1.0,)
     is_x = axis.axis_name == "x"
     (axis.axes.set_xscale if is_x else axis.axes.set_yscale)("log")
     (axis.axes.set_xlim if is_x else axis.axes.set_ylim)(low, high)
@@ -155,6 +161,13 @@ def wrapped(text: str, width: int, lines: int) -> str:
     return "\n".join(textwrap.wrap(" ".join(text.split()), width, max_lines=lines, placeholder=" …"))
 
 
+def whole_numbers(axis: Axis) -> None:
+    """Ticks of a linear axis at whole numbers only: counts and steps have no halves."""
+    from matplotlib.ticker import MaxNLocator
+
+    axis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+
+
 def explain(axes: Axes, text: str) -> None:
     """Say in the middle of empty axes why there is nothing to see."""
     axes.set_xticks([])
@@ -166,9 +179,10 @@ def explain(axes: Axes, text: str) -> None:
     )
 
 
-def title(figure: Figure, text: str, note: str = "", width: int = 100) -> None:
-    """Bold first line of the whole figure, with notes (n, what was left out) in small letters under it."""
-    lines = textwrap.wrap(note, int(width * 1.3)) if note else []
+def title(figure: Figure, text: str, note: str = "") -> None:
+    """First lines of the whole figure: what it is, then notes (n, what was left out), wrapped to the figure's width."""
+    width = int(figure.get_figwidth() * _CHARACTERS_PER_INCH)
+    lines = textwrap.wrap(note, width) if note else []
     figure.suptitle("\n".join([wrapped(text, width, 2), *lines]), x=0.01, ha="left", size=9, linespacing=1.35)
 
 
@@ -177,7 +191,12 @@ def plural(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def ratio_label(numerator: Sequence[str], denominator: Sequence[str]) -> str:
-    """Axis label of a ratio: its groups, or how many when they would not fit."""
-    sides = [" + ".join(names) if len(" + ".join(names)) <= 30 else f"{len(names)} groups" for names in (numerator, denominator)]
-    return f"ratio of masses, {sides[0]} / {sides[1]} (logarithmic)"
+def ratio_name(ratio: Ratio) -> str:
+    """A ratio as an axis label: its groups, or how many they are when the names would not fit."""
+    sides = []
+    for names in (ratio.numerator, ratio.denominator):
+        joined = " + ".join(names)
+        sides.append(
+            joined if len(joined) <= 24 else f"{len(names)} groups" if len(names) > 1 else wrapped(joined, 24, 1)
+        )
+    return " / ".join(sides)

@@ -11,9 +11,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from capture.environments.base import ROBOT, ObjectKind, SceneObject, Task
+from capture.environments.base import ROBOT, Task
 from capture.environments.simulator import SimulatedEnvironment
 from capture.environments.suites import Suite
+from schemas.vocabulary import ObjectKind, SceneObject
 
 
 @dataclass(frozen=True)

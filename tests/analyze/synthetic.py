@@ -47,7 +47,9 @@ def default_grouping() -> Grouping:
         "masked": ("role:masked_image",),
         "other": ("*",),
     }
-    return Grouping("default", groups, Ratio(("visual",), ("linguistic",)), description="visual = every valid image key")
+    return Grouping(
+        "default", groups, Ratio(("visual",), ("linguistic",)), description="visual = every valid image key"
+    )
 
 
 def custom_grouping(with_ratio: bool = True) -> Grouping:

@@ -125,7 +125,9 @@ def test_unknown_names_say_what_exists(tokens, selector, said):
     assert said in str(caught.value)
 
 
-@pytest.mark.parametrize("selector", ["patch:base[0:3,0:1]", "patch:base[1:1,0:1]", "keys:5-22", "keys:x", "patch:base"])
+@pytest.mark.parametrize(
+    "selector", ["patch:base[0:3,0:1]", "patch:base[1:1,0:1]", "keys:5-22", "keys:x", "patch:base"]
+)
 def test_regions_outside_the_layout_are_errors(tokens, selector):
     with pytest.raises(SelectorError, match="expected"):
         weights(tokens, selector)
@@ -147,7 +149,9 @@ def test_masses_of_a_complete_disjoint_grouping_sum_to_the_row_sum(data):
     grouping = data.draw(groupings(tokens))
     rows = random_rows(tokens, (2, 3), data.draw(st.integers(0, 2**16)))
     resolved = resolve(grouping, tokens)
-    masses = np.einsum("rlhk,rkg->rlhg", rows.astype(float), np.broadcast_to(resolved.weights, (*rows.shape[::3], len(resolved.names))))
+    masses = np.einsum(
+        "rlhk,rkg->rlhg", rows.astype(float), np.broadcast_to(resolved.weights, (*rows.shape[::3], len(resolved.names)))
+    )
     np.testing.assert_allclose(masses.sum(axis=-1), rows.sum(axis=-1, dtype=float), rtol=1e-5)
 
 
@@ -162,15 +166,27 @@ def test_segments_answer_exactly_what_rows_answer_or_refuse(data):
     assert (members.sum(axis=2) == 1).all()
     on_segments = weights_on_segments(resolved.weights, members)
     constant = all(
-        len(np.unique(np.broadcast_to(resolved.weights, (tokens.num_replans, *resolved.weights.shape[1:]))[r, members[r, :, s]], axis=0)) <= 1
+        len(
+            np.unique(
+                np.broadcast_to(resolved.weights, (tokens.num_replans, *resolved.weights.shape[1:]))[
+                    r, members[r, :, s]
+                ],
+                axis=0,
+            )
+        )
+        <= 1
         for r in range(tokens.num_replans)
         for s in range(len(segments))
     )
     assert (on_segments is not None) == constant
     if on_segments is not None:
         atoms = np.stack([segment_masses(rows[r], members[r]) for r in range(tokens.num_replans)])
-        by_segment = np.einsum("rls,rsg->rlg", atoms, np.broadcast_to(on_segments, (tokens.num_replans, *on_segments.shape[1:])))
-        by_key = np.einsum("rlk,rkg->rlg", rows, np.broadcast_to(resolved.weights, (tokens.num_replans, *resolved.weights.shape[1:])))
+        by_segment = np.einsum(
+            "rls,rsg->rlg", atoms, np.broadcast_to(on_segments, (tokens.num_replans, *on_segments.shape[1:]))
+        )
+        by_key = np.einsum(
+            "rlk,rkg->rlg", rows, np.broadcast_to(resolved.weights, (tokens.num_replans, *resolved.weights.shape[1:]))
+        )
         np.testing.assert_allclose(by_segment, by_key, rtol=1e-4, atol=1e-7)
 
 
@@ -185,7 +201,11 @@ def test_union_and_difference_partition(data):
 
 
 def test_names_of_groups_and_ratios_are_checked():
-    for groups, said in [({}, "no groups"), ({"a b": ("*",)}, "cannot name a group"), ({"numerator": ("*",)}, "cannot name")]:
+    for groups, said in [
+        ({}, "no groups"),
+        ({"a b": ("*",)}, "cannot name a group"),
+        ({"numerator": ("*",)}, "cannot name"),
+    ]:
         with pytest.raises(GroupingError, match=said):
             Grouping("g", groups)
     for first, second in combinations(("x", "y"), 2):

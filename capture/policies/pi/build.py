@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from capture.policies.pi.checkpoint import detect_format
 from capture.policies.pi.config import GEMMA_VARIANTS, GemmaConfig, find_variant
 from capture.policies.pi.embedded import dummy_policy, embedded_policy
 from capture.policies.pi.policy import PiPolicy, load_pi_policy
@@ -34,6 +35,7 @@ def build_pi_policy(
         policy = dummy_policy(device=device)
     else:
         path = Path(checkpoint).expanduser()
+        detect_format(path)  # a folder that is no checkpoint is the first thing to say
         policy = load_pi_policy(path, _find_tokenizer(path, tokenizer), device=device)
     config = policy.model.config
     for option, given, actual in (
@@ -70,8 +72,6 @@ def _find_tokenizer(checkpoint: Path, tokenizer: str | None) -> Path:
     for place in places:
         if place.is_file():
             return place
-    if not checkpoint.is_dir():
-        return places[-1]  # the missing checkpoint is the mistake to report
     raise BadArgument(
         f"The checkpoint {checkpoint} needs PaliGemma's tokenizer and none was found at {listing(places)}; fetch "
         "paligemma_tokenizer.model (openpi downloads it from gs://big_vision) and give --tokenizer PATH."

@@ -1,6 +1,6 @@
-"""Read pi0 and pi0.5 checkpoints: recognise the format, work out the sizes, load strictly.
+"""Read pi0 and pi0.5 checkpoints: recognise the format, work out the sizes, load openpi's PyTorch format strictly.
 
-Supported: openpi's PyTorch format (config.json and model.safetensors). openpi's JAX format and LeRobot's are recognised.
+openpi's PyTorch format is config.json and model.safetensors. Its JAX format is read in `orbax`; LeRobot's is recognised.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ _TIED_TABLE = _PALIGEMMA + "lm_head.weight"
 #: The expert's output layer is never used and never trained: random numbers of 250 million parameters.
 _JUNK = "paligemma_with_expert.gemma_expert.lm_head.weight"
 
-_SUPPORTED = "openpi's PyTorch format (a folder with config.json and model.safetensors)"
+_OPENPI_TORCH = "openpi's PyTorch format (config.json and model.safetensors)"
+_OPENPI_JAX = "openpi's JAX format (params/_METADATA)"
 #: Text slots when nothing else is said (openpi's model defaults).
 _MAX_TOKEN_LEN = {True: 200, False: 48}
 
@@ -76,7 +77,7 @@ def detect_format(folder: str | Path) -> CheckpointFormat:
             f"'{folder}' is the params folder of a checkpoint; give its parent '{folder.parent}'."
         )
     raise UnsupportedCheckpoint(
-        f"'{folder}' is not a pi checkpoint: expected {_SUPPORTED}, found {listing(sorted(p.name for p in folder.iterdir()))}."
+        f"'{folder}' is not a pi checkpoint: expected {_OPENPI_TORCH} or {_OPENPI_JAX}, found {listing(sorted(p.name for p in folder.iterdir()))}."
     )
 
 
@@ -98,9 +99,7 @@ def load_openpi_torch(
     found_format = detect_format(folder)
     if found_format != "openpi_torch":
         spoken = {"openpi_jax": "openpi's JAX (orbax)", "lerobot": "LeRobot's"}[found_format]
-        raise UnsupportedCheckpoint(
-            f"'{folder}' is a checkpoint in {spoken} format, which cannot be loaded yet; supported: {_SUPPORTED}."
-        )
+        raise UnsupportedCheckpoint(f"'{folder}' is a checkpoint in {spoken} format, not in {_OPENPI_TORCH}.")
     try:
         with safe_open(folder / "model.safetensors", framework="pt") as stored:
             by_model_name = _model_names(set(stored.keys()))

@@ -120,7 +120,9 @@ class GemmaAttention(nn.Module):
         """Return this block's keys and values of the tokens (batch, token, width)."""
         return KeysValues(rotation.apply(self._heads(self.k_proj(x))), self._heads(self.v_proj(x)))
 
-    def forward(self, x: Tensor, seen: KeysValues, mask: Tensor | None, rotation: Rotation, rows_to: RowSink | None) -> Tensor:
+    def forward(
+        self, x: Tensor, seen: KeysValues, mask: Tensor | None, rotation: Rotation, rows_to: RowSink | None
+    ) -> Tensor:
         """Attend from the tokens (batch, token, width) to all `seen` keys, mask (batch, token or 1, key)."""
         query = rotation.apply(self._heads(self.q_proj(x)))
         mixed = attend(query, seen.keys, seen.values, mask, self.scale, rows_to=rows_to)

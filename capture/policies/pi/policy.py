@@ -15,8 +15,8 @@ from torch import Tensor
 from capture.attention import RowCollector
 from capture.environments.base import Observation
 from capture.policies.base import PolicyCamera, PolicyInput, camera_frame, initial_noise, weights_digest
-from capture.policies.pi.checkpoint import load_openpi_torch
 from capture.policies.pi.config import PiConfig
+from capture.policies.pi.loading import load_pi_model
 from capture.policies.pi.model import PiModel, denoise_times
 from capture.policies.pi.preprocess import (
     NormalisationMode,
@@ -218,19 +218,19 @@ def load_pi_policy(
     dtype: torch.dtype = torch.float32,
     device: str | torch.device = "cpu",
 ) -> PiPolicy:
-    """Load a policy from a checkpoint in openpi's PyTorch format and a tokenizer file.
+    """Load a policy from a checkpoint folder (openpi's PyTorch or JAX format) and a tokenizer file.
 
     Normalisation and the meaning of actions are those of openpi's LIBERO configurations: pi0.5 quantiles and plain
     actions, pi0 z-scores and actions relative to the state.
     """
     # The cheap files first: a missing tokenizer should not cost the minutes that the weights take.
     prompt_tokenizer = PromptTokenizer(tokenizer)
-    model = load_openpi_torch(checkpoint, config=config, dtype=dtype, device=device)
+    model, checkpoint_format = load_pi_model(checkpoint, config=config, dtype=dtype, device=device)
     pi05 = model.config.pi05
     source = PiSource(
         name="pi05" if pi05 else "pi0",
         checkpoint=str(checkpoint),
-        checkpoint_format="openpi_torch",
+        checkpoint_format=checkpoint_format,
         untrained=False,
     )
     return PiPolicy(

@@ -18,10 +18,15 @@ class CheckpointMismatch(UserError, ValueError):
     """The checkpoint's tensors are not those of the model: names or shapes differ."""
 
 
+def expected_tensors(config: PiConfig, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
+    """Return name -> tensor without memory (meta) of `PiModel(config, dtype)`: shapes, and the precision of each."""
+    with torch.device("meta"):
+        return PiModel(config, dtype).state_dict()
+
+
 def expected_shapes(config: PiConfig) -> Shapes:
     """Return name -> shape of every tensor of `PiModel(config)`, without allocating any."""
-    with torch.device("meta"):
-        return {name: tuple(tensor.shape) for name, tensor in PiModel(config).state_dict().items()}
+    return {name: tuple(tensor.shape) for name, tensor in expected_tensors(config).items()}
 
 
 def check_shapes(found: Shapes, expected: Shapes) -> None:

@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import pytest
+import torch
 from pi_golden import GOLDEN, LARGE_GOLDEN, GoldenCase, load_case, make_observation
 
 from capture.environments.base import Observation
 from capture.policies.pi.embedded import dummy_policy, embedded_policy
+
+
+@pytest.fixture(scope="package", autouse=True)
+def one_thread():
+    """Threads that wait for each other on busy cores make these small models ten times slower, and timings a lottery."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session", params=["pi05_batch2", "pi0_batch2", "pi05_full_layout"])

@@ -21,6 +21,7 @@ from capture.policies.pi.checkpoint import (
 )
 from capture.policies.pi.config import NAMED_CONFIGS, SiglipConfig, find_config, find_variant
 from capture.policies.pi.jax_weights import from_jax_flat
+from capture.policies.pi.loading import load_pi_model
 from capture.policies.pi.strict import expected_shapes
 from schemas.errors import BadArgument, UnknownName, UserError
 
@@ -144,7 +145,7 @@ def test_jax_and_lerobot_checkpoints_are_named_and_refused(tmp_path):
     (jax / "params").mkdir(parents=True)
     (jax / "params" / "_METADATA").write_text("{}")
     assert detect_format(jax) == "openpi_jax"
-    with pytest.raises(UnsupportedCheckpoint, match=r"openpi's JAX \(orbax\) format.*supported: openpi's PyTorch"):
+    with pytest.raises(UnsupportedCheckpoint, match=r"openpi's JAX \(orbax\) format, not in openpi's PyTorch"):
         load_openpi_torch(jax)
     with pytest.raises(UnsupportedCheckpoint, match="give its parent"):
         detect_format(jax / "params")
@@ -154,6 +155,8 @@ def test_jax_and_lerobot_checkpoints_are_named_and_refused(tmp_path):
     (lerobot / "config.json").write_text('{"type": "pi05"}')
     with pytest.raises(UnsupportedCheckpoint, match="LeRobot's format"):
         load_openpi_torch(lerobot)
+    with pytest.raises(UnsupportedCheckpoint, match=r"LeRobot's format.*supported are openpi's PyTorch.*JAX"):
+        load_pi_model(lerobot)
     (lerobot / "config.json").write_text('{"type": "act"}')
     with pytest.raises(UnsupportedCheckpoint, match="type 'act'"):
         load_openpi_torch(lerobot)

@@ -87,7 +87,7 @@ def test_a_replan_is_quick(request, observation, name):
     policy = request.getfixturevalue(name)
     given = policy.prepare(observation, INSTRUCTION)
     policy.act(given, 0)
-    start = time.perf_counter()
+    start = time.process_time()
     policy.act(given, 0)
-    # generous: 0.5 s and 15 ms on two quiet cores
-    assert time.perf_counter() - start < (5.0 if name == "embedded" else 0.5)
+    # processor time of one thread, which a busy machine does not change much: 0.4 s and 15 ms were measured
+    assert time.process_time() - start < (1.5 if name == "embedded" else 0.2)

@@ -1,0 +1,32 @@
+"""Stores made by the real command line in the real simulator, once per session."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from capture.__main__ import main as capture
+
+#: The policy of test size gives four actions a call.
+DUMMY = ("pi", "--checkpoint", "dummy", "--replan-steps", "4", "--max-steps", "12")
+
+
+@pytest.fixture(scope="session")
+def run_capture() -> Callable[..., None]:
+    """Run `vla-capture pi` with the dummy policy and further arguments; anything but success fails the test."""
+
+    def run(*arguments: object) -> None:
+        assert capture([*DUMMY, *map(str, arguments)]) == 0
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def captured_store(run_capture: Callable[..., None], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two built-in tasks with two episodes each; the second command resumes the store of the first."""
+    store = tmp_path_factory.mktemp("captured") / "robosuite.zarr"
+    run_capture("--task-id", 0, "--num-episodes", 2, "--store", store)
+    run_capture("--task-id", 1, "--num-episodes", 2, "--store", store, "--resume")
+    return store

@@ -1,0 +1,134 @@
+"""What a person can get wrong: always one sentence, exit code 2, no traceback, and nothing half made."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from analyze.__main__ import main as analyze
+from capture.__main__ import main as capture
+
+DUMMY = ["pi", "--checkpoint", "dummy", "--replan-steps", "4"]
+
+
+def run(command, arguments, capsys) -> str:
+    """Run in this process; return what was said on stderr, after checking the form of it."""
+    try:
+        code = command([str(argument) for argument in arguments])
+    except SystemExit as stopped:  # argparse
+        code = stopped.code
+    said = capsys.readouterr().err.strip()
+    assert code == 2, said
+    assert said.count("\n") == 0
+    assert "Traceback" not in said
+    return said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--task-suite", "libero_spacial"], "Did you mean 'libero_spatial'?"),
+        (["--task-id", "8"], "its tasks are 0 to 7"),
+        (["--task-id", "-1"], "its tasks are 0 to 7"),
+        (["--task-suite", "libero_10", "--task-id", "10"], "its tasks are 0 to 9"),
+        (["--layers", "6"], "expected block indices 0 to 2, or recorded-call numbers 3 to 5"),
+        (["--layers", "1", "4"], "the same block 1"),
+        (["--layers", "one"], "invalid int value"),
+        (["--heads", "8"], "expected 0 to 7"),
+        (["--denoise-steps", "3"], "expected numbers 0 to 2, 'first', 'last' or 'all'"),
+        (["--queries", "some"], "expected 'mean' or 'all'"),
+        (["--precision", "24"], "expected mantissa bits from 1 to 23, or 'exact'"),
+        (["--replan-steps", "5"], "expected 1 to 4"),
+        (["--max-steps", "0"], "expected at least 1"),
+        (["--num-episodes", "0"], "expected at least 1"),
+        (["--num-episodes", "51"], "its initial states are 0 to 49"),
+        (["--num-image-tokens", "256"], "4 keys; leave the option out"),
+        (["--paligemma-variant", "gemma_2b"], "contradicts the policy 'dummy'"),
+        (["--action-expert-variant", "gemma_300"], "Did you mean 'gemma_300m'?"),
+        (["--device", "cuda:99"], "CUDA devices"),
+        (["--resume", "--overwrite"], "not allowed with"),
+        (["--checkpoint", "no/such/folder"], "There is no checkpoint"),
+        (["--libero-assets", "no/such/folder", "--task-suite", "libero_10", "--task-id", "0"], "--libero-assets"),
+    ],
+)
+def test_capture(arguments, expected, capsys, tmp_path):
+    store = tmp_path / "a.zarr"
+    assert expected in run(capture, [*DUMMY, "--store", store, *arguments], capsys)
+
+
+def test_store_without_suffix_or_in_an_unwritable_place(tmp_path, capsys):
+    assert "ends with '.zarr'" in run(capture, [*DUMMY, "--store", tmp_path / "store"], capsys)
+    (tmp_path / "file").write_text("")
+    said = run(capture, [*DUMMY, "--store", tmp_path / "file" / "a.zarr"], capsys)
+    assert "give another --store" in said
+
+
+@pytest.mark.simulator
+def test_existing_store_needs_resume_or_overwrite(captured_store, capsys):
+    said = run(capture, [*DUMMY, "--task-id", "0", "--store", captured_store], capsys)
+    assert "exists already and holds 4 episodes; add --resume" in said
+
+
+@pytest.mark.simulator
+def test_resume_with_other_settings_names_the_field(captured_store, capsys):
+    said = run(capture, [*DUMMY, "--max-steps", 12, "--seed", 8, "--store", captured_store, "--resume"], capsys)
+    assert "its protocol.seed is 7, this run's is 8" in said
+
+
+@pytest.mark.simulator
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--grouping", "defualt"], "Did you mean 'default'?"),
+        (["--grouping", "missing.toml"], "Cannot read grouping file missing.toml"),
+        (["--group", "nouns"], "expected NAME=SELECTOR"),
+        (["--group", "x=camera:base"], "Did you mean 'base_0_rgb'?"),
+        (["--group", "x=word:cubes"], "Did you mean 'cube'?"),
+        (["--group", "x=object:backround"], "Did you mean 'background'?"),
+        (["--group", "x=wrod:cube"], "did you mean 'word'"),
+        (["--group", "x=role:state & role:bos"], "has no key in any of the 4 selected episodes"),
+        (["--group", "a=word:cube", "--group", "b=role:instruction"], "Groups 'a' and 'b' share"),
+        (["--group", "x=word:cube", "--ratio", "y/x"], "refers to group 'y'"),
+        (["--ratio", "visual"], "expected GROUP[,GROUP]/GROUP[,GROUP]"),
+        (["--layers", "6"], "expected block indices 0 to 2"),
+        (["--denoise", "1"], "was not recorded; recorded: 0, 2"),
+        (["--heads", "9"], "Head 9 was not recorded"),
+        (["--tasks", "5"], "it has tasks 0, 1"),
+    ],
+)
+def test_analyze(arguments, expected, captured_store, tmp_path, capsys):
+    assert expected in run(analyze, [captured_store, "--output", tmp_path / "out", *arguments], capsys)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.simulator
+def test_stores_that_cannot_be_read(captured_store, tmp_path, capsys):
+    assert "There is no store at" in run(analyze, [captured_store.with_name("robosite.zarr")], capsys)
+    assert "Did you mean" in run(analyze, [captured_store.with_name("robosite.zarr")], capsys)
+    assert "is not a store" in run(analyze, [tmp_path], capsys)
+
+    newer = tmp_path / "newer.zarr"
+    shutil.copytree(captured_store, newer)
+    document = json.loads((newer / "zarr.json").read_text())
+    document["attributes"]["format_version"] = 2
+    (newer / "zarr.json").write_text(json.dumps(document))
+    assert "format version 2, and this program reads up to version 1" in run(analyze, [newer], capsys)
+
+    (newer / "zarr.json").write_text("{")
+    assert "cannot be read" in run(analyze, [newer], capsys)
+
+
+@pytest.mark.simulator
+def test_output_folder_that_cannot_be_written(captured_store, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    said = run(analyze, [captured_store, "--output", tmp_path / "file" / "results", "--no-plots"], capsys)
+    assert "Cannot write results to" in said
+
+
+@pytest.mark.simulator
+def test_two_stores_with_the_same_episodes_are_refused(captured_store, tmp_path, capsys):
+    copy = tmp_path / "copy.zarr"
+    shutil.copytree(captured_store, copy)
+    assert "both hold task000_episode000" in run(analyze, [captured_store, copy, "--no-plots"], capsys)
