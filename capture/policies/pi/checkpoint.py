@@ -76,8 +76,9 @@ def detect_format(folder: str | Path) -> CheckpointFormat:
         raise UnsupportedCheckpoint(
             f"'{folder}' is the params folder of a checkpoint; give its parent '{folder.parent}'."
         )
+    content = listing(sorted(path.name for path in folder.iterdir()))
     raise UnsupportedCheckpoint(
-        f"'{folder}' is not a pi checkpoint: expected {_OPENPI_TORCH} or {_OPENPI_JAX}, found {listing(sorted(p.name for p in folder.iterdir()))}."
+        f"'{folder}' is not a pi checkpoint: expected {_OPENPI_TORCH} or {_OPENPI_JAX}, found {content}."
     )
 
 

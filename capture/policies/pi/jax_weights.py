@@ -7,7 +7,7 @@ Leaves of the transformers carry all layers on their first axis (they are scanne
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 import torch
@@ -22,6 +22,8 @@ LANGUAGE = "paligemma_with_expert.paligemma.model.language_model."
 EXPERT = "paligemma_with_expert.gemma_expert.model."
 
 Convert = Callable[[np.ndarray], np.ndarray]
+#: one JAX leaf -> every torch tensor made from it, by name
+LeafConverter = Callable[[np.ndarray], dict[str, np.ndarray]]
 
 
 def _same(w: np.ndarray) -> np.ndarray:
@@ -120,34 +122,53 @@ _EXPERT_MARK = re.compile(r"_1(?=/|$)")
 _PROJECTION = re.compile(r"((?:action|state|time)\w*)/(kernel|bias)")
 
 
-def convert_leaf(path: str, leaf: np.ndarray) -> dict[str, np.ndarray] | None:
-    """Return the torch tensors made from one JAX leaf by name, or None for a leaf that no pi model has.
+def leaf_converter(path: str) -> LeafConverter | None:
+    """Return what turns a JAX leaf of this path into torch tensors by name, or None for a leaf that no pi model has.
 
-    For checkpoints too large to hold twice: read, convert and assign leaf by leaf.
+    For checkpoints too large to hold twice: look all paths up first, then read, convert and assign leaf by leaf.
     """
-    image_block, language = "PaliGemma/img/Transformer/encoderblock/", "PaliGemma/llm/"
+    image_block, image, language = "PaliGemma/img/Transformer/encoderblock/", "PaliGemma/img/", "PaliGemma/llm/"
     if path.startswith(image_block):
         found = _IMAGE_BLOCK.get(path.removeprefix(image_block))
-        return None if found is None else _unstack(leaf, VISION + "encoder.layers.", [found])
-    if path.startswith("PaliGemma/img/"):
-        found = _IMAGE.get(path.removeprefix("PaliGemma/img/"))
-        return None if found is None else {found[0]: found[1](leaf)}
+        return None if found is None else _stacked(VISION + "encoder.layers.", [found])
+    if path.startswith(image):
+        return _single("", _IMAGE.get(path.removeprefix(image)))
     if path.startswith(language):
         below, marks = _EXPERT_MARK.subn("", path.removeprefix(language))
         model = EXPERT if marks else LANGUAGE
-        if below in _GEMMA:
-            name, convert = _GEMMA[below]
-            return {model + name: convert(leaf)}
         several = _GEMMA_BLOCK.get(below.removeprefix("layers/"))
-        return None if several is None else _unstack(leaf, model + "layers.", several)
+        return _single(model, _GEMMA.get(below)) if several is None else _stacked(model + "layers.", several)
     projection = _PROJECTION.fullmatch(path)
     if projection is None:
         return None
-    return {f"{projection[1]}.weight": leaf.T} if projection[2] == "kernel" else {f"{projection[1]}.bias": leaf}
+    kernel = projection[2] == "kernel"
+    return _single(projection[1], (".weight", _transposed) if kernel else (".bias", _same))
 
 
-def _unstack(leaf: np.ndarray, layers: str, targets: list[tuple[str, Convert]]) -> dict[str, np.ndarray]:
-    return {f"{layers}{i}.{name}": convert(one) for i, one in enumerate(leaf) for name, convert in targets}
+def _single(before: str, found: tuple[str, Convert] | None) -> LeafConverter | None:
+    if found is None:
+        return None
+    name, convert = found
+    return lambda leaf: {before + name: convert(leaf)}
+
+
+def _stacked(layers: str, targets: list[tuple[str, Convert]]) -> LeafConverter:
+    def unstack(leaf: np.ndarray) -> dict[str, np.ndarray]:
+        return {f"{layers}{i}.{name}": convert(one) for i, one in enumerate(leaf) for name, convert in targets}
+
+    return unstack
+
+
+def find_converters(paths: Iterable[str]) -> dict[str, LeafConverter]:
+    """Return path -> converter for all leaves of a checkpoint; `CheckpointMismatch` lists those no pi model has."""
+    found = {path: leaf_converter(path) for path in paths}
+    unknown = sorted(path for path, converter in found.items() if converter is None)
+    if unknown:
+        raise CheckpointMismatch(
+            f"The checkpoint has {len(unknown)} arrays that a pi model does not have (LoRA arrays must be merged "
+            f"first): {', '.join(unknown)}."
+        )
+    return {path: converter for path, converter in found.items() if converter is not None}
 
 
 def from_jax_flat(leaves: Mapping[str, np.ndarray], config: PiConfig) -> dict[str, Tensor]:
@@ -156,19 +177,11 @@ def from_jax_flat(leaves: Mapping[str, np.ndarray], config: PiConfig) -> dict[st
     Raises `CheckpointMismatch` that lists every leaf that is unknown (such as unmerged LoRA leaves), and every tensor
     that is missing or of another shape than the configuration says.
     """
-    state: dict[str, Tensor] = {}
-    unknown = []
-    for path, leaf in leaves.items():
-        tensors = convert_leaf(path, leaf)
-        if tensors is None:
-            unknown.append(path)
-            continue
-        for name, array in tensors.items():
-            state[name] = torch.from_numpy(np.array(array, dtype=np.float32, order="C"))
-    if unknown:
-        raise CheckpointMismatch(
-            f"The checkpoint has {len(unknown)} leaves that a pi model does not have (LoRA leaves must be merged "
-            f"first): {', '.join(sorted(unknown))}."
-        )
+    converters = find_converters(leaves)
+    state = {
+        name: torch.from_numpy(np.array(array, dtype=np.float32, order="C"))
+        for path, leaf in leaves.items()
+        for name, array in converters[path](leaf).items()
+    }
     check_shapes({name: tuple(tensor.shape) for name, tensor in state.items()}, expected_shapes(config))
     return state

@@ -7,7 +7,6 @@ zarr array under its path joined with ".".
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,9 +17,9 @@ from torch import Tensor
 
 from capture.policies.pi.checkpoint import UnreadableCheckpoint, UnsupportedCheckpoint, detect_format
 from capture.policies.pi.config import PiConfig, find_config
-from capture.policies.pi.jax_weights import convert_leaf
+from capture.policies.pi.jax_weights import find_converters
 from capture.policies.pi.model import PiModel
-from capture.policies.pi.strict import CheckpointMismatch, build_model, check_shapes, expected_shapes, expected_tensors
+from capture.policies.pi.strict import build_model, check_shapes, expected_shapes, expected_tensors
 from schemas.errors import MissingDependency
 
 
@@ -116,31 +115,12 @@ def load_openpi_jax(
             "pi0_libero" if any(leaf.path.startswith("state_proj/") for leaf in leaves) else "pi05_libero"
         )
     kept_as = expected_tensors(config, dtype)
+    converters = find_converters(leaf.path for leaf in leaves)
     state: dict[str, Tensor] = {}
-    unknown = []
-    for leaf, name, array in _converted(params, leaves):
-        if name is None:
-            unknown.append(leaf.path)
-            continue
-        # Cast at once: the whole model in float32 beside the one being built would be twice the memory.
-        target = kept_as[name].dtype if name in kept_as else dtype
-        state[name] = torch.from_numpy(np.array(array, order="C")).to(target)
-    if unknown:
-        raise CheckpointMismatch(
-            f"The checkpoint has {len(unknown)} arrays that a pi model does not have (LoRA arrays must be merged "
-            f"first): {', '.join(sorted(unknown))}."
-        )
+    for leaf in leaves:
+        for name, array in converters[leaf.path](read_leaf(params, leaf)).items():
+            # Cast at once: all of it in float32 beside the model being built would be twice the memory.
+            target = kept_as[name].dtype if name in kept_as else dtype
+            state[name] = torch.from_numpy(np.array(array, order="C")).to(target)
     check_shapes({name: tuple(tensor.shape) for name, tensor in state.items()}, expected_shapes(config))
     return build_model(config, state, state.__getitem__, dtype=dtype, device=device)
-
-
-def _converted(params: Path, leaves: list[Leaf]) -> Iterator[tuple[Leaf, str | None, np.ndarray]]:
-    """Yield (leaf, torch name, array), one leaf in memory at a time; the name is None for a leaf no pi model has."""
-    for leaf in leaves:
-        array = read_leaf(params, leaf)
-        converted = convert_leaf(leaf.path, array)
-        if converted is None:
-            yield leaf, None, array
-            continue
-        for name, part in converted.items():
-            yield leaf, name, part

@@ -25,8 +25,13 @@ class PatchEmbeddings(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Map (image, 3, height, width) float32 to (image, patch, width), patches row by row from the top left."""
-        patches = self.patch_embedding(images.to(self.patch_embedding.weight.dtype))
-        return patches.flatten(2).transpose(1, 2) + self.position_embedding.weight
+        weight, bias = self.patch_embedding.weight, self.patch_embedding.bias
+        size = weight.shape[-1]
+        pixels = images.unflatten(3, (-1, size)).unflatten(2, (-1, size))
+        # (image, 3, row, y, column, x) -> (image, row · column, 3 · y · x): patches do not overlap, so the convolution is
+        # one matrix product. Convolutions on a GPU are rounded to TF32 unless a global switch says otherwise.
+        patches = pixels.permute(0, 2, 4, 1, 3, 5).flatten(3).flatten(1, 2)
+        return F.linear(patches.to(weight.dtype), weight.flatten(1), bias) + self.position_embedding.weight
 
 
 class SiglipAttention(nn.Module):

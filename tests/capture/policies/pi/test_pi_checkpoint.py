@@ -181,7 +181,7 @@ def test_damaged_config_json(checkpoint, text):
 def test_jax_leaves_are_checked_too(pi05_case):
     leaves = dict(pi05_case.weights)
     leaves["PaliGemma/llm/layers/attn/q_einsum/lora_a"] = np.zeros((3, 8, 64, 4))
-    with pytest.raises(CheckpointMismatch, match=r"1 leaves.*q_einsum/lora_a"):
+    with pytest.raises(CheckpointMismatch, match=r"1 arrays.*q_einsum/lora_a"):
         from_jax_flat(leaves, pi05_case.config)
     leaves = dict(pi05_case.weights)
     del leaves["PaliGemma/llm/layers/mlp_1/gating_einsum"]

@@ -88,19 +88,13 @@ def test_damaged_metadata(checkpoint, text):
         load_openpi_jax(checkpoint)
 
 
-def test_unknown_arrays_are_listed(checkpoint, pi0_case):
+def test_unknown_arrays_are_listed_before_anything_is_read(checkpoint, pi0_case):
     path = checkpoint / "params" / "_METADATA"
     metadata = json.loads(path.read_text())
-    metadata["store_array_data_equal_to_fill_value"] = False
-    tree = metadata["tree_metadata"]
-    name = next(key for key in tree if "action_in_proj" in key and "bias" in key)
-    tree["extra"] = {**tree[name], "key_metadata": [{**part} for part in tree[name]["key_metadata"]]}
-    for part in tree["extra"]["key_metadata"]:
-        if part["key"] == "bias":
-            part["key"] = "lora_a"
+    keys = [{"key": key, "key_type": 2} for key in ("params", "action_in_proj", "lora_a", "value")]
+    metadata["tree_metadata"]["extra"] = {"key_metadata": keys}
     path.write_text(json.dumps(metadata))
-    # the array itself is absent, which is found first
-    with pytest.raises(UnreadableCheckpoint, match="action_in_proj/lora_a"):
+    with pytest.raises(CheckpointMismatch, match=r"1 arrays.*action_in_proj/lora_a"):
         load_openpi_jax(checkpoint, config=pi0_case.config)
 
 
