@@ -72,7 +72,7 @@ setup-analyze: .venv/analyze-installed
 .venv/capture-installed: .venv/analyze-installed requirements-libero.txt
 	@echo "Installing the capture environment into .venv (torch, MuJoCo, robosuite, LIBERO; a minute or more) ..."
 	$(PIP) -e '.[capture,dev]'
-	$(PIP) --no-deps -r requirements-libero.txt
+	$(PIP) --no-deps --use-pep517 -r requirements-libero.txt
 	sh scripts/ensure_rendering.sh
 	@touch $@
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +29,17 @@ from schemas.store import (
 )
 from schemas.vocabulary import EpisodeTokens
 
+#: The group of an episode whose attributes are an `EpisodeSeal`.
+SEAL_GROUP = "seal"
+
+
+@dataclass(frozen=True)
+class EpisodeSeal:
+    """sha256 of every `zarr.json` of an episode by its path, and of the store's own: chunks have checksums, and JSON has none."""
+
+    run: str
+    files: dict[str, str]
+
 
 @dataclass(frozen=True)
 class StoredEpisode:
@@ -43,24 +56,67 @@ class StoredEpisode:
     def attributes(self) -> EpisodeAttributes:
         """What the episode says of itself."""
         try:
-            return from_json(EpisodeAttributes, _read_attributes(self.folder))
+            return from_json(EpisodeAttributes, _attributes_of(self.sealed("zarr.json")))
         except (OSError, ValueError, KeyError) as error:
+            if isinstance(error, CorruptEpisode):
+                raise
             raise CorruptEpisode(f"Episode {self.name} cannot be read: its attributes are damaged ({error}).") from None
+
+    @cached_property
+    def seal(self) -> EpisodeSeal:
+        """The digests of the episode's metadata."""
+        try:
+            given = _attributes_of((self.folder / SEAL_GROUP / "zarr.json").read_bytes())
+            return from_json(EpisodeSeal, given)
+        except (OSError, ValueError, KeyError) as error:
+            raise CorruptEpisode(f"Episode {self.name} cannot be read: its seal is damaged ({error}).") from None
+
+    def sealed(self, file: str) -> bytes:
+        """The bytes of one `zarr.json` of the episode; raises `CorruptEpisode` when they are not those that were written."""
+        try:
+            content = (self.folder / file).read_bytes()
+        except OSError as error:
+            raise CorruptEpisode(f"Episode {self.name} lacks its {file} ({error.strerror}).") from None
+        if hashlib.sha256(content).hexdigest() != self.seal.files.get(file):
+            raise CorruptEpisode(f"Episode {self.name} is damaged: its {file} is not the one that was written.")
+        return content
+
+    @property
+    def is_of_this_run(self) -> bool:
+        """Whether the store's own attributes are, to the byte, those that the episode was recorded under."""
+        run = self.folder.parents[1] / "zarr.json"
+        return hashlib.sha256(run.read_bytes()).hexdigest() == self.seal.run
 
     @cached_property
     def group(self) -> zarr.Group:
         """The episode's Zarr group."""
         return zarr.open_group(self.folder, mode="r", use_consolidated=False)
 
+    @cached_property
+    def _opened(self) -> dict[str, zarr.Array]:
+        return {}
+
     def array(self, name: str) -> zarr.Array:
-        """One array of the episode; raises `CorruptEpisode` when it is missing or has another shape than promised."""
+        """One array of the episode; raises `CorruptEpisode` when it lacks a file or has another shape than promised."""
+        if name not in self._opened:
+            self._opened[name] = self._open(name)
+        return self._opened[name]
+
+    def _open(self, name: str) -> zarr.Array:
         promised = self.attributes.arrays.get(name)
+        if promised is None:
+            raise CorruptEpisode(f"Episode {self.name} lacks the array {name}: its attributes do not list it.")
+        self.sealed(f"{name}/zarr.json")
         try:
             array = self.group[name]
         except (KeyError, OSError, ValueError) as error:
             raise CorruptEpisode(f"Episode {self.name} lacks the array {name} ({error}).") from None
-        if not isinstance(array, zarr.Array) or promised is None or tuple(array.shape) != promised.shape:
+        if not isinstance(array, zarr.Array) or tuple(array.shape) != promised.shape:
             raise CorruptEpisode(f"Array {name} of episode {self.name} has not the shape that its attributes promise.")
+        # A missing file reads as the fill value, and in a picture that may be any picture's number.
+        for file in _chunk_files(array):
+            if not (self.folder / name / file).is_file():
+                raise CorruptEpisode(f"Array {name} of episode {self.name} has lost its file {file}.")
         return array
 
     def read(self, name: str, index: Any = ...) -> NDArray[Any]:
@@ -68,10 +124,13 @@ class StoredEpisode:
         array = self.array(name)
         try:
             values = np.asarray(array[index])
-        except (OSError, ValueError, RuntimeError) as error:
-            raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {error}.") from None
-        lost = {"f": np.isnan, "i": lambda numbers: numbers == -1}.get(values.dtype.kind)
-        if (lost is not None and lost(values).any()) or (name.endswith("/key_role") and not values.all()):
+        except IndexError:
+            raise  # the caller's mistake
+        except Exception as error:  # damaged bytes can make codecs raise anything
+            raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {error}.") from error
+        kind = values.dtype.kind
+        lost = np.isnan(values) if kind == "f" else values == -1 if kind == "i" else np.zeros(0, dtype=bool)
+        if lost.any() or (name.endswith("/key_role") and not values.all()):
             raise CorruptEpisode(f"Array {name} of episode {self.name} has missing values: a chunk is lost.")
         return values
 
@@ -141,7 +200,7 @@ def open_store(path: Path) -> Store:
         )
     try:
         attributes = _read_attributes(path)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise StoreError(f"{path} is not a store: it has no zarr.json.") from None
     except (OSError, ValueError, KeyError) as error:
         raise StoreError(f"The store {path} cannot be read: {error}.") from None
@@ -155,10 +214,21 @@ def open_store(path: Path) -> Store:
     return Store(path, root, tuple(StoredEpisode(path / EPISODES_GROUP / name) for _, name in keyed))
 
 
+def _chunk_files(array: zarr.Array) -> Iterator[str]:
+    """Paths of the files that hold an array, relative to it."""
+    extents = zip(array.shape, array.shards or array.chunks, strict=True)
+    for coordinates in itertools.product(*(range(-(-size // extent)) for size, extent in extents)):
+        yield array.metadata.encode_chunk_key(coordinates)
+
+
 def _read_attributes(folder: Path) -> dict[str, Any]:
-    document = json.loads((folder / "zarr.json").read_text(encoding="utf-8"))
-    if not isinstance(document, dict) or document.get("node_type") != "group":
-        raise ValueError("zarr.json does not describe a group")
+    return _attributes_of((folder / "zarr.json").read_bytes())
+
+
+def _attributes_of(group_document: bytes) -> dict[str, Any]:
+    document = json.loads(group_document)
+    if not isinstance(document, dict) or (document.get("zarr_format"), document.get("node_type")) != (3, "group"):
+        raise ValueError("zarr.json does not describe a group of Zarr format 3")
     attributes = document.get("attributes", {})
     if not isinstance(attributes, dict):
         raise ValueError("zarr.json has no attributes")

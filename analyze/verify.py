@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from analyze.reader import Store, StoredEpisode
 from schemas.digest import ArrayDigest
 from schemas.precision import mass_error_bound
-from schemas.store import CorruptEpisode, RootAttributes
+from schemas.store import CorruptEpisode, EpisodeAttributes, RootAttributes, episode_name, parse_episode_name
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,8 @@ def verify_store(store: Store, progress: Callable[[int], object] | None = None) 
     """Check every episode; `progress` is called with 1 after each. An empty list means the store is whole."""
     faults = []
     for episode in store.episodes:
-        faults += [Fault(episode.name, problem) for problem in _problems(store.attributes, episode)]
+        problems = dict.fromkeys(_problems(store.attributes, episode))  # several checks may stumble over one fault
+        faults += [Fault(episode.name, problem) for problem in problems]
         if progress is not None:
             progress(1)
     return faults
@@ -34,44 +37,88 @@ def verify_store(store: Store, progress: Callable[[int], object] | None = None) 
 def _problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
     try:
         attributes = episode.attributes
+        if not episode.is_of_this_run:
+            yield "it was recorded under other attributes than the store has now: one of them has been changed"
     except CorruptEpisode as error:
         yield str(error)
         return
-    expected = {f"{site.name}/{name}" for site in root.sites for name in ("rows", "row_sum", "atoms", "key_role")}
-    for name in sorted(expected - set(attributes.arrays)):
+    if parse_episode_name(episode.name) != (attributes.task_id, attributes.episode_index):
+        yield f"its attributes are those of {episode_name(attributes.task_id, attributes.episode_index)}"
+    for file in episode.seal.files:
+        yield from _guarded(_metadata_problems(episode, file))
+    shapes = _expected_shapes(root, attributes)
+    for name in sorted(set(shapes) - set(attributes.arrays)):
         yield f"the array {name} is not in the episode"
     for name, record in attributes.arrays.items():
-        try:
-            yield from _array_problems(episode, name, record.sha256)
-        except CorruptEpisode as error:
-            yield str(error)
+        expected = shapes.get(name, (attributes.num_replans,))
+        if record.shape[: len(expected)] != expected:
+            yield f"the array {name} has the shape {record.shape}; expected {expected}"
+        yield from _guarded(_digest_problems(episode, name, record.sha256))
+    bound = mass_error_bound(root.recording.mantissa_bits)
     for site in root.sites:
-        if f"{site.name}/rows" in attributes.arrays:
-            try:
-                yield from _row_sum_problems(episode, site.name, mass_error_bound(root.recording.mantissa_bits))
-            except CorruptEpisode as error:
-                yield str(error)
+        yield from _guarded(_sum_problems(episode, f"{site.name}/rows", f"{site.name}/row_sum", bound))
+        yield from _guarded(_sum_problems(episode, f"{site.name}/atoms", f"{site.name}/row_sum", 0.0))
+    yield from _guarded(_prompt_problems(episode))
 
 
-def _array_problems(episode: StoredEpisode, name: str, sha256: str) -> Iterator[str]:
+def _guarded(check: Iterator[str]) -> Iterator[str]:
+    try:
+        yield from check
+    except CorruptEpisode as error:
+        yield str(error)
+
+
+def _expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dict[str, tuple[int, ...]]:
+    """First axes of every array that must be there; arrays that are not named here begin with the replans."""
+    recording, replans = root.recording, attributes.num_replans
+    queries = 1 if recording.queries == "mean" else recording.num_action_queries
+    cells = (replans, len(recording.layers), len(recording.denoise_steps), len(recording.heads), queries)
+    shapes: dict[str, tuple[int, ...]] = {"denoise_time": (len(recording.denoise_steps),)}
+    shapes |= dict.fromkeys(("env_step", "noise_seed", "prompt_index", "state", "actions"), (replans,))
+    for site in root.sites:
+        shapes[f"{site.name}/rows"] = (*cells, site.num_keys)
+        shapes[f"{site.name}/row_sum"] = cells
+        shapes[f"{site.name}/atoms"] = (*cells, len(attributes.segments.get(site.name, ())))
+        shapes[f"{site.name}/key_role"] = (replans, site.num_keys)
+        shapes[f"{site.name}/layer"] = (len(recording.layers),)
+        shapes[f"{site.name}/denoise"] = (len(recording.denoise_steps),)
+        shapes[f"{site.name}/head"] = (len(recording.heads),)
+    return shapes
+
+
+def _metadata_problems(episode: StoredEpisode, file: str) -> Iterator[str]:
+    episode.sealed(file)
+    yield from ()
+
+
+def _blocks(episode: StoredEpisode, name: str) -> Iterator[tuple[slice, NDArray[Any]]]:
     array = episode.array(name)
-    digest = ArrayDigest()
     step = max(1, (array.shards or array.chunks)[0])
     for first in range(0, array.shape[0], step):
-        digest.update(episode.read(name, slice(first, first + step)))
+        part = slice(first, first + step)
+        yield part, episode.read(name, part)
+
+
+def _digest_problems(episode: StoredEpisode, name: str, sha256: str) -> Iterator[str]:
+    digest = ArrayDigest()
+    for _, values in _blocks(episode, name):
+        digest.update(values)
     if digest.hexdigest() != sha256:
         yield f"the values of {name} are not those that were written (digest differs)"
 
 
-def _row_sum_problems(episode: StoredEpisode, site: str, bound: float) -> Iterator[str]:
-    """Stored rows must add up to the exact sums within what rounding allows (and float32 summation, 1e-5)."""
-    sums = episode.read(f"{site}/row_sum").astype(np.float64)
-    array = episode.array(f"{site}/rows")
-    step = max(1, (array.shards or array.chunks)[0])
-    for first in range(0, array.shape[0], step):
-        rows = episode.read(f"{site}/rows", slice(first, first + step))
-        if (rows < 0).any():
-            yield f"{site}/rows holds negative numbers"
-        error = np.abs(rows.sum(axis=-1, dtype=np.float64) - sums[first : first + step])
-        if (error > (bound + 1e-5) * sums[first : first + step]).any():
-            yield f"{site}/rows does not add up to {site}/row_sum (largest difference {error.max():.2g})"
+def _sum_problems(episode: StoredEpisode, name: str, sums_name: str, bound: float) -> Iterator[str]:
+    """Rows, and masses of segments, must add up to the exact sums within what rounding allows (and float32 summation, 1e-5)."""
+    sums = episode.read(sums_name).astype(np.float64)
+    for part, values in _blocks(episode, name):
+        if (values < 0).any():
+            yield f"{name} holds negative numbers"
+        error = np.abs(values.sum(axis=-1, dtype=np.float64) - sums[part])
+        if (error > (bound + 1e-5) * sums[part]).any():
+            yield f"{name} does not add up to {sums_name} (largest difference {error.max():.2g})"
+
+
+def _prompt_problems(episode: StoredEpisode) -> Iterator[str]:
+    index = episode.read("prompt_index")
+    if not np.isin(index, np.arange(len(episode.attributes.prompts))).all():
+        yield "prompt_index names prompts that the attributes do not have"

@@ -18,30 +18,29 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 TARGET_CHUNK_BYTES = 2 << 20
 
 
-#: What a missing chunk reads as, by kind of number. None of these occurs in floats and signed integers that are stored; of
-#: unsigned arrays, key roles never are 0, and pictures are only known to be complete by their digest.
+#: What a missing chunk reads as, by kind of number. None of these occurs in floats and signed integers that are stored. Any
+#: value of a picture can be one, so that readers of pictures must look whether the chunk's file is there.
 MISSING = {"f": float("nan"), "i": -1, "u": 0}
 
 
 def replans_per_block(bytes_per_replan: int, max_replans: int) -> int:
     """Replans in one chunk, for one layer and denoise step.
 
-    A multiple of 8: Blosc silently skips its bit shuffle when a chunk's number of elements is not one.
+    The chunk's number of elements is a multiple of 8: Blosc silently skips its bit shuffle when it is not.
     """
-    wanted = max(1, TARGET_CHUNK_BYTES // max(1, bytes_per_replan))
-    return 8 * math.ceil(min(wanted, max_replans) / 8)
+    step = 8 // math.gcd(8, bytes_per_replan // 4)
+    wanted = min(max(1, TARGET_CHUNK_BYTES // max(1, bytes_per_replan)), max(1, max_replans))
+    return step * math.ceil(wanted / step)
 
 
-def create_blocked(
-    group: zarr.Group, name: str, shape: tuple[int, ...], block: int, axes: Sequence[str], one_chunk: bool = False
-) -> zarr.Array:
-    """Create a float32 array that grows along replans by whole shards of `block` replans.
+def create_blocked(group: zarr.Group, name: str, shape: tuple[int, ...], block: int, axes: Sequence[str]) -> zarr.Array:
+    """Create a float32 array (replan, layer, denoise, ...) that grows along replans by whole shards of `block` replans.
 
-    A chunk holds one layer and one denoise step (so that an analysis of three layers does not read the others), or with
-    `one_chunk` everything of the block. A missing chunk reads as NaN, never as zeros that look like data.
+    A chunk holds one layer and one denoise step, so that an analysis of three layers does not read the others. A missing
+    chunk reads as NaN, never as zeros that look like data.
     """
     shard = (block, *shape[1:])
-    chunk = shard if one_chunk else (block, 1, 1, *shape[3:])
+    chunk = (block, 1, 1, *shape[3:])
     if math.prod(chunk) % 8:
         raise AssertionError(f"chunk {chunk} is not a multiple of 8 elements: bit shuffle would be skipped")
     return group.create_array(
@@ -58,16 +57,18 @@ def create_blocked(
 
 
 def write_whole(group: zarr.Group, name: str, values: NDArray[np.generic], axes: Sequence[str]) -> zarr.Array:
-    """Write a complete array in one go: one shard, one chunk per eight replans of pictures, one chunk otherwise."""
-    pictures = values.ndim == 4
-    chunk = (min(8, values.shape[0]), *values.shape[1:]) if pictures else values.shape
-    shard = (chunk[0] * math.ceil(values.shape[0] / chunk[0]), *values.shape[1:]) if pictures else None
+    """Write a complete array in one go and as one file: one chunk when it is small, else a shard of chunks along its first axis."""
+    length = values.shape[0]
+    chunk_length = max(
+        1, min(length, TARGET_CHUNK_BYTES // max(1, math.prod(values.shape[1:]) * values.dtype.itemsize))
+    )
+    rest = tuple(max(1, extent) for extent in values.shape[1:])
     array = group.create_array(
         name,
         shape=values.shape,
         dtype=values.dtype,
-        chunks=chunk,
-        shards=shard,
+        chunks=(chunk_length, *rest),
+        shards=(chunk_length * math.ceil(length / chunk_length), *rest) if chunk_length < length else None,
         compressors=(
             BloscCodec(cname="zstd", clevel=3, shuffle="shuffle", typesize=values.dtype.itemsize),
             Crc32cCodec(),

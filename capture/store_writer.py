@@ -6,6 +6,8 @@ kills the process in between leaves the store as it was.
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import os
 import shutil
 import socket
@@ -23,7 +25,7 @@ from numpy.typing import NDArray
 from capture.attention import RecordedRows
 from capture.store_arrays import create_blocked, replans_per_block, write_whole
 from schemas.digest import ArrayDigest
-from schemas.errors import BadArgument
+from schemas.errors import BadArgument, UserError
 from schemas.jsonable import MalformedDocument, from_json, to_json
 from schemas.layout import Prompt, SiteLayout
 from schemas.precision import round_mantissa
@@ -48,6 +50,13 @@ from schemas.store import (
 from schemas.vocabulary import SceneObject
 
 WriteMode = Literal["new", "resume", "overwrite"]
+
+#: The group of an episode whose attributes hold the sha256 of every `zarr.json` of the episode and of the store's own.
+SEAL_GROUP = "seal"
+
+
+class StoreWriteFailed(StoreError, OSError):
+    """The operating system refused a write: the disk is full, a permission is missing, a device failed."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +106,7 @@ class RunStore:
 
     def committed(self) -> set[tuple[int, int]]:
         """(task id, episode index) of every complete episode."""
-        folder = self.path / EPISODES_GROUP
-        return {parse_episode_name(entry.name) for entry in folder.iterdir() if entry.is_dir()}
+        return {parse_episode_name(folder.name) for folder in _episode_folders(self.path)}
 
     @contextmanager
     def episode(
@@ -107,9 +115,11 @@ class RunStore:
         """Write one episode; leaving the block without `commit` drops it."""
         name = episode_name(start.task_id, start.episode_index)
         folder = self.partial_folder / f"{name}-{_process_tag()}"
-        folder.mkdir(parents=True)
         try:
-            yield EpisodeWriter(self, folder, start, denoise_times, max_replans)
+            with _naming_the_failure(f"episode {name} of {self.path}"):
+                _make_partial(folder)
+                writer = EpisodeWriter(self, folder, start, denoise_times, max_replans)
+            yield writer
         finally:
             shutil.rmtree(folder, ignore_errors=True)
             _remove_if_empty(self.partial_folder)
@@ -124,23 +134,26 @@ def open_run(path: Path, attributes: RootAttributes, mode: WriteMode) -> RunStor
     """
     if path.suffix != STORE_SUFFIX:
         raise BadArgument(f"Cannot write a store at {path}: expected a name that ends with '{STORE_SUFFIX}'.")
+    # Episodes are written beside the store itself: beside a link to it may be another file system.
+    path = path.resolve() if path.is_symlink() else path
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists():
             if mode == "new":
                 refuse_existing(path)
             existing = _read_root(path)
-            if mode == "resume":
-                check_same_run(path, existing, attributes)
-                _remove_dead_partials(path)
-                return RunStore(path, existing)
-            _delete_store(path)
-        _create_root(path, attributes)
+            if mode == "overwrite":
+                _delete_store(path)
+                existing = _create_root(path, attributes)
+        else:
+            existing = _create_root(path, attributes)
+        check_same_run(path, existing, attributes)
+        _remove_dead_partials(path)
     except OSError as error:
-        if isinstance(error, StoreError):
+        if isinstance(error, UserError):
             raise
         raise BadArgument(f"Cannot write a store at {path}: {error.strerror or error}; give another --store.") from None
-    return RunStore(path, attributes)
+    return RunStore(path, existing)
 
 
 def refuse_existing(path: Path) -> NoReturn:
@@ -173,10 +186,22 @@ def _first_difference(old: object, new: object, where: str) -> tuple[str, object
             if found:
                 return found
         return None
+    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new) and where.startswith("sites"):
+        pairs = enumerate(zip(old, new, strict=True))
+        return next((found for i, (a, b) in pairs if (found := _first_difference(a, b, f"{where}[{i}]"))), None)
     return None if old == new else (where, old, new)
 
 
+def _episode_folders(path: Path) -> list[Path]:
+    folder = path / EPISODES_GROUP
+    if not folder.is_dir():
+        raise StoreError(f"{path} cannot be used as a store: it has no group '{EPISODES_GROUP}'; give another --store.")
+    return [entry for entry in folder.iterdir() if entry.is_dir()]
+
+
 def _read_root(path: Path) -> RootAttributes:
+    if not path.exists():
+        raise StoreError(f"The store {path} has been removed.")
     if not (path / "zarr.json").is_file():
         raise StoreError(f"{path} exists and is not a store; give another --store.")
     try:
@@ -190,29 +215,31 @@ def _read_root(path: Path) -> RootAttributes:
         raise StoreError(f"{path} has attributes that cannot be read: {error}") from None
 
 
-def _create_root(path: Path, attributes: RootAttributes) -> None:
+def _create_root(path: Path, attributes: RootAttributes) -> RootAttributes:
+    """Create an empty store in one step; returns what it says of itself, which another process may have written."""
     building = path.with_name(f"{path.name}{PARTIAL_SUFFIX}") / f"root-{_process_tag()}"
-    building.parent.mkdir(exist_ok=True)
     try:
-        root = zarr.open_group(building, mode="w", zarr_format=3)
+        _make_partial(building)
+        root = zarr.create_group(building, zarr_format=3)
         root.update_attributes(to_json(attributes))
         root.create_group(EPISODES_GROUP)
         _flush_folder(building)
         building.rename(path)
+        _flush_entry(path.parent)
     except OSError:
+        # Another process of the same array job was first, unless there is nothing.
         if not path.exists():
             raise
-        # Another process of the same array job was first; what it wrote must be the same run.
-        check_same_run(path, _read_root(path), attributes)
     finally:
         shutil.rmtree(building, ignore_errors=True)
         _remove_if_empty(building.parent)
+    return _read_root(path)
 
 
 def _delete_store(path: Path) -> None:
     # Renamed first, so that a crash while deleting cannot leave half a store under the old name.
     doomed = path.with_name(f"{path.name}{PARTIAL_SUFFIX}") / f"deleted-{_process_tag()}"
-    doomed.parent.mkdir(exist_ok=True)
+    _make_partial(doomed)
     path.rename(doomed)
     shutil.rmtree(doomed)
     _remove_if_empty(doomed.parent)
@@ -228,29 +255,60 @@ class EpisodeWriter:
         self.folder = folder
         self.start = start
         self.denoise_times = denoise_times
-        self.group = zarr.open_group(folder, mode="w", zarr_format=3)
+        self.name = episode_name(start.task_id, start.episode_index)
+        self.what = f"episode {self.name} of {store.path}"
+        self.group = zarr.create_group(folder, zarr_format=3)
         self.sites = {site.name: _SiteWriter(self, site, max_replans) for site in store.attributes.sites}
         self.prompts: dict[Prompt, int] = {}
         self.records: list[ReplanRecord] = []
         self.digests: dict[str, ArrayRecord] = {}
 
     def append(self, record: ReplanRecord) -> None:
-        """Add the next replan."""
-        for name, site in self.sites.items():
-            site.append(record.rows[name], record.key_role[name])
+        """Add the next replan.
+
+        Raises:
+            ValueError: the record does not fit the run or the replans before it, or holds numbers that are not finite.
+            StoreWriteFailed: the disk is full, or refuses in another way.
+        """
+        self._check(record)
+        with _naming_the_failure(self.what):
+            for name, site in self.sites.items():
+                site.append(record.rows[name], record.key_role[name])
         self.prompts.setdefault(record.prompt, len(self.prompts))
         # Rows are on their way to disk; the rest is small and waits for the end.
         self.records.append(replace(record, rows={}))
 
+    def _check(self, record: ReplanRecord) -> None:
+        first = self.records[0] if self.records else record
+        for what in ("frames", "coverage"):
+            given, expected = list(getattr(record, what)), list(getattr(first, what))
+            if given != expected:
+                raise ValueError(f"a replan has {what} of the cameras {given}, the first one of {expected}")
+        numbers = {"state": record.state, "actions": record.actions, **record.coverage}
+        for what, values in numbers.items():
+            if not np.isfinite(values).all():
+                raise ValueError(f"the {what} of a replan are not all finite numbers")
+
     def commit(self, success: bool, num_steps: int) -> Path:
         """Finish, verify and publish the episode; returns its folder in the store.
 
-        Raises `StoreExists` when another writer has published the same episode meanwhile.
+        Raises:
+            StoreExists: another writer has published the same episode meanwhile.
+            RunMismatch: the store has been replaced by one of another run meanwhile.
+            StoreWriteFailed: the disk is full, or refuses in another way.
         """
-        for site in self.sites.values():
-            site.finish()
-        self._write_side_arrays()
-        attributes = EpisodeAttributes(
+        with _naming_the_failure(self.what):
+            for site in self.sites.values():
+                site.finish()
+            self._write_side_arrays()
+            self.group.update_attributes(to_json(self._attributes(success, num_steps)))
+            self._write_seal()
+            self._read_back()
+            _flush_folder(self.folder)
+            return self._publish()
+
+    def _attributes(self, success: bool, num_steps: int) -> EpisodeAttributes:
+        return EpisodeAttributes(
             task_id=self.start.task_id,
             task_name=self.start.task_name,
             instruction=self.start.instruction,
@@ -266,10 +324,11 @@ class EpisodeWriter:
             provenance=dict(self.start.provenance),
             arrays=dict(sorted(self.digests.items())),
         )
-        self.group.update_attributes(to_json(attributes))
-        self._read_back()
-        _flush_folder(self.folder)
-        target = self.store.path / EPISODES_GROUP / episode_name(self.start.task_id, self.start.episode_index)
+
+    def _publish(self) -> Path:
+        # Somebody may have overwritten the store with another run while this episode was rolled out.
+        check_same_run(self.store.path, _read_root(self.store.path), self.store.attributes)
+        target = self.store.path / EPISODES_GROUP / self.name
         try:
             self.folder.rename(target)
         except OSError:
@@ -302,6 +361,13 @@ class EpisodeWriter:
             coverage = np.stack([record.coverage[camera] for record in records])
             self.write(f"objects/{camera}", coverage, ("replan", "patch", "object"))
 
+    def _write_seal(self) -> None:
+        """Note the digest of every piece of metadata: chunks have checksums, and JSON has none of its own."""
+        files = sorted(self.folder.rglob("zarr.json"))
+        digests = {file.relative_to(self.folder).as_posix(): _sha256(file) for file in files}
+        attributes = {"run": _sha256(self.store.path / "zarr.json"), "files": digests}
+        self.group.create_group(SEAL_GROUP, attributes=attributes)
+
     def _read_back(self) -> None:
         """Read every array from disk and hold it against what was written, block by block."""
         written = zarr.open_group(self.folder, mode="r", use_consolidated=False)
@@ -311,7 +377,10 @@ class EpisodeWriter:
             digest = ArrayDigest()
             step = (array.shards or array.chunks)[0] if array.ndim else 1
             for first in range(0, array.shape[0], max(1, step)):
-                digest.update(np.asarray(array[first : first + step]))
+                try:
+                    digest.update(np.asarray(array[first : first + step]))
+                except ValueError as error:
+                    raise CorruptEpisode(f"Array {name} cannot be read back from {self.folder}: {error}.") from None
             if tuple(array.shape) != record.shape or digest.hexdigest() != record.sha256:
                 raise CorruptEpisode(f"Array {name} read back from {self.folder} differs from what was written.")
 
@@ -326,8 +395,8 @@ class _SiteWriter:
         self.bits = recording.mantissa_bits
         queries = 1 if recording.queries == "mean" else recording.num_action_queries
         self.shape = (len(recording.layers), len(recording.denoise_steps), len(recording.heads), queries)
-        bytes_per_replan = 4 * self.shape[2] * self.shape[3] * layout.num_keys
-        self.block = replans_per_block(bytes_per_replan, max_replans)
+        self.bytes_per_replan = 4 * self.shape[2] * self.shape[3] * layout.num_keys
+        self.block = replans_per_block(self.bytes_per_replan, max_replans)
         self.rows_array: zarr.Array | None = None
         self.rows_digest = ArrayDigest()
         self.pending: list[NDArray[np.float32]] = []
@@ -340,9 +409,14 @@ class _SiteWriter:
 
     def append(self, recorded: RecordedRows, key_role: NDArray[np.uint8]) -> None:
         expected = (*self.shape, self.layout.num_keys)
-        if recorded.rows.shape != expected or not np.isfinite(recorded.rows).all():
+        shapes = (recorded.rows.shape, recorded.row_sum.shape, key_role.shape)
+        if shapes != (expected, self.shape, expected[-1:]):
             raise ValueError(
-                f"site '{self.layout.name}' recorded rows of shape {recorded.rows.shape}, expected {expected}, all finite"
+                f"site '{self.layout.name}' recorded rows, row sums and key roles of shapes {shapes}, expected {expected} and so on"
+            )
+        if not np.isfinite(recorded.rows).all() or (recorded.rows < 0).any():
+            raise ValueError(
+                f"site '{self.layout.name}' recorded rows that are not probabilities: negative or not finite"
             )
         segments = segments_of(self.layout, key_role)
         members = segment_members(self.layout, key_role[None], segments)[0]
@@ -359,7 +433,7 @@ class _SiteWriter:
         self.pending.clear()
         total = self.num_written + len(rows)
         if self.rows_array is None:
-            block = self.block if len(rows) == self.block else 8 * -(-len(rows) // 8)
+            block = replans_per_block(self.bytes_per_replan, min(len(rows), self.block))
             shape = (total, *rows.shape[1:])
             self.rows_array = create_blocked(self.episode.group, f"{self.layout.name}/rows", shape, block, ROW_AXES)
         else:
@@ -398,10 +472,47 @@ def _process_tag() -> str:
 
 def _remove_dead_partials(store: Path) -> None:
     """Remove what killed processes of this machine left beside the store. Other machines' processes cannot be judged from here."""
-    for folder in store.with_name(store.name + PARTIAL_SUFFIX).glob("*"):
-        host, _, rest = folder.name.partition("-")[2].rpartition("-")[0].rpartition("-")
-        if host == socket.gethostname() and rest.isdigit() and not Path(f"/proc/{rest}").exists():
+    partial = store.with_name(store.name + PARTIAL_SUFFIX)
+    for folder in partial.glob("*"):
+        host, _, process = folder.name.partition("-")[2].rpartition("-")[0].rpartition("-")
+        if host == socket.gethostname() and process.isdigit() and not _is_running(int(process)):
             shutil.rmtree(folder, ignore_errors=True)
+    _remove_if_empty(partial)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)  # signal 0 asks, and does nothing
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+@contextmanager
+def _naming_the_failure(what: str) -> Iterator[None]:
+    """Turn an error of the operating system into one sentence that says what was being written."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, UserError):
+            raise
+        raise StoreWriteFailed(
+            f"Cannot write {what}: {error.strerror or error}. Nothing of this episode was kept, and the episodes before it are "
+            "unharmed; remove the cause and go on with --resume."
+        ) from error
+
+
+def _make_partial(folder: Path) -> None:
+    """Create a folder for what is being written; another process may be removing the (empty) parent at this moment."""
+    while True:
+        folder.parent.mkdir(exist_ok=True)
+        try:
+            folder.mkdir()
+        except FileNotFoundError:
+            continue
+        return
 
 
 def _remove_if_empty(folder: Path) -> None:
@@ -423,8 +534,16 @@ def _flush_entry(path: Path) -> None:
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
+    except OSError as error:
+        # Some network file systems cannot flush directories; they have nothing to offer instead.
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
     finally:
         os.close(handle)
+
+
+def _sha256(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 __all__ = [
@@ -432,6 +551,7 @@ __all__ = [
     "EpisodeWriter",
     "ReplanRecord",
     "RunStore",
+    "StoreWriteFailed",
     "check_same_run",
     "open_run",
     "refuse_existing",

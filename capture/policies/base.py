@@ -85,7 +85,7 @@ class Policy(Protocol):
     def cameras(self) -> tuple[PolicyCamera, ...]:
         """The camera slots that see something, in key order."""
 
-    def denoise_times(self) -> NDArray[np.floating]:
+    def denoise_times(self) -> NDArray[np.float64]:
         """Return the noise level or flow time of each denoise step, (denoise,)."""
 
     def provenance(self) -> dict[str, Any]:
