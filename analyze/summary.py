@@ -99,7 +99,8 @@ def _header(run: AnalysedRun, grouping: Grouping, episodes: pl.DataFrame) -> str
     lines += _labelled("averaged over", f"denoise steps {listing(run.denoise_steps, 40)}; {run.heads}")
     lines += _labelled("grouping", f"{grouping.name}{': ' + grouping.description if grouping.description else ''}")
     for name, selectors in grouping.groups.items():
-        lines += textwrap.wrap(f"{name} = {' | '.join(selectors)}", WIDTH, **_indents(17, 21))
+        absent = "" if overall[f"{name}_keys"].sum() else "   (no keys here)"
+        lines += textwrap.wrap(f"{name} = {' | '.join(selectors)}{absent}", WIDTH, **_indents(17, 21))
     if grouping.ratio:
         lines += _labelled("ratio", _ratio_definition(grouping))
     for note in run.notes:
@@ -110,7 +111,7 @@ def _header(run: AnalysedRun, grouping: Grouping, episodes: pl.DataFrame) -> str
 def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: pl.DataFrame) -> str:
     rows = overall_rows(tasks)
     header = ["layer", "mean ± std", "median", "of means", "geom.", f"{run.level:.0%} interval"]
-    header += ["uniform", "lift", "verdict"]
+    header += ["uniform", "lift"] + ["verdict"] * grouping.compares_modalities
     body = [
         [
             row["layer"],
@@ -119,7 +120,7 @@ def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: pl.DataFrame) ->
             format_interval(row["ratio_mean_low"], row["ratio_mean_high"]),
             format_number(row["uniform_ratio"]),
             format_number(row["ratio_lift"]),
-            verdict(row["ratio_mean"]),
+            *[verdict(row["ratio_mean"])] * grouping.compares_modalities,
         ]
         for row in _by_layer(rows)
     ]
@@ -132,7 +133,7 @@ def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: pl.DataFrame) ->
     return "\n".join(
         [
             _title(f"RATIO  {_ratio_definition(grouping)}"),
-            text_table(header, body, left=(0, 8)),
+            text_table(header, body, left=(0, 8) if grouping.compares_modalities else (0,)),
             "",
             *textwrap.wrap(legend, WIDTH),
             *textwrap.wrap(_baseline_sentence(grouping, overall), WIDTH),
@@ -151,13 +152,18 @@ def _baseline_sentence(grouping: Grouping, overall: dict[str, float]) -> str:
     assert grouping.ratio is not None
     uniform = overall["uniform_ratio"]
     if uniform is None:
-        return "There is no uniform baseline, because a side of the ratio has no keys; the verdict means little without one."
+        return "There is no uniform baseline, because a side of the ratio has no keys; the ratio means little without one."
     above = sum(overall[f"{name}_keys"] for name in grouping.ratio.numerator)
     below = sum(overall[f"{name}_keys"] for name in grouping.ratio.denominator)
+    baseline = (
+        f"Uniform attention alone gives ratio = {format_number(uniform)}, because there are {format_number(above)} keys on one "
+        f"side and {format_number(below)} on the other"
+    )
+    if not grouping.compares_modalities:
+        return f"{baseline}: read the ratio beside it, or read the lift."
     return (
-        f"The verdict (above {VISUAL_ABOVE} visual, below {LINGUISTIC_BELOW} linguistic) means little without the lift: uniform "
-        f"attention alone gives ratio = {format_number(uniform)}, because there are {format_number(above)} keys on one side "
-        f"and {format_number(below)} on the other. That alone would be called '{verdict(uniform)}'."
+        f"{baseline}, and that alone would be called '{verdict(uniform)}': the verdict (above {VISUAL_ABOVE} visual, below "
+        f"{LINGUISTIC_BELOW} linguistic) means little without the lift."
     )
 
 
@@ -186,20 +192,21 @@ def _nonfinite_section(tasks: pl.DataFrame) -> str:
 
 
 def _groups_section(grouping: Grouping, tasks: pl.DataFrame, kind: str) -> str:
-    """Layers by groups; in blocks of as many groups as the width allows."""
-    names = [name if len(name) <= 24 else name[:23] + "…" for name in grouping.names]
+    """Layers by groups that have keys; in blocks of as many groups as the width allows."""
+    groups = [group for group in grouping.names if overall_rows(tasks)[f"{group}_keys"].sum()]
+    names = [name if len(name) <= 24 else name[:23] + "…" for name in groups]
     cells = {
         group: [
             _percent(row[f"{group}_fraction"]) if kind == "fraction" else format_number(row[f"{group}_lift"])
             for row in _by_layer(overall_rows(tasks))
         ]
-        for group in grouping.names
+        for group in groups
     }
     layers = [row["layer"] for row in _by_layer(overall_rows(tasks))]
     room = WIDTH - max(map(len, [*layers, "layer"]))
     blocks: list[list[int]] = [[]]
     used = 0
-    for i, group in enumerate(grouping.names):
+    for i, group in enumerate(groups):
         width = 2 + max(map(len, [names[i], *cells[group]]))
         if used + width > room and blocks[-1]:
             blocks.append([])
@@ -209,7 +216,7 @@ def _groups_section(grouping: Grouping, tasks: pl.DataFrame, kind: str) -> str:
     tables = [
         text_table(
             ["layer", *(names[i] for i in block)],
-            [[layer, *(cells[grouping.names[i]][j] for i in block)] for j, layer in enumerate(layers)],
+            [[layer, *(cells[groups[i]][j] for i in block)] for j, layer in enumerate(layers)],
             left=(0,),
         )
         for block in blocks
@@ -219,7 +226,7 @@ def _groups_section(grouping: Grouping, tasks: pl.DataFrame, kind: str) -> str:
         note = ""
     else:
         title = "LIFT  mass per key, against the mean over valid keys"
-        note = "\n1 = what uniform attention gives; - = the group has no keys."
+        note = "\n1 = what uniform attention gives."
     return "\n".join([_title(title), "\n\n".join(tables)]) + note
 
 

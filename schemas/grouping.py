@@ -16,8 +16,8 @@ from schemas.selectors import SelectorError, parse_selector
 REST = "*"
 
 
-#: Column names of tables begin with group names; these two are taken by the ratio.
-_RESERVED_NAMES = ("numerator", "denominator")
+#: Column names of tables begin with group names; these are taken by the ratio.
+_RESERVED_NAMES = ("numerator", "denominator", "ratio")
 _GROUP_NAME = re.compile(r"[A-Za-z0-9_][\w.@-]*$")
 
 
@@ -71,7 +71,7 @@ class Grouping:
         for group, selectors in self.groups.items():
             if group in _RESERVED_NAMES or not _GROUP_NAME.match(group):
                 raise GroupingError(
-                    f"'{group}' cannot name a group: expected letters, digits, '_', '.', '-', and neither of "
+                    f"'{group}' cannot name a group: expected letters, digits, '_', '.', '-', and none of "
                     f"{listing(_RESERVED_NAMES)}."
                 )
             if not selectors:
@@ -94,6 +94,11 @@ class Grouping:
                 )
         if self.ratio and not (self.ratio.numerator and self.ratio.denominator):
             raise GroupingError(f"The ratio of grouping '{self.name}' needs a numerator and a denominator.")
+
+    @property
+    def compares_modalities(self) -> bool:
+        """Whether the ratio is one of seeing over reading, so that the published thresholds can be applied to it."""
+        return self.ratio is not None and self.ratio.denominator == ("linguistic",)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -68,9 +68,16 @@ def test_untrained_weights_are_said_first():
 def test_ratio_stands_beside_its_baseline_lift_and_a_sentence_about_the_verdict():
     text = " ".join(summarise(*CASES["default"]()).split())
     assert "uniform lift verdict" in text
-    assert "uniform attention alone gives ratio = 36.57" in text
+    assert "Uniform attention alone gives ratio = 36.57" in text
+    assert "that alone would be called 'visual-dominant'" in text
     assert "512 keys on one side and 14 on the other" in text
     assert "bootstrap over tasks and episodes within tasks" in text
+
+
+def test_verdict_is_only_given_for_seeing_over_reading():
+    text = " ".join(summarise(*CASES["custom"]()).split())
+    assert "verdict" not in text
+    assert "read the ratio beside it, or read the lift" in text
 
 
 def test_nonfinite_ratios_are_counted_per_layer():

@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+import pytest
+
+from schemas.errors import BadArgument, did_you_mean, listing
+from schemas.layers import select_layers
+from schemas.layout import PatchGrid, Piece, Prompt, Role, SiteLayout, Span, find_role
+from schemas.words import find_phrase, split_words, words_of
+
+
+def span(name: str, start: int, stop: int, **more) -> Span:
+    return Span(name, "text", start, stop, **more)
+
+
+@pytest.mark.parametrize(
+    ("spans", "said"),
+    [
+        ((span("a", 0, 2), span("b", 3, 4)), "the next free key is 2"),
+        ((span("a", 0, 2), span("b", 1, 4)), "without gap or overlap"),
+        ((span("a", 0, 0),), "covers keys 0..0"),
+        ((span("a", 0, 2), span("a", 2, 4)), "two spans named 'a'"),
+        ((span("a", 0, 2, grid=PatchGrid(1, 3, 14, 42)),), "covers 3"),
+    ],
+)
+def test_spans_must_tile_the_keys(spans, said):
+    with pytest.raises(BadArgument, match=said):
+        SiteLayout("joint", spans)
+
+
+def test_a_layout_finds_spans_and_cameras():
+    layout = SiteLayout("joint", (span("a", 0, 2, camera="cam"), span("b", 2, 5)))
+    assert layout.num_keys == 5
+    assert layout.span_of_key().tolist() == [0, 0, 1, 1, 1]
+    assert layout.camera_span("cam").name == "a"
+    with pytest.raises(LookupError, match="Existing: a, b"):
+        layout.span("c")
+
+
+def test_role_codes_never_change():
+    # They are written in stores: a changed number would give old stores a new meaning.
+    assert {role.label: int(role) for role in Role} == {
+        "image": 1, "masked_image": 2, "bos": 3, "template": 4, "instruction": 5, "state": 6, "padding": 7,
+        "action": 8, "proprio": 9, "blank": 10, "future": 11, "value": 12, "text": 13, "null": 14,
+    }  # fmt: skip
+    assert find_role("Image") is Role.IMAGE
+
+
+def test_words_split_at_spaces_underscores_and_punctuation():
+    text = "Pick_up the O'Brien's hand-held mug, (red)."
+    assert [text[a:b] for a, b in split_words(text)] == ["Pick", "up", "the", "O'Brien's", "hand-held", "mug", "red"]
+
+
+def test_words_stop_at_the_instruction():
+    text = "Task: put State here, State: 1 2"
+    pieces = tuple(Piece(i, text[i : i + 1], i, i + 1) for i in range(len(text)))
+    prompt = Prompt(text, pieces, (6, 20))
+    words = words_of(prompt)
+    assert [word.text for word in words] == ["put", "State", "here"]
+    assert words[1].keys == tuple(range(10, 15))
+    assert prompt.instruction_text == "put State here"
+
+
+def test_a_phrase_is_whole_words_in_sequence_at_every_place():
+    text = "the red mug and the red bowl"
+    pieces = tuple(Piece(i, "", a, b) for i, (a, b) in enumerate(split_words(text)))
+    words = words_of(Prompt(text, pieces, (0, len(text))))
+    assert [word.keys[0] for word in find_phrase(words, "The RED")] == [0, 1, 4, 5]
+    assert find_phrase(words, "red and") == ()
+    assert find_phrase(words, "mu") == ()
+
+
+def test_layer_numbers_of_the_published_scripts():
+    chosen = select_layers([25, 0, 17], 18, "pi05")
+    assert chosen.blocks == (7, 0, 17)
+    assert chosen.labels == (25, 0, 17)
+    assert "25 = block 7" in (chosen.note or "")
+    assert select_layers([0, 8, 17], 18, "pi0").note is None
+    assert select_layers(None, 3, "pi05").blocks == (0, 1, 2)
+    with pytest.raises(BadArgument, match=r"expected block indices 0 to 27\.$"):
+        select_layers([28], 28, "cosmos")
+
+
+def test_half_a_name_and_a_near_name_are_recognised():
+    assert did_you_mean("base", ["wrist", "base_0_rgb"]) == " Did you mean 'base_0_rgb'?"
+    assert did_you_mean("LIBERO_10", ["libero_10"]) == " Did you mean 'libero_10'?"
+    assert did_you_mean("zzz", ["libero_10"]) == ""
+    assert listing(range(5), limit=3) == "0, 1, 2 and 2 more"
+    assert listing([]) == "none"
