@@ -19,6 +19,8 @@ from schemas.grouping import Grouping
 WIDTH = 100
 #: Thresholds of the published interpretation guide, on the mean ratio.
 VISUAL_ABOVE, LINGUISTIC_BELOW = 1.5, 0.67
+#: Below this, a percentile bootstrap interval spans little more than the episodes themselves.
+FEW_EPISODES = 5
 
 
 @dataclass(frozen=True)
@@ -152,12 +154,14 @@ def _baseline_sentence(grouping: Grouping, overall: dict[str, float]) -> str:
     assert grouping.ratio is not None
     uniform = overall["uniform_ratio"]
     if uniform is None:
-        return "There is no uniform baseline, because a side of the ratio has no keys; the ratio means little without one."
+        return (
+            "There is no uniform baseline, because a side of the ratio has no keys; the ratio means little without one."
+        )
     above = sum(overall[f"{name}_keys"] for name in grouping.ratio.numerator)
     below = sum(overall[f"{name}_keys"] for name in grouping.ratio.denominator)
     baseline = (
-        f"Uniform attention alone gives ratio = {format_number(uniform)}, because there are {format_number(above)} keys on one "
-        f"side and {format_number(below)} on the other"
+        f"Uniform attention alone gives ratio = {format_number(uniform)}, because there are on average {format_number(above)} keys "
+        f"on one side and {format_number(below)} on the other"
     )
     if not grouping.compares_modalities:
         return f"{baseline}: read the ratio beside it, or read the lift."
@@ -261,6 +265,13 @@ def _across_section(run: AnalysedRun, grouping: Grouping, tasks: pl.DataFrame, s
     shown = layer if layer == LAYERS_AVG else f"layer {layer}"
     what = "ratio" if grouping.ratio else f"fractions of {listing(grouping.names[:5])}"
     table = text_table(header, body, left=(0,), last=last, texts=texts if last else None, width=WIDTH)
+    fewest = rows["num_episodes"].min()
+    if grouping.ratio and scope == "task" and isinstance(fewest, int) and 1 < fewest < FEW_EPISODES:
+        warning = (
+            f"Intervals over fewer than {FEW_EPISODES} episodes of a task are too narrow: resampling cannot show what was "
+            "not drawn."
+        )
+        table = "\n".join([table, *textwrap.wrap(warning, WIDTH)])
     return "\n".join([_title(f"PER {name.upper()}{of}  {what}, {shown}"), table])
 
 

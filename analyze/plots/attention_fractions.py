@@ -39,6 +39,8 @@ def plot_attention_fractions(tasks: pl.DataFrame, grouping: Grouping, folder: Pa
     styles = group_styles(grouping.names)
     bottom = np.zeros(len(layers))
     for i, name in enumerate(grouping.names):
+        if not rows[f"{name}_keys"].sum():
+            continue  # a group without a key, like state digits where the prompt has none
         style = styles[name]
         empty = not fractions[:, i].any()
         label = wrapped(name, 28, 1) + (" (0)" if empty else "")

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 STEM = "ratio_distribution"
+_BASELINE_RANGE_COLOR = "#E6E6E6"
 _MEDIAN_COLOR, _BOX_COLOR, _DOT_COLOR = "#D55E00", "#CFE3F1", "#333333"
 
 
@@ -70,7 +71,7 @@ def plot_ratio_distribution(replans: pl.DataFrame, grouping: Grouping, folder: P
     for axes in (top, bottom):
         _baseline(axes, uniform)
         axes.grid(axis="x")
-    top.legend(handles=_legend(bool(uniform.size)), loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    top.legend(handles=_legend(uniform), loc="upper left", bbox_to_anchor=(1.0, 1.0))
     bottom.set_xlabel(f"ratio of masses, {ratio_name(grouping.ratio)} (logarithmic)")
     return save_figure(figure, folder, STEM, data)
 
@@ -129,13 +130,17 @@ def _boxes(axes: Axes, shown: pl.DataFrame, layers: list[str]) -> None:
 def _baseline(axes: Axes, uniform: NDArray[np.float64]) -> None:
     if uniform.size == 0:
         return
-    low, high = float(uniform.min()), float(uniform.max())
-    if high > low * 1.001:
-        axes.axvspan(low, high, color=BASELINE_COLOR, alpha=0.10, linewidth=0)
+    if _differs(uniform):
+        axes.axvspan(float(uniform.min()), float(uniform.max()), color=_BASELINE_RANGE_COLOR, linewidth=0, zorder=0)
     axes.axvline(float(np.median(uniform)), color=BASELINE_COLOR, linestyle="--", linewidth=1.2)
 
 
-def _legend(with_baseline: bool) -> list[Artist]:
+def _differs(uniform: NDArray[np.float64]) -> bool:
+    """Whether the replans have different baselines, because their prompts have different lengths."""
+    return bool(uniform.max() > uniform.min() * 1.001)
+
+
+def _legend(uniform: NDArray[np.float64]) -> list[Artist]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -144,8 +149,15 @@ def _legend(with_baseline: bool) -> list[Artist]:
         Patch(facecolor=_BOX_COLOR, edgecolor=DATA_COLOR, label="box: quartiles of replans;\nwhiskers: 5 % to 95 %"),
         Line2D([], [], color=_DOT_COLOR, marker="o", markersize=3, linewidth=0, label="dot: mean of an episode"),
     ]
-    baseline = Line2D([], [], color=BASELINE_COLOR, linestyle="--", linewidth=1.2, label=BASELINE_LABEL)
-    return [*handles, baseline] if with_baseline else handles
+    if uniform.size:
+        several = _differs(uniform)
+        label = f"{BASELINE_LABEL}, median" if several else BASELINE_LABEL
+        handles.append(Line2D([], [], color=BASELINE_COLOR, linestyle="--", linewidth=1.2, label=label))
+        if several:
+            handles.append(
+                Patch(facecolor=_BASELINE_RANGE_COLOR, label=f"{BASELINE_LABEL}: range over\nreplans (prompts differ)")
+            )
+    return handles
 
 
 def _counts(overall: pl.DataFrame, rows: pl.DataFrame, chosen: str) -> str:
