@@ -72,13 +72,13 @@ class StoredEpisode:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: its seal is damaged ({error}).") from None
 
     def sealed(self, file: str) -> bytes:
-        """The bytes of one `zarr.json` of the episode; raises `CorruptEpisode` when they are not those that were written."""
+        """The bytes of one `zarr.json` of the episode; raises `CorruptEpisode` when they are not those that the seal knows."""
         try:
             content = (self.folder / file).read_bytes()
         except OSError as error:
             raise CorruptEpisode(f"Episode {self.name} lacks its {file} ({error.strerror}).") from None
         if hashlib.sha256(content).hexdigest() != self.seal.files.get(file):
-            raise CorruptEpisode(f"Episode {self.name} is damaged: its {file} is not the one that was written.")
+            raise CorruptEpisode(f"Episode {self.name} is damaged: its {file} does not agree with its seal.")
         return content
 
     @property

@@ -29,6 +29,17 @@ def _capture(argv: Sequence[str]) -> int:
     from capture.store_writer import refuse_existing
 
     arguments = build_parser().parse_args(argv)
+    if arguments.policy == "parity":
+        from capture.device import choose_device
+        from capture.policies.pi.parity import run_parity
+
+        return run_parity(
+            arguments.case,
+            arguments.format,
+            limit=arguments.limit,
+            as_json=arguments.json,
+            device=choose_device(arguments.device),
+        )
     settings = run_settings(arguments)
     # A store in the way is found before minutes are spent on loading a model.
     if settings.mode == "new" and settings.store.exists():
@@ -55,6 +66,11 @@ def _build_policy(arguments: argparse.Namespace, device: str) -> Policy:
         arguments.checkpoint,
         tokenizer=arguments.tokenizer,
         device=device,
+        checkpoint_format=arguments.checkpoint_format,
+        config_name=arguments.config_name,
+        model_config=arguments.model_config,
+        discrete_state_input=arguments.discrete_state_input,
+        dtype=arguments.dtype,
         paligemma_variant=arguments.paligemma_variant,
         action_expert_variant=arguments.action_expert_variant,
         num_image_tokens=arguments.num_image_tokens,

@@ -20,7 +20,9 @@ _EXAMPLES = """examples:
   vla-capture pi                                             embedded untrained policy, built-in tasks
   vla-capture pi --checkpoint ~/.cache/openpi/openpi-assets/checkpoints/pi05_libero \\
       --task-suite libero_10 --num-episodes 5 --output-dir results/attention_ratio
+  vla-capture pi --checkpoint lerobot/pi05_libero_finetuned --tokenizer PATH --task-suite libero_10
   vla-capture pi --task-suite libero_10 --task-id 0 --num-episodes 1 --max-steps 40 --libero-assets PATH
+  vla-capture parity CASE --format orbax                     our numbers against a reference's, on your own checkpoint
 """
 
 
@@ -44,7 +46,29 @@ def build_parser() -> argparse.ArgumentParser:
     _add_run_arguments(pi)
     _add_recording_arguments(pi)
     _add_store_arguments(pi)
+    parity = families.add_parser(
+        "parity",
+        help="compare a pi model with what a reference implementation computed",
+        description="Run a case folder (case.json, a checkpoint, inputs.npz, expected.npz) and print the largest differences. "
+        "Exit code 0: all within the limit, 1: beyond it, 2: the case cannot be used.",
+    )
+    _add_parity_arguments(parity)
     return parser
+
+
+def _add_parity_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("case", type=Path, metavar="CASE", help="case folder")
+    parser.add_argument(
+        "--format", metavar="NAME", help="orbax, openpi or lerobot (default: every format that the case carries)"
+    )
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    parser.add_argument(
+        "--limit",
+        type=float,
+        metavar="X",
+        help="largest difference that passes (default: 5e-5; 0.1 for bfloat16 cases)",
+    )
+    parser.add_argument("--device", default="cpu", help="auto, cpu (default), cuda, cuda:1 ...")
 
 
 def _add_pi_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,8 +77,30 @@ def _add_pi_arguments(parser: argparse.ArgumentParser) -> None:
         "--checkpoint",
         default=EMBEDDED,
         metavar="PATH",
-        help=f"checkpoint folder; '{EMBEDDED}' (default) is a small untrained policy that comes with the tool, "
-        f"'{DUMMY}' a smaller one for trying things out",
+        help="checkpoint folder of openpi (JAX or PyTorch) or LeRobot, ORG/NAME on the Hugging Face hub, or gs://...; "
+        f"'{EMBEDDED}' (default) is a small untrained policy that comes with the tool, '{DUMMY}' a smaller one for trying things out",
+    )
+    model.add_argument(
+        "--checkpoint-format",
+        metavar="NAME",
+        help="openpi_torch, openpi_jax or lerobot (default: recognised from the files)",
+    )
+    model.add_argument(
+        "--config-name", metavar="NAME", help="openpi's name for the configuration (pi05_libero, pi0_libero ...)"
+    )
+    model.add_argument(
+        "--model-config",
+        type=Path,
+        metavar="PATH",
+        help="JSON file with the sizes that a checkpoint does not state (default: a case.json beside the checkpoint, if any)",
+    )
+    model.add_argument(
+        "--discrete-state-input", action="store_true", help="openpi's pi0.5 trained with the state in its prompt"
+    )
+    model.add_argument(
+        "--dtype",
+        metavar="NAME",
+        help="float32 or bfloat16 (default: what a LeRobot checkpoint says, else float32)",
     )
     model.add_argument("--tokenizer", metavar="PATH", help="sentencepiece model of the policy's language model")
     model.add_argument("--paligemma-variant", metavar="NAME", help="checked against the checkpoint (gemma_2b ...)")
@@ -73,7 +119,10 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
     run.add_argument("--num-episodes", type=int, default=5, metavar="N", help="episodes per task (default: 5)")
     run.add_argument("--seed", type=int, default=7, help="seed of the simulator and of all noise (default: 7)")
     run.add_argument(
-        "--replan-steps", type=int, default=5, metavar="N", help="actions executed per policy call (default: 5)"
+        "--replan-steps",
+        type=int,
+        metavar="N",
+        help="actions executed per policy call (default: 5 for openpi, n_action_steps for LeRobot)",
     )
     run.add_argument(
         "--max-steps", type=int, metavar="N", help="steps after waiting (default: the suite's published number)"

@@ -14,12 +14,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from capture.contributions import Projection, gram_matrix, part_contributions
 from schemas.errors import BadArgument
 
 #: What the reference puts in place of the logits of masked keys: so low that their probability is exactly 0.
 MASKED_LOGIT = -2.3819763e38
 
 RowSink = Callable[[Tensor], None]
+#: Takes a call's values (batch, kv_head, key, dim), its projection to the residual stream, and the update (batch, query, width).
+UpdateSink = Callable[[Tensor, Projection, Tensor], None]
 
 
 def attend(
@@ -66,6 +69,10 @@ class RowCollector(Protocol):
         """Return the function that takes the rows (batch, head, query, key) of this call, or None for "not wanted"."""
         ...
 
+    def update_sink(self, layer: int, denoise_step: int, action_queries: slice) -> UpdateSink | None:
+        """Return the function that takes, after the rows, what this call added to the residual stream, or None."""
+        return None
+
 
 class SiteNotRecorded(RuntimeError):
     """Rows that were asked for never came out of the model, or came out more than once."""
@@ -102,23 +109,31 @@ class RecordedRows:
 
     rows: (layer, denoise, head, query, key) float32, the axes in the order of the plan.
     row_sum: (layer, denoise, head, query) float32, summed over keys in float64 from the rows as computed.
+    contribution: (layer, denoise, part, part) float32, see `capture.contributions`; None when not asked for.
     """
 
     rows: np.ndarray
     row_sum: np.ndarray
+    contribution: np.ndarray | None = None
 
 
 @dataclass
-class AttentionRecorder:
+class AttentionRecorder(RowCollector):
     """Collect the rows of one site during one replan (batch 1): make a new one for every replan.
 
     Only the wanted heads and action queries are copied, so nothing query x query sized outlives a call. The copies
     stay on the device until `finish`, which moves them at once: a transfer per block would stall a GPU.
+
+    parts: (key, part) bool, disjoint parts of the keys whose contributions are wanted, or None for rows only.
     """
 
     plan: RecordingPlan
     num_keys: int
+    parts: np.ndarray | None = None
     _rows: dict[tuple[int, int], list[Tensor]] = field(default_factory=dict, init=False, repr=False)
+    _grams: dict[tuple[int, int], list[Tensor]] = field(default_factory=dict, init=False, repr=False)
+    #: All heads' rows of the call whose update is awaited.
+    _awaited: Tensor | None = field(default=None, init=False, repr=False)
 
     def wants(self, layer: int, denoise_step: int) -> bool:
         """Say whether the plan contains this block at this denoise step."""
@@ -137,6 +152,22 @@ class AttentionRecorder:
 
         return take
 
+    def update_sink(self, layer: int, denoise_step: int, action_queries: slice) -> UpdateSink | None:
+        """Return the function that takes the update of this call, or None when contributions are not asked for."""
+        if self.parts is None or not self.wants(layer, denoise_step):
+            return None
+        parts = torch.from_numpy(self.parts)
+
+        def take(values: Tensor, project: Projection, update: Tensor) -> None:
+            if self._awaited is None:
+                raise SiteNotRecorded(f"Layer {layer} gave an update before its rows.")
+            each = part_contributions(self._awaited, values[0], parts.to(values.device), project)
+            gram = gram_matrix(each, update[0, action_queries])
+            self._grams.setdefault((layer, denoise_step), []).append(gram)
+            self._awaited = None
+
+        return take
+
     def _take(self, layer: int, denoise_step: int, rows: Tensor, action_queries: slice) -> None:
         batch, heads, _, keys = rows.shape
         if batch != 1:
@@ -145,25 +176,33 @@ class AttentionRecorder:
             raise ValueError(f"site '{self.plan.site}' has {self.num_keys} keys, but the model gave rows of {keys}")
         if max(self.plan.heads) >= heads:
             raise BadArgument(f"Head {max(self.plan.heads)} does not exist: the model's heads are 0 to {heads - 1}.")
+        of_actions = rows[0, :, action_queries].detach()
+        if self.parts is not None:
+            self._awaited = of_actions
         wanted = torch.tensor(self.plan.heads, device=rows.device)
-        chosen = rows[0, :, action_queries].detach().index_select(0, wanted)
+        chosen = of_actions.index_select(0, wanted)
         if self.plan.queries == "mean":
             chosen = chosen.mean(dim=1, keepdim=True)
         self._rows.setdefault((layer, denoise_step), []).append(chosen)
 
     def finish(self) -> RecordedRows:
         """Return the rows of the whole plan; raise `SiteNotRecorded` when a call is missing or came twice."""
+        rows = self._stacked(self._rows, "rows")
+        contribution = None if self.parts is None else self._stacked(self._grams, "updates")
+        return RecordedRows(rows, rows.sum(axis=-1, dtype=np.float64).astype(np.float32), contribution)
+
+    def _stacked(self, collected: dict[tuple[int, int], list[Tensor]], what: str) -> np.ndarray:
+        """Stack what was collected into (layer, denoise, ...), moved off the device at once."""
         cells = [(layer, step) for layer in self.plan.layers for step in self.plan.denoise_steps]
         faults = []
         for layer, step in cells:
-            times = len(self._rows.get((layer, step), ()))
+            times = len(collected.get((layer, step), ()))
             if times != 1:
                 faults.append(f"layer {layer} at denoise step {step} {'never' if not times else f'{times} times'}")
         if faults:
             raise SiteNotRecorded(
-                f"Site '{self.plan.site}' should have given rows once for each of {len(cells)} pairs of layer and "
+                f"Site '{self.plan.site}' should have given {what} once for each of {len(cells)} pairs of layer and "
                 f"denoise step, but came: {'; '.join(faults[:6])}{' ...' if len(faults) > 6 else ''}."
             )
-        stacked = torch.stack([self._rows[cell][0] for cell in cells]).cpu().numpy()
-        rows = stacked.reshape(len(self.plan.layers), len(self.plan.denoise_steps), *stacked.shape[1:])
-        return RecordedRows(rows=rows, row_sum=rows.sum(axis=-1, dtype=np.float64).astype(np.float32))
+        stacked = torch.stack([collected[cell][0] for cell in cells]).cpu().numpy()
+        return stacked.reshape(len(self.plan.layers), len(self.plan.denoise_steps), *stacked.shape[1:])

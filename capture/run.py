@@ -44,7 +44,8 @@ class RunSettings:
     task_id: int | None
     num_episodes: int
     seed: int
-    replan_steps: int
+    #: None: what the policy's own evaluation does
+    replan_steps: int | None
     max_steps: int
     store: Path
     mode: WriteMode
@@ -99,7 +100,7 @@ def run_capture(settings: RunSettings, policy: Policy, device: str) -> list[Epis
         suite=settings.suite.name,
         seed=settings.seed,
         wait_steps=10,
-        replan_steps=settings.replan_steps,
+        replan_steps=policy.default_replan_steps if settings.replan_steps is None else settings.replan_steps,
         max_steps=settings.max_steps,
     )
     check_protocol(protocol, policy)
@@ -143,6 +144,14 @@ def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int) -
         say(
             "These weights are random and UNTRAINED: the numbers show that the tool works, and say nothing about any policy."
         )
+    facts = identity.config
+    if not identity.untrained:
+        say(
+            f"Checkpoint: {identity.family} in format {identity.checkpoint_format}, {facts['dtype']}, configuration: "
+            f"{facts['configuration']}; normalisation {facts['normalisation']}, prompt {facts['prompt_format']}, "
+            f"cameras {listing(f'{camera.name} = {camera.source}' for camera in identity.cameras)}."
+        )
+    say(f"A policy call gives {identity.action_horizon} actions, of which {protocol.replan_steps} are executed.")
     pictures = [np.prod((camera.grid.image_height, camera.grid.image_width, 3)).item() for camera in policy.cameras]
     say(
         f"Recording {len(recording.layers)} layers, denoise steps {listing(recording.denoise_steps)}, {len(recording.heads)} heads, "

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 import zarr
@@ -284,7 +284,7 @@ class EpisodeWriter:
             given, expected = list(getattr(record, what)), list(getattr(first, what))
             if given != expected:
                 raise ValueError(f"a replan has {what} of the cameras {given}, the first one of {expected}")
-        numbers = {"state": record.state, "actions": record.actions, **record.coverage}
+        numbers: dict[str, NDArray[Any]] = {"state": record.state, "actions": record.actions, **record.coverage}
         for what, values in numbers.items():
             if not np.isfinite(values).all():
                 raise ValueError(f"the {what} of a replan are not all finite numbers")
@@ -298,6 +298,7 @@ class EpisodeWriter:
             StoreWriteFailed: the disk is full, or refuses in another way.
         """
         with _naming_the_failure(self.what):
+            self._check_store()
             for site in self.sites.values():
                 site.finish()
             self._write_side_arrays()
@@ -325,9 +326,12 @@ class EpisodeWriter:
             arrays=dict(sorted(self.digests.items())),
         )
 
-    def _publish(self) -> Path:
+    def _check_store(self) -> None:
         # Somebody may have overwritten the store with another run while this episode was rolled out.
         check_same_run(self.store.path, _read_root(self.store.path), self.store.attributes)
+
+    def _publish(self) -> Path:
+        self._check_store()
         target = self.store.path / EPISODES_GROUP / self.name
         try:
             self.folder.rename(target)

@@ -78,6 +78,10 @@ class Policy(Protocol):
         """Actions of one chunk."""
 
     @property
+    def default_replan_steps(self) -> int:
+        """Actions of a chunk that the policy's own published evaluation executes before it asks again."""
+
+    @property
     def num_action_queries(self) -> int:
         """Queries that are actions, in every recorded call."""
 

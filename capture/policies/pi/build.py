@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
-from capture.policies.pi.checkpoint import detect_format
-from capture.policies.pi.config import GEMMA_VARIANTS, GemmaConfig, find_variant
+import torch
+
+from capture.policies.pi.config import GEMMA_VARIANTS, GemmaConfig, find_config, find_variant
 from capture.policies.pi.embedded import dummy_policy, embedded_policy
-from capture.policies.pi.policy import PiPolicy, load_pi_policy
+from capture.policies.pi.formats import detect_format, find_format
+from capture.policies.pi.loading import CheckpointOptions, load_pi_policy
+from capture.policies.pi.locate import find_checkpoint, find_tokenizer
+from capture.policies.pi.policy import PiPolicy
 from schemas.errors import BadArgument, listing
+
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+_UNTRAINED = {"embedded": embedded_policy, "dummy": dummy_policy}
 
 
 def build_pi_policy(
@@ -16,27 +24,44 @@ def build_pi_policy(
     *,
     tokenizer: str | None,
     device: str,
+    checkpoint_format: str | None = None,
+    config_name: str | None = None,
+    model_config: Path | None = None,
+    discrete_state_input: bool = False,
+    dtype: str | None = None,
     paligemma_variant: str | None = None,
     action_expert_variant: str | None = None,
     num_image_tokens: int | None = None,
 ) -> PiPolicy:
     """Build the policy and hold it against what the user says about it.
 
-    `checkpoint` is a folder, or one of the two untrained policies that come with the package: `embedded`, `dummy`.
-    Raises `BadArgument` when a variant or the number of image tokens contradicts the policy.
+    `checkpoint` is a folder, a name on a hub, or one of the two untrained policies that come with the package: `embedded`,
+    `dummy`. Raises `BadArgument` when a variant or the number of image tokens contradicts the policy.
     """
     wanted = {
         "--paligemma-variant": find_variant(paligemma_variant) if paligemma_variant else None,
         "--action-expert-variant": find_variant(action_expert_variant) if action_expert_variant else None,
     }
-    if checkpoint == "embedded":
-        policy = embedded_policy(device=device)
-    elif checkpoint == "dummy":
-        policy = dummy_policy(device=device)
+    options = CheckpointOptions(
+        checkpoint_format=find_format(checkpoint_format) if checkpoint_format else None,
+        config_name=config_name,
+        model_config=model_config,
+        discrete_state_input=discrete_state_input,
+        dtype=find_dtype(dtype) if dtype else None,
+    )
+    if config_name is not None:
+        find_config(config_name)  # a name that does not exist is said before anything is fetched
+    if checkpoint in _UNTRAINED:
+        if dataclasses.replace(options, dtype=None) != CheckpointOptions() or options.dtype == torch.bfloat16:
+            raise BadArgument(
+                f"The policy '{checkpoint}' comes with the program, in float32; --checkpoint-format, --config-name, --model-config, "
+                "--discrete-state-input and --dtype bfloat16 are for checkpoints."
+            )
+        policy = _UNTRAINED[checkpoint](device=device)
     else:
-        path = Path(checkpoint).expanduser()
-        detect_format(path)  # a folder that is no checkpoint is the first thing to say
-        policy = load_pi_policy(path, _find_tokenizer(path, tokenizer), device=device)
+        path = find_checkpoint(checkpoint)
+        detect_format(path, options.checkpoint_format)  # a folder that is no checkpoint is the first thing to say
+        policy = load_pi_policy(path, find_tokenizer(path, tokenizer), options=options, device=device)
     config = policy.model.config
     for option, given, actual in (
         ("--paligemma-variant", wanted["--paligemma-variant"], config.paligemma),
@@ -55,24 +80,13 @@ def build_pi_policy(
     return policy
 
 
+def find_dtype(name: str) -> torch.dtype:
+    """Return the precision of that name."""
+    if name not in DTYPES:
+        raise BadArgument(f"Cannot use --dtype '{name}'; expected {listing(DTYPES)}.")
+    return DTYPES[name]
+
+
 def _sizes(config: GemmaConfig) -> str:
     name = next((name for name, variant in GEMMA_VARIANTS.items() if variant == config), "its own sizes")
     return f"width {config.width} and depth {config.depth} ({name})"
-
-
-def _find_tokenizer(checkpoint: Path, tokenizer: str | None) -> Path:
-    """The sentencepiece model: the one named, else the checkpoint's own, else openpi's cache."""
-    if tokenizer is not None:
-        return Path(tokenizer).expanduser()
-    places = (
-        checkpoint / "tokenizer" / "tokenizer.model",
-        checkpoint / "paligemma_tokenizer.model",
-        Path("~/.cache/openpi/big_vision/paligemma_tokenizer.model").expanduser(),
-    )
-    for place in places:
-        if place.is_file():
-            return place
-    raise BadArgument(
-        f"The checkpoint {checkpoint} needs PaliGemma's tokenizer and none was found at {listing(places)}; fetch "
-        "paligemma_tokenizer.model (openpi downloads it from gs://big_vision) and give --tokenizer PATH."
-    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from capture.policies.pi.flow_time import MAX_PERIOD, MIN_PERIOD, TimeConvention
 from schemas.errors import BadArgument, unknown_name
 
 #: openpi's camera slots, in the order of their keys. Which camera fills which slot is the preprocessing's business.
@@ -70,7 +71,8 @@ class PiConfig:
     """Everything that fixes the shape of a pi0 (`pi05=False`) or pi0.5 model.
 
     `discrete_state_input`: the prompt carries the robot's state as digits. openpi's released LIBERO policy does not do
-    so; a table of "which tokens are state" follows from this flag, not from the model family.
+    so; a table of "which tokens are state" follows from this flag, not from the model family. `float32_vision`: in
+    bfloat16 the image encoder and its projector stay in float32 (LeRobot's precision, not openpi's).
     """
 
     paligemma: GemmaConfig
@@ -84,6 +86,10 @@ class PiConfig:
     discrete_state_input: bool = False
     num_denoise_steps: int = 10
     cameras: tuple[str, ...] = CAMERA_SLOTS
+    time_convention: TimeConvention = "accumulated"
+    min_period: float = MIN_PERIOD
+    max_period: float = MAX_PERIOD
+    float32_vision: bool = False
 
     def __post_init__(self) -> None:
         vlm, expert = self.paligemma, self.action_expert
@@ -120,7 +126,7 @@ class PiConfig:
         return self.prefix_len + self.suffix_len
 
 
-#: Full-size models by openpi's names.
+#: Full-size models by openpi's names for the configurations that a LIBERO policy is trained with.
 NAMED_CONFIGS: dict[str, PiConfig] = {
     "pi05_libero": PiConfig(
         paligemma=GEMMA_VARIANTS["gemma_2b"],
@@ -138,6 +144,8 @@ NAMED_CONFIGS: dict[str, PiConfig] = {
         pi05=False,
     ),
 }
+# The same model; its LoRA arrays are merged when a checkpoint is read.
+NAMED_CONFIGS["pi0_libero_low_mem_finetune"] = NAMED_CONFIGS["pi0_libero"]
 
 
 def find_config(name: str) -> PiConfig:

@@ -17,6 +17,7 @@ from capture.policies.pi.config import GemmaConfig, PiConfig, SiglipConfig, find
 from capture.policies.pi.model import PiModel
 from capture.policies.pi.policy import PiPolicy, PiSource
 from capture.policies.pi.preprocess import NormStats, Statistics
+from capture.policies.pi.processing import OPENPI_REPLAN_STEPS, OpenpiProcessing
 from capture.policies.pi.strict import Shapes, expected_shapes, model_from_state
 from capture.policies.pi.tokenizer import PromptTokenizer
 
@@ -127,14 +128,14 @@ def build_random_model(config: PiConfig, seed: int, device: str | torch.device =
     return model_from_state(config, random_weights(config, seed), device=device)
 
 
-def _random_policy(name: str, config: PiConfig, seed: int, device: str | torch.device) -> PiPolicy:
-    source = PiSource(name=name, checkpoint=f"random weights, seed {seed}", checkpoint_format="seeded", untrained=True)
+def _random_policy(
+    name: str, config: PiConfig, seed: int, device: str | torch.device, replan_steps: int = OPENPI_REPLAN_STEPS
+) -> PiPolicy:
     return PiPolicy(
         build_random_model(config, seed, device),
         PromptTokenizer(TOKENIZER_PATH),
-        builtin_stats(),
-        source,
-        normalisation="quantile",
+        OpenpiProcessing(config, builtin_stats(), normalisation="quantile", replan_steps=replan_steps),
+        PiSource(name=name, checkpoint=f"random weights, seed {seed}", checkpoint_format="seeded", untrained=True),
     )
 
 
@@ -144,5 +145,5 @@ def embedded_policy(seed: int = 0, device: str | torch.device = "cpu") -> PiPoli
 
 
 def dummy_policy(seed: int = 0, device: str | torch.device = "cpu") -> PiPolicy:
-    """Build the policy of test size."""
-    return _random_policy("dummy", DUMMY_CONFIG, seed, device)
+    """Build the policy of test size; all four actions of a chunk are executed."""
+    return _random_policy("dummy", DUMMY_CONFIG, seed, device, replan_steps=DUMMY_CONFIG.action_horizon)

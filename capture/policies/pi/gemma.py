@@ -14,7 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from capture.attention import RowSink, attend
+from capture.attention import RowSink, UpdateSink, attend
+from capture.contributions import Projection
 from capture.policies.pi.config import GemmaConfig
 
 RMS_NORM_EPS = 1e-6
@@ -95,9 +96,14 @@ class AdaptiveRMSNorm(nn.Module):
         return (rms_normalise(x) * (1.0 + scale) + shift).to(x.dtype), gate.to(x.dtype)
 
 
+def gated(branch: Tensor, gate: Tensor | None) -> Tensor:
+    """Return branch · gate; no gate means 1."""
+    return branch if gate is None else branch * gate
+
+
 def add_branch(x: Tensor, branch: Tensor, gate: Tensor | None) -> Tensor:
     """Return x + branch · gate; no gate means 1."""
-    return x + (branch if gate is None else branch * gate)
+    return x + gated(branch, gate)
 
 
 class GemmaAttention(nn.Module):
@@ -172,6 +178,7 @@ class GemmaBlock(nn.Module):
         before: KeysValues | None = None,
         condition: Tensor | None = None,
         rows_to: RowSink | None = None,
+        update_to: UpdateSink | None = None,
     ) -> tuple[Tensor, KeysValues]:
         """Run the tokens x (batch, token, width) through the block.
 
@@ -181,9 +188,17 @@ class GemmaBlock(nn.Module):
         normed, gate = self.input_layernorm(x, condition)
         own = self.self_attn.keys_values(normed, rotation)
         seen = own if before is None else before.then(own)
-        x = add_branch(x, self.self_attn(normed, seen, mask, rotation, rows_to), gate)
+        branch = self.self_attn(normed, seen, mask, rotation, rows_to)
+        if update_to is not None:
+            update_to(seen.values, self._projection(gate), gated(branch, gate))
+        x = add_branch(x, branch, gate)
         normed, gate = self.post_attention_layernorm(x, condition)
         return add_branch(x, self.mlp(normed), gate), own
+
+    def _projection(self, gate: Tensor | None) -> Projection:
+        """Return the map from mixed values (query, head · dim) to the residual stream, in float32, for batch 1."""
+        weight = self.self_attn.o_proj.weight.float()
+        return lambda mixed: gated(F.linear(mixed, weight), None if gate is None else gate[0].float())
 
 
 class GemmaModel(nn.Module):

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from capture.policies.pi.config import PiConfig
-from capture.policies.pi.strict import CheckpointMismatch, check_shapes, expected_shapes
+from capture.policies.pi.jax_lora import LoraPair, find_lora_pairs, merge_lora
+from capture.policies.pi.strict import CheckpointMismatch, Shapes, check_shapes, expected_shapes
 
 VISION = "paligemma_with_expert.paligemma.model.vision_tower.vision_model."
 PROJECTOR = "paligemma_with_expert.paligemma.model.multi_modal_projector.linear."
@@ -22,8 +24,12 @@ LANGUAGE = "paligemma_with_expert.paligemma.model.language_model."
 EXPERT = "paligemma_with_expert.gemma_expert.model."
 
 Convert = Callable[[np.ndarray], np.ndarray]
-#: one JAX leaf -> every torch tensor made from it, by name
-LeafConverter = Callable[[np.ndarray], dict[str, np.ndarray]]
+
+#: What to say when the arrays that make a pi model are not there.
+OTHER_OPENPI_MODEL = (
+    " It has no action expert of a pi0 or pi0.5 model: it is of another model family (openpi's pi0-FAST, which writes actions as "
+    "text, or PaliGemma alone)."
+)
 
 
 def _same(w: np.ndarray) -> np.ndarray:
@@ -59,6 +65,10 @@ def _first(convert: Convert) -> Convert:
 
 def _second(convert: Convert) -> Convert:
     return lambda w: convert(w[1])
+
+
+def _third(convert: Convert) -> Convert:
+    return lambda w: convert(w[2])
 
 
 #: leaf -> (torch name, conversion); one entry per leaf that is not stacked
@@ -98,6 +108,12 @@ _GEMMA_BLOCK: dict[str, list[tuple[str, Convert]]] = {
         ("self_attn.k_proj.weight", _first(_per_head)),
         ("self_attn.v_proj.weight", _second(_per_head)),
     ],
+    # as many key heads as query heads: one array for all three
+    "attn/qkv_einsum/w": [
+        ("self_attn.q_proj.weight", _first(_per_head)),
+        ("self_attn.k_proj.weight", _second(_per_head)),
+        ("self_attn.v_proj.weight", _third(_per_head)),
+    ],
     "attn/attn_vec_einsum/w": [("self_attn.o_proj.weight", _out_of_heads)],
     "mlp/gating_einsum": [
         ("mlp.gate_proj.weight", _first(_transposed)),
@@ -122,22 +138,45 @@ _EXPERT_MARK = re.compile(r"_1(?=/|$)")
 _PROJECTION = re.compile(r"((?:action|state|time)\w*)/(kernel|bias)")
 
 
-def leaf_converter(path: str) -> LeafConverter | None:
-    """Return what turns a JAX leaf of this path into torch tensors by name, or None for a leaf that no pi model has.
+@dataclass(frozen=True)
+class LeafPlan:
+    """What becomes of one JAX leaf: every torch tensor made from it, as (name, conversion).
 
-    For checkpoints too large to hold twice: look all paths up first, then read, convert and assign leaf by leaf.
+    `layers` is the torch prefix of the layers when the leaf is stacked (its first axis are the layers), else None.
     """
+
+    targets: tuple[tuple[str, Convert], ...]
+    layers: str | None = None
+
+    def layer(self, index: int, array: np.ndarray) -> dict[str, np.ndarray]:
+        """Convert one layer of a stacked leaf."""
+        return {f"{self.layers}{index}.{name}": convert(array) for name, convert in self.targets}
+
+    def whole(self, leaf: np.ndarray) -> dict[str, np.ndarray]:
+        """Convert a whole leaf."""
+        if self.layers is None:
+            return {name: convert(leaf) for name, convert in self.targets}
+        return {name: array for i, one in enumerate(leaf) for name, array in self.layer(i, one).items()}
+
+    def shapes(self, leaf_shape: tuple[int, ...]) -> Shapes:
+        """Return the names and shapes of the tensors that a leaf of this shape gives, without any memory."""
+        empty = np.broadcast_to(np.float32(0), leaf_shape)
+        return {name: tuple(array.shape) for name, array in self.whole(empty).items()}
+
+
+def plan_leaf(path: str) -> LeafPlan | None:
+    """Return what becomes of a JAX leaf of this path, or None for a leaf that no pi model has."""
     image_block, image, language = "PaliGemma/img/Transformer/encoderblock/", "PaliGemma/img/", "PaliGemma/llm/"
     if path.startswith(image_block):
         found = _IMAGE_BLOCK.get(path.removeprefix(image_block))
-        return None if found is None else _stacked(VISION + "encoder.layers.", [found])
+        return None if found is None else LeafPlan((found,), VISION + "encoder.layers.")
     if path.startswith(image):
         return _single("", _IMAGE.get(path.removeprefix(image)))
     if path.startswith(language):
         below, marks = _EXPERT_MARK.subn("", path.removeprefix(language))
         model = EXPERT if marks else LANGUAGE
         several = _GEMMA_BLOCK.get(below.removeprefix("layers/"))
-        return _single(model, _GEMMA.get(below)) if several is None else _stacked(model + "layers.", several)
+        return _single(model, _GEMMA.get(below)) if several is None else LeafPlan(tuple(several), model + "layers.")
     projection = _PROJECTION.fullmatch(path)
     if projection is None:
         return None
@@ -145,43 +184,45 @@ def leaf_converter(path: str) -> LeafConverter | None:
     return _single(projection[1], (".weight", _transposed) if kernel else (".bias", _same))
 
 
-def _single(before: str, found: tuple[str, Convert] | None) -> LeafConverter | None:
-    if found is None:
-        return None
-    name, convert = found
-    return lambda leaf: {before + name: convert(leaf)}
+def _single(before: str, found: tuple[str, Convert] | None) -> LeafPlan | None:
+    return None if found is None else LeafPlan(((before + found[0], found[1]),))
 
 
-def _stacked(layers: str, targets: list[tuple[str, Convert]]) -> LeafConverter:
-    def unstack(leaf: np.ndarray) -> dict[str, np.ndarray]:
-        return {f"{layers}{i}.{name}": convert(one) for i, one in enumerate(leaf) for name, convert in targets}
+def plan_leaves(paths: Iterable[str]) -> tuple[dict[str, LeafPlan], dict[str, LoraPair]]:
+    """Return what becomes of every leaf of a checkpoint, and which leaves are LoRA pairs to be merged into another.
 
-    return unstack
-
-
-def find_converters(paths: Iterable[str]) -> dict[str, LeafConverter]:
-    """Return path -> converter for all leaves of a checkpoint; `CheckpointMismatch` lists those no pi model has."""
-    found = {path: leaf_converter(path) for path in paths}
-    unknown = sorted(path for path, converter in found.items() if converter is None)
+    `CheckpointMismatch` lists the leaves that no pi model has; LoRA leaves that are no pair belong to those.
+    """
+    paths = list(paths)
+    pairs = find_lora_pairs(paths)
+    merged = {path for pair in pairs.values() for path in (pair.a, pair.b)}
+    found = {path: plan_leaf(path) for path in paths if path not in merged}
+    unknown = sorted(path for path, plan in found.items() if plan is None)
     if unknown:
+        family = "" if any(path.startswith("action_in_proj/") for path in paths) else OTHER_OPENPI_MODEL
         raise CheckpointMismatch(
-            f"The checkpoint has {len(unknown)} arrays that a pi model does not have (LoRA arrays must be merged "
-            f"first): {', '.join(unknown)}."
+            f"The checkpoint has {len(unknown)} arrays that a pi model does not have: {', '.join(unknown)}.{family}"
         )
-    return {path: converter for path, converter in found.items() if converter is not None}
+    if "action_in_proj/kernel" not in found:
+        raise CheckpointMismatch(f"The checkpoint has no action_in_proj.{OTHER_OPENPI_MODEL}")
+    return {path: plan for path, plan in found.items() if plan is not None}, pairs
 
 
 def from_jax_flat(leaves: Mapping[str, np.ndarray], config: PiConfig) -> dict[str, Tensor]:
-    """Return the state dict (float32) of a `PiModel(config)` from all leaves of a JAX checkpoint.
+    """Return the state dict (float32) of a `PiModel(config)` from all leaves of a JAX checkpoint; LoRA pairs are merged.
 
-    Raises `CheckpointMismatch` that lists every leaf that is unknown (such as unmerged LoRA leaves), and every tensor
-    that is missing or of another shape than the configuration says.
+    Raises `CheckpointMismatch` that lists every leaf that is unknown, and every tensor that is missing or of another shape
+    than the configuration says.
     """
-    converters = find_converters(leaves)
-    state = {
-        name: torch.from_numpy(np.array(array, dtype=np.float32, order="C"))
-        for path, leaf in leaves.items()
-        for name, array in converters[path](leaf).items()
-    }
+    plans, pairs = plan_leaves(leaves)
+    state: dict[str, Tensor] = {}
+    for path, plan in plans.items():
+        leaf = np.asarray(leaves[path], dtype=np.float32)
+        if path in pairs:
+            pair = pairs[path]
+            leaf = np.stack(
+                [merge_lora(path, w, *ab) for w, *ab in zip(leaf, leaves[pair.a], leaves[pair.b], strict=True)]
+            )
+        state |= {name: torch.from_numpy(np.array(array, order="C")) for name, array in plan.whole(leaf).items()}
     check_shapes({name: tuple(tensor.shape) for name, tensor in state.items()}, expected_shapes(config))
     return state

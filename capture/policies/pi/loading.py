@@ -1,31 +1,127 @@
-"""Load a pi model from a checkpoint folder in whichever format it is."""
+"""Load a pi model, or a whole policy, from a checkpoint folder in whichever format it is."""
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import torch
 
-from capture.policies.pi.checkpoint import CheckpointFormat, UnsupportedCheckpoint, detect_format, load_openpi_torch
-from capture.policies.pi.config import PiConfig
+from capture.policies.pi.case import CASE_FILE, read_config
+from capture.policies.pi.checkpoint import load_openpi_torch
+from capture.policies.pi.config import PiConfig, find_config
+from capture.policies.pi.formats import CheckpointFormat, detect_format
+from capture.policies.pi.lerobot import load_lerobot, load_lerobot_weights
 from capture.policies.pi.model import PiModel
-from capture.policies.pi.orbax import load_openpi_jax
+from capture.policies.pi.orbax import implied_config_name, list_leaves, load_openpi_jax
+from capture.policies.pi.policy import PiPolicy, PiSource
+from capture.policies.pi.preprocess import read_norm_stats
+from capture.policies.pi.processing import OpenpiProcessing, Processing
+from capture.policies.pi.tokenizer import PromptTokenizer
+from schemas.errors import BadArgument
 
 
 def load_pi_model(
     folder: str | Path,
     *,
+    checkpoint_format: CheckpointFormat | None = None,
     config: PiConfig | None = None,
     dtype: torch.dtype = torch.float32,
     device: str | torch.device = "cpu",
 ) -> tuple[PiModel, CheckpointFormat]:
     """Return the model and the format it was found in; `config` overrides what the checkpoint says or implies."""
-    found = detect_format(folder)
-    if found == "openpi_torch":
-        return load_openpi_torch(folder, config=config, dtype=dtype, device=device), found
-    if found == "openpi_jax":
-        return load_openpi_jax(folder, config=config, dtype=dtype, device=device), found
-    raise UnsupportedCheckpoint(
-        f"'{folder}' is a checkpoint in LeRobot's format, which cannot be loaded yet; supported are openpi's PyTorch "
-        "format (config.json and model.safetensors) and openpi's JAX format (params/_METADATA)."
+    found = detect_format(folder, checkpoint_format)
+    load = {"openpi_torch": load_openpi_torch, "openpi_jax": load_openpi_jax, "lerobot": load_lerobot_weights}[found]
+    return load(folder, config=config, dtype=dtype, device=device), found
+
+
+@dataclasses.dataclass(frozen=True)
+class CheckpointOptions:
+    """What a user may say about a checkpoint that it does not say itself; None leaves it to the checkpoint.
+
+    config_name: one of openpi's names. model_config: a file like case.json. discrete_state_input: openpi's pi0.5 with the
+    state in the prompt.
+    """
+
+    checkpoint_format: CheckpointFormat | None = None
+    config_name: str | None = None
+    model_config: Path | None = None
+    discrete_state_input: bool = False
+    dtype: torch.dtype | None = None
+
+
+def load_pi_policy(
+    checkpoint: str | Path,
+    tokenizer: str | Path,
+    *,
+    options: CheckpointOptions | None = None,
+    config: PiConfig | None = None,
+    device: str | torch.device = "cpu",
+) -> PiPolicy:
+    """Load a policy from a checkpoint folder of any of the three formats and a tokenizer file.
+
+    `config` fixes the model's configuration for library callers; the command line names one in `options`.
+    """
+    folder, options = Path(checkpoint), options or CheckpointOptions()
+    found = detect_format(folder, options.checkpoint_format)
+    if config is not None:
+        configuration = "given"
+    else:
+        config, configuration = choose_config(folder, found, options)
+    if options.discrete_state_input and config is not None:
+        _check_state_input(config)
+    # The cheap files first: a missing tokenizer should not cost the minutes that the weights take.
+    prompt_tokenizer = PromptTokenizer(tokenizer)
+    processing: Processing
+    if found == "lerobot":
+        model, processing = load_lerobot(folder, sizes=config, dtype=options.dtype, device=device)
+    else:
+        norm_stats = read_norm_stats(folder)
+        dtype = options.dtype or torch.float32
+        model, _ = load_pi_model(folder, checkpoint_format=found, config=config, dtype=dtype, device=device)
+        if options.discrete_state_input:
+            _check_state_input(model.config)
+            model.config = dataclasses.replace(model.config, discrete_state_input=True)
+        pi05 = model.config.pi05
+        # openpi's LIBERO configurations: pi0.5 quantiles and plain actions, pi0 z-scores and actions relative to the state.
+        processing = OpenpiProcessing(
+            model.config, norm_stats, normalisation="quantile" if pi05 else "z-score", relative_actions=not pi05
+        )
+    source = PiSource(
+        name="pi05" if model.config.pi05 else "pi0",
+        checkpoint=str(checkpoint),
+        checkpoint_format=found,
+        untrained=False,
+        configuration=configuration,
     )
+    return PiPolicy(model, prompt_tokenizer, processing, source)
+
+
+def choose_config(folder: Path, found: CheckpointFormat, options: CheckpointOptions) -> tuple[PiConfig | None, str]:
+    """Return the configuration that the user or a case.json beside the checkpoint states, and where it comes from.
+
+    None: the checkpoint's own files say what there is to say.
+    """
+    if options.config_name is not None and options.model_config is not None:
+        raise BadArgument("Give --config-name or --model-config, not both.")
+    if found == "lerobot" and (options.config_name is not None or options.discrete_state_input):
+        raise BadArgument(
+            "A LeRobot checkpoint states its configuration in config.json; leave --config-name and --discrete-state-input out."
+        )
+    if options.config_name is not None:
+        return find_config(options.config_name), f"openpi's {options.config_name}"
+    if options.model_config is not None:
+        path = options.model_config.expanduser()
+        return read_config(path), str(path)
+    beside = folder.absolute().parent / CASE_FILE
+    if beside.is_file():
+        return read_config(beside), f"{CASE_FILE} beside the checkpoint"
+    if found == "openpi_jax":
+        name = implied_config_name(leaf.path for leaf in list_leaves(folder / "params"))
+        return find_config(name), f"openpi's {name} (not stated by the checkpoint)"
+    return None, "config.json and the tensors"
+
+
+def _check_state_input(config: PiConfig) -> None:
+    if not config.pi05:
+        raise BadArgument("--discrete-state-input is for pi0.5; a pi0 policy reads its state as a token of its own.")

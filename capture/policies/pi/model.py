@@ -10,43 +10,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from capture.attention import RowCollector
 from capture.policies.pi.config import PiConfig
+from capture.policies.pi.flow_time import denoise_times, embed_times
 from capture.policies.pi.gemma import GemmaModel, KeysValues, Rotation
 from capture.policies.pi.siglip import Projector, VisionTower
-
-#: Shortest and longest period of the time embedding.
-MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0
-
-
-def denoise_times(num_steps: int) -> np.ndarray:
-    """Return the flow times at which the network is evaluated, (denoise,) float32: 1 = noise, towards 0 = action.
-
-    Accumulated in float32 as the JAX reference does (1, 0.9, 0.79999995, ...): the fastest wave of the time embedding
-    turns these roundings into visible differences of attention.
-    """
-    step = np.float32(-1.0 / num_steps)
-    times = [np.float32(1.0)]
-    while len(times) < num_steps:
-        times.append(np.float32(times[-1] + step))
-    return np.array(times, dtype=np.float32)
-
-
-def embed_times(times: np.ndarray, width: int) -> Tensor:
-    """Return [sin, cos] waves of the times (denoise,) as (denoise, width) float32 on the CPU.
-
-    Periods are geometric from MIN_PERIOD to MAX_PERIOD. All in float32 like the JAX reference, and always on the CPU,
-    because angles reach 1571 rad, where another device's rounding of the periods would show.
-    """
-    fraction = torch.linspace(0.0, 1.0, width // 2, dtype=torch.float32)
-    period = MIN_PERIOD * (MAX_PERIOD / MIN_PERIOD) ** fraction
-    angle = torch.from_numpy(times)[:, None] * (1.0 / period * 2.0 * torch.pi)
-    return torch.cat([torch.sin(angle), torch.cos(angle)], dim=-1)
 
 
 @dataclass(frozen=True)
@@ -101,7 +73,8 @@ class PiModel(nn.Module):
     """A pi0 or pi0.5 model in float32 or bfloat16.
 
     With `dtype=torch.bfloat16` these stay in float32, as in openpi's PyTorch model: patch and position embedding, all
-    Gemma norms with the dense layers of the adaptive ones, and the projections of state, action and time. Unlike there,
+    Gemma norms with the dense layers of the adaptive ones, and the projections of state, action and time; with the
+    configuration's `float32_vision` (LeRobot) the whole image encoder and its projector too. Unlike there,
     attention logits and the rotary embedding are float32 too (as in the JAX reference), so that recorded rows are not
     made of logits with 8 bits.
     """
@@ -129,6 +102,9 @@ class PiModel(nn.Module):
             raise ValueError(f"pi models run in float32 or bfloat16, not in {dtype}")
         self.paligemma_with_expert.to(dtype)
         self._inner.vision_tower.vision_model.embeddings.float()
+        if self.config.float32_vision:
+            self._inner.vision_tower.float()
+            self._inner.multi_modal_projector.float()
         for gemma in (self._vlm, self._expert):
             gemma.norm.float()
             for block in gemma.blocks:
@@ -163,7 +139,7 @@ class PiModel(nn.Module):
         batch = tokens.shape[0]
         # All cameras share the encoder: one pass over (camera · batch) images.
         encoded = self._inner.vision_tower(torch.cat([images[camera] for camera in cameras]))
-        patches = self._inner.multi_modal_projector(encoded).unflatten(0, (len(cameras), batch))
+        patches = self._inner.multi_modal_projector(encoded).to(self.dtype).unflatten(0, (len(cameras), batch))
         text = self._vlm.embed(tokens)
         valid = [image_masks[camera][:, None].expand(batch, self.config.siglip.num_tokens) for camera in cameras]
         return torch.cat([*patches.unbind(0), text], dim=1), torch.cat([*valid, token_mask], dim=1)
@@ -248,14 +224,27 @@ class PiModel(nn.Module):
         action_queries = slice(config.first_action_query, config.suffix_len)
 
         steps = config.num_denoise_steps if num_steps is None else num_steps
-        all_waves = embed_times(denoise_times(steps), config.action_expert.width).to(noise.device)
+        all_waves = embed_times(
+            denoise_times(steps, config.time_convention),
+            config.action_expert.width,
+            config.time_convention,
+            min_period=config.min_period,
+            max_period=config.max_period,
+        ).to(noise.device)
         x = noise
         for step, waves in enumerate(all_waves):
             tokens_now, condition = self._embed_suffix(state, x, waves)
             hidden = tokens_now.to(self.dtype)
             for layer, block in enumerate(self._expert.blocks):
-                sink = None if recorder is None else recorder.sink(layer, step, action_queries)
-                hidden, _ = block(hidden, mask, rotation, before=prefix.cache[layer], condition=condition, rows_to=sink)
+                hidden, _ = block(
+                    hidden,
+                    mask,
+                    rotation,
+                    before=prefix.cache[layer],
+                    condition=condition,
+                    rows_to=recorder.sink(layer, step, action_queries) if recorder is not None else None,
+                    update_to=recorder.update_sink(layer, step, action_queries) if recorder is not None else None,
+                )
             normed, _ = self._expert.norm(hidden[:, action_queries], condition)
             x = x + (-1.0 / steps) * self.action_out_proj(normed.float())
         return x

@@ -1,12 +1,14 @@
 """Read openpi's JAX checkpoints (orbax, OCDBT) leaf by leaf with tensorstore; neither JAX nor orbax is needed.
 
 A checkpoint folder holds `params/` with `_METADATA` (JSON: the tree) and an OCDBT key-value store, in which every leaf is a
-zarr array under its path joined with ".".
+zarr array under its path joined with ".". Stacked leaves are read layer by layer, largest leaves first, so that memory never
+holds much more than the model itself.
 """
 
 from __future__ import annotations
 
-import json
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,11 +17,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from capture.policies.pi.checkpoint import UnreadableCheckpoint, UnsupportedCheckpoint, detect_format
 from capture.policies.pi.config import PiConfig, find_config
-from capture.policies.pi.jax_weights import find_converters
+from capture.policies.pi.formats import UnreadableCheckpoint, detect_format, read_json_object
+from capture.policies.pi.jax_lora import merge_lora
+from capture.policies.pi.jax_weights import plan_leaves
 from capture.policies.pi.model import PiModel
-from capture.policies.pi.strict import build_model, check_shapes, expected_shapes, expected_tensors
+from capture.policies.pi.strict import Shapes, build_model, check_shapes, expected_shapes, expected_tensors
 from schemas.errors import MissingDependency
 
 
@@ -38,59 +41,90 @@ def list_leaves(params: Path) -> list[Leaf]:
 
     The saved tree starts with "params", and runs of openpi's training end every path with "value"; both are taken off.
     """
-    metadata = _read_metadata(params / "_METADATA")
+    metadata = read_json_object(params / "_METADATA")
+    if not metadata.get("tree_metadata"):
+        raise UnreadableCheckpoint(f"'{params / '_METADATA'}' does not describe a tree of arrays.")
     driver = "zarr3" if metadata.get("use_zarr3") else "zarr"
     complete = bool(metadata.get("store_array_data_equal_to_fill_value"))
     try:
-        keys = [[part["key"] for part in leaf["key_metadata"]] for leaf in metadata["tree_metadata"].values()]
-        stored = [".".join(parts) for parts in keys]
+        keys = [[str(part["key"]) for part in leaf["key_metadata"]] for leaf in metadata["tree_metadata"].values()]
     except (KeyError, TypeError, AttributeError) as error:
         raise UnreadableCheckpoint(f"'{params / '_METADATA'}' does not describe a tree of arrays.") from error
+    stored = [".".join(parts) for parts in keys]
     paths = [parts[1:] if parts[0] == "params" else parts for parts in keys]
-    if all(path[-1] == "value" for path in paths):
+    if all(path[-1:] == ["value"] for path in paths):
         paths = [path[:-1] for path in paths]
     return [Leaf("/".join(path), store_key, driver, complete) for path, store_key in zip(paths, stored, strict=True)]
 
 
-def _read_metadata(path: Path) -> dict[str, Any]:
-    try:
-        metadata = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise UnreadableCheckpoint(f"'{path}' is not valid JSON ({error}).") from error
-    if not isinstance(metadata, dict) or not metadata.get("tree_metadata"):
-        raise UnreadableCheckpoint(f"'{path}' does not describe a tree of arrays.")
-    return metadata
+class OpenLeaf:
+    """A leaf that is open for reading: its shape is known, its numbers are not in memory yet."""
+
+    def __init__(self, params: Path, leaf: Leaf):
+        self._what = f"The array '{leaf.path}' of '{params}' cannot be read: files are missing or damaged"
+        self.path = leaf.path
+        self._spec = {
+            "driver": leaf.driver,
+            "kvstore": {"driver": "ocdbt", "base": f"file://{params.resolve()}/", "path": f"{leaf.store_key}/"},
+            # Where the checkpoint says that it stores every chunk, one that is not there is an error and not zeros.
+            "fill_missing_data_reads": not leaf.all_chunks_stored,
+        }
+        array = self._open(cache_bytes=0)
+        self.shape: tuple[int, ...] = tuple(array.shape)
+        rows_of_a_chunk = array.chunk_layout.read_chunk.shape[0] if array.rank else 1
+        #: One chunk often holds all layers, and is then kept for as long as its layers are read one by one.
+        self._cache_bytes = 0
+        if self.shape and rows_of_a_chunk > 1:
+            self._cache_bytes = int(
+                1.1 * self.size * array.dtype.numpy_dtype.itemsize * rows_of_a_chunk / self.shape[0]
+            )
+
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        return math.prod(self.shape)
+
+    def read(self) -> np.ndarray:
+        """Return the whole leaf as float32, with the axes of the JAX model."""
+        return self._read(self._open(cache_bytes=0))
+
+    def layers(self) -> Iterator[np.ndarray]:
+        """Return the leaf as float32, one layer (first axis) after the other."""
+        array = self._open(self._cache_bytes)
+        for i in range(self.shape[0]):
+            yield self._read(array[i])
+
+    def _open(self, cache_bytes: int) -> Any:
+        tensorstore = import_tensorstore()
+        context = tensorstore.Context({"cache_pool": {"total_bytes_limit": cache_bytes}})
+        spec = {**self._spec, "recheck_cached_data": False}
+        try:
+            return tensorstore.open(spec, open=True, read=True, context=context).result()
+        except (ValueError, OSError) as error:
+            raise UnreadableCheckpoint(f"{self._what} ({str(error).splitlines()[0]}).") from error
+
+    def _read(self, array: Any) -> np.ndarray:
+        try:
+            return np.asarray(array.read().result()).astype(np.float32, copy=False)
+        except (ValueError, OSError) as error:
+            raise UnreadableCheckpoint(f"{self._what} ({str(error).splitlines()[0]}).") from error
 
 
-def read_leaf(params: Path, leaf: Leaf) -> np.ndarray:
-    """Read one leaf as float32, with the axes of the JAX model.
-
-    Where the checkpoint says that it stores every chunk, a chunk that is not there is an error and not zeros.
-    """
+def import_tensorstore() -> Any:
+    """Return the tensorstore module, or say how to get it."""
     try:
         import tensorstore
     except ImportError as error:
         raise MissingDependency(
             "Checkpoints in openpi's JAX format are read with tensorstore, which is not installed; "
-            "install it with `pip install tensorstore`."
+            "install it with `pip install 'vla-attention[openpi]'`."
         ) from error
-    spec = {
-        "driver": leaf.driver,
-        "kvstore": {
-            "driver": "ocdbt",
-            "base": f"file://{params.resolve()}/",
-            "path": f"{leaf.store_key}/",
-        },
-        "fill_missing_data_reads": not leaf.all_chunks_stored,
-    }
-    try:
-        array = tensorstore.open(spec, open=True, read=True).result().read().result()
-    except (ValueError, OSError) as error:
-        raise UnreadableCheckpoint(
-            f"The array '{leaf.path}' of '{params}' cannot be read: files are missing or damaged "
-            f"({str(error).splitlines()[0]})."
-        ) from error
-    return np.asarray(array).astype(np.float32, copy=False)
+    return tensorstore
+
+
+def read_leaf(params: Path, leaf: Leaf) -> np.ndarray:
+    """Read one leaf as float32, with the axes of the JAX model."""
+    return OpenLeaf(params, leaf).read()
 
 
 def load_openpi_jax(
@@ -104,23 +138,56 @@ def load_openpi_jax(
 
     Such a checkpoint does not say which configuration it was trained with. Without `config` it is openpi's pi05_libero, or
     pi0_libero when it has a state projection; all shapes are checked against it, but the action horizon shows in none.
+    LoRA arrays are merged into the weights that they adapt.
     """
     folder = Path(folder)
-    if detect_format(folder) != "openpi_jax":
-        raise UnsupportedCheckpoint(f"'{folder}' is not a checkpoint in openpi's JAX (orbax) format.")
+    detect_format(folder, "openpi_jax")
     params = folder / "params"
     leaves = list_leaves(params)
+    plans, pairs = plan_leaves(leaf.path for leaf in leaves)
     if config is None:
-        config = find_config(
-            "pi0_libero" if any(leaf.path.startswith("state_proj/") for leaf in leaves) else "pi05_libero"
-        )
+        config = find_config(implied_config_name(leaf.path for leaf in leaves))
+    stored = {leaf.path: OpenLeaf(params, leaf) for leaf in leaves}
+    shapes: Shapes = {}
+    for path, plan in plans.items():
+        shapes |= _shapes_of(plan.shapes, stored[path])
+    check_shapes(shapes, expected_shapes(config))
+
     kept_as = expected_tensors(config, dtype)
-    converters = find_converters(leaf.path for leaf in leaves)
     state: dict[str, Tensor] = {}
-    for leaf in leaves:
-        for name, array in converters[leaf.path](read_leaf(params, leaf)).items():
-            # Cast at once: all of it in float32 beside the model being built would be twice the memory.
-            target = kept_as[name].dtype if name in kept_as else dtype
-            state[name] = torch.from_numpy(np.array(array, order="C")).to(target)
-    check_shapes({name: tuple(tensor.shape) for name, tensor in state.items()}, expected_shapes(config))
+
+    def keep(arrays: dict[str, np.ndarray]) -> None:
+        for name, array in arrays.items():
+            tensor = torch.from_numpy(np.ascontiguousarray(array))  # copies what is transposed, and nothing else
+            # openpi's server restores every parameter as bfloat16, those too that are then used in float32.
+            state[name] = tensor.to(dtype).to(device=device, dtype=kept_as[name].dtype)
+
+    # The largest first: what reading one takes on top of itself is then taken while little else is there.
+    for path in sorted(plans, key=lambda path: stored[path].size, reverse=True):
+        plan = plans[path]
+        if plan.layers is None:
+            keep(plan.whole(stored[path].read()))
+        elif path in pairs:
+            factors = zip(
+                stored[path].layers(), stored[pairs[path].a].layers(), stored[pairs[path].b].layers(), strict=True
+            )
+            for i, (w, a, b) in enumerate(factors):
+                keep(plan.layer(i, merge_lora(path, w, a, b)))
+        else:
+            for i, w in enumerate(stored[path].layers()):
+                keep(plan.layer(i, w))
     return build_model(config, state, state.__getitem__, dtype=dtype, device=device)
+
+
+def implied_config_name(paths: Iterator[str]) -> str:
+    """Return openpi's LIBERO configuration for a tree of these leaves."""
+    return "pi0_libero" if any(path.startswith("state_proj/") for path in paths) else "pi05_libero"
+
+
+def _shapes_of(shapes: Any, leaf: OpenLeaf) -> Shapes:
+    try:
+        found: Shapes = shapes(leaf.shape)
+    except (ValueError, IndexError):
+        # An array with another number of axes than its conversion expects: say so by its JAX name.
+        found = {leaf.path: leaf.shape}
+    return found

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,38 +16,28 @@ from capture.attention import RowCollector
 from capture.environments.base import Observation
 from capture.policies.base import PolicyCamera, PolicyInput, camera_frame, initial_noise, weights_digest
 from capture.policies.pi.config import PiConfig
-from capture.policies.pi.loading import load_pi_model
-from capture.policies.pi.model import PiModel, denoise_times
-from capture.policies.pi.preprocess import (
-    NormalisationMode,
-    NormStats,
-    environment_actions,
-    libero_state,
-    model_image,
-    pad_to,
-    read_norm_stats,
-)
-from capture.policies.pi.tokenizer import PromptTokenizer
-from schemas.errors import BadArgument
+from capture.policies.pi.flow_time import denoise_times
+from capture.policies.pi.model import PiModel
+from capture.policies.pi.preprocess import libero_state, pad_to
+from capture.policies.pi.processing import Processing
+from capture.policies.pi.tokenizer import PromptTokenizer, TokenizedPrompt, check_vocabulary
 from schemas.layout import PatchGrid, Role, SiteLayout, Span, roles_from_spans
-
-#: Which environment camera fills which slot (openpi's LIBERO inputs); other slots are black and masked.
-CAMERA_OF_SLOT = {"base_0_rgb": "agentview", "left_wrist_0_rgb": "robot0_eye_in_hand"}
-
-#: The state that openpi's LIBERO inputs build: position, axis-angle, two finger joints.
-STATE_DIM = 8
 
 PROMPT_SPAN, STATE_SPAN, ACTION_SPAN = "prompt", "state", "actions"
 
 
 @dataclass(frozen=True)
 class PiSource:
-    """Where a policy's weights come from: `checkpoint` is a path, or a description of how they were made."""
+    """Where a policy's weights come from: `checkpoint` is a path, or a description of how they were made.
+
+    `configuration`: what fixed the sizes and the layout: the checkpoint itself, a named configuration, a case.json.
+    """
 
     name: str
     checkpoint: str
     checkpoint_format: str
     untrained: bool
+    configuration: str = "built in"
 
 
 def site_layout(config: PiConfig) -> SiteLayout:
@@ -78,34 +68,15 @@ def patch_grid(config: PiConfig) -> PatchGrid:
 
 
 class PiPolicy:
-    """A pi0 or pi0.5 model with its tokenizer and statistics, for LIBERO-like observations.
+    """A pi0 or pi0.5 model with its tokenizer and its processing, for LIBERO-like observations."""
 
-    `relative_actions`: the model was trained on differences to the state (openpi's pi0_libero), so the state is added.
-    """
-
-    def __init__(
-        self,
-        model: PiModel,
-        tokenizer: PromptTokenizer,
-        norm_stats: NormStats,
-        source: PiSource,
-        *,
-        normalisation: NormalisationMode,
-        relative_actions: bool = False,
-    ):
+    def __init__(self, model: PiModel, tokenizer: PromptTokenizer, processing: Processing, source: PiSource):
         config = model.config
-        if tokenizer.vocab_size > config.vocab_size:
-            raise BadArgument(
-                f"The tokenizer has {tokenizer.vocab_size} pieces, but the model '{source.name}' knows "
-                f"{config.vocab_size}: it is another model's tokenizer."
-            )
-        norm_stats.check(normalisation, STATE_DIM)
+        check_vocabulary(tokenizer, config.vocab_size, source.name)
         self.model = model
         self.tokenizer = tokenizer
-        self.norm_stats = norm_stats
+        self.processing = processing
         self.source = source
-        self.normalisation = normalisation
-        self.relative_actions = relative_actions
         self.name = source.name
         self.sites = (site_layout(config),)
         self.num_layers = config.action_expert.depth
@@ -113,15 +84,17 @@ class PiPolicy:
         self.num_denoise_steps = config.num_denoise_steps
         self.action_horizon = config.action_horizon
         self.num_action_queries = config.action_horizon
+        self.default_replan_steps = processing.default_replan_steps
         self.cameras = tuple(
-            PolicyCamera(slot, CAMERA_OF_SLOT[slot], rotate_180=True, grid=patch_grid(config))
+            PolicyCamera(slot, processing.environment_cameras[slot], rotate_180=True, grid=patch_grid(config))
             for slot in config.cameras
-            if slot in CAMERA_OF_SLOT
+            if slot in processing.environment_cameras
         )
+        self._warned: set[str] = set()
 
     def denoise_times(self) -> NDArray[np.float64]:
         """Return the flow time of each denoise step, (denoise,): 1 = noise, towards 0 = action."""
-        return denoise_times(self.num_denoise_steps).astype(np.float64)
+        return denoise_times(self.num_denoise_steps, self.model.config.time_convention).astype(np.float64)
 
     @cached_property
     def _digest(self) -> str:
@@ -137,49 +110,68 @@ class PiPolicy:
             "checkpoint_format": self.source.checkpoint_format,
             "weights_digest": self._digest,
             "untrained": self.source.untrained,
+            "configuration": self.source.configuration,
             "config": {**asdict(config), "cameras": list(config.cameras)},
             "dtype": str(self.model.dtype).removeprefix("torch."),
             "device": str(self.model.device),
-            "normalisation": self.normalisation,
-            "relative_actions": self.relative_actions,
-            "prompt_format": "task-state-action" if config.discrete_state_input else "instruction-newline",
+            **self.processing.provenance(),
+            "prompt_format": self.processing.prompt_format,
+            "long_prompts": "cut" if self.processing.cut_long_prompts else "refused",
             "tokenizer_digest": self.tokenizer.digest,
         }
 
     def prepare(self, observation: Observation, instruction: str) -> PolicyInput:
-        """Turn an observation and an instruction into the model's input (openpi's LIBERO inputs, batch 1)."""
+        """Turn an observation and an instruction into the model's input (batch 1)."""
         config, device = self.model.config, self.model.device
         size = config.siglip.image_size
-        frames = {
-            camera.slot: model_image(camera_frame(observation, camera.environment_camera), size)
+        pictures = {
+            camera.slot: self.processing.model_picture(camera_frame(observation, camera.environment_camera), size)
             for camera in self.cameras
         }
         state = libero_state(observation.eef_pos, observation.eef_quat, observation.gripper_qpos)
-        normalised = self.norm_stats.state.normalise(state, self.normalisation)
+        normalised = self.processing.normalise_state(state)
         layout = self.sites[0]
         prompt_span = layout.span(PROMPT_SPAN)
         tokenized = self.tokenizer.tokenize(
             instruction,
             max_token_len=config.max_token_len,
             first_key=prompt_span.start,
-            state=normalised if config.discrete_state_input else None,
+            state=normalised,
+            prompt_format=self.processing.prompt_format,
+            cut=self.processing.cut_long_prompts,
         )
-        roles = {camera: Role.IMAGE if camera in frames else Role.MASKED_IMAGE for camera in config.cameras}
+        self._warn_of_cut(tokenized, instruction)
+        roles = {camera: Role.IMAGE if camera in pictures else Role.MASKED_IMAGE for camera in config.cameras}
         # The prompt's own roles replace the placeholder below.
         roles |= {PROMPT_SPAN: Role.TEXT, STATE_SPAN: Role.STATE, ACTION_SPAN: Role.ACTION}
         key_role = roles_from_spans(layout, roles)
         key_role[prompt_span.start : prompt_span.stop] = tokenized.roles
 
-        black = np.zeros((size, size, 3), dtype=np.uint8)
+        black = torch.full((1, 3, size, size), -1.0)
         tensors: dict[str, Tensor] = {
             "tokens": torch.from_numpy(tokenized.ids)[None].to(device),
             "token_mask": torch.from_numpy(tokenized.mask)[None].to(device),
             "state": torch.from_numpy(pad_to(normalised, config.action_dim)).float()[None].to(device),
         }
         for camera in config.cameras:
-            tensors[f"image:{camera}"] = image_tensor(frames.get(camera, black)).to(device)
-            tensors[f"image_mask:{camera}"] = torch.tensor([camera in frames], device=device)
+            tensors[f"image:{camera}"] = (pictures[camera][1] if camera in pictures else black).to(device)
+            tensors[f"image_mask:{camera}"] = torch.tensor([camera in pictures], device=device)
+        frames = {slot: frame for slot, (frame, _) in pictures.items()}
         return PolicyInput(frames=frames, key_role=key_role, prompt=tokenized.prompt, state=state, tensors=tensors)
+
+    def _warn_of_cut(self, tokenized: TokenizedPrompt, instruction: str) -> None:
+        """Say once per instruction that its prompt was cut; the store shows it too, as a text longer than its pieces."""
+        if not tokenized.num_cut or instruction in self._warned:
+            return
+        self._warned.add(instruction)
+        pieces = tokenized.prompt.pieces
+        lost = tokenized.prompt.text[pieces[-1].stop if pieces else 0 :]
+        print(
+            f"Warning: the prompt of '{instruction}' has {tokenized.num_cut} tokens more than the policy's "
+            f"{len(tokenized.ids)} slots; they are cut as the reference implementation does, and the policy never reads {lost!r}.",
+            file=sys.stderr,
+            flush=True,
+        )
 
     def act(
         self, policy_input: PolicyInput, noise_seed: int, recorder: RowCollector | None = None
@@ -196,48 +188,4 @@ class PiPolicy:
             noise=torch.from_numpy(noise).to(self.model.device),
             recorder=recorder,
         )
-        return environment_actions(
-            sampled[0].cpu().numpy().astype(np.float64),
-            self.norm_stats,
-            self.normalisation,
-            relative_to=policy_input.state if self.relative_actions else None,
-        )
-
-
-def image_tensor(image: NDArray[np.uint8]) -> Tensor:
-    """Return (1, 3, height, width) float32 in [-1, 1] of an image (height, width, 3): x/255·2 - 1, as in openpi."""
-    scaled = image.astype(np.float32) / 255.0 * 2.0 - 1.0
-    return torch.from_numpy(np.ascontiguousarray(scaled.transpose(2, 0, 1)))[None]
-
-
-def load_pi_policy(
-    checkpoint: str | Path,
-    tokenizer: str | Path,
-    *,
-    config: PiConfig | None = None,
-    dtype: torch.dtype = torch.float32,
-    device: str | torch.device = "cpu",
-) -> PiPolicy:
-    """Load a policy from a checkpoint folder (openpi's PyTorch or JAX format) and a tokenizer file.
-
-    Normalisation and the meaning of actions are those of openpi's LIBERO configurations: pi0.5 quantiles and plain
-    actions, pi0 z-scores and actions relative to the state.
-    """
-    # The cheap files first: a missing tokenizer should not cost the minutes that the weights take.
-    prompt_tokenizer = PromptTokenizer(tokenizer)
-    model, checkpoint_format = load_pi_model(checkpoint, config=config, dtype=dtype, device=device)
-    pi05 = model.config.pi05
-    source = PiSource(
-        name="pi05" if pi05 else "pi0",
-        checkpoint=str(checkpoint),
-        checkpoint_format=checkpoint_format,
-        untrained=False,
-    )
-    return PiPolicy(
-        model,
-        prompt_tokenizer,
-        read_norm_stats(checkpoint),
-        source,
-        normalisation="quantile" if pi05 else "z-score",
-        relative_actions=not pi05,
-    )
+        return self.processing.environment_actions(sampled[0].cpu().numpy(), policy_input.state)

@@ -121,15 +121,19 @@ class NormStats:
     state: Statistics
     actions: Statistics
 
-    def check(self, mode: NormalisationMode, state_dim: int) -> None:
-        """Raise `UnusableNormStats` unless they cover the state and the environment's actions in this mode."""
+    def check(self, mode: NormalisationMode, state_dim: int, padded_dim: int) -> None:
+        """Raise `UnusableNormStats` unless they are those of the state and the environment's actions in this mode.
+
+        Older checkpoints hold statistics padded to the model's `padded_dim`; any other length is another robot's.
+        """
         for name, statistics, needed in (
             ("state", self.state, state_dim),
             ("actions", self.actions, ENVIRONMENT_ACTION_DIM),
         ):
-            if len(statistics.mean) < needed:
+            if len(statistics.mean) not in (needed, padded_dim):
                 raise UnusableNormStats(
-                    f"The normalisation statistics of '{name}' have {len(statistics.mean)} numbers; {needed} are needed."
+                    f"The normalisation statistics of '{name}' have {len(statistics.mean)} numbers; {needed} are needed "
+                    f"(or {padded_dim}, padded)."
                 )
             if mode == "quantile" and (statistics.q01 is None or statistics.q99 is None):
                 raise UnusableNormStats(f"The normalisation statistics of '{name}' lack q01 and q99 for quantile mode.")

@@ -1,7 +1,7 @@
 """Instruction (and state) to prompt tokens, with the role of every token and the characters it stands for.
 
-Prompt formats are openpi's, whose tokenizer is PaliGemma's sentencepiece model. Roles come from character offsets, never from
-searching token ids: an instruction may well contain the word "State".
+Prompt formats are openpi's and LeRobot's, whose tokenizer is PaliGemma's sentencepiece model. Roles come from character
+offsets, never from searching token ids: an instruction may well contain the word "State".
 """
 
 from __future__ import annotations
@@ -10,13 +10,23 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import sentencepiece
 from numpy.typing import NDArray
 
+from capture.policies.pi.config import PALIGEMMA_VOCABULARY
 from schemas.errors import BadArgument, UserError
 from schemas.layout import ROLE_DTYPE, Piece, Prompt, Role
+
+#: Pieces of Gemma's vocabulary, which PaliGemma's begins with.
+GEMMA_VOCABULARY = 256_000
+
+#: `instruction-newline`: openpi without state, "\n" encoded on its own. `task-state-action`: pi0.5 with the state as digits,
+#: "Task: {instruction}, State: {bins};\nAction: ", in both ecosystems. `raw-instruction-newline` and `raw-instruction`:
+#: LeRobot's pi0, the instruction as the task says it, encoded in one go with or without "\n" at its end.
+PromptFormat = Literal["instruction-newline", "task-state-action", "raw-instruction-newline", "raw-instruction"]
 
 
 class TokenizerNotFound(UserError, FileNotFoundError):
@@ -32,13 +42,15 @@ class TokenizedPrompt:
     """A prompt as the model reads it, padded to its text slots.
 
     ids: (text,) int64; mask: (text,) bool, True = a real token; roles: (text,) uint8 codes of `Role`; prompt: the text
-    given to the model, its pieces with their keys, and the range of the instruction.
+    given to the model, its pieces with their keys, and the range of the instruction. num_cut: tokens that did not fit and
+    were cut off; the prompt's text is whole, and its last pieces are missing.
     """
 
     ids: NDArray[np.int64]
     mask: NDArray[np.bool_]
     roles: NDArray[np.uint8]
     prompt: Prompt
+    num_cut: int = 0
 
 
 @dataclass(frozen=True)
@@ -62,10 +74,13 @@ class _Token:
 
 def clean_instruction(instruction: str) -> str:
     """Return the instruction as openpi cleans it: strip, then "_" and newlines become spaces, nothing else changes."""
-    cleaned = instruction.strip().replace("_", " ").replace("\n", " ")
-    if not cleaned.strip():
-        raise BadArgument(f"The instruction {instruction!r} is empty: a policy needs at least one word.")
-    return cleaned
+    return _not_empty(instruction.strip().replace("_", " ").replace("\n", " "))
+
+
+def _not_empty(text: str) -> str:
+    if not text.strip():
+        raise BadArgument(f"The instruction {text!r} is empty: a policy needs at least one word.")
+    return text
 
 
 def digitise_state(state: NDArray[np.floating]) -> NDArray[np.int64]:
@@ -103,34 +118,44 @@ class PromptTokenizer:
         return int(self._processor.get_piece_size())
 
     def tokenize(
-        self, instruction: str, *, max_token_len: int, first_key: int = 0, state: NDArray[np.floating] | None = None
+        self,
+        instruction: str,
+        *,
+        max_token_len: int,
+        first_key: int = 0,
+        state: NDArray[np.floating] | None = None,
+        prompt_format: PromptFormat | None = None,
+        cut: bool = False,
     ) -> TokenizedPrompt:
-        """Tokenize an instruction, and the state too when one is given.
-
-        Formats (openpi): without state BOS, instruction, "\\n" (encoded on its own); with it, in one go,
-        "Task: {instruction}, State: {bins};\\nAction: ".
+        """Tokenize an instruction, and the state too when the format has it.
 
         Args:
-            instruction: as the task says it; it is cleaned here.
-            max_token_len: text slots of the model. A longer prompt is a `BadArgument`, where openpi would cut it.
+            instruction: as the task says it; it is cleaned here where the format does so.
+            max_token_len: text slots of the model.
             first_key: key of the first text slot, for the pieces.
             state: (state,) normalised, unpadded.
+            prompt_format: None takes openpi's: with the state when there is one.
+            cut: cut a longer prompt as the reference implementations do, instead of refusing it as a `BadArgument`.
         """
-        sections = _sections(clean_instruction(instruction), state)
+        if prompt_format is None:
+            prompt_format = "instruction-newline" if state is None else "task-state-action"
+        sections = _sections(instruction, state, prompt_format)
         tokens = self._encode(sections)
-        length = 1 + len(tokens)
-        if length > max_token_len:
+        num_cut = max(0, 1 + len(tokens) - max_token_len)
+        if num_cut and not cut:
             raise BadArgument(
-                f"The prompt of the instruction '{instruction}' has {length} tokens, but the model has room for "
+                f"The prompt of the instruction '{instruction}' has {1 + len(tokens)} tokens, but the model has room for "
                 f"{max_token_len}; shorten the instruction."
             )
+        text = "".join(section.text for section in sections)
+        role_of_character = [section.role for section in sections for _ in section.text]
+        tokens = tokens[: len(tokens) - num_cut]
+        length = 1 + len(tokens)
         ids = np.zeros(max_token_len, dtype=np.int64)
         mask = np.arange(max_token_len) < length
         roles = np.full(max_token_len, Role.PADDING, dtype=ROLE_DTYPE)
         ids[0], roles[0] = self._processor.bos_id(), Role.BOS
         ids[1:length] = [token.id for token in tokens]
-        text = "".join(section.text for section in sections)
-        role_of_character = [section.role for section in sections for _ in section.text]
         roles[1:length] = [_role(token, text, role_of_character) for token in tokens]
         pieces = tuple(
             Piece(key=first_key + slot, text=token.piece, start=token.start, stop=token.stop)
@@ -138,7 +163,7 @@ class PromptTokenizer:
         )
         start = role_of_character.index(Role.INSTRUCTION)
         prompt = Prompt(text, pieces, (start, start + role_of_character.count(Role.INSTRUCTION)))
-        return TokenizedPrompt(ids=ids, mask=mask, roles=roles, prompt=prompt)
+        return TokenizedPrompt(ids=ids, mask=mask, roles=roles, prompt=prompt, num_cut=num_cut)
 
     def _encode(self, sections: Sequence[_Section]) -> list[_Token]:
         """Encode the sections, joined except where one is to be encoded alone; offsets are into the whole text."""
@@ -171,14 +196,21 @@ class PromptTokenizer:
         return _spread_bytes(tokens)
 
 
-def _sections(cleaned: str, state: NDArray[np.floating] | None) -> list[_Section]:
-    instruction = _Section(cleaned, Role.INSTRUCTION)
+def _sections(instruction: str, state: NDArray[np.floating] | None, prompt_format: PromptFormat) -> list[_Section]:
+    if prompt_format == "raw-instruction-newline":
+        raw = instruction.removesuffix("\n")
+        return [_Section(_not_empty(raw), Role.INSTRUCTION), _Section("\n", Role.TEMPLATE)]
+    if prompt_format == "raw-instruction":
+        return [_Section(_not_empty(instruction), Role.INSTRUCTION)]
+    cleaned = _Section(clean_instruction(instruction), Role.INSTRUCTION)
+    if prompt_format == "instruction-newline":
+        return [cleaned, _Section("\n", Role.TEMPLATE, encode_alone=True)]
     if state is None:
-        return [instruction, _Section("\n", Role.TEMPLATE, encode_alone=True)]
+        raise ValueError(f"the prompt format {prompt_format} needs the state")
     bins = " ".join(str(number) for number in digitise_state(state))
     return [
         _Section("Task: ", Role.TEMPLATE),
-        instruction,
+        cleaned,
         _Section(", State: ", Role.TEMPLATE),
         _Section(bins, Role.STATE),
         _Section(";\nAction: ", Role.TEMPLATE),
@@ -203,3 +235,18 @@ def _role(token: _Token, text: str, role_of_character: list[Role]) -> Role:
     visible = [i for i in characters if i < len(text) and not text[i].isspace()]
     found = [role_of_character[i] for i in visible] or [role_of_character[min(token.start, len(text) - 1)]]
     return max(dict.fromkeys(found), key=found.count)
+
+
+def check_vocabulary(tokenizer: PromptTokenizer, table_rows: int, model: str) -> None:
+    """Raise `BadArgument` when the tokenizer cannot be the model's: more pieces than its table, or not PaliGemma's for one
+    of full size (256000 pieces of Gemma, perhaps with the locations and segments that pi never reads)."""
+    pieces = tokenizer.vocab_size
+    if pieces > table_rows:
+        raise BadArgument(
+            f"The tokenizer has {pieces} pieces, but the model '{model}' knows {table_rows}: it is another model's tokenizer."
+        )
+    if table_rows == PALIGEMMA_VOCABULARY and pieces < GEMMA_VOCABULARY:
+        raise BadArgument(
+            f"The tokenizer has {pieces} pieces, but the model '{model}' was made with PaliGemma's, which has "
+            f"{PALIGEMMA_VOCABULARY}: it is another model's tokenizer."
+        )

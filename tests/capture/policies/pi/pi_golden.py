@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
+from jax_leaves import to_jax_leaves
+from torch import Tensor
 
+from capture.attention import RowCollector
 from capture.environments.base import Observation
-from capture.policies.pi.config import GemmaConfig, PiConfig, SiglipConfig
+from capture.policies.pi.case import Case, read_case
+from capture.policies.pi.config import PiConfig
+from capture.policies.pi.loading import load_pi_model
 from capture.policies.pi.model import PiModel
+from capture.policies.pi.parity import run_case
 
 ROOT = Path(__file__).parents[4]
 GOLDEN = ROOT / "tests" / "golden" / "pi"
@@ -19,27 +25,7 @@ GOLDEN = ROOT / "tests" / "golden" / "pi"
 LARGE_GOLDEN = ROOT.parent / "shared" / "golden" / "pi"
 
 
-def case_config(case: dict) -> PiConfig:
-    """The configuration that a golden case's case.json describes."""
-    sizes = case["config"]
-    gemma = {
-        part: GemmaConfig(**{name: size for name, size in sizes[part].items() if name != "lora_configs"})
-        for part in ("paligemma", "action_expert")
-    }
-    siglip = SiglipConfig(**{name: size for name, size in sizes["siglip"].items() if name != "num_classes"})
-    return PiConfig(
-        **gemma,
-        siglip=siglip,
-        vocab_size=sizes["vocab_size"],
-        action_dim=sizes["action_dim"],
-        action_horizon=sizes["action_horizon"],
-        max_token_len=sizes["max_token_len"],
-        num_denoise_steps=sizes["num_steps"],
-        pi05=case["model"] == "pi05",
-    )
-
-
-class KeepAll:
+class KeepAll(RowCollector):
     """A row collector for parity tests: every layer, denoise step, batch entry, head and suffix query."""
 
     def __init__(self):
@@ -57,42 +43,61 @@ class KeepAll:
         return np.stack([np.stack([self.rows[step, layer] for layer in range(layers)]) for step in range(steps)])
 
 
+#: folder of the checkpoint that gives a golden case its weights: the first that is there
+WEIGHTS = ("checkpoint", "checkpoint_openpi_torch")
+
+
 @dataclass
 class GoldenCase:
-    folder: Path
-    config: PiConfig
-    inputs: dict[str, np.ndarray]
-    expected: dict[str, np.ndarray]
-    weights: dict[str, np.ndarray]
+    """A case, its weights, and the collectors that the tests want."""
+
+    case: Case
+    weights: dict[str, Tensor]
+
+    @property
+    def config(self) -> PiConfig:
+        return self.case.config
+
+    @property
+    def inputs(self):
+        return self.case.inputs
+
+    @property
+    def expected(self):
+        return self.case.expected
+
+    @property
+    def leaves(self) -> dict[str, np.ndarray]:
+        """The weights as leaves of the JAX model."""
+        return to_jax_leaves(self.weights, self.config)
 
     def single(self, entry: int) -> GoldenCase:
         """The same case with one entry of the batch."""
         inputs = {name: x[entry : entry + 1] if x.ndim else x for name, x in self.inputs.items()}
-        return replace(self, inputs=inputs)
+        return replace(self, case=replace(self.case, inputs=inputs))
 
     def sample(self, model: PiModel, recorder=None) -> np.ndarray:
         """Run the model on the case's inputs."""
-        given = self.inputs
-
-        def image(camera):
-            return torch.from_numpy(given[f"image_{camera}"].astype(np.float32) / 255 * 2 - 1).permute(0, 3, 1, 2)
-
-        return model.sample_actions(
-            images={camera: image(camera) for camera in self.config.cameras},
-            image_masks={camera: torch.from_numpy(given[f"image_mask_{camera}"]) for camera in self.config.cameras},
-            tokens=torch.from_numpy(given["tokenized_prompt"]),
-            token_mask=torch.from_numpy(given["tokenized_prompt_mask"]),
-            state=torch.from_numpy(given["state"]),
-            noise=torch.from_numpy(given["noise"]),
-            num_steps=int(given["num_steps"]),
-            recorder=recorder,
-        ).numpy()
+        return run_case(self.case, model, recorder)
 
 
 def load_case(folder: Path) -> GoldenCase:
-    case = json.loads((folder / "case.json").read_text())
-    arrays = [dict(np.load(folder / f"{name}.npz")) for name in ("inputs", "expected", "weights_flat")]
-    return GoldenCase(folder, case_config(case), *arrays)
+    case = read_case(folder)
+    checkpoint = next(folder / name for name in WEIGHTS if (folder / name).is_dir())
+    model, _ = load_pi_model(checkpoint, config=case.config)
+    return GoldenCase(case, dict(model.state_dict()))
+
+
+def read_manifest(name: str) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of a full-size checkpoint."""
+    manifest = json.loads(gzip.decompress((GOLDEN / "key_manifests" / f"{name}.json.gz").read_bytes()))
+    # either [shape, dtype] or the shape alone
+    return {key: tuple(entry[0] if isinstance(entry[0], list) else entry) for key, entry in manifest.items()}
+
+
+def read_manifest_dtypes(name: str) -> dict[str, str]:
+    manifest = json.loads(gzip.decompress((GOLDEN / "key_manifests" / f"{name}.json.gz").read_bytes()))
+    return {key: dtype for key, (_, dtype) in manifest.items()}
 
 
 def make_observation(seed: int) -> Observation:

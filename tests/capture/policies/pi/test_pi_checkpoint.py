@@ -7,22 +7,16 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from pi_golden import GOLDEN, KeepAll, load_case
+from pi_golden import GOLDEN, KeepAll, load_case, read_manifest
 from safetensors.torch import load_file, save_file
 
-from capture.policies.pi.checkpoint import (
-    CheckpointMismatch,
-    CheckpointNotFound,
-    UnreadableCheckpoint,
-    UnsupportedCheckpoint,
-    detect_format,
-    infer_config,
-    load_openpi_torch,
-)
+from capture.policies.pi.checkpoint import load_openpi_torch, model_names
 from capture.policies.pi.config import NAMED_CONFIGS, SiglipConfig, find_config, find_variant
-from capture.policies.pi.jax_weights import from_jax_flat
-from capture.policies.pi.loading import load_pi_model
-from capture.policies.pi.strict import expected_shapes
+from capture.policies.pi.formats import CheckpointNotFound, UnreadableCheckpoint
+from capture.policies.pi.jax_weights import from_jax_flat, plan_leaves
+from capture.policies.pi.model import PiModel
+from capture.policies.pi.sizes import infer_config
+from capture.policies.pi.strict import CheckpointMismatch, check_shapes, expected_shapes
 from schemas.errors import BadArgument, UnknownName, UserError
 
 STORED = GOLDEN / "pi05_batch2" / "checkpoint_openpi_torch"
@@ -44,9 +38,9 @@ def rewrite(folder, change):
     save_file(tensors, folder / "model.safetensors")
 
 
-def test_openpi_s_file_holds_the_same_model_as_the_jax_leaves(pi05_case):
+def test_jax_leaves_convert_to_the_same_model(pi05_case):
     loaded = load_openpi_torch(STORED, config=pi05_case.config).state_dict()
-    converted = from_jax_flat(pi05_case.weights, pi05_case.config)
+    converted = from_jax_flat(pi05_case.leaves, pi05_case.config)
     assert loaded.keys() == converted.keys()
     for name, tensor in converted.items():
         assert torch.equal(loaded[name], tensor), name
@@ -134,34 +128,6 @@ def test_missing_folder(tmp_path):
         load_openpi_torch(tmp_path / "nowhere")
 
 
-def test_folder_that_is_no_checkpoint(tmp_path):
-    (tmp_path / "holiday.jpg").touch()
-    with pytest.raises(UnsupportedCheckpoint, match=r"expected openpi's PyTorch format.*found holiday\.jpg"):
-        load_openpi_torch(tmp_path)
-
-
-def test_jax_and_lerobot_checkpoints_are_named_and_refused(tmp_path):
-    jax = tmp_path / "jax"
-    (jax / "params").mkdir(parents=True)
-    (jax / "params" / "_METADATA").write_text("{}")
-    assert detect_format(jax) == "openpi_jax"
-    with pytest.raises(UnsupportedCheckpoint, match=r"openpi's JAX \(orbax\) format, not in openpi's PyTorch"):
-        load_openpi_torch(jax)
-    with pytest.raises(UnsupportedCheckpoint, match="give its parent"):
-        detect_format(jax / "params")
-    lerobot = tmp_path / "lerobot"
-    lerobot.mkdir()
-    (lerobot / "model.safetensors").touch()
-    (lerobot / "config.json").write_text('{"type": "pi05"}')
-    with pytest.raises(UnsupportedCheckpoint, match="LeRobot's format"):
-        load_openpi_torch(lerobot)
-    with pytest.raises(UnsupportedCheckpoint, match=r"LeRobot's format.*supported are openpi's PyTorch.*JAX"):
-        load_pi_model(lerobot)
-    (lerobot / "config.json").write_text('{"type": "act"}')
-    with pytest.raises(UnsupportedCheckpoint, match="type 'act'"):
-        load_openpi_torch(lerobot)
-
-
 @pytest.mark.parametrize("kept", [0, 5, 2000, 0.5])
 def test_truncated_safetensors(checkpoint, pi05_case, kept):
     file = checkpoint / "model.safetensors"
@@ -179,11 +145,11 @@ def test_damaged_config_json(checkpoint, text):
 
 
 def test_jax_leaves_are_checked_too(pi05_case):
-    leaves = dict(pi05_case.weights)
+    leaves = dict(pi05_case.leaves)
     leaves["PaliGemma/llm/layers/attn/q_einsum/lora_a"] = np.zeros((3, 8, 64, 4))
     with pytest.raises(CheckpointMismatch, match=r"1 arrays.*q_einsum/lora_a"):
         from_jax_flat(leaves, pi05_case.config)
-    leaves = dict(pi05_case.weights)
+    leaves = dict(pi05_case.leaves)
     del leaves["PaliGemma/llm/layers/mlp_1/gating_einsum"]
     with pytest.raises(CheckpointMismatch, match="6 missing"):
         from_jax_flat(leaves, pi05_case.config)
@@ -192,7 +158,7 @@ def test_jax_leaves_are_checked_too(pi05_case):
 def test_pi0_leaves_do_not_pass_for_pi05(pi05_case):
     pi0 = load_case(GOLDEN / "pi0_batch2")
     with pytest.raises(CheckpointMismatch, match=r"missing.*extra"):
-        from_jax_flat(pi0.weights, pi05_case.config)
+        from_jax_flat(pi0.leaves, pi05_case.config)
 
 
 def test_names_are_looked_up_with_help():
@@ -212,3 +178,68 @@ def test_sizes_that_do_not_fit_are_refused():
     assert (full.prefix_len, full.suffix_len, full.key_len) == (968, 10, 978)
     pi0 = find_config("pi0_libero")
     assert (pi0.prefix_len, pi0.suffix_len, pi0.key_len, pi0.first_action_query) == (816, 51, 867, 1)
+
+
+@pytest.mark.parametrize("name", ["pi05_libero", "pi0_libero"])
+def test_full_size_openpi_torch_keys_load_strictly(name):
+    manifest = read_manifest(f"openpi_torch_{name}")
+    shapes = {key: manifest[raw] for key, raw in model_names(manifest).items()}
+    horizon = find_config(name).action_horizon
+    config = infer_config(shapes, {"action_dim": 32, "action_horizon": horizon, "paligemma_variant": "gemma_2b"})
+    assert config == find_config(name)
+    load_meta(shapes, config)
+
+
+@pytest.mark.parametrize(("name", "kind"), [("lerobot_pi05", "pi05_libero"), ("lerobot_pi0", "pi0_libero")])
+@pytest.mark.parametrize("leave_out", ["", "embed_tokens.weight", "prefix"])
+def test_full_size_lerobot_keys_load_strictly(name, kind, leave_out):
+    """With and without the prefix "model." and the table's own name, as older files are."""
+    manifest = read_manifest(name)
+    if leave_out == "prefix":
+        manifest = {key.removeprefix("model."): shape for key, shape in manifest.items()}
+    elif leave_out:
+        manifest = {key: shape for key, shape in manifest.items() if not key.endswith(leave_out)}
+        assert len(manifest) == len(read_manifest(name)) - 1
+    shapes = {key: manifest[raw] for key, raw in model_names(manifest).items()}
+    stated = {
+        "chunk_size": 50,
+        "max_action_dim": 32,
+        "paligemma_variant": "gemma_2b",
+        "action_expert_variant": "gemma_300m",
+    }
+    config = infer_config(shapes, stated, action_horizon="chunk_size", action_dim="max_action_dim")
+    assert config == dataclasses.replace(find_config(kind), action_horizon=50)
+    load_meta(shapes, config)
+
+
+@pytest.mark.parametrize("name", ["pi05_libero", "pi0_libero"])
+def test_full_size_jax_leaves_load_strictly(name):
+    leaves = read_manifest(f"openpi_jax_{name}")
+    plans, pairs = plan_leaves(leaves)
+    assert not pairs
+    shapes = {}
+    for path, plan in plans.items():
+        shapes |= plan.shapes(leaves[path])
+    load_meta(shapes, find_config(name))
+
+
+def load_meta(shapes, config):
+    """Load tensors without memory into a model without memory, strictly."""
+    check_shapes(shapes, expected_shapes(config))
+    with torch.device("meta"):
+        model = PiModel(config)
+    model.load_state_dict({name: torch.empty(shape, device="meta") for name, shape in shapes.items()}, strict=True)
+
+
+def test_pi0_fast_is_named(pi05_case):
+    leaves = [path for path in pi05_case.leaves if "_1" not in path and "time" not in path and "action" not in path]
+    with pytest.raises(CheckpointMismatch, match="pi0-FAST"):
+        plan_leaves(leaves)
+
+
+def test_factors_that_fit_no_weight_are_refused(pi05_case):
+    leaves = dict(pi05_case.leaves)
+    base = "PaliGemma/llm/layers/attn/q_einsum/"
+    leaves[base + "lora_a"], leaves[base + "lora_b"] = np.zeros((3, 8, 64, 4)), np.zeros((3, 8, 4, 15))
+    with pytest.raises(CheckpointMismatch, match=r"q_einsum/w have shapes .* do not fit"):
+        from_jax_flat(leaves, pi05_case.config)

@@ -1,16 +1,16 @@
 """Our model against openpi's: attention of every layer and denoise step, and actions."""
 
-import json
+import dataclasses
 
 import numpy as np
 import pytest
 import torch
-from pi_golden import GOLDEN, KeepAll
+from pi_golden import KeepAll, read_manifest, read_manifest_dtypes
 
 from capture.attention import AttentionRecorder, RecordingPlan
 from capture.policies.pi.config import find_config
-from capture.policies.pi.jax_weights import from_jax_flat
-from capture.policies.pi.model import PiModel, denoise_times
+from capture.policies.pi.flow_time import denoise_times, embed_times
+from capture.policies.pi.model import PiModel
 from capture.policies.pi.strict import expected_shapes, model_from_state
 
 LIMIT = 5e-5
@@ -20,7 +20,7 @@ _TABLE = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weig
 
 
 def model_of(case, dtype=torch.float32):
-    return model_from_state(case.config, from_jax_flat(case.weights, case.config), dtype=dtype)
+    return model_from_state(case.config, case.weights, dtype=dtype)
 
 
 def test_attention_and_actions_are_the_reference_s(golden_case):
@@ -96,20 +96,20 @@ def test_recorder_is_told_which_queries_are_actions(golden_case):
 
 @pytest.mark.parametrize(("name", "count"), [("pi05_libero", 812), ("pi0_libero", 777)])
 def test_full_size_names_and_shapes_are_those_of_openpi(name, count):
-    manifest = json.loads((GOLDEN / "key_manifests" / f"openpi_torch_{name}.json").read_text())
+    manifest = read_manifest(f"openpi_torch_{name}")
     assert len(manifest) == count
-    shapes = {key: tuple(shape) for key, (shape, _) in manifest.items() if key != _JUNK}
+    shapes = {key: shape for key, shape in manifest.items() if key != _JUNK}
     shapes[_TABLE] = shapes.pop(_TIED)
     assert expected_shapes(find_config(name)) == shapes
 
 
 def test_bfloat16_placement_is_openpi_s():
-    manifest = json.loads((GOLDEN / "key_manifests" / "openpi_torch_pi05_libero.json").read_text())
+    manifest = read_manifest_dtypes("openpi_torch_pi05_libero")
     with torch.device("meta"):
         model = PiModel(find_config("pi05_libero"), torch.bfloat16)
     placed = {name: str(tensor.dtype).removeprefix("torch.") for name, tensor in model.state_dict().items()}
     assert {name: dtype for name, dtype in placed.items() if name != _TABLE} == {
-        name: dtype for name, (_, dtype) in manifest.items() if name not in (_JUNK, _TIED)
+        name: dtype for name, dtype in manifest.items() if name not in (_JUNK, _TIED)
     }
 
 
@@ -119,3 +119,33 @@ def test_denoise_times_are_accumulated_in_float32():
     assert times[0] == 1.0
     assert times[2] == np.float32(0.79999995)
     np.testing.assert_allclose(times, np.arange(10, 0, -1) / 10, atol=1e-6)
+
+
+def test_lerobot_steps_time_and_embeds_it_in_float64():
+    times = denoise_times(10, "stepped")
+    assert times.dtype == np.float32
+    np.testing.assert_array_equal(times, np.float32(1.0 - np.arange(10) * 0.1))
+    period = 4e-3 * 1000.0 ** np.linspace(0, 1, 8)
+    angle = times.astype(np.float64)[:, None] * (1.0 / period * 2 * np.pi)
+    wanted = np.concatenate([np.sin(angle), np.cos(angle)], axis=-1).astype(np.float32)
+    np.testing.assert_allclose(embed_times(times, 16, "stepped").numpy(), wanted, rtol=0, atol=1e-7)
+    assert np.abs(embed_times(times, 16).numpy() - wanted).max() > 1e-6
+
+
+def test_the_two_conventions_of_time_differ_by_what_was_measured(pi05_case):
+    """LeRobot's own code is 4.4e-5 away from the JAX numbers on this case, which is what its convention makes here."""
+    keep = KeepAll()
+    config = dataclasses.replace(pi05_case.config, time_convention="stepped")
+    actions = pi05_case.sample(model_from_state(config, pi05_case.weights), keep)
+    difference = np.abs(keep.stacked() - pi05_case.expected["attn"]).max()
+    assert 2e-5 < difference < 1.5e-4
+    np.testing.assert_allclose(actions, pi05_case.expected["actions"], rtol=0, atol=1.5e-4)
+
+
+def test_lerobot_keeps_the_image_encoder_in_float32():
+    with torch.device("meta"):
+        model = PiModel(dataclasses.replace(find_config("pi05_libero"), float32_vision=True), torch.bfloat16)
+    manifest = read_manifest_dtypes("lerobot_pi05")
+    junk = {f"model.{name}" for name in (_JUNK, _TIED)}
+    placed = {f"model.{name}": str(tensor.dtype).removeprefix("torch.") for name, tensor in model.state_dict().items()}
+    assert placed == {name: dtype for name, dtype in manifest.items() if name not in junk}

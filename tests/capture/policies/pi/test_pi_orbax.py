@@ -1,18 +1,25 @@
 """openpi's JAX checkpoints, written by openpi and orbax themselves, read without either."""
 
+import dataclasses
 import json
 import shutil
 
 import numpy as np
 import pytest
 import torch
+from jax_leaves import to_jax_leaves
 from pi_golden import GOLDEN, LARGE_GOLDEN, load_case
 
-from capture.policies.pi.checkpoint import CheckpointMismatch, UnreadableCheckpoint, UnsupportedCheckpoint
+from benchmarks.orbax_writer import write_leaves
+from capture.policies.pi.config import GemmaConfig
+from capture.policies.pi.embedded import DUMMY_CONFIG, random_weights
+from capture.policies.pi.formats import UnreadableCheckpoint, UnsupportedCheckpoint
+from capture.policies.pi.jax_lora import merge_lora
 from capture.policies.pi.jax_weights import from_jax_flat
 from capture.policies.pi.loading import load_pi_model
-from capture.policies.pi.orbax import list_leaves, load_openpi_jax, read_leaf
+from capture.policies.pi.orbax import OpenLeaf, list_leaves, load_openpi_jax, read_leaf
 from capture.policies.pi.preprocess import read_norm_stats
+from capture.policies.pi.strict import CheckpointMismatch
 
 pytest.importorskip("tensorstore")
 STORED = GOLDEN / "pi0_batch2" / "checkpoint"
@@ -31,26 +38,125 @@ def pi0_case():
 
 
 def test_every_leaf_is_bit_identical(pi0_case):
+    """The loader's conversion, undone by code that shares nothing with it."""
     leaves = list_leaves(STORED / "params")
-    assert {leaf.path for leaf in leaves} == set(pi0_case.weights)
+    wanted = pi0_case.leaves
+    assert {leaf.path for leaf in leaves} == set(wanted)
     for leaf in leaves:
-        np.testing.assert_array_equal(read_leaf(STORED / "params", leaf), pi0_case.weights[leaf.path])
+        np.testing.assert_array_equal(read_leaf(STORED / "params", leaf), wanted[leaf.path])
+        opened = OpenLeaf(STORED / "params", leaf)
+        np.testing.assert_array_equal(np.stack(list(opened.layers())), wanted[leaf.path])
 
 
 @pytest.mark.parametrize("name", ["pi0_batch2", "pi05_batch2", "pi05_full_layout"])
 def test_loaded_model_is_that_of_the_flat_weights(name):
-    folder = GOLDEN / name if name == "pi0_batch2" else LARGE_GOLDEN / name
+    folder = LARGE_GOLDEN / name
     if not folder.is_dir():
-        pytest.skip("this golden checkpoint is not in the repository, and not beside this checkout")
+        pytest.skip("the flat weights are not in the repository, and not beside this checkout")
     case = load_case(folder)
     model, found = load_pi_model(folder / "checkpoint", config=case.config)
     assert found == "openpi_jax"
-    expected = from_jax_flat(case.weights, case.config)
+    expected = from_jax_flat(dict(np.load(folder / "weights_flat.npz")), case.config)
     assert model.state_dict().keys() == expected.keys()
     for key, tensor in model.state_dict().items():
         assert torch.equal(tensor, expected[key]), key
-    actions = case.sample(model)
-    np.testing.assert_allclose(actions, case.expected["actions"], rtol=0, atol=5e-5)
+
+
+#: As many key heads as query heads (one array for all three), two key heads, and pi0.
+OTHER_SIZES = {
+    "eight key heads": {"num_kv_heads": 8},
+    "two key heads": {"num_heads": 4, "num_kv_heads": 2, "head_dim": 12},
+}
+
+
+@pytest.mark.parametrize("sizes", OTHER_SIZES)
+@pytest.mark.parametrize("options", [{"dtype": "bfloat16"}, {"value_suffix": False, "chunk_per_layer": True}, {}])
+@pytest.mark.parametrize("pi05", [True, False])
+def test_other_sizes_and_ways_of_storing(tmp_path, sizes, options, pi05):
+    parts = {
+        name: GemmaConfig(width=width, depth=3, mlp_dim=40, **{"head_dim": 8, **OTHER_SIZES[sizes]})
+        for name, width in (("paligemma", 32), ("action_expert", 20))
+    }
+    config = dataclasses.replace(DUMMY_CONFIG, pi05=pi05, discrete_state_input=False, **parts)
+    state = random_weights(config, 3)
+    if options.get("dtype") == "bfloat16":
+        state = {name: tensor.bfloat16().float() for name, tensor in state.items()}
+    leaves = to_jax_leaves(state, config)
+    assert any("qkv_einsum" in path for path in leaves) == (sizes == "eight key heads")
+    write_leaves(tmp_path / "params", leaves, **options)
+    loaded = load_openpi_jax(tmp_path, config=config).state_dict()
+    for name, tensor in state.items():
+        assert torch.equal(loaded[name], tensor), name
+
+
+def lora_factors(leaves, generator, rank=3):
+    """Factors for every weight that openpi adapts, by their names in its models."""
+    factors = {}
+    for path, w in leaves.items():
+        if "/attn/" in path:
+            names = [path.removesuffix("w") + f"lora_{x}" for x in "ab"]
+        elif "/mlp" in path:
+            names = [f"{path}_lora_{x}" for x in "ab"]
+        else:
+            continue
+        factors[names[0]] = generator.normal(size=(*w.shape[:-1], rank)).astype(np.float32)
+        factors[names[1]] = generator.normal(size=(*w.shape[:-2], rank, w.shape[-1])).astype(np.float32)
+    return factors
+
+
+def test_lora_is_merged_as_openpi_s_equations_say():
+    """openpi evaluates x·w + (x·a)·b by two einsums, whose letters decide what is summed over."""
+    generator = np.random.default_rng(0)
+    x = generator.normal(size=(2, 5, 6))
+    heads = generator.normal(size=(2, 5, 4, 3))
+
+    def of(*shape):
+        return generator.normal(size=shape)
+
+    cases = [
+        ("attn/q_einsum/w", "BTD,NDH->BTNH", "BTD,NDL->BTNL", "BTNL,NLH->BTNH", x, of(4, 6, 3), of(4, 6, 2), of(4, 2, 3)),
+        (
+            "attn/kv_einsum_1/w", "BSD,cKDH->cBSKH", "BSD,cKDL->cBSKL", "cBSKL,cKLH->cBSKH",
+            x, of(2, 1, 6, 3), of(2, 1, 6, 2), of(2, 1, 2, 3),
+        ),
+        (
+            "attn/attn_vec_einsum/w", "BTNH,NHD->BTD", "BTNH,NHL->BTL", "BTL,NLD->BTD",
+            heads, of(4, 3, 6), of(4, 3, 2), of(4, 2, 6),
+        ),
+        ("mlp/gating_einsum", "BTD,cDF->cBTF", "BTD,cDL->cBTL", "cBTL,cLF->cBTF", x, of(2, 6, 7), of(2, 6, 2), of(2, 2, 7)),
+    ]  # fmt: skip
+    for path, plain, first, second, given, w, a, b in cases:
+        wanted = np.einsum(plain, given, w) + np.einsum(second, np.einsum(first, given, a), b)
+        merged = merge_lora(f"PaliGemma/llm/layers/{path}", w, a, b)
+        np.testing.assert_allclose(np.einsum(plain, given, merged), wanted, rtol=1e-5, atol=1e-5, err_msg=path)
+
+
+def test_a_lora_checkpoint_is_merged_layer_by_layer(tmp_path):
+    state = random_weights(DUMMY_CONFIG, 1)
+    leaves = to_jax_leaves(state, DUMMY_CONFIG)
+    factors = lora_factors(leaves, np.random.default_rng(1))
+    assert len(factors) == 20
+    write_leaves(tmp_path / "params", leaves | factors)
+    loaded = load_openpi_jax(tmp_path, config=DUMMY_CONFIG).state_dict()
+    expected = from_jax_flat(leaves | factors, DUMMY_CONFIG)
+    for name, tensor in expected.items():
+        assert torch.equal(loaded[name], tensor), name
+    changed = [name for name in state if not torch.equal(state[name], loaded[name])]
+    assert len(changed) == 2 * 3 * 7
+
+
+def test_half_a_lora_pair_is_refused_by_name(tmp_path):
+    leaves = to_jax_leaves(random_weights(DUMMY_CONFIG, 1), DUMMY_CONFIG)
+    factors = lora_factors(leaves, np.random.default_rng(1))
+    del factors["PaliGemma/llm/layers/mlp_1/linear_lora_b"]
+    write_leaves(tmp_path / "params", leaves | factors)
+    with pytest.raises(CheckpointMismatch, match=r"1 arrays.*mlp_1/linear_lora_a"):
+        load_openpi_jax(tmp_path, config=DUMMY_CONFIG)
+
+
+def test_bfloat16_rounds_every_weight_as_openpi_s_server_does(pi0_case):
+    model = load_openpi_jax(STORED, config=pi0_case.config, dtype=torch.bfloat16)
+    assert torch.equal(model.state_proj.weight, pi0_case.weights["state_proj.weight"].bfloat16().float())
 
 
 def test_a_checkpoint_is_cast_to_the_wanted_precision(pi0_case):
@@ -99,5 +205,5 @@ def test_unknown_arrays_are_listed_before_anything_is_read(checkpoint, pi0_case)
 
 
 def test_another_format_is_refused():
-    with pytest.raises(UnsupportedCheckpoint, match="not a checkpoint in openpi's JAX"):
+    with pytest.raises(UnsupportedCheckpoint, match="not in openpi's JAX format"):
         load_openpi_jax(GOLDEN / "pi05_batch2" / "checkpoint_openpi_torch")

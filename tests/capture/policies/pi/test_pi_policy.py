@@ -14,9 +14,11 @@ from capture.environments.base import Observation
 from capture.policies.base import Policy, initial_noise, weights_digest
 from capture.policies.pi.config import find_config
 from capture.policies.pi.embedded import DUMMY_CONFIG, TOKENIZER_PATH, build_random_model, builtin_stats
-from capture.policies.pi.policy import PiPolicy, PiSource, load_pi_policy, site_layout
+from capture.policies.pi.loading import load_pi_policy
+from capture.policies.pi.policy import PiPolicy, PiSource, site_layout
 from capture.policies.pi.preprocess import model_image
-from capture.policies.pi.tokenizer import PromptTokenizer, TokenizerNotFound
+from capture.policies.pi.processing import OpenpiProcessing
+from capture.policies.pi.tokenizer import PromptTokenizer, TokenizerNotFound, check_vocabulary
 from schemas.errors import BadArgument, UnknownName
 from schemas.layout import Role
 
@@ -45,10 +47,8 @@ def dummy_pi0():
     return PiPolicy(
         build_random_model(config, 0),
         PromptTokenizer(TOKENIZER_PATH),
-        builtin_stats(),
+        OpenpiProcessing(config, builtin_stats(), normalisation="z-score", relative_actions=True),
         PiSource("dummy-pi0", "random weights, seed 0", "seeded", untrained=True),
-        normalisation="z-score",
-        relative_actions=True,
     )
 
 
@@ -192,7 +192,41 @@ STATE_NAMES = ("eef_pos", "eef_quat", "gripper_qpos")
 def test_a_tokenizer_larger_than_the_table_is_refused(dummy):
     small = build_random_model(dataclasses.replace(DUMMY_CONFIG, vocab_size=300), 0)
     with pytest.raises(BadArgument, match="another model's tokenizer"):
-        PiPolicy(small, dummy.tokenizer, dummy.norm_stats, dummy.source, normalisation="quantile")
+        PiPolicy(small, dummy.tokenizer, dummy.processing, dummy.source)
+
+
+def test_a_tokenizer_of_another_full_size_model_is_refused(dummy):
+    """Llama's 32000 pieces would fit into PaliGemma's table, and every word would be another."""
+
+    class Pieces:
+        def __init__(self, count):
+            self.vocab_size = count
+
+    for count in (256_000, 257_152):
+        check_vocabulary(Pieces(count), 257_152, "pi05")
+    for count in (32_000, 300_000):
+        with pytest.raises(BadArgument, match=rf"{count} pieces.*another model's tokenizer"):
+            check_vocabulary(Pieces(count), 257_152, "pi05")
+
+
+def test_a_prompt_that_is_cut_is_said_once_and_stays_visible(dummy, observation, capsys):
+    config = dataclasses.replace(DUMMY_CONFIG, max_token_len=12)
+    policy = PiPolicy(build_random_model(config, 0), dummy.tokenizer, dummy.processing, dummy.source)
+    for _ in range(2):
+        given = policy.prepare(observation, INSTRUCTION)
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "more than the policy's 12 slots; they are cut" in said
+    assert len(given.prompt.pieces) == 11
+    assert given.prompt.text.endswith(";\nAction: ")
+    assert given.prompt.pieces[-1].stop < len(given.prompt.text)
+    assert policy.provenance()["long_prompts"] == "cut"
+    assert np.isfinite(policy.act(given, 0)).all()
+
+
+def test_default_number_of_executed_actions(dummy, embedded):
+    assert dummy.default_replan_steps == dummy.action_horizon == 4
+    assert embedded.default_replan_steps == 5
 
 
 def test_policy_from_a_checkpoint_folder(tmp_path, observation):

@@ -7,7 +7,6 @@ import pytest
 from pi_golden import GOLDEN
 from PIL import Image
 
-from capture.policies.pi.policy import image_tensor
 from capture.policies.pi.preprocess import (
     NormStats,
     NormStatsNotFound,
@@ -22,6 +21,7 @@ from capture.policies.pi.preprocess import (
     read_norm_stats,
     resize_with_pad,
 )
+from capture.policies.pi.processing import image_tensor
 from capture.policies.pi.tokenizer import digitise_state
 from schemas.errors import UserError
 
@@ -164,11 +164,19 @@ def test_quantile_mode_without_quantiles():
         Statistics(mean=np.zeros(1), std=np.ones(1)).normalise(np.zeros(1), "quantile")
 
 
-def test_statistics_must_cover_state_and_actions(stats):
-    stats.check("quantile", 8)
-    with pytest.raises(UnusableNormStats, match="'state' have 8 numbers; 9 are needed"):
-        stats.check("quantile", 9)
-    without = Statistics(mean=np.zeros(8), std=np.ones(8))
-    NormStats(without, without).check("z-score", 8)
+def numbers(dim, **more):
+    return Statistics(mean=np.zeros(dim), std=np.ones(dim), **more)
+
+
+def test_statistics_must_be_those_of_state_and_actions(stats):
+    stats.check("quantile", 8, 32)
+    NormStats(numbers(32), numbers(32)).check("z-score", 8, 32)
+    for state, actions, message in (
+        (7, 7, "'state' have 7 numbers; 8 are needed"),
+        (14, 7, "'state' have 14 numbers; 8 are needed"),
+        (8, 8, r"'actions' have 8 numbers; 7 are needed \(or 32, padded\)"),
+    ):
+        with pytest.raises(UnusableNormStats, match=message):
+            NormStats(numbers(state), numbers(actions)).check("z-score", 8, 32)
     with pytest.raises(UnusableNormStats, match="'state' lack q01"):
-        NormStats(without, without).check("quantile", 8)
+        NormStats(numbers(8), numbers(7)).check("quantile", 8, 32)

@@ -95,6 +95,40 @@ def test_pieces_cover_the_text_and_roles_follow_the_characters(tokenizer, instru
     assert visible(Role.TEMPLATE) == ("" if state is None else "Task:,State:;Action:")
 
 
+@pytest.mark.parametrize("instruction", AWKWARD)
+@pytest.mark.parametrize("prompt_format", ["raw-instruction-newline", "raw-instruction"])
+def test_raw_prompts_leave_the_instruction_alone(tokenizer, processor, instruction, prompt_format):
+    got = tokenizer.tokenize(instruction, max_token_len=200, prompt_format=prompt_format)
+    body = instruction.removesuffix("\n") if prompt_format == "raw-instruction-newline" else instruction
+    text = body + "\n" * (prompt_format == "raw-instruction-newline")
+    assert got.prompt.text == text
+    assert got.prompt.instruction_text == body
+    assert got.ids[got.mask].tolist() == processor.encode(text, add_bos=True)
+    roles = {text[p.start : p.stop]: got.roles[p.key] for p in got.prompt.pieces}
+    assert all(
+        (role == Role.TEMPLATE) == (piece == "\n" and text.endswith("\n"))
+        for piece, role in roles.items()
+        if piece != "\n"
+    )
+    assert (got.roles[got.mask] == Role.STATE).sum() == 0
+
+
+@pytest.mark.parametrize("instruction", AWKWARD)
+@pytest.mark.parametrize("state", [None, STATE], ids=["plain", "with-state"])
+@pytest.mark.parametrize("room", [1, 2, 5, 30])
+def test_a_cut_prompt_is_the_beginning_of_the_whole_one(tokenizer, instruction, state, room):
+    whole = tokenizer.tokenize(instruction, max_token_len=200, state=state)
+    cut = tokenizer.tokenize(instruction, max_token_len=room, state=state, cut=True)
+    length = int(whole.mask.sum())
+    assert cut.num_cut == max(0, length - room)
+    kept = min(room, length)
+    np.testing.assert_array_equal(cut.ids[:kept], whole.ids[:kept])
+    np.testing.assert_array_equal(cut.roles[:kept], whole.roles[:kept])
+    assert cut.mask.sum() == kept
+    assert cut.prompt.pieces == whole.prompt.pieces[: kept - 1]
+    assert cut.prompt.text == whole.prompt.text
+
+
 def test_a_newline_is_a_template_token_of_its_own(tokenizer):
     got = tokenizer.tokenize("open the door", max_token_len=20)
     assert got.prompt.pieces[-1].text == "\n"

@@ -1,0 +1,75 @@
+"""Write a checkpoint in the layout of openpi's JAX format (orbax, OCDBT) with tensorstore, leaf by leaf.
+
+Not what orbax writes byte by byte, but what a reader sees: `_METADATA` with the tree, and every leaf as a zarr array in one
+OCDBT store. For benchmarks, and for tests of shapes and precisions that the golden checkpoints do not have.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import tensorstore
+
+
+def write_orbax(
+    params: Path,
+    shapes: Mapping[str, tuple[int, ...]],
+    layer_of: Callable[[str, int], np.ndarray],
+    *,
+    dtype: str = "float32",
+    value_suffix: bool = True,
+    chunk_per_layer: bool = False,
+) -> None:
+    """Write a `params` folder.
+
+    Args:
+        params: the folder, which is made.
+        shapes: JAX path joined by "/" -> shape of the leaf.
+        layer_of: (path, index on the first axis) -> that part of the leaf; asked for in order, so that a leaf need never be in
+            memory twice.
+        dtype: float32 or bfloat16, as stored.
+        value_suffix: end every path with "value", as openpi's training does.
+        chunk_per_layer: one chunk for each index of the first axis; otherwise one chunk for the leaf.
+    """
+    params.mkdir(parents=True)
+    tree = {}
+    for path, shape in shapes.items():
+        parts = ["params", *path.split("/"), *(["value"] if value_suffix else [])]
+        tree[str(tuple(parts))] = {
+            "key_metadata": [{"key": part, "key_type": 2} for part in parts],
+            "value_metadata": {"value_type": "jax.Array", "skip_deserialize": False, "write_shape": list(shape)},
+        }
+        chunks = [1, *shape[1:]] if chunk_per_layer else list(shape)
+        array = tensorstore.open(
+            {
+                "driver": "zarr",
+                "kvstore": {"driver": "ocdbt", "base": f"file://{params.resolve()}/", "path": ".".join(parts) + "/"},
+                "metadata": {
+                    "shape": list(shape),
+                    "chunks": chunks,
+                    "dtype": {"float32": "<f4", "bfloat16": "bfloat16"}[dtype],
+                    "compressor": {"id": "zstd", "level": 1},
+                },
+                "store_data_equal_to_fill_value": True,
+            },
+            create=True,
+        ).result()
+        if chunk_per_layer:
+            for i in range(shape[0]):
+                array[i].write(layer_of(path, i).astype(array.dtype.numpy_dtype)).result()
+        else:
+            whole = np.empty(shape, dtype=array.dtype.numpy_dtype)
+            for i in range(shape[0]):
+                whole[i] = layer_of(path, i)
+            array.write(whole).result()
+    metadata = {"tree_metadata": tree, "use_zarr3": False, "store_array_data_equal_to_fill_value": True}
+    (params / "_METADATA").write_text(json.dumps(metadata))
+
+
+def write_leaves(params: Path, leaves: Mapping[str, np.ndarray], **options: object) -> None:
+    """Write arrays in memory."""
+    shapes = {path: tuple(leaf.shape) for path, leaf in leaves.items()}
+    write_orbax(params, shapes, lambda path, i: leaves[path][i], **options)  # type: ignore[arg-type]

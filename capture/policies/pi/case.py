@@ -1,0 +1,173 @@
+"""Parity cases: a small folder with a checkpoint, inputs, and what a reference implementation made of them.
+
+case.json states the sizes that no checkpoint states about itself; it also serves a checkpoint that lies beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+
+from capture.policies.pi.config import CAMERA_SLOTS, GemmaConfig, PiConfig, SiglipConfig
+from capture.policies.pi.formats import CheckpointFormat, read_json_object
+from schemas.errors import BadArgument, UserError, listing, unknown_name
+
+CaseFormat = Literal["orbax", "openpi", "lerobot"]
+
+#: Folder of the checkpoint in each format that a case may carry, and the loader's name for the format.
+CHECKPOINT_FOLDERS: dict[CaseFormat, tuple[str, CheckpointFormat]] = {
+    "orbax": ("checkpoint", "openpi_jax"),
+    "openpi": ("checkpoint_openpi_torch", "openpi_torch"),
+    "lerobot": ("checkpoint_lerobot", "lerobot"),
+}
+CASE_FILE = "case.json"
+
+
+class UnusableCase(UserError, ValueError):
+    """The case folder lacks a file, or a file does not hold what a case needs."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A case folder: sizes, inputs and expected results.
+
+    inputs: image_<slot> (batch, height, width, 3) uint8, image_mask_<slot> (batch,), state (batch, action dim),
+    tokenized_prompt and tokenized_prompt_mask (batch, text), noise (batch, horizon, action dim), num_steps.
+    expected: actions (batch, horizon, action dim), attn (denoise, layer, batch, head, query, key), all suffix queries.
+    """
+
+    name: str
+    folder: Path
+    config: PiConfig
+    dtype: torch.dtype
+    inputs: Mapping[str, np.ndarray]
+    expected: Mapping[str, np.ndarray]
+
+    @property
+    def formats(self) -> tuple[CaseFormat, ...]:
+        """The formats that the case carries a checkpoint in."""
+        return tuple(name for name, (folder, _) in CHECKPOINT_FOLDERS.items() if (self.folder / folder).is_dir())
+
+    def checkpoint(self, case_format: CaseFormat) -> tuple[Path, CheckpointFormat]:
+        """Return the folder of the checkpoint in a format; the error names the formats that are there."""
+        if case_format not in self.formats:
+            raise UnusableCase(
+                f"The case '{self.folder}' carries no checkpoint in the format '{case_format}' (folder "
+                f"{CHECKPOINT_FOLDERS[case_format][0]}); it carries {listing(self.formats)}."
+            )
+        name, checkpoint_format = CHECKPOINT_FOLDERS[case_format]
+        return self.folder / name, checkpoint_format
+
+
+def find_case_format(name: str) -> CaseFormat:
+    """Return the format of that name; the error lists the three."""
+    for known in CHECKPOINT_FOLDERS:
+        if known == name:
+            return known
+    raise unknown_name("case format", name, CHECKPOINT_FOLDERS)
+
+
+def read_config(path: Path) -> PiConfig:
+    """Read the sizes of a model from a case.json, or from a file with its `model` and `config`."""
+    if not path.is_file():
+        raise UnusableCase(f"There is no '{path}', which states the sizes of the model.")
+    content = read_json_object(path)
+    try:
+        return _config(content)
+    except (KeyError, TypeError) as error:
+        raise UnusableCase(
+            f"'{path}' does not state the sizes of a pi model: {error!s} is missing or wrong; expected 'model' (pi0 or pi05) and "
+            "'config' with paligemma, action_expert, siglip, vocab_size, action_dim, action_horizon, max_token_len, num_steps."
+        ) from error
+
+
+def _config(content: Mapping[str, Any]) -> PiConfig:
+    sizes: Mapping[str, Any] = content["config"]
+    model = content["model"]
+    if model not in ("pi0", "pi05"):
+        raise BadArgument(f"A case is of model 'pi0' or 'pi05', not '{model}'.")
+
+    def part(name: str, ignored: str) -> dict[str, int]:
+        return {key: value for key, value in sizes[name].items() if key != ignored}
+
+    layout: Mapping[str, Any] = content.get("layout", {})
+    return PiConfig(
+        paligemma=GemmaConfig(**part("paligemma", "lora_configs")),
+        action_expert=GemmaConfig(**part("action_expert", "lora_configs")),
+        siglip=SiglipConfig(**part("siglip", "num_classes")),
+        vocab_size=sizes["vocab_size"],
+        action_dim=sizes["action_dim"],
+        action_horizon=sizes["action_horizon"],
+        max_token_len=sizes["max_token_len"],
+        num_denoise_steps=sizes["num_steps"],
+        pi05=model == "pi05",
+        discrete_state_input=bool(sizes.get("discrete_state_input", False)),
+        cameras=tuple(layout.get("image_keys", CAMERA_SLOTS)),
+    )
+
+
+def read_case(folder: str | Path) -> Case:
+    """Read a case folder; `UnusableCase` says which file or array is missing or of the wrong shape."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise UnusableCase(f"There is no case folder at '{folder}'.")
+    if not (folder / CASE_FILE).is_file():
+        found = listing(sorted(path.name for path in folder.iterdir()))
+        raise UnusableCase(f"'{folder}' is no case: it has no {CASE_FILE}, but {found}.")
+    config = read_config(folder / CASE_FILE)
+    content = read_json_object(folder / CASE_FILE)
+    computed = str(content.get("compute_dtype", "float32"))
+    if computed not in ("float32", "bfloat16"):
+        raise UnusableCase(f"'{folder / CASE_FILE}' says compute_dtype '{computed}'; expected float32 or bfloat16.")
+    inputs, expected = _arrays(folder / "inputs.npz"), _arrays(folder / "expected.npz")
+    _check_shapes(folder / "inputs.npz", inputs, _input_shapes(config, inputs))
+    _check_shapes(folder / "expected.npz", expected, _expected_shapes(config, inputs))
+    dtype = torch.bfloat16 if computed == "bfloat16" else torch.float32
+    return Case(str(content.get("name", folder.name)), folder, config, dtype, inputs, expected)
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return dict(stored)
+    except FileNotFoundError:
+        raise UnusableCase(f"There is no '{path}', which a case needs.") from None
+    except (ValueError, OSError, EOFError, BadZipFile) as error:
+        raise UnusableCase(f"'{path}' cannot be read as arrays ({error}).") from error
+
+
+Wanted = dict[str, tuple[int, ...]]
+
+
+def _input_shapes(config: PiConfig, inputs: Mapping[str, np.ndarray]) -> Wanted:
+    batch = len(inputs["noise"]) if "noise" in inputs and inputs["noise"].ndim else 1
+    size = config.siglip.image_size
+    text = (batch, config.max_token_len)
+    # The noise first: the batch is read off it.
+    wanted: Wanted = {"noise": (batch, config.action_horizon, config.action_dim), "num_steps": ()}
+    wanted |= {f"image_{camera}": (batch, size, size, 3) for camera in config.cameras}
+    wanted |= {f"image_mask_{camera}": (batch,) for camera in config.cameras}
+    wanted |= {"tokenized_prompt": text, "tokenized_prompt_mask": text}
+    return wanted | {"state": (batch, config.action_dim)}
+
+
+def _expected_shapes(config: PiConfig, inputs: Mapping[str, np.ndarray]) -> Wanted:
+    batch, expert = len(inputs["noise"]), config.action_expert
+    rows = (int(inputs["num_steps"]), expert.depth, batch, expert.num_heads, config.suffix_len, config.key_len)
+    return {"actions": (batch, config.action_horizon, config.action_dim), "attn": rows}
+
+
+def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray], wanted: Wanted) -> None:
+    for name, shape in wanted.items():
+        if name not in arrays:
+            raise UnusableCase(f"'{path}' has no array '{name}'; it has {listing(sorted(arrays))}.")
+        if arrays[name].shape != shape:
+            raise UnusableCase(
+                f"'{name}' of '{path}' has shape {arrays[name].shape}, but the sizes of {CASE_FILE} make it {shape}."
+            )

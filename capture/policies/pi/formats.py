@@ -1,0 +1,137 @@
+"""Recognise the format of a checkpoint folder from its files, and say of other folders what they are."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from schemas.errors import UserError, listing, unknown_name
+
+CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot"]
+CHECKPOINT_FORMATS: tuple[CheckpointFormat, ...] = get_args(CheckpointFormat)
+
+#: How each format is called in messages, with the files that make it.
+SPOKEN: dict[CheckpointFormat, str] = {
+    "openpi_torch": "openpi's PyTorch format (config.json and model.safetensors)",
+    "openpi_jax": "openpi's JAX format (params/_METADATA)",
+    "lerobot": "LeRobot's format (config.json with a type, model.safetensors and policy_preprocessor.json)",
+}
+
+#: Words in the configuration of a transformers checkpoint that name the policy it belongs to.
+_OTHER_FAMILIES = {
+    "openvla": "OpenVLA",
+    "gr00t": "GR00T",
+    "groot": "GR00T",
+    "smolvla": "SmolVLA",
+    "smolvlm": "SmolVLM",
+    "paligemma": "PaliGemma (the vision-language model alone)",
+    "gemma": "Gemma (the language model alone)",
+    "siglip": "SigLIP (the image encoder alone)",
+}
+
+
+class CheckpointNotFound(UserError, FileNotFoundError):
+    """The checkpoint folder does not exist."""
+
+
+class UnsupportedCheckpoint(UserError, ValueError):
+    """The folder is no checkpoint, or one of another kind."""
+
+
+class UnreadableCheckpoint(UserError, ValueError):
+    """The folder has the right files, but one of them is damaged."""
+
+
+def find_format(name: str) -> CheckpointFormat:
+    """Return the format of that name; the error lists the three."""
+    for known in CHECKPOINT_FORMATS:
+        if known == name:
+            return known
+    raise unknown_name("checkpoint format", name, CHECKPOINT_FORMATS)
+
+
+def detect_format(folder: str | Path, wanted: CheckpointFormat | None = None) -> CheckpointFormat:
+    """Say in which format a checkpoint folder is; `wanted` takes the decision when its files are there.
+
+    Raises `CheckpointNotFound`, `UnsupportedCheckpoint` (which says what the folder is instead) or `UnreadableCheckpoint`.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise CheckpointNotFound(f"There is no checkpoint folder at '{folder}'.")
+    has_params = (folder / "params" / "_METADATA").is_file()
+    has_tensors = (folder / "config.json").is_file() and (folder / "model.safetensors").is_file()
+    if wanted is not None:
+        if not (has_params if wanted == "openpi_jax" else has_tensors):
+            content = listing(sorted(path.name for path in folder.iterdir()))
+            raise UnsupportedCheckpoint(f"'{folder}' is not in {SPOKEN[wanted]}: it holds {content}.")
+        return wanted
+    if has_params:
+        return "openpi_jax"
+    if has_tensors:
+        return _format_of_config(folder, read_json_object(folder / "config.json"))
+    raise UnsupportedCheckpoint(_what_it_is(folder))
+
+
+def _format_of_config(folder: Path, config: dict[str, Any]) -> CheckpointFormat:
+    kind = config.get("type")
+    if kind in ("pi0", "pi05"):
+        return "lerobot"
+    if kind is not None:
+        raise UnsupportedCheckpoint(
+            f"'{folder}' is a LeRobot checkpoint of another model family: type '{kind}', not pi0 or pi05."
+        )
+    family = _transformers_family(config)
+    if family is not None:
+        raise UnsupportedCheckpoint(f"'{folder}' is a checkpoint of another model family: {family}, not pi0 or pi0.5.")
+    return "openpi_torch"
+
+
+def _transformers_family(config: dict[str, Any]) -> str | None:
+    """Name the model of a transformers configuration, or None for a configuration of another kind."""
+    if "model_type" not in config and "architectures" not in config:
+        return None
+    named = [config.get("model_type"), *(config.get("architectures") or [])]
+    words = [str(word) for word in named if word]
+    for part, family in _OTHER_FAMILIES.items():
+        if any(part in word.casefold() for word in words):
+            return family
+    return f"a transformers model '{words[0] if words else 'without a name'}'"
+
+
+def _what_it_is(folder: Path) -> str:
+    """Say in one sentence why a folder is no pi checkpoint, and what to give instead where that can be seen."""
+    names = sorted(path.name for path in folder.iterdir())
+    if folder.name == "params" and "_METADATA" in names:
+        return f"'{folder}' is the params folder of a checkpoint; give its parent '{folder.parent}'."
+    inner = sorted(path.parent.parent.name for path in folder.glob("*/params/_METADATA"))
+    if inner:
+        return f"'{folder}' holds checkpoints rather than being one; give one of its folders {listing(inner)}."
+    if (folder / "pretrained_model" / "config.json").is_file():
+        return f"'{folder}' is a LeRobot training folder; give '{folder / 'pretrained_model'}'."
+    if "config.json" in names:
+        config = read_json_object(folder / "config.json")
+        if config.get("type") in ("pi0", "pi05"):
+            return f"'{folder}' is a LeRobot checkpoint without its model.safetensors: found {listing(names)}."
+        family = config.get("type") or _transformers_family(config)
+        if family:
+            return f"'{folder}' is a checkpoint of another model family: {family}, not pi0 or pi0.5."
+    if any("cosmos" in name.casefold() for name in names):
+        return f"'{folder}' is a checkpoint of another model family: Cosmos Policy, not pi0 or pi0.5."
+    return (
+        f"'{folder}' is not a pi checkpoint: expected {SPOKEN['openpi_torch']}, {SPOKEN['openpi_jax']} or "
+        f"{SPOKEN['lerobot']}, found {listing(names)}."
+    )
+
+
+def read_json_object(path: Path) -> dict[str, Any]:
+    """Read a JSON file that holds an object."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UnreadableCheckpoint(f"There is no '{path}', which the checkpoint needs.") from None
+    except (ValueError, OSError) as error:
+        raise UnreadableCheckpoint(f"'{path}' is not valid JSON ({error}).") from error
+    if not isinstance(content, dict):
+        raise UnreadableCheckpoint(f"'{path}' should hold a JSON object, but holds a {type(content).__name__}.")
+    return content

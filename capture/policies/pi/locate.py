@@ -1,0 +1,142 @@
+"""Find a checkpoint and a tokenizer: on disk, in the caches of openpi and the Hugging Face hub, or by their own clients.
+
+Downloads go where the ecosystem's own tools put them, so that nothing is fetched twice. Without a network, or without a
+client, the error says what to fetch and where to put it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+from schemas.errors import BadArgument, MissingDependency, UserError, listing
+
+_HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
+#: What a policy needs of a hub repository; nothing else is fetched.
+HUB_FILES = (
+    "config.json",
+    "model.safetensors",
+    "policy_*.json",
+    "policy_*.safetensors",
+    "assets/**",
+    "tokenizer/**",
+    "*.model",
+)
+#: What a policy needs of an openpi checkpoint; training states are several times as large.
+OPENPI_FOLDERS = ("params", "assets")
+
+TOKENIZER_NAME = "paligemma_tokenizer.model"
+TOKENIZER_URL = "gs://big_vision/paligemma_tokenizer.model"
+#: LeRobot's policies name this hub repository, whose files need a licence to be accepted.
+TOKENIZER_REPOSITORY = "google/paligemma-3b-pt-224"
+
+
+class CheckpointUnavailable(UserError, ConnectionError):
+    """A checkpoint has to be fetched and cannot be."""
+
+
+def find_checkpoint(name: str) -> Path:
+    """Return the folder of a checkpoint: a local folder, `gs://...` in openpi's cache, or `ORG/NAME` of the hub.
+
+    What is not in the cache is downloaded; `CheckpointUnavailable` or `MissingDependency` say what to do when that fails.
+    """
+    if name.startswith("gs://"):
+        return _from_openpi_cache(name.rstrip("/"))
+    path = Path(name).expanduser()
+    if not path.exists() and _HUB_NAME.fullmatch(name):
+        return _from_hub(name)
+    return path
+
+
+def openpi_cache() -> Path:
+    """The folder that openpi downloads to: OPENPI_DATA_HOME, else ~/.cache/openpi."""
+    return Path(os.environ.get("OPENPI_DATA_HOME", "~/.cache/openpi")).expanduser()
+
+
+def hub_cache() -> Path:
+    """The folder that the Hugging Face hub's client downloads to."""
+    home = os.environ.get("HF_HOME") or Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "huggingface"
+    return Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub").expanduser()
+
+
+def _from_hub(name: str) -> Path:
+    how = (
+        f"fetch it where there is a network with `hf download {name}`, copy the folder here and give its path "
+        "(there is no such local folder)"
+    )
+    try:
+        from huggingface_hub import snapshot_download
+    except ImportError as error:
+        raise MissingDependency(
+            f"'{name}' is a name on the Hugging Face hub, whose client is not installed; install it with "
+            f"`pip install 'vla-attention[hub]'`, or {how}."
+        ) from error
+    try:
+        return Path(snapshot_download(name, allow_patterns=list(HUB_FILES)))
+    except Exception as error:  # the client raises its own errors, those of its HTTP library, and OSError
+        raise CheckpointUnavailable(
+            f"'{name}' could not be fetched from the Hugging Face hub ({_first_line(error)}); {how}."
+        ) from error
+
+
+def _from_openpi_cache(url: str) -> Path:
+    target = openpi_cache() / url.removeprefix("gs://")
+    if target.is_dir():
+        return target
+    how = f"fetch it with `gsutil -m cp -r {url} {target.parent}/` (so that {target / 'params'} exists)"
+    try:
+        import gcsfs
+    except ImportError as error:
+        raise MissingDependency(
+            f"'{url}' is not in openpi's cache at '{target}', and gcsfs, which could download it, is not installed; {how}, or "
+            "`pip install gcsfs`."
+        ) from error
+    partial = target.with_name(target.name + ".partial")
+    try:
+        _download(gcsfs.GCSFileSystem(token="anon"), url, partial)
+    except Exception as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise CheckpointUnavailable(f"'{url}' could not be fetched ({_first_line(error)}); {how}.") from error
+    partial.rename(target)
+    return target
+
+
+def _download(files: Any, url: str, partial: Path) -> None:
+    """Copy the folders that a policy needs; the caller moves them into place when all are there."""
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    source = url.removeprefix("gs://")
+    present = [folder for folder in OPENPI_FOLDERS if files.exists(f"{source}/{folder}")]
+    if "params" not in present:
+        raise FileNotFoundError("there is no checkpoint with a params folder at that address")
+    for folder in present:
+        files.get(f"{source}/{folder}", str(partial / folder), recursive=True)
+
+
+def _first_line(error: BaseException) -> str:
+    text = str(error).strip()
+    return f"{type(error).__name__}: {text.splitlines()[0].rstrip('.')}" if text else type(error).__name__
+
+
+def find_tokenizer(checkpoint: Path, given: str | None) -> Path:
+    """Return the sentencepiece model: the one named, else the checkpoint's own, else that of openpi's or the hub's cache."""
+    if given is not None:
+        return Path(given).expanduser()
+    places = [
+        checkpoint / "tokenizer" / "tokenizer.model",
+        checkpoint / "tokenizer.model",
+        checkpoint / TOKENIZER_NAME,
+        openpi_cache() / TOKENIZER_URL.removeprefix("gs://"),
+    ]
+    snapshots = hub_cache() / f"models--{TOKENIZER_REPOSITORY.replace('/', '--')}" / "snapshots"
+    places += sorted(snapshots.glob("*/tokenizer.model"))
+    for place in places:
+        if place.is_file():
+            return place
+    raise BadArgument(
+        f"The checkpoint '{checkpoint}' needs PaliGemma's tokenizer and none was found at {listing(places)} or in '{snapshots}'; "
+        f"fetch {TOKENIZER_NAME} ({TOKENIZER_URL}) or tokenizer.model of {TOKENIZER_REPOSITORY}, and give --tokenizer PATH."
+    )

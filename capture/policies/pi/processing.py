@@ -1,0 +1,124 @@
+"""Between the environment and the model: what differs between the ecosystems that pi policies come from.
+
+openpi and LeRobot resize with different filters, normalise with different formulas, write different prompts and execute
+different numbers of actions. A `Processing` is all of that for one policy; `PiPolicy` is the same for both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from capture.policies.pi.config import PiConfig
+from capture.policies.pi.preprocess import NormalisationMode, NormStats, environment_actions, model_image
+from capture.policies.pi.tokenizer import PromptFormat
+
+#: Which environment camera fills which slot (openpi's LIBERO inputs); other slots are black and masked.
+CAMERA_OF_SLOT = {"base_0_rgb": "agentview", "left_wrist_0_rgb": "robot0_eye_in_hand"}
+
+#: The state that LIBERO's inputs build in both ecosystems: position, axis-angle, two finger joints.
+STATE_DIM = 8
+
+#: Actions that openpi's LIBERO client executes of each chunk.
+OPENPI_REPLAN_STEPS = 5
+
+
+class Processing(Protocol):
+    """What a policy does to observations and actions outside the model."""
+
+    @property
+    def prompt_format(self) -> PromptFormat:
+        """How instruction and state become text."""
+
+    @property
+    def cut_long_prompts(self) -> bool:
+        """Whether a prompt with more tokens than slots is cut (with a warning) or refused."""
+
+    @property
+    def environment_cameras(self) -> Mapping[str, str]:
+        """Slot of the model -> camera of the environment; slots that are not here are black and masked."""
+
+    @property
+    def default_replan_steps(self) -> int:
+        """Actions that the ecosystem's own evaluation executes of each chunk."""
+
+    def model_picture(self, frame: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], Tensor]:
+        """Return the model's image of a raw camera frame: (size, size, 3) uint8 to keep, (1, 3, size, size) in [-1, 1]."""
+
+    def normalise_state(self, state: NDArray[np.float64]) -> NDArray[np.floating]:
+        """Return the state (state,) in the model's range, not padded."""
+
+    def environment_actions(
+        self, model_actions: NDArray[np.floating], state: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the actions (horizon, 7) for the environment of the model's (horizon, action dim)."""
+
+    def provenance(self) -> dict[str, Any]:
+        """Return what identifies the processing, as plain JSON values."""
+
+
+class OpenpiProcessing:
+    """openpi's LIBERO client and server transforms.
+
+    `relative_actions`: the model was trained on differences to the state (openpi's pi0_libero), so the state is added.
+    """
+
+    def __init__(
+        self,
+        config: PiConfig,
+        norm_stats: NormStats,
+        *,
+        normalisation: NormalisationMode,
+        relative_actions: bool = False,
+        replan_steps: int = OPENPI_REPLAN_STEPS,
+    ):
+        norm_stats.check(normalisation, STATE_DIM, config.action_dim)
+        self.norm_stats = norm_stats
+        self.normalisation = normalisation
+        self.relative_actions = relative_actions
+        self.default_replan_steps = replan_steps
+        self.prompt_format: PromptFormat = "task-state-action" if config.discrete_state_input else "instruction-newline"
+        self.cut_long_prompts = True
+        self.environment_cameras: Mapping[str, str] = {
+            slot: CAMERA_OF_SLOT[slot] for slot in config.cameras if slot in CAMERA_OF_SLOT
+        }
+
+    def model_picture(self, frame: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], Tensor]:
+        """Rotate by 180°, resize with PIL's bilinear filter; uint8 all the way."""
+        image = model_image(frame, size)
+        return image, image_tensor(image)
+
+    def normalise_state(self, state: NDArray[np.float64]) -> NDArray[np.floating]:
+        """Normalise by the checkpoint's statistics."""
+        return self.norm_stats.state.normalise(state, self.normalisation)
+
+    def environment_actions(
+        self, model_actions: NDArray[np.floating], state: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Undo the normalisation, add the state where actions are relative to it, keep seven dimensions."""
+        return environment_actions(
+            model_actions.astype(np.float64),
+            self.norm_stats,
+            self.normalisation,
+            relative_to=state if self.relative_actions else None,
+        )
+
+    def provenance(self) -> dict[str, Any]:
+        """Return the ecosystem, the normalisation and what actions mean."""
+        return {
+            "processing": "openpi",
+            "normalisation": self.normalisation,
+            "relative_actions": self.relative_actions,
+            "image_resize": "PIL bilinear with antialiasing",
+        }
+
+
+def image_tensor(image: NDArray[np.uint8]) -> Tensor:
+    """Return (1, 3, height, width) float32 in [-1, 1] of an image (height, width, 3): x/255·2 - 1, as in openpi."""
+    scaled = image.astype(np.float32) / 255.0 * 2.0 - 1.0
+    return torch.from_numpy(np.ascontiguousarray(scaled.transpose(2, 0, 1)))[None]

@@ -1,0 +1,94 @@
+"""Which format a folder is in, and what is said of folders that are something else."""
+
+import json
+
+import pytest
+from pi_golden import GOLDEN
+
+from capture.policies.pi.formats import UnreadableCheckpoint, UnsupportedCheckpoint, detect_format, find_format
+from schemas.errors import UnknownName
+
+
+def make(folder, *names, config=None):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    if config is not None:
+        (folder / "config.json").write_text(json.dumps(config))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("folder", "expected"),
+    [
+        ("pi0_batch2/checkpoint", "openpi_jax"),
+        ("pi0_batch2/checkpoint_lerobot", "lerobot"),
+        ("pi05_batch2/checkpoint_openpi_torch", "openpi_torch"),
+        ("pi05_batch2/checkpoint_lerobot", "lerobot"),
+    ],
+)
+def test_golden_checkpoints_are_recognised(folder, expected):
+    assert detect_format(GOLDEN / folder) == expected
+    assert detect_format(GOLDEN / folder, expected) == expected
+
+
+def test_a_folder_in_two_formats_is_taken_as_the_user_says(tmp_path):
+    make(tmp_path, "params/_METADATA", "model.safetensors", config={"action_horizon": 10})
+    assert detect_format(tmp_path) == "openpi_jax"
+    assert detect_format(tmp_path, "openpi_torch") == "openpi_torch"
+    with pytest.raises(UnsupportedCheckpoint, match=r"not in openpi's JAX format.*it holds"):
+        detect_format(GOLDEN / "pi05_batch2" / "checkpoint_lerobot", "openpi_jax")
+
+
+def test_names_of_formats():
+    assert find_format("lerobot") == "lerobot"
+    with pytest.raises(UnknownName, match=r"Did you mean 'openpi_torch'\?"):
+        find_format("openpi_tourch")
+
+
+@pytest.mark.parametrize(
+    ("config", "family"),
+    [
+        ({"type": "act"}, "type 'act'"),
+        ({"type": "smolvla"}, "type 'smolvla'"),
+        ({"type": "pi0_fast"}, "type 'pi0_fast'"),
+        ({"model_type": "openvla", "architectures": ["OpenVLAForActionPrediction"]}, "OpenVLA"),
+        ({"architectures": ["GR00T_N1_5"]}, "GR00T"),
+        ({"model_type": "paligemma"}, "PaliGemma"),
+        ({"model_type": "llama"}, "a transformers model 'llama'"),
+        ({"architectures": []}, "without a name"),
+    ],
+)
+@pytest.mark.parametrize("weights", ["model.safetensors", "model-00001-of-00002.safetensors"])
+def test_other_families_are_named(tmp_path, config, family, weights):
+    make(tmp_path, weights, config=config)
+    with pytest.raises(UnsupportedCheckpoint, match="another model family") as caught:
+        detect_format(tmp_path)
+    assert family.removeprefix("type '").removesuffix("'") in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [
+        (["holiday.jpg"], r"expected openpi's PyTorch format.*JAX.*LeRobot's.*found holiday\.jpg"),
+        (["29999/params/_METADATA", "30000/params/_METADATA"], r"give one of its folders 29999, 30000"),
+        (["pretrained_model/config.json"], "give '.*pretrained_model'"),
+        (["Cosmos-Policy-LIBERO-Predict2-2B.pt"], "Cosmos Policy"),
+        ([], "found none"),
+    ],
+)
+def test_other_folders_get_a_hint(tmp_path, files, expected):
+    with pytest.raises(UnsupportedCheckpoint, match=expected):
+        detect_format(make(tmp_path, *files))
+
+
+def test_special_folders(tmp_path):
+    params = make(tmp_path / "a", "params/_METADATA") / "params"
+    with pytest.raises(UnsupportedCheckpoint, match="give its parent"):
+        detect_format(params)
+    with pytest.raises(UnsupportedCheckpoint, match=r"without its model\.safetensors"):
+        detect_format(make(tmp_path / "b", "train_config.json", config={"type": "pi05"}))
+    (tmp_path / "c").mkdir()
+    (make(tmp_path / "c", "model.safetensors") / "config.json").write_text("[]")
+    with pytest.raises(UnreadableCheckpoint, match="should hold a JSON object"):
+        detect_format(tmp_path / "c")

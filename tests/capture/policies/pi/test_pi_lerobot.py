@@ -1,0 +1,352 @@
+"""LeRobot checkpoints: what their files decide, what is refused, and preprocessing against what LeRobot computed."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from pi_golden import GOLDEN, make_observation
+from safetensors.torch import load_file, save_file
+
+from capture.policies.base import Policy
+from capture.policies.pi.formats import UnreadableCheckpoint, UnsupportedCheckpoint
+from capture.policies.pi.lerobot_config import UnsupportedLerobotFeature, read_lerobot_config
+from capture.policies.pi.lerobot_pipeline import LerobotNormaliser, read_lerobot_pipeline
+from capture.policies.pi.lerobot_processing import lerobot_image
+from capture.policies.pi.loading import CheckpointOptions, load_pi_policy
+from capture.policies.pi.preprocess import UnusableNormStats, libero_state
+from capture.policies.pi.strict import CheckpointMismatch
+from capture.policies.pi.tokenizer import PromptTokenizer, digitise_state
+from schemas.errors import BadArgument, UserError
+from schemas.layout import Role
+from tests.small_tokenizer import train_small_tokenizer
+
+FOLDER = GOLDEN / "lerobot_preproc"
+CASE = json.loads((FOLDER / "case.json").read_text())
+TEXT = {name: text for entry in CASE["text"] for name, [text] in entry.items()}
+MODES = {"MEAN_STD": "meanstd", "QUANTILES": "quantiles"}
+INSTRUCTION = "put the black bowl on the plate"
+
+
+@pytest.fixture(scope="module")
+def tokenizer_path(tmp_path_factory):
+    return train_small_tokenizer(tmp_path_factory.mktemp("tokenizer") / "small.model")
+
+
+@pytest.fixture(params=["pi05_batch2", "pi0_batch2"])
+def checkpoint(tmp_path, request):
+    """A copy of a golden checkpoint, with the case.json beside it that states its odd sizes."""
+    shutil.copytree(GOLDEN / request.param / "checkpoint_lerobot", tmp_path / "checkpoint")
+    shutil.copy(GOLDEN / request.param / "case.json", tmp_path)
+    return tmp_path / "checkpoint"
+
+
+def edit(path, change):
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+# --- preprocessing, number by number
+
+
+@pytest.fixture(scope="module")
+def inputs():
+    return dict(np.load(FOLDER / "inputs.npz"))
+
+
+@pytest.fixture(scope="module")
+def expected():
+    return dict(np.load(FOLDER / "expected.npz"))
+
+
+def normaliser(mode, feature):
+    statistics = {name: np.float32(values) for name, values in CASE["stats"][feature].items()}
+    return LerobotNormaliser(mode, statistics, 1e-8)
+
+
+def state_of(inputs):
+    names = ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos")
+    return libero_state(*(inputs[name][0] for name in names))
+
+
+def test_images(inputs, expected):
+    got = lerobot_image(inputs["agentview_image"][0], 224)
+    assert got.dtype == torch.float32
+    assert np.abs(got.numpy() - expected["image_slot0"]).max() <= 2 / 255
+    # in fact it is the same arithmetic
+    np.testing.assert_allclose(got.numpy(), expected["image_slot0"], rtol=0, atol=1e-6)
+
+
+def test_images_that_are_not_square_are_padded_and_those_of_the_right_size_kept():
+    wide = lerobot_image(np.full((100, 200, 3), 255, dtype=np.uint8), 50)
+    assert (wide[:, :, 12:37] == 1).all()
+    assert (wide[:, :, :12] == -1).all()
+    assert (wide[:, :, 37:] == -1).all()
+    same = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+    np.testing.assert_allclose((lerobot_image(same, 4)[0].permute(1, 2, 0) + 1) * 127.5, same[::-1, ::-1], atol=1e-4)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_numbers(inputs, expected, mode):
+    state = state_of(inputs)
+    np.testing.assert_allclose(state, expected["state8"][0], rtol=0, atol=1e-6)
+    got = normaliser(mode, "observation.state").normalise(state)
+    assert got.dtype == np.float32
+    np.testing.assert_allclose(got, expected[f"state_{MODES[mode]}"][0], rtol=0, atol=1e-6)
+    actions = normaliser(mode, "action").unnormalise(inputs["model_actions"])
+    np.testing.assert_allclose(actions, expected[f"actions_{MODES[mode]}"], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_prompts_with_state(inputs, mode, tokenizer_path):
+    state = normaliser(mode, "observation.state").normalise(state_of(inputs))
+    tokenizer = PromptTokenizer(tokenizer_path)
+    got = tokenizer.tokenize(
+        CASE["prompts"][0], max_token_len=200, state=state, prompt_format="task-state-action", cut=True
+    )
+    assert got.prompt.text == TEXT[MODES[mode]]
+    assert " ".join(map(str, digitise_state(state))) in TEXT[MODES[mode]]
+
+
+def test_pi0_prompt(tokenizer_path):
+    tokenizer = PromptTokenizer(tokenizer_path)
+    for task in (CASE["prompts"][0], CASE["prompts"][0] + "\n"):
+        got = tokenizer.tokenize(task, max_token_len=48, prompt_format="raw-instruction-newline")
+        assert got.prompt.text == TEXT["pi0_newline"]
+        assert got.prompt.instruction_text == CASE["prompts"][0]
+        assert got.roles[got.mask][-1] == Role.TEMPLATE
+    # neither stripped nor cleaned, and in one go
+    raw = tokenizer.tokenize("  put_the bowl ", max_token_len=48, prompt_format="raw-instruction-newline")
+    assert raw.prompt.text == "  put_the bowl \n"
+    assert tokenizer.tokenize("put", max_token_len=48, prompt_format="raw-instruction").prompt.text == "put"
+
+
+def test_ranges_of_zero_count_as_eps():
+    statistics = {"q01": np.float32([1, 0]), "q99": np.float32([1, 2])}
+    got = LerobotNormaliser("QUANTILES", statistics, 1e-8).normalise(np.array([1.0, 1.0]))
+    assert got.tolist() == [-1.0, 0.0]
+    np.testing.assert_array_equal(LerobotNormaliser("IDENTITY", {}, 1e-8).normalise(np.ones(2)), np.ones(2))
+
+
+# --- the whole policy
+
+
+def typed(policy) -> Policy:
+    return policy
+
+
+def test_the_files_decide_everything(checkpoint, tokenizer_path):
+    policy = typed(load_pi_policy(checkpoint, tokenizer_path))
+    pi05 = policy.name == "pi05"
+    config = policy.model.config
+    assert config.cameras == ("image", "image2", "empty_camera_0")
+    assert [(camera.slot, camera.environment_camera) for camera in policy.cameras] == [
+        ("image", "agentview"),
+        ("image2", "robot0_eye_in_hand"),
+    ]
+    assert (policy.action_horizon, policy.default_replan_steps) == ((6, 5) if pi05 else (7, 5))
+    assert (config.max_token_len, config.num_denoise_steps) == ((24, 10) if pi05 else (16, 5))
+    assert config.time_convention == "stepped"
+    facts = policy.provenance()
+    assert facts["checkpoint_format"] == "lerobot"
+    assert facts["normalisation"] == "state {0}, action {0}".format("QUANTILES" if pi05 else "MEAN_STD")
+    assert facts["prompt_format"] == ("task-state-action" if pi05 else "raw-instruction-newline")
+    assert facts["configuration"] == "case.json beside the checkpoint"
+
+    given = policy.prepare(make_observation(1), INSTRUCTION)
+    assert given.frames["image"].shape == (56, 56, 3)
+    assert (
+        np.abs(given.tensors["image:image"].numpy() * 127.5 + 127.5 - given.frames["image"].transpose(2, 0, 1)).max()
+        < 0.51
+    )
+    assert (given.tensors["image:empty_camera_0"] == -1).all()
+    assert not given.tensors["image_mask:empty_camera_0"].any()
+    actions = policy.act(given, 0)
+    assert actions.shape == (policy.action_horizon, 7)
+    assert np.isfinite(actions).all()
+
+
+def test_another_order_of_cameras_steps_and_precision(checkpoint, tokenizer_path):
+    def change(config):
+        features = config["input_features"]
+        order = ["observation.images.empty_camera_0", "observation.images.image2", "observation.images.image"]
+        config["input_features"] = {"observation.state": features["observation.state"]} | {
+            n: features[n] for n in order
+        }
+        config.update(n_action_steps=3, num_inference_steps=4, dtype="bfloat16", min_period=5e-3)
+
+    edit(checkpoint / "config.json", change)
+    policy = load_pi_policy(checkpoint, tokenizer_path)
+    assert policy.model.config.cameras == ("image2", "image", "empty_camera_0")
+    assert policy.model.dtype == torch.bfloat16
+    assert policy.default_replan_steps == 3
+    assert policy.denoise_times().tolist() == [1.0, 0.75, 0.5, 0.25]
+    assert policy.model.config.min_period == 5e-3
+    assert policy.model.paligemma_with_expert.paligemma.model.multi_modal_projector.linear.weight.dtype == torch.float32
+    assert np.isfinite(policy.act(policy.prepare(make_observation(1), INSTRUCTION), 0)).all()
+    float32 = load_pi_policy(checkpoint, tokenizer_path, options=CheckpointOptions(dtype=torch.float32))
+    assert float32.model.dtype == torch.float32
+
+
+def test_renamed_cameras_and_empty_cameras_that_only_a_number_states(checkpoint, tokenizer_path):
+    def change(config):
+        features = config["input_features"]
+        for name in ("image", "image2", "empty_camera_0"):
+            feature = features.pop(f"observation.images.{name}")
+        features |= {"observation.images.top": feature, "observation.images.wrist": feature}
+        config["empty_cameras"] = 1
+
+    edit(checkpoint / "config.json", change)
+    with pytest.raises(UnsupportedLerobotFeature, match=r"top, .*wrist.*the environment offers .*no picture"):
+        load_pi_policy(checkpoint, tokenizer_path)
+    names = {"observation.images.image": "observation.images.wrist"}
+    step = {"registry_name": "rename_observations_processor", "config": {"rename_map": names}}
+    edit(checkpoint / "policy_preprocessor.json", lambda content: content["steps"].__setitem__(0, step))
+    policy = load_pi_policy(checkpoint, tokenizer_path)
+    assert policy.model.config.cameras == ("wrist", "top", "empty_camera_0")
+    assert [camera.environment_camera for camera in policy.cameras] == ["agentview"]
+
+
+def test_older_pipelines_lack_the_relative_steps(checkpoint, tokenizer_path):
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        edit(
+            checkpoint / name,
+            lambda content: content.update(
+                steps=[s for s in content["steps"] if not s["registry_name"].startswith(("relative_", "absolute_"))]
+            ),
+        )
+    assert load_pi_policy(checkpoint, tokenizer_path)
+
+
+def test_weights_without_prefix_and_without_embed_tokens(checkpoint, tokenizer_path):
+    whole = load_pi_policy(checkpoint, tokenizer_path).provenance()["weights_digest"]
+    tensors = load_file(checkpoint / "model.safetensors")
+    table = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
+    older = {name.removeprefix("model."): tensor for name, tensor in tensors.items()}
+    older["paligemma_with_expert.paligemma.lm_head.weight"] = older.pop(table)
+    save_file(older, checkpoint / "model.safetensors")
+    assert load_pi_policy(checkpoint, tokenizer_path).provenance()["weights_digest"] == whole
+
+
+# --- refusals
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"use_visual_memory": True}, "use_visual_memory True"),
+        ({"use_proprioceptive_memory": True}, "use_proprioceptive_memory True"),
+        ({"use_relative_actions": True}, "use_relative_actions True"),
+        ({"use_peft": True}, "use_peft True"),
+        ({"rtc_config": {"enabled": True}}, "rtc_config {'enabled': True}"),
+        ({"rtc_training_max_delay": 4}, "rtc_training_max_delay 4"),
+        ({"n_obs_steps": 2}, "n_obs_steps 2"),
+        ({"use_magic": True}, "does not know.*use_magic True"),
+        ({"adapt_to_pi_aloha": "yes"}, "does not know.*adapt_to_pi_aloha 'yes'"),
+        ({"n_action_steps": 51}, "n_action_steps 51 of a chunk_size"),
+        ({"dtype": "float16"}, "supported are float32 and bfloat16"),
+        ({"image_resolution": [224, 200]}, "square"),
+        ({"image_resolution": [224, 224]}, "take images of 56 pixels"),
+        ({"chunk_size": "six"}, "chunk_size 'six'"),
+        ({"output_features": {"action": {"type": "ACTION", "shape": [14]}}}, "actions of 14 numbers.*another robot"),
+        ({"output_features": {"action": 7}}, "without types and shapes"),
+        ({"type": "act"}, "type 'act'"),
+    ],
+)
+def test_unsupported_features_are_refused_by_name(checkpoint, tokenizer_path, change, expected):
+    edit(checkpoint / "config.json", lambda content: content.update(change))
+    if expected.startswith("actions of 14"):  # statistics are checked first: leave them out of it
+        for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+            edit(checkpoint / name, lambda c: [s["config"].update(norm_map={"ACTION": "IDENTITY"}) for s in c["steps"]])
+    with pytest.raises((UnsupportedCheckpoint, CheckpointMismatch), match=expected) as caught:
+        load_pi_policy(checkpoint, tokenizer_path)
+    assert isinstance(caught.value, UserError)
+    assert "\n" not in str(caught.value)
+
+
+def test_settings_that_are_off_or_belong_to_training_are_no_obstacle(checkpoint):
+    edit(checkpoint / "config.json", lambda content: content.update(use_magic=False, new=None, optimizer_fused=True))
+    assert read_lerobot_config(checkpoint).cameras
+
+
+def step_of(content, name):
+    return next(step for step in content["steps"] if step["registry_name"] == name)
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "expected"),
+    [
+        ("pre", lambda c: c["steps"].append({"registry_name": "crop_processor"}), "not supported: 'crop_processor'"),
+        ("pre", lambda c: c["steps"].append({"class": "my.Step"}), "not supported: 'my.Step'"),
+        ("pre", lambda c: c["steps"].append(step_of(c, "tokenizer_processor")), "tokenizer_processor twice"),
+        ("pre", lambda c: step_of(c, "relative_actions_processor")["config"].update(enabled=True), "relative"),
+        ("post", lambda c: step_of(c, "absolute_actions_processor")["config"].update(enabled=True), "relative"),
+        ("pre", lambda c: step_of(c, "tokenizer_processor")["config"].update(padding_side="left"), "padding_side 'left'"),
+        ("pre", lambda c: step_of(c, "tokenizer_processor")["config"].update(max_length=99), "max_length 99"),
+        ("pre", lambda c: step_of(c, "normalizer_processor")["config"]["norm_map"].update(STATE="MIN_MAX"), "MIN_MAX"),
+        ("pre", lambda c: step_of(c, "normalizer_processor")["config"]["norm_map"].update(VISUAL="MEAN_STD"), "images by"),
+        ("post", lambda c: c["steps"].pop(0), "no step unnormalizer_processor"),
+        ("pre", lambda c: step_of(c, "normalizer_processor").update(state_file="../x.safetensors"), "not there"),
+        ("pre", lambda c: step_of(c, "normalizer_processor").pop("state_file"), "not there"),
+        ("pre", lambda c: c.update(steps=[s for s in c["steps"] if "new_line" not in s["registry_name"]
+                                          and "prepare_state" not in s["registry_name"]]), "makes its prompt|^$"),
+    ],
+)  # fmt: skip
+def test_unsupported_pipelines_are_refused_by_name(checkpoint, file, change, expected):
+    edit(checkpoint / f"policy_{file}processor.json", change)
+    config = read_lerobot_config(checkpoint)
+    if expected.startswith("makes its prompt") and not config.pi05:
+        # a pi0 pipeline without the step gives the bare instruction
+        assert not read_lerobot_pipeline(checkpoint, config).new_line
+        return
+    with pytest.raises(UserError, match=expected):
+        read_lerobot_pipeline(checkpoint, config)
+
+
+def test_missing_damaged_and_misshapen_statistics(checkpoint):
+    config = read_lerobot_config(checkpoint)
+    [state_file] = checkpoint.glob("policy_preprocessor_step_*.safetensors")
+    key = "observation.state.q01" if config.pi05 else "observation.state.mean"
+    tensors = load_file(state_file)
+    save_file({**tensors, key: tensors[key][:7].clone()}, state_file)
+    with pytest.raises(UnusableNormStats, match=rf"{key}' .* shape \(7,\); 8 numbers are needed"):
+        read_lerobot_pipeline(checkpoint, config)
+    save_file({name: tensor for name, tensor in tensors.items() if name != key}, state_file)
+    with pytest.raises(UnusableNormStats, match=f"lacks {key}"):
+        read_lerobot_pipeline(checkpoint, config)
+    state_file.write_bytes(state_file.read_bytes()[:100])
+    with pytest.raises(UnreadableCheckpoint, match="damaged"):
+        read_lerobot_pipeline(checkpoint, config)
+    state_file.unlink()
+    with pytest.raises(UnusableNormStats, match="not there"):
+        read_lerobot_pipeline(checkpoint, config)
+    (checkpoint / "policy_postprocessor.json").unlink()
+    with pytest.raises(UnsupportedCheckpoint, match=r"no policy_postprocessor\.json"):
+        read_lerobot_pipeline(checkpoint, config)
+
+
+def test_the_type_must_be_that_of_the_tensors(checkpoint, tokenizer_path):
+    pi05 = read_lerobot_config(checkpoint).pi05
+    other = GOLDEN / ("pi0_batch2" if pi05 else "pi05_batch2") / "checkpoint_lerobot" / "model.safetensors"
+    shutil.copy(other, checkpoint / "model.safetensors")
+    with pytest.raises(CheckpointMismatch, match="its tensors are those of pi0"):
+        load_pi_policy(checkpoint, tokenizer_path)
+
+
+def test_sizes_that_only_a_case_file_states(checkpoint, tokenizer_path, tmp_path):
+    (tmp_path / "case.json").rename(tmp_path / "sizes.json")
+    with pytest.raises(CheckpointMismatch, match=r"32 wide.*case\.json beside its folder, or --model-config"):
+        load_pi_policy(checkpoint, tokenizer_path)
+    options = CheckpointOptions(model_config=tmp_path / "sizes.json")
+    assert (
+        load_pi_policy(checkpoint, tokenizer_path, options=options).provenance()["configuration"].endswith("sizes.json")
+    )
+    for contradiction in (
+        CheckpointOptions(config_name="pi05_libero"),
+        CheckpointOptions(discrete_state_input=True),
+        CheckpointOptions(config_name="pi05_libero", model_config=tmp_path / "sizes.json"),
+    ):
+        with pytest.raises(BadArgument):
+            load_pi_policy(checkpoint, tokenizer_path, options=contradiction)

@@ -1,0 +1,207 @@
+"""Checkpoints through the real command line: each format drives the simulator, and each mistake ends with one sentence."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from safetensors.torch import load_file, save_file
+
+from analyze.__main__ import main as analyze
+from capture.__main__ import main as capture
+from capture.policies.pi.embedded import TOKENIZER_PATH
+from schemas.errors import listing
+from tests.small_tokenizer import train_small_tokenizer
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "pi"
+#: folder -> what the manifest says of it: format, prompt, normalisation, executed actions
+CHECKPOINTS = {
+    "pi0_batch2/checkpoint": ("openpi_jax", "instruction-newline", "z-score"),
+    "pi0_batch2/checkpoint_lerobot": ("lerobot", "raw-instruction-newline", "state MEAN_STD, action MEAN_STD"),
+    "pi05_batch2/checkpoint_openpi_torch": ("openpi_torch", "instruction-newline", "quantile"),
+    "pi05_batch2/checkpoint_lerobot": ("lerobot", "task-state-action", "state QUANTILES, action QUANTILES"),
+}
+
+
+@pytest.fixture(scope="session")
+def small_tokenizer(tmp_path_factory) -> Path:
+    return train_small_tokenizer(tmp_path_factory.mktemp("tokenizer") / "small.model")
+
+
+@pytest.mark.simulator
+@pytest.mark.parametrize("name", CHECKPOINTS)
+def test_a_checkpoint_drives_the_simulator_and_its_store_is_analysed(name, small_tokenizer, tmp_path, capsys):
+    store = tmp_path / "store.zarr"
+    arguments = [
+        "--tokenizer",
+        small_tokenizer,
+        "--task-id",
+        0,
+        "--num-episodes",
+        1,
+        "--max-steps",
+        7,
+        "--store",
+        store,
+    ]
+    assert capture(["pi", "--checkpoint", str(GOLDEN / name), *map(str, arguments)]) == 0
+    said = capsys.readouterr()
+    checkpoint_format, prompt, normalisation = CHECKPOINTS[name]
+    assert f"in format {checkpoint_format}" in said.out
+    assert "of which 5 are executed" in said.out
+    # the state does not fit into this model's 24 text slots: LeRobot cuts it, visibly
+    assert ("Warning: the prompt" in said.err) == (prompt == "task-state-action")
+
+    attributes = dict(zarr.open_group(store, mode="r").attrs)
+    policy = attributes["policy"]
+    assert policy["checkpoint_format"] == checkpoint_format
+    assert policy["family"] == name.split("_")[0]
+    assert len(policy["digest"]) == 64
+    assert policy["untrained"] is False
+    facts = policy["config"]
+    assert facts["prompt_format"] == prompt
+    assert facts["normalisation"] == normalisation
+    assert facts["configuration"] == "case.json beside the checkpoint"
+    assert facts["dtype"] == "float32"
+    assert facts["config"]["siglip"]["image_size"] == 56
+    assert attributes["protocol"]["replan_steps"] == 5
+
+    episode = zarr.open_group(store / "episodes/task000_episode000", mode="r")
+    camera = policy["cameras"][0]["name"]
+    assert episode[f"frames/{camera}"].shape == (2, 56, 56, 3)
+    assert np.isfinite(episode["joint/rows"][:]).all()
+    np.testing.assert_allclose(episode["joint/row_sum"][:], 1, atol=1e-5)
+    if prompt == "task-state-action":
+        prompt_read = dict(episode.attrs)["prompts"][0]
+        assert prompt_read["pieces"][-1]["stop"] < len(prompt_read["text"])
+    assert analyze([str(store), "--output", str(tmp_path / "results"), "--no-plots"]) == 0
+    assert analyze(["verify", str(store)]) == 0
+
+
+def test_the_three_formats_of_one_model_have_one_digest(small_tokenizer):
+    from capture.policies.pi.loading import load_pi_policy
+
+    digests = {
+        load_pi_policy(GOLDEN / name, small_tokenizer).provenance()["weights_digest"]
+        for name in CHECKPOINTS
+        if name.startswith("pi0_")
+    }
+    assert len(digests) == 1
+
+
+# --- what a person can get wrong
+
+
+def refused(arguments, capsys) -> str:
+    code = capture(["pi", *map(str, arguments)])
+    said = capsys.readouterr().err.strip()
+    assert code == 2, said
+    assert "\n" not in said, said
+    assert "Traceback" not in said
+    return said
+
+
+def copied(name: str, folder: Path) -> Path:
+    """A copy of a golden checkpoint, with its case.json beside it."""
+    shutil.copytree(GOLDEN / name, folder / "checkpoint")
+    shutil.copy(GOLDEN / name.split("/")[0] / "case.json", folder)
+    return folder / "checkpoint"
+
+
+def edit_json(path: Path, change) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def drop_largest(folder: Path) -> None:
+    max((file for file in folder.rglob("*") if file.is_file()), key=lambda file: file.stat().st_size).unlink()
+
+
+def shorten(path: Path) -> None:
+    def change(content):
+        for key, numbers in content["norm_stats"]["state"].items():
+            content["norm_stats"]["state"][key] = numbers[:7]
+
+    edit_json(path, change)
+
+
+def misname(path: Path) -> None:
+    tensors = load_file(path)
+    tensors["something.else"] = tensors.pop("time_mlp_in.bias")
+    tensors["action_in_proj.bias"] = tensors["action_in_proj.bias"][:5].clone()
+    save_file(tensors, path)
+
+
+STATS = "assets/physical-intelligence/libero/norm_stats.json"
+TORCH, JAX, LEROBOT = "pi05_batch2/checkpoint_openpi_torch", "pi0_batch2/checkpoint", "pi05_batch2/checkpoint_lerobot"
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil", "expected"),
+    [
+        (TORCH, lambda c: truncate(c / "model.safetensors"), ["model.safetensors", "damaged or its copy incomplete"]),
+        (LEROBOT, lambda c: truncate(c / "model.safetensors"), ["damaged or its copy incomplete"]),
+        (JAX, lambda c: drop_largest(c / "params"), ["files are missing or damaged"]),
+        (JAX, lambda c: (c / "params/manifest.ocdbt").unlink(), ["files are missing or damaged"]),
+        (TORCH, lambda c: misname(c / "model.safetensors"),
+         ["1 missing: time_mlp_in.bias", "1 extra: something.else", "1 of the wrong shape: action_in_proj.bias is (5,)"]),
+        (TORCH, lambda c: shorten(c / STATS), ["'state' have 7 numbers; 8 are needed"]),
+        (JAX, lambda c: (c / STATS).unlink(), ["no norm_stats.json"]),
+        (LEROBOT, lambda c: edit_json(c / "config.json", lambda j: j.update(use_peft=True)), ["use_peft True"]),
+        (LEROBOT, lambda c: edit_json(c / "config.json", lambda j: j.update(type="smolvla")), ["another model family", "smolvla"]),
+        (TORCH, lambda c: edit_json(c / "config.json", lambda j: j.update(model_type="openvla")), ["OpenVLA"]),
+        (LEROBOT, lambda c: (c / "policy_preprocessor.json").unlink(), ["no policy_preprocessor.json"]),
+        (TORCH, lambda c: (c / "model.safetensors").unlink(), ["is not a pi checkpoint", "found assets, config.json"]),
+        (TORCH, lambda c: (c.parent / "case.json").unlink(), ["32 wide", "--model-config PATH"]),
+        (JAX, lambda c: (c.parent / "case.json").unlink(), ["tensors are not those of the model"]),
+        (JAX, lambda c: edit_json(c.parent / "case.json", lambda j: j["config"]["paligemma"].update(width=128)), ["wrong shape"]),
+    ],
+)  # fmt: skip
+def test_spoiled_checkpoints(name, spoil, expected, small_tokenizer, tmp_path, capsys):
+    checkpoint = copied(name, tmp_path)
+    spoil(checkpoint)
+    store = tmp_path / "a.zarr"
+    said = refused(["--checkpoint", checkpoint, "--tokenizer", small_tokenizer, "--store", store], capsys)
+    for words in expected:
+        assert words in said
+    assert not store.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--paligemma-variant", "gemma_300m"], "contradicts the policy"),
+        (["--action-expert-variant", "dummy"], "contradicts the policy"),
+        (["--num-image-tokens", "256"], "16 keys; leave the option out"),
+        (["--checkpoint-format", "lerobot"], "not in LeRobot's format"),
+        (["--config-name", "pi0_libero"], "tensors are not those of the model"),
+        (["--model-config", "none.json"], "There is no 'none.json'"),
+        (["--discrete-state-input"], "is for pi0.5"),
+        (["--tokenizer", "none.model"], "There is no tokenizer file"),
+        (["--tokenizer", str(TOKENIZER_PATH)], "the model 'pi0' knows 300: it is another model's tokenizer"),
+        (["--replan-steps", "8"], "expected 1 to 7"),
+    ],
+)
+def test_arguments_that_contradict_a_checkpoint(arguments, expected, small_tokenizer, tmp_path, capsys):
+    said = refused(
+        ["--checkpoint", GOLDEN / JAX, "--tokenizer", small_tokenizer, "--store", tmp_path / "a.zarr", *arguments],
+        capsys,
+    )
+    assert expected in said
+
+
+def test_a_checkpoint_without_a_tokenizer(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("OPENPI_DATA_HOME", str(tmp_path))
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
+    said = refused(["--checkpoint", GOLDEN / JAX, "--store", tmp_path / "a.zarr"], capsys)
+    assert "give --tokenizer PATH" in said
+    assert listing([GOLDEN / JAX / "tokenizer" / "tokenizer.model"]) in said
