@@ -76,6 +76,9 @@ def _expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dic
         shapes[f"{site.name}/row_sum"] = cells
         shapes[f"{site.name}/atoms"] = (*cells, len(attributes.segments.get(site.name, ())))
         shapes[f"{site.name}/key_role"] = (replans, site.num_keys)
+        if recording.contributions:
+            parts = len(attributes.segments.get(site.name, ())) + 1
+            shapes[f"{site.name}/contribution"] = (*cells[:3], parts, parts)
         shapes[f"{site.name}/layer"] = (len(recording.layers),)
         shapes[f"{site.name}/denoise"] = (len(recording.denoise_steps),)
         shapes[f"{site.name}/head"] = (len(recording.heads),)

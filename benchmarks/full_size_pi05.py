@@ -141,7 +141,7 @@ def load_and_run(folder: Path, checkpoint_format: str, dtype: str) -> dict[str, 
     plan = RecordingPlan(tuple(range(18)), (0, 9), tuple(range(8)), "mean", "joint")
     recorder = AttentionRecorder(plan, policy.sites[0].num_keys)
     begun = time.perf_counter()
-    actions = policy.act(given, 0, recorder)
+    actions = policy.act(given, 0, {"joint": recorder})
     replan = time.perf_counter() - begun
     assert np.isfinite(actions).all()
     assert np.allclose(recorder.finish().row_sum, 1, atol=1e-3)

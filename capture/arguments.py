@@ -157,6 +157,12 @@ def _add_recording_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"mantissa bits kept of each probability, or 'exact' (default: {DEFAULT_MANTISSA_BITS}, "
         "which bounds the error of every ratio by 0.1 %%)",
     )
+    attention.add_argument(
+        "--contributions",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="also record what each part of the keys adds to the residual stream, value-weighted (default: yes)",
+    )
     attention.add_argument("--no-frames", action="store_true", help="do not store the model's input images")
 
 
@@ -201,6 +207,7 @@ def run_settings(arguments: argparse.Namespace) -> RunSettings:
             queries=arguments.queries,
             mantissa_bits=parse_precision(arguments.precision),
             frames=not arguments.no_frames,
+            contributions=arguments.contributions,
         ),
     )
 

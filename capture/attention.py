@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from capture.contributions import Projection, gram_matrix, part_contributions
+from capture.contributions import Projection, gram_matrix, keys_of_parts, part_contributions
 from schemas.errors import BadArgument
 
 #: What the reference puts in place of the logits of masked keys: so low that their probability is exactly 0.
@@ -132,6 +132,7 @@ class AttentionRecorder(RowCollector):
     parts: np.ndarray | None = None
     _rows: dict[tuple[int, int], list[Tensor]] = field(default_factory=dict, init=False, repr=False)
     _grams: dict[tuple[int, int], list[Tensor]] = field(default_factory=dict, init=False, repr=False)
+    _keys_of_parts: list[slice | Tensor] | None = field(default=None, init=False, repr=False)
     #: All heads' rows of the call whose update is awaited.
     _awaited: Tensor | None = field(default=None, init=False, repr=False)
 
@@ -156,12 +157,14 @@ class AttentionRecorder(RowCollector):
         """Return the function that takes the update of this call, or None when contributions are not asked for."""
         if self.parts is None or not self.wants(layer, denoise_step):
             return None
-        parts = torch.from_numpy(self.parts)
+        members = self.parts
 
         def take(values: Tensor, project: Projection, update: Tensor) -> None:
             if self._awaited is None:
                 raise SiteNotRecorded(f"Layer {layer} gave an update before its rows.")
-            each = part_contributions(self._awaited, values[0], parts.to(values.device), project)
+            if self._keys_of_parts is None:
+                self._keys_of_parts = keys_of_parts(members, values.device)
+            each = part_contributions(self._awaited, values[0], self._keys_of_parts, project)
             gram = gram_matrix(each, update[0, action_queries])
             self._grams.setdefault((layer, denoise_step), []).append(gram)
             self._awaited = None

@@ -9,38 +9,50 @@ recording leaves out can be checked: over all other parts, 1ᵀ G 1 is the updat
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 #: The name of the last part.
 UPDATE = "update"
 
-#: Maps mixed values (query, head · dim) to the residual stream (query, width): output projection, and gate if there is one.
+#: Maps mixed values (any, head · dim) to the residual stream (any, width): output projection, and gate if there is one.
 Projection = Callable[[Tensor], Tensor]
 
 
-def part_contributions(rows: Tensor, values: Tensor, members: Tensor, project: Projection) -> Tensor:
+def keys_of_parts(members: NDArray[np.bool_], device: torch.device) -> list[slice | Tensor]:
+    """Return the keys of each part, for indexing a key axis; members is (key, part) bool. Most parts are one run of keys."""
+    parts: list[slice | Tensor] = []
+    for part in range(members.shape[1]):
+        keys = np.flatnonzero(members[:, part])
+        if keys.size and keys[-1] - keys[0] + 1 == keys.size:
+            parts.append(slice(int(keys[0]), int(keys[-1]) + 1))
+        else:
+            parts.append(torch.from_numpy(keys).to(device))
+    return parts
+
+
+def part_contributions(rows: Tensor, values: Tensor, parts: Sequence[slice | Tensor], project: Projection) -> Tensor:
     """Return the contribution of each part of the keys to each query, (query, part, width) float32.
 
     Args:
         rows: (head, query, key) float32 probabilities, all heads.
         values: (kv_head, key, dim); head h reads the key/value head h // (heads / kv_heads).
-        members: (key, part) bool, which keys a part has; parts are disjoint.
-        project: applied to (query, head · dim) float32.
+        parts: the keys of each part, from `keys_of_parts`; parts are disjoint.
+        project: applied to (query · part, head · dim) float32.
     """
-    heads, queries, _ = rows.shape
-    shared = heads // values.shape[0]
+    heads, queries, keys = rows.shape
+    kv_heads, _, dim = values.shape
+    # The heads that share a key/value head become further queries of it: values are never repeated.
+    shared = rows.reshape(kv_heads, heads // kv_heads * queries, keys)
     values = values.float()
-    parts = []
-    for part in range(members.shape[1]):
-        keys = members[:, part].nonzero().squeeze(-1)
-        # (kv_head, shared · query, key) x (kv_head, key, dim): values are never repeated over the heads that share them.
-        chosen = rows.index_select(2, keys).reshape(values.shape[0], shared * queries, -1)
-        mixed = torch.matmul(chosen, values.index_select(1, keys)).view(heads, queries, -1)
-        parts.append(project(mixed.transpose(0, 1).flatten(1)).float())
-    return torch.stack(parts, dim=1)
+    mixed = torch.stack([torch.matmul(shared[:, :, part], values[:, part]) for part in parts])
+    # (part, kv_head, shared head · query, dim) to (query, part, head · dim), so that one product projects everything.
+    mixed = mixed.view(len(parts), heads, queries, dim).permute(2, 0, 1, 3).reshape(queries * len(parts), heads * dim)
+    return project(mixed).float().view(queries, len(parts), -1)
 
 
 def gram_matrix(contributions: Tensor, update: Tensor) -> Tensor:

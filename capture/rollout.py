@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,8 @@ from capture.noise import noise_seed
 from capture.policies.base import Policy
 from capture.store_writer import EpisodeStart, EpisodeWriter, ReplanRecord, RunStore
 from schemas.errors import BadArgument
+from schemas.layout import SiteLayout
+from schemas.segments import segment_members, segments_of
 from schemas.store import Protocol, Recording
 
 #: Called after each replan with (environment steps done, most steps of the episode).
@@ -101,11 +103,17 @@ def run_episode(
     return EpisodeResult(task.task_id, episode_index, success, step, replans, folder)
 
 
-def recording_plans(recording: Recording, policy: Policy) -> Iterator[tuple[str, AttentionRecorder]]:
-    """Fresh recorders for one replan, one per site."""
-    for site in policy.sites:
+def make_recorders(
+    recording: Recording, sites: Sequence[SiteLayout], key_role: Mapping[str, NDArray[np.uint8]]
+) -> dict[str, AttentionRecorder]:
+    """Fresh recorders for one replan, one per site; contributions are those of the replan's own segments."""
+    recorders: dict[str, AttentionRecorder] = {}
+    for site in sites:
         plan = RecordingPlan(recording.layers, recording.denoise_steps, recording.heads, recording.queries, site.name)
-        yield site.name, AttentionRecorder(plan, site.num_keys)
+        roles = key_role[site.name]
+        parts = segment_members(site, roles[None], segments_of(site, roles))[0] if recording.contributions else None
+        recorders[site.name] = AttentionRecorder(plan, site.num_keys, parts)
+    return recorders
 
 
 def _wait(environment: Environment, steps: int) -> Observation:
@@ -130,9 +138,8 @@ def _replan(
     protocol, recording = store.attributes.protocol, store.attributes.recording
     policy_input = policy.prepare(observation, task.instruction)
     seed = noise_seed(protocol.seed, task.task_id, episode_index, len(writer.records))
-    (site, recorder), *others = recording_plans(recording, policy)
-    assert not others, "pi has one site"
-    actions = policy.act(policy_input, seed, recorder)
+    recorders = make_recorders(recording, policy.sites, policy_input.key_role)
+    actions = policy.act(policy_input, seed, recorders)
     coverage = {
         camera.slot: patch_coverage(
             environment.segmentation(camera.environment_camera),
@@ -147,8 +154,8 @@ def _replan(
         ReplanRecord(
             env_step=protocol.wait_steps + step,
             noise_seed=seed,
-            rows={site: recorder.finish()},
-            key_role={site: policy_input.key_role},
+            rows={site: recorder.finish() for site, recorder in recorders.items()},
+            key_role=policy_input.key_role,
             prompt=policy_input.prompt,
             state=policy_input.state,
             actions=actions,

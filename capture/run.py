@@ -34,6 +34,7 @@ class RecordingSettings:
     queries: str = "mean"
     mantissa_bits: int = 10
     frames: bool = True
+    contributions: bool = True
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,7 @@ def plan_recording(settings: RecordingSettings, policy: Policy) -> tuple[Recordi
         num_action_queries=policy.num_action_queries,
         mantissa_bits=settings.mantissa_bits,
         frames=settings.frames,
+        contributions=settings.contributions,
     )
     return recording, layers.note
 

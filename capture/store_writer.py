@@ -32,6 +32,7 @@ from schemas.precision import round_mantissa
 from schemas.segments import Segment, merge_segments, segment_masses, segment_members, segments_of
 from schemas.store import (
     ATOM_AXES,
+    CONTRIBUTION_AXES,
     EPISODES_GROUP,
     PARTIAL_SUFFIX,
     ROW_AXES,
@@ -408,6 +409,7 @@ class _SiteWriter:
         self.row_sums: list[NDArray[np.float32]] = []
         self.roles: list[NDArray[np.uint8]] = []
         self.masses: list[tuple[tuple[Segment, ...], NDArray[np.float32]]] = []
+        self.contributions: list[NDArray[np.float32]] = []
         self.segments: tuple[Segment, ...] = ()
         episode.group.create_group(layout.name)
 
@@ -424,6 +426,7 @@ class _SiteWriter:
             )
         segments = segments_of(self.layout, key_role)
         members = segment_members(self.layout, key_role[None], segments)[0]
+        self._take_contribution(recorded.contribution, len(segments))
         # Atoms and sums come from the rows as computed, before rounding: what storage takes away stays known.
         self.masses.append((segments, segment_masses(recorded.rows, members)))
         self.row_sums.append(recorded.row_sum)
@@ -431,6 +434,18 @@ class _SiteWriter:
         self.pending.append(round_mantissa(recorded.rows, self.bits))
         if len(self.pending) == self.block:
             self._flush()
+
+    def _take_contribution(self, gram: NDArray[np.float32] | None, num_segments: int) -> None:
+        wanted = self.episode.store.attributes.recording.contributions
+        expected = (*self.shape[:2], num_segments + 1, num_segments + 1) if wanted else None
+        if (None if gram is None else gram.shape) != expected:
+            raise ValueError(
+                f"site '{self.layout.name}' gave contributions {None if gram is None else gram.shape}, expected {expected}"
+            )
+        if gram is not None:
+            if not np.isfinite(gram).all():
+                raise ValueError(f"site '{self.layout.name}' gave contributions that are not all finite")
+            self.contributions.append(gram)
 
     def _flush(self) -> None:
         rows = np.stack(self.pending)
@@ -459,6 +474,8 @@ class _SiteWriter:
         for replan, (segments, masses) in enumerate(self.masses):
             atoms[replan][..., [column[segment] for segment in segments]] = masses
         episode.write(f"{name}/atoms", atoms, ATOM_AXES)
+        if self.contributions:
+            self._write_contributions(column)
         episode.write(f"{name}/row_sum", np.stack(self.row_sums), ROW_AXES[:-1])
         episode.write(f"{name}/key_role", np.stack(self.roles), ("replan", "key"))
         recording = episode.store.attributes.recording
@@ -468,6 +485,15 @@ class _SiteWriter:
             ("head", recording.heads),
         ):
             episode.write(f"{name}/{axis}", np.array(numbers, dtype=np.int32), (axis,))
+
+    def _write_contributions(self, column: dict[Segment, int]) -> None:
+        size = len(column) + 1
+        grams = np.zeros((self.num_written, *self.shape[:2], size, size), dtype=np.float32)
+        for replan, ((segments, _), gram) in enumerate(zip(self.masses, self.contributions, strict=True)):
+            # A segment that a replan does not have contributes nothing there; the update is the last part.
+            at = [*(column[segment] for segment in segments), size - 1]
+            grams[replan][..., np.ix_(at, at)[0], np.ix_(at, at)[1]] = gram
+        self.episode.write(f"{self.layout.name}/contribution", grams, CONTRIBUTION_AXES)
 
 
 def _process_tag() -> str:

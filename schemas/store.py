@@ -35,6 +35,8 @@ PARTIAL_SUFFIX = ".partial"
 
 ROW_AXES = ("replan", "layer", "denoise", "head", "query", "key")
 ATOM_AXES = (*ROW_AXES[:-1], "segment")
+#: Parts are the episode's segments in order, then the block's whole attention update.
+CONTRIBUTION_AXES = ("replan", "layer", "denoise", "part", "other_part")
 
 _EPISODE_NAME = re.compile(r"task(\d{3,})_episode(\d{3,})$")
 
@@ -69,7 +71,8 @@ class Recording:
 
     `layers` are block indices; `layer_labels` are the numbers that the user typed for them (the same unless the
     reference's recorded-call numbers were used). `queries` is `mean` (over the action queries) or `all`.
-    `mantissa_bits` is the precision of the rows (23 = exact).
+    `mantissa_bits` is the precision of the rows (23 = exact). `contributions`: the Gram matrix of value-weighted contributions,
+    mean over the action queries, is recorded too.
     """
 
     layers: tuple[int, ...]
@@ -80,6 +83,7 @@ class Recording:
     num_action_queries: int
     mantissa_bits: int
     frames: bool = True
+    contributions: bool = False
 
 
 @dataclass(frozen=True)

@@ -39,12 +39,13 @@ class PolicyCamera:
 class PolicyInput:
     """One observation and instruction, ready for the model.
 
-    frames: slot -> (height, width, 3) uint8, the images as the model sees them. key_role: (key,) uint8 codes of `Role`.
+    frames: slot -> (height, width, 3) uint8, the images as the model sees them. key_role: site -> (key,) uint8 codes of
+    `Role`.
     state: (8,) float64, not normalised. tensors: what the model takes, by its own names, batch 1.
     """
 
     frames: Mapping[str, NDArray[np.uint8]]
-    key_role: NDArray[np.uint8]
+    key_role: Mapping[str, NDArray[np.uint8]]
     prompt: Prompt
     state: NDArray[np.float64]
     tensors: Mapping[str, Tensor]
@@ -99,9 +100,12 @@ class Policy(Protocol):
         """Turn an observation and an instruction into the model's input."""
 
     def act(
-        self, policy_input: PolicyInput, noise_seed: int, recorder: RowCollector | None = None
+        self, policy_input: PolicyInput, noise_seed: int, recorders: Mapping[str, RowCollector] | None = None
     ) -> NDArray[np.float64]:
-        """Return the action chunk (horizon, 7) for the environment. The same seed gives the same noise anywhere."""
+        """Return the action chunk (horizon, 7) for the environment. The same seed gives the same noise anywhere.
+
+        `recorders`: for each site whose rows are wanted, where they go.
+        """
 
 
 def camera_frame(observation: Observation, camera: str) -> NDArray[np.uint8]:

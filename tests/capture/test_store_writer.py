@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from capture.store_arrays import replans_per_block, write_whole
 from capture.store_writer import open_run
 from schemas import store as contract
 from schemas.json_files import FOLDER
+from schemas.layout import Role
 from schemas.precision import mass_error_bound
 from schemas.segments import segment_members
 from tests.store_kit import StoreSpec, denoise_times, episode_records, root_attributes, write_episode, write_store
@@ -273,6 +275,25 @@ def test_tensorstore_reads_it(written):
         array = tensorstore.open({"driver": "zarr3", "kvstore": file_store}, read=True).result()
         assert tuple(array.domain.labels) == tuple(episode.array(name).metadata.dimension_names), name  # type: ignore[union-attr]
         assert (array.read().result() == episode.read(name)).all(), name
+
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "store.md"
+
+
+@pytest.mark.parametrize("example", re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL))
+def test_the_examples_of_the_documentation_run(written, tmp_path, monkeypatch, capsys, example):
+    (tmp_path / "run.zarr").symlink_to(written[0])
+    monkeypatch.chdir(tmp_path)
+    exec(compile(example, str(DOCUMENT), "exec"), {})
+    assert len(capsys.readouterr().out) > 10
+
+
+def test_the_documentation_lists_every_array_and_role(written):
+    text = DOCUMENT.read_text(encoding="utf-8")
+    for name in open_store(written[0]).episodes[0].attributes.arrays:
+        assert name.rpartition("/")[2] in text or "frames" in name or "objects" in name, name
+    for role in Role:
+        assert f"{role.value} {role.label}" in text
 
 
 def test_a_store_has_no_code_and_no_objects(written):

@@ -209,6 +209,18 @@ def test_recording_does_not_change_what_the_robot_does(captured_store, run_captu
     assert np.array_equal(one[:, 0, 0, 0], full[:, 1, 1, 3])
 
 
+def test_contributions_of_the_segments_add_up_to_the_update(captured_store):
+    episode = zarr.open_group(captured_store / "episodes/task001_episode000", mode="r")
+    gram = episode["joint/contribution"][:].astype(np.float64)
+    names = [f"{part['span']}:{part['role']}" for part in episode.attrs["segments"]["joint"]]
+    assert gram.shape[-2:] == (len(names) + 1, len(names) + 1)
+    np.testing.assert_allclose(gram[..., :-1, :-1].sum((-2, -1)), gram[..., -1, -1], rtol=1e-3)
+    masked = [i for i, name in enumerate(names) if "masked" in name or "padding" in name]
+    assert masked
+    assert not gram[..., masked, :].any()
+    assert (np.linalg.eigvalsh(gram) > -1e-4 * gram[..., -1:, -1]).all()
+
+
 def test_output_dir_and_save_viz_run_the_analysis_too(run_capture, tmp_path):
     run_capture("--task-id", 0, "--num-episodes", 1, "--output-dir", tmp_path, "--save-viz", "--layers", 2)
     assert (tmp_path / "robosuite.zarr" / "zarr.json").is_file()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
@@ -157,7 +158,9 @@ class PiPolicy:
             tensors[f"image:{camera}"] = (pictures[camera][1] if camera in pictures else black).to(device)
             tensors[f"image_mask:{camera}"] = torch.tensor([camera in pictures], device=device)
         frames = {slot: frame for slot, (frame, _) in pictures.items()}
-        return PolicyInput(frames=frames, key_role=key_role, prompt=tokenized.prompt, state=state, tensors=tensors)
+        return PolicyInput(
+            frames=frames, key_role={layout.name: key_role}, prompt=tokenized.prompt, state=state, tensors=tensors
+        )
 
     def _warn_of_cut(self, tokenized: TokenizedPrompt, instruction: str) -> None:
         """Say once per instruction that its prompt was cut; the store shows it too, as a text longer than its pieces."""
@@ -174,7 +177,7 @@ class PiPolicy:
         )
 
     def act(
-        self, policy_input: PolicyInput, noise_seed: int, recorder: RowCollector | None = None
+        self, policy_input: PolicyInput, noise_seed: int, recorders: Mapping[str, RowCollector] | None = None
     ) -> NDArray[np.float64]:
         """Return the action chunk (horizon, 7) for the environment; the noise depends on `noise_seed` only."""
         config, tensors = self.model.config, policy_input.tensors
@@ -186,6 +189,6 @@ class PiPolicy:
             token_mask=tensors["token_mask"],
             state=tensors["state"],
             noise=torch.from_numpy(noise).to(self.model.device),
-            recorder=recorder,
+            recorder=(recorders or {}).get(self.sites[0].name),
         )
         return self.processing.environment_actions(sampled[0].cpu().numpy(), policy_input.state)

@@ -23,8 +23,8 @@ def record(policy, observation, instruction=INSTRUCTION, seed=0):
     plan = RecordingPlan(tuple(range(18)), (0, 9), tuple(range(8)), "all", "joint")
     recorder = AttentionRecorder(plan, policy.sites[0].num_keys)
     given = policy.prepare(observation, instruction)
-    policy.act(given, seed, recorder)
-    return recorder.finish().rows, given.key_role
+    policy.act(given, seed, {"joint": recorder})
+    return recorder.finish().rows, given.key_role["joint"]
 
 
 def distance(one, other):

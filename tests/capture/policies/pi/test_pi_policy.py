@@ -94,17 +94,17 @@ def test_frames_are_the_rotated_pictures_of_the_real_cameras(policy, observation
 def test_roles_agree_with_the_keys_that_get_attention(policy, observation):
     given = policy.prepare(observation, INSTRUCTION)
     [layout] = policy.sites
-    assert given.key_role.shape == (layout.num_keys,)
+    assert given.key_role["joint"].shape == (layout.num_keys,)
     recorder = AttentionRecorder(plan_of(policy, "all"), layout.num_keys)
-    policy.act(given, 0, recorder)
+    policy.act(given, 0, {"joint": recorder})
     rows = recorder.finish().rows
     assert rows.shape[3] == policy.num_action_queries == policy.action_horizon
-    invalid = np.isin(given.key_role, [Role.MASKED_IMAGE, Role.PADDING])
+    invalid = np.isin(given.key_role["joint"], [Role.MASKED_IMAGE, Role.PADDING])
     assert (rows[..., invalid] == 0).all()
     assert (rows[..., ~invalid].max(axis=(0, 1, 2, 3)) > 0).all()
     np.testing.assert_allclose(recorder.finish().row_sum, 1, atol=1e-5)
 
-    role = dict(zip(*np.unique(given.key_role, return_counts=True), strict=True))
+    role = dict(zip(*np.unique(given.key_role["joint"], return_counts=True), strict=True))
     tokens = policy.model.config.siglip.num_tokens
     assert role[Role.IMAGE] == 2 * tokens
     assert role[Role.MASKED_IMAGE] == tokens
@@ -112,24 +112,24 @@ def test_roles_agree_with_the_keys_that_get_attention(policy, observation):
     assert role[Role.ACTION] == policy.action_horizon
     for piece in given.prompt.pieces:
         inside = given.prompt.instruction[0] <= piece.start < given.prompt.instruction[1]
-        assert (given.key_role[piece.key] == Role.INSTRUCTION) == inside or piece.text.startswith("▁")
+        assert (given.key_role["joint"][piece.key] == Role.INSTRUCTION) == inside or piece.text.startswith("▁")
 
 
 def test_pi0_has_one_state_key_and_pi05_states_it_in_the_prompt(dummy, dummy_pi0, embedded, observation):
     pi0 = dummy_pi0.prepare(observation, INSTRUCTION)
     span = dummy_pi0.sites[0].span("state")
-    assert np.flatnonzero(pi0.key_role == Role.STATE).tolist() == [span.start]
+    assert np.flatnonzero(pi0.key_role["joint"] == Role.STATE).tolist() == [span.start]
     digits = dummy.prepare(observation, INSTRUCTION)
-    assert (digits.key_role == Role.STATE).sum() > 8
+    assert (digits.key_role["joint"] == Role.STATE).sum() > 8
     assert ", State: " in digits.prompt.text
-    assert not (embedded.prepare(observation, INSTRUCTION).key_role == Role.STATE).any()
+    assert not (embedded.prepare(observation, INSTRUCTION).key_role["joint"] == Role.STATE).any()
 
 
 def test_recording_does_not_change_a_bit_of_the_actions(policy, observation):
     given = policy.prepare(observation, INSTRUCTION)
     plain = policy.act(given, 7)
     recorder = AttentionRecorder(plan_of(policy), policy.sites[0].num_keys)
-    np.testing.assert_array_equal(policy.act(given, 7, recorder), plain)
+    np.testing.assert_array_equal(policy.act(given, 7, {"joint": recorder}), plain)
     assert plain.shape == (policy.action_horizon, 7)
     assert plain.dtype == np.float64
     assert np.isfinite(plain).all()
