@@ -101,11 +101,12 @@ def groupings(draw: st.DrawFn, tokens: EpisodeTokens) -> Grouping:
     cameras = tokens.layout.cameras
     grid = tokens.layout.camera_span(cameras[0]).grid
     assert grid is not None
+    assert tokens.prompt_index is not None
     choices = [
         *(f"camera:{camera}" for camera in cameras),
         *(f"role:{role}" for role in ("image", "instruction", "template", "action", "padding", "state")),
         *(f"span:{span.name}" for span in tokens.layout.spans),
-        *(f"word:{word}" for word in sorted({word.text for line in tokens.words for word in line})),
+        *(f"word:{word}" for word in sorted({word.text for i in set(tokens.prompt_index) for word in tokens.words[i]})),
         *(f"object:{name}" for name in (*OBJECTS, "@interest", "@robot", "@background")),
         f"patch:{cameras[0]}[0:{draw(st.integers(1, grid.rows))},0:{draw(st.integers(1, grid.columns))}]",
         f"keys:0-{draw(st.integers(0, tokens.layout.num_keys - 1))}",
