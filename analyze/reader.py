@@ -19,8 +19,10 @@ from schemas.errors import did_you_mean, listing
 from schemas.jsonable import MalformedDocument, from_json
 from schemas.store import (
     EPISODES_GROUP,
+    SEAL_GROUP,
     CorruptEpisode,
     EpisodeAttributes,
+    EpisodeSeal,
     RootAttributes,
     StoreError,
     StoreNotFound,
@@ -28,17 +30,6 @@ from schemas.store import (
     parse_episode_name,
 )
 from schemas.vocabulary import EpisodeTokens
-
-#: The group of an episode whose attributes are an `EpisodeSeal`.
-SEAL_GROUP = "seal"
-
-
-@dataclass(frozen=True)
-class EpisodeSeal:
-    """sha256 of every `zarr.json` of an episode by its path, and of the store's own: chunks have checksums, and JSON has none."""
-
-    run: str
-    files: dict[str, str]
 
 
 @dataclass(frozen=True)

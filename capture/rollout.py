@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from capture.attention import AttentionRecorder, RecordingPlan
 from capture.environments.base import Environment, Observation, Task
 from capture.environments.coverage import patch_coverage
+from capture.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
 from capture.noise import noise_seed
 from capture.policies.base import Policy
-from capture.store_writer import EpisodeStart, EpisodeWriter, ReplanRecord, RunStore
+from capture.store_writer import RunStore
 from schemas.errors import BadArgument
 from schemas.layout import SiteLayout
 from schemas.segments import segment_members, segments_of

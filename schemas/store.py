@@ -38,6 +38,9 @@ ATOM_AXES = (*ROW_AXES[:-1], "segment")
 #: Parts are the episode's segments in order, then the block's whole attention update.
 CONTRIBUTION_AXES = ("replan", "layer", "denoise", "part", "other_part")
 
+#: The group of an episode whose attributes are an `EpisodeSeal`.
+SEAL_GROUP = "seal"
+
 _EPISODE_NAME = re.compile(r"task(\d{3,})_episode(\d{3,})$")
 
 
@@ -149,6 +152,14 @@ class ArrayRecord:
 
     shape: tuple[int, ...]
     sha256: str
+
+
+@dataclass(frozen=True)
+class EpisodeSeal:
+    """sha256 of every `zarr.json` of an episode by its path, and of the store's own: chunks have checksums, and JSON has none."""
+
+    run: str
+    files: dict[str, str]
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ from typing import Any, Literal
 import numpy as np
 
 from capture.attention import RecordedRows
-from capture.store_writer import EpisodeStart, EpisodeWriter, ReplanRecord, RunStore, WriteMode, open_run
+from capture.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
+from capture.store_writer import RunStore, WriteMode, open_run
 from schemas.layout import INVALID_ROLES, PatchGrid, Piece, Prompt, Role, SiteLayout, Span
 from schemas.store import (
     FORMAT_NAME,

@@ -27,7 +27,8 @@ from zarr.storage import LocalStore
 
 from analyze.reader import open_store
 from analyze.verify import verify_store
-from capture.store_writer import StoreWriteFailed, open_run
+from capture.durable_files import StoreWriteFailed
+from capture.store_writer import open_run
 from schemas.errors import BadArgument, UserError
 from schemas.store import FormatTooNew, RunMismatch, StoreError, StoreExists, episode_name
 from tests.store_kit import (
