@@ -41,6 +41,7 @@ def _analyze(argv: Sequence[str]) -> int:
         heads=_tuple(arguments.heads),
         per_head=arguments.per_head,
         tasks=_tuple(arguments.tasks),
+        site=arguments.site,
         seed=arguments.seed,
     )
     analysis = analyse(stores, settings)

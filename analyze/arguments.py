@@ -43,6 +43,9 @@ def build_parser() -> argparse.ArgumentParser:
     )
     grouping.add_argument("--ratio", metavar="A,B/C", help="groups of the ratio's numerator and denominator")
     chosen = parser.add_argument_group("selection")
+    chosen.add_argument(
+        "--site", metavar="NAME", help="softmax family: joint (pi), self or cross (Cosmos); default: the first one"
+    )
     chosen.add_argument("--layers", type=int, nargs="+", metavar="N", help="layers (default: all recorded)")
     chosen.add_argument(
         "--denoise", nargs="+", metavar="STEP", help="denoise steps, first, last or all (default: all recorded)"

@@ -13,13 +13,14 @@ from analyze.aggregate import add_layers_avg, episodes_table, per_replan, tasks_
 from analyze.atomic_file import replacing
 from analyze.reader import Store
 from analyze.results_file import write_results_of_suites
-from analyze.selection import Selection, check_combinable, select, select_episodes
+from analyze.selection import Selection, check_combinable, choose_site, select, select_episodes
 from analyze.summary import AnalysedRun, summary_text, write_summary
 from analyze.tables import load_tokens, steps_table, vocabulary_of
 from analyze.terminal import progress_bar
 from schemas.builtin_groupings import find_grouping
 from schemas.errors import BadArgument, listing
 from schemas.grouping import Grouping, parse_group_argument, parse_ratio_argument, with_groups
+from schemas.store import RootAttributes
 from schemas.vocabulary import Vocabulary
 
 DEFAULT_GROUPING = "default"
@@ -37,6 +38,7 @@ class AnalysisSettings:
     heads: tuple[int, ...] | None = None
     per_head: bool = False
     tasks: tuple[int, ...] | None = None
+    site: str | None = None
     seed: int = 0
 
 
@@ -92,7 +94,7 @@ def analyse(stores: Sequence[Store], settings: AnalysisSettings) -> Analysis:
     root = stores[0].attributes
     selection = select(root, settings.layers, settings.denoise, settings.heads, settings.per_head)
     chosen = [(store, episode) for store in stores for episode in select_episodes(store, settings.tasks)]
-    site = root.sites[0].name
+    site = choose_site(root, settings.site)
     selected = load_tokens(chosen, site)
     grouping = choose_grouping(settings, vocabulary_of(selected))
     with progress_bar(len(selected), "episodes") as advance:
@@ -107,7 +109,7 @@ def analyse(stores: Sequence[Store], settings: AnalysisSettings) -> Analysis:
         untrained=policy.untrained,
         denoise_steps=selection.denoise_steps,
         heads=_describe_heads(selection, root.policy.num_heads),
-        notes=[selection.note] if selection.note else [],
+        notes=_notes(root, selection, site),
     )
     text = summary_text(run, grouping, episodes, tasks)
     return Analysis(tuple(stores), grouping, selection, steps, replans, episodes, tasks, text)
@@ -135,6 +137,17 @@ def write_tables(analysis: Analysis, folder: Path) -> WrittenFiles:
             f"Cannot write results to {folder}: {error.strerror or error}; give another --output."
         ) from None
     return written
+
+
+def _notes(root: RootAttributes, selection: Selection, site: str) -> list[str]:
+    notes = [selection.note] if selection.note else []
+    others = [other.name for other in root.sites if other.name != site]
+    if others:
+        notes.append(
+            f"Masses of the site '{site}' only; the other sites ({listing(others)}) are softmaxes of their own, and a mass of one "
+            "must not be divided by a mass of another. Choose with --site."
+        )
+    return notes
 
 
 def _describe_heads(selection: Selection, num_heads: int) -> str:

@@ -128,11 +128,14 @@ class StoredEpisode:
     def tokens(self, root: RootAttributes, site: str) -> EpisodeTokens:
         """What every key of a site is in this episode."""
         layout = next(layout for layout in root.sites if layout.name == site)
-        cameras = [name.removeprefix("objects/") for name in self.attributes.arrays if name.startswith("objects/")]
+        stored = [name.removeprefix("objects/") for name in self.attributes.arrays if name.startswith("objects/")]
+        cameras = [camera for camera in stored if camera in layout.cameras]
+        # A prompt's pieces are keys of the site that reads it; elsewhere (Cosmos's self-attention) there are no words.
+        reads = any(span.kind == "text" for span in layout.spans)
         return EpisodeTokens(
             layout=layout,
             key_role=self.read(f"{site}/key_role"),
-            prompts=self.attributes.prompts,
+            prompts=self.attributes.prompts if reads else (),
             prompt_index=self.read("prompt_index"),
             objects=self.attributes.objects,
             coverage=_StoredCoverage(self, cameras),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from analyze.reader import Store, StoredEpisode
-from schemas.errors import BadArgument, listing
+from schemas.errors import BadArgument, listing, unknown_name
 from schemas.layers import LayerSelection, select_layers
 from schemas.store import RootAttributes, StoreError, parse_episode_name
 
@@ -70,6 +70,16 @@ def select(
         per_head=per_head,
         note=wanted.note,
     )
+
+
+def choose_site(root: RootAttributes, name: str | None) -> str:
+    """The wanted site, or the first one. Sites are normalised separately: one analysis never mixes them."""
+    names = [site.name for site in root.sites]
+    if name is None:
+        return names[0]
+    if name not in names:
+        raise unknown_name("site", name, names)
+    return name
 
 
 def parse_denoise_steps(words: Sequence[str] | None, recorded: Sequence[int]) -> tuple[int, ...]:

@@ -100,6 +100,7 @@ def test_resume_with_other_settings_names_the_field(captured_store, capsys):
         (["--denoise", "1"], "was not recorded; recorded: 0, 2"),
         (["--heads", "9"], "Head 9 was not recorded"),
         (["--tasks", "5"], "it has tasks 0, 1"),
+        (["--site", "cross"], "Unknown site 'cross'. Existing: joint."),
     ],
 )
 def test_analyze(arguments, expected, captured_store, tmp_path, capsys):
