@@ -71,7 +71,7 @@ setup-analyze: .venv/analyze-installed
 # The GPU node: torch and the simulators on top of it, and what the tests need.
 .venv/capture-installed: .venv/analyze-installed requirements-libero.txt
 	@echo "Installing the capture environment into .venv (torch, MuJoCo, robosuite, LIBERO; a minute or more) ..."
-	$(PIP) -e '.[capture,openpi,hub,dev]'
+	$(PIP) -e '.[capture,cosmos,openpi,hub,dev]'
 	$(PIP) --no-deps --use-pep517 -r requirements-libero.txt
 	sh scripts/ensure_rendering.sh
 	@touch $@

@@ -36,18 +36,19 @@ class GroupMeasures:
 
 def group_measures(
     mass: NDArray[np.float64],
-    row_sum: NDArray[np.float64],
+    valid_mass: NDArray[np.float64],
     num_keys: NDArray[np.float64],
     num_valid: NDArray[np.int64],
 ) -> GroupMeasures:
     """Fractions and lifts of masses.
 
     fraction = mass / sum of the masses of all groups; density = mass / number of keys;
-    lift = density / (row sum / number of valid keys), so that uniform attention over the valid keys gives 1.
+    lift = density / (mass of all valid keys / their number), so that attention that is uniform over the valid keys gives 1. Keys of
+    a null sink (Cosmos's padded text) are not valid, and what they take is no part of the comparison.
 
     Args:
         mass: (replan, ..., group).
-        row_sum: (replan, ...), sum over all keys.
+        valid_mass: (replan, ...), sum over all valid keys.
         num_keys: (replan or 1, group), fractional where objects cover parts of patches.
         num_valid: (replan or 1,).
 
@@ -59,7 +60,7 @@ def group_measures(
     valid = num_valid.reshape(num_valid.shape[0], *middle, 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         fraction = mass / mass.sum(axis=-1, keepdims=True)
-        lift = np.where(keys > 0, (mass / keys) / (row_sum[..., None] / valid), np.nan)
+        lift = np.where(keys > 0, (mass / keys) / (valid_mass[..., None] / valid), np.nan)
     return GroupMeasures(mass, fraction, lift)
 
 

@@ -79,7 +79,9 @@ def steps_table(
 def episode_masses(
     item: SelectedEpisode, resolved: ResolvedGrouping, selection: Selection, site: str
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Masses (replan, layer, denoise, head or 1, group) and row sums (replan, layer, denoise, head or 1) of one episode.
+    """Masses (replan, layer, denoise, head or 1, group + 1) and row sums (replan, layer, denoise, head or 1) of one episode.
+
+    The last mass is that of all valid keys.
 
     Averaged over the stored queries and, unless heads are kept apart, over the selected heads. Uses the stored segment
     masses when the grouping does not cut through a segment, and reads rows otherwise.
@@ -87,17 +89,27 @@ def episode_masses(
     episode, tokens = item.episode, item.tokens
     row_sum = _reduce(_cells(episode.read(f"{site}/row_sum"), selection), selection).astype(np.float64)
     segments = episode.attributes.segments[site]
-    on_segments = weights_on_segments(resolved.weights, segment_members(tokens.layout, tokens.static_roles, segments))
+    weights = _with_valid(resolved.weights, tokens.valid)
+    on_segments = weights_on_segments(weights, segment_members(tokens.layout, tokens.static_roles, segments))
     if on_segments is not None:
         atoms = _cells(episode.read(f"{site}/atoms"), selection)
         return masses(_reduce(atoms, selection, axis=-2), on_segments), row_sum
-    shape = (*row_sum.shape, len(resolved.names))
+    shape = (*row_sum.shape, weights.shape[2])
     result = np.empty(shape)
     for i, layer in enumerate(selection.layers):
         for j, step in enumerate(selection.denoise):
             rows = episode.read(f"{site}/rows", (slice(None), layer, step))[:, None, None, list(selection.heads)]
-            result[:, i, j] = masses(_reduce(rows, selection, axis=-2), resolved.weights)[:, 0, 0]
+            result[:, i, j] = masses(_reduce(rows, selection, axis=-2), weights)[:, 0, 0]
     return result, row_sum
+
+
+def _with_valid(weights: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Weights (replan or 1, key, group) with one more group: the valid keys (replan or 1, key)."""
+    replans = max(len(weights), len(valid))
+    parts = [
+        np.broadcast_to(part, (replans, *part.shape[1:])) for part in (weights, valid[:, :, None].astype(np.float32))
+    ]
+    return np.concatenate(parts, axis=2)
 
 
 def _cells(values: NDArray[np.float32], selection: Selection) -> NDArray[np.float32]:
@@ -115,7 +127,8 @@ def _episode_steps(
     item: SelectedEpisode, resolved: ResolvedGrouping, grouping: Grouping, selection: Selection, site: str
 ) -> pl.DataFrame:
     mass, row_sum = episode_masses(item, resolved, selection, site)
-    measures = group_measures(mass, row_sum, resolved.num_keys, resolved.num_valid)
+    mass, valid_mass = mass[..., :-1], mass[..., -1]
+    measures = group_measures(mass, valid_mass, resolved.num_keys, resolved.num_valid)
     shape = row_sum.shape
     attributes, episode = item.episode.attributes, item.episode
 

@@ -67,8 +67,7 @@ def _guarded(check: Iterator[str]) -> Iterator[str]:
 def _expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dict[str, tuple[int, ...]]:
     """First axes of every array that must be there; arrays that are not named here begin with the replans."""
     recording, replans = root.recording, attributes.num_replans
-    queries = 1 if recording.queries == "mean" else recording.num_action_queries
-    cells = (replans, len(recording.layers), len(recording.denoise_steps), len(recording.heads), queries)
+    cells = (replans, len(recording.layers), len(recording.denoise_steps), len(recording.heads), recording.num_queries)
     shapes: dict[str, tuple[int, ...]] = {"denoise_time": (len(recording.denoise_steps),)}
     shapes |= dict.fromkeys(("env_step", "noise_seed", "prompt_index", "state", "actions"), (replans,))
     for site in root.sites:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from schemas.command_line import run_command
+from schemas.errors import BadArgument
 
 if TYPE_CHECKING:
     from capture.policies.base import Policy
@@ -30,16 +31,7 @@ def _capture(argv: Sequence[str]) -> int:
 
     arguments = build_parser().parse_args(argv)
     if arguments.policy == "parity":
-        from capture.device import choose_device
-        from capture.policies.pi.parity import run_parity
-
-        return run_parity(
-            arguments.case,
-            arguments.format,
-            limit=arguments.limit,
-            as_json=arguments.json,
-            device=choose_device(arguments.device),
-        )
+        return _parity(arguments)
     settings = run_settings(arguments)
     # A store in the way is found before minutes are spent on loading a model.
     if settings.mode == "new" and settings.store.exists():
@@ -59,7 +51,46 @@ def _capture(argv: Sequence[str]) -> int:
     return _analyze(arguments, settings.store)
 
 
+def _parity(arguments: argparse.Namespace) -> int:
+    from capture.device import choose_device
+    from capture.policies.cosmos.case import case_kind
+
+    device = choose_device(arguments.device)
+    if case_kind(arguments.case) is not None:
+        from capture.policies.cosmos.parity import run_cosmos_parity
+
+        if arguments.format is not None or arguments.limit is not None:
+            raise BadArgument("Cosmos cases have one format and their own limits; leave out --format and --limit.")
+        return run_cosmos_parity([arguments.case], as_json=arguments.json, device=device)
+    from capture.policies.pi.parity import run_parity
+
+    return run_parity(arguments.case, arguments.format, limit=arguments.limit, as_json=arguments.json, device=device)
+
+
 def _build_policy(arguments: argparse.Namespace, device: str) -> Policy:
+    if arguments.policy == "cosmos":
+        from capture.policies.cosmos.build import build_cosmos_policy
+        from capture.policies.cosmos.config import DEFAULT_CONFIG_NAME
+
+        return build_cosmos_policy(
+            arguments.checkpoint,
+            device=device,
+            config_name=arguments.config_name or DEFAULT_CONFIG_NAME,
+            num_denoising_steps_action=arguments.num_denoising_steps_action,
+            chunk_size=arguments.chunk_size,
+            num_open_loop_steps=arguments.num_open_loop_steps,
+            dataset_stats_path=arguments.dataset_stats_path,
+            t5_text_embeddings_path=arguments.t5_text_embeddings_path,
+            t5_tokenizer=arguments.t5_tokenizer,
+            t5_encoder=arguments.t5_encoder,
+            vae_path=arguments.vae_path,
+            dtype=arguments.dtype,
+            query_frame=arguments.query_frame,
+            visual_frame=arguments.visual_frame,
+            text_frame=arguments.text_frame,
+            prefer_s=arguments.prefer_s,
+            prefer_call=arguments.prefer_call,
+        )
     from capture.policies.pi.build import build_pi_policy
 
     return build_pi_policy(
@@ -84,6 +115,12 @@ def _analyze(arguments: argparse.Namespace, store: Path) -> int:
         command += ["--output", str(arguments.output_dir)]
     if arguments.save_viz:
         command += ["--save-viz"]
+    if arguments.policy == "cosmos":
+        # The published scripts' proxy: one latent frame's mass over another's, both of self-attention. Named by the frames,
+        # because the denominator's default frame is a blank picture and holds no language.
+        above, below = arguments.visual_frame, arguments.text_frame
+        command += ["--site", "self", "--group", f"{above}=frame:{above}", "--group", f"{below}=frame:{below}"]
+        command += ["--ratio", f"{above}/{below}", "--denoise", arguments.prefer_call]
     return subprocess.run(command, check=False).returncode
 
 

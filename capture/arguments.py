@@ -35,6 +35,17 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     families = parser.add_subparsers(dest="policy", required=True, metavar="POLICY", parser_class=OneSentenceParser)
+    cosmos = families.add_parser(
+        "cosmos",
+        help="Cosmos Policy",
+        description="Record a Cosmos Policy: self-attention over latent frames, cross-attention over text.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    _add_cosmos_arguments(cosmos)
+    _add_run_arguments(cosmos)
+    _add_recording_arguments(cosmos)
+    _add_store_arguments(cosmos)
     pi = families.add_parser(
         "pi",
         help="pi0 or pi0.5",
@@ -54,6 +65,52 @@ def build_parser() -> argparse.ArgumentParser:
     )
     _add_parity_arguments(parity)
     return parser
+
+
+def _add_cosmos_arguments(parser: argparse.ArgumentParser) -> None:
+    model = parser.add_argument_group("model")
+    model.add_argument(
+        "--ckpt-path",
+        "--checkpoint",
+        dest="checkpoint",
+        default=EMBEDDED,
+        metavar="PATH",
+        help="checkpoint folder, ORG/NAME on the Hugging Face hub, or a file of weights; "
+        f"'{EMBEDDED}' (default) is a small untrained policy that comes with the tool, '{DUMMY}' a smaller one",
+    )
+    model.add_argument("--config-name", metavar="NAME", help="the reference's name for the configuration")
+    model.add_argument("--dataset-stats-path", metavar="PATH", help="statistics (default: the checkpoint's own)")
+    model.add_argument(
+        "--t5-text-embeddings-path", metavar="PATH", help="precomputed embeddings (default: the checkpoint's own)"
+    )
+    model.add_argument(
+        "--t5-tokenizer", metavar="PATH", help="T5's spiece.model: makes words of the instruction selectable"
+    )
+    model.add_argument(
+        "--t5-encoder", metavar="PATH", help="T5 model folder, for instructions without a precomputed embedding"
+    )
+    model.add_argument("--vae-path", metavar="PATH", help="image encoder's weights (default: the checkpoint's own)")
+    model.add_argument("--num-denoising-steps-action", type=int, metavar="N", help="denoise steps (default: 5)")
+    model.add_argument("--chunk-size", type=int, metavar="N", help="actions of a call (default: 16)")
+    model.add_argument(
+        "--num-open-loop-steps", type=int, metavar="N", help="actions executed per call (default: the chunk)"
+    )
+    model.add_argument("--dtype", metavar="NAME", help="float32 or bfloat16 (default: bfloat16 on a GPU)")
+    model.add_argument("--device", default="auto", help="auto (default: a GPU if there is one), cpu, cuda, cuda:1 ...")
+    frames = parser.add_argument_group("frames of the published proxy (the store keeps all of them)")
+    frames.add_argument(
+        "--query-frame", default="action", metavar="NAME", help="whose queries are recorded (default: action)"
+    )
+    frames.add_argument(
+        "--visual-frame", default="curr_last", metavar="NAME", help="numerator frame (default: curr_last)"
+    )
+    frames.add_argument(
+        "--text-frame", default="frame0", metavar="NAME", help="denominator frame (default: frame0, a blank one)"
+    )
+    frames.add_argument(
+        "--prefer-S", dest="prefer_s", type=int, metavar="N", help="length that the analysed call must have"
+    )
+    frames.add_argument("--prefer-call", default="last", metavar="NAME", help="last (default) or first of those calls")
 
 
 def _add_parity_arguments(parser: argparse.ArgumentParser) -> None:
@@ -149,7 +206,11 @@ def _add_recording_arguments(parser: argparse.ArgumentParser) -> None:
         help="numbers, first, last or all (default: first last)",
     )
     attention.add_argument("--heads", type=int, nargs="+", metavar="N", help="attention heads (default: all)")
-    attention.add_argument("--queries", default="mean", help="mean over the action queries (default), or all of them")
+    attention.add_argument(
+        "--queries",
+        default="mean",
+        help="mean over the action queries (default), steps (one mean per action step), or all",
+    )
     attention.add_argument(
         "--precision",
         default=str(DEFAULT_MANTISSA_BITS),

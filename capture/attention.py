@@ -20,6 +20,9 @@ from schemas.errors import BadArgument
 #: What the reference puts in place of the logits of masked keys: so low that their probability is exactly 0.
 MASKED_LOGIT = -2.3819763e38
 
+#: Numbers of one call's rows from which on they do not wait on the device.
+_LARGE_ROWS = 2**20
+
 RowSink = Callable[[Tensor], None]
 #: Takes a call's values (batch, kv_head, key, dim), its projection to the residual stream, and the update (batch, query, width).
 UpdateSink = Callable[[Tensor, Projection, Tensor], None]
@@ -83,13 +86,13 @@ class RecordingPlan:
     """Which rows of one site are recorded at every replan.
 
     `layers`, `denoise_steps` and `heads` are indices, kept in the order given; `queries` is "mean" (over the action
-    queries, in float32) or "all".
+    queries, in float32), "steps" (weighted means, one per action step and dimension) or "all".
     """
 
     layers: tuple[int, ...]
     denoise_steps: tuple[int, ...]
     heads: tuple[int, ...]
-    queries: Literal["mean", "all"]
+    queries: Literal["mean", "steps", "all"]
     site: str
 
     def __post_init__(self) -> None:
@@ -99,8 +102,10 @@ class RecordingPlan:
                 raise BadArgument(
                     f"The {name} of site '{self.site}' must be one or more different indices from 0 up, not {chosen}."
                 )
-        if self.queries not in ("mean", "all"):
-            raise BadArgument(f"The queries of site '{self.site}' must be 'mean' or 'all', not '{self.queries}'.")
+        if self.queries not in ("mean", "steps", "all"):
+            raise BadArgument(
+                f"The queries of site '{self.site}' must be 'mean', 'steps' or 'all', not '{self.queries}'."
+            )
 
 
 @dataclass(frozen=True)
@@ -122,14 +127,17 @@ class AttentionRecorder(RowCollector):
     """Collect the rows of one site during one replan (batch 1): make a new one for every replan.
 
     Only the wanted heads and action queries are copied, so nothing query x query sized outlives a call. The copies
-    stay on the device until `finish`, which moves them at once: a transfer per block would stall a GPU.
+    stay on the device until `finish`, which moves them at once: a transfer per block would stall a GPU. Large ones (all
+    queries of a Cosmos policy) are moved as they come: they would fill it.
 
     parts: (key, part) bool, disjoint parts of the keys whose contributions are wanted, or None for rows only.
+    pools: (pool, action query), the weights of the means that the plan's queries "steps" stand for.
     """
 
     plan: RecordingPlan
     num_keys: int
     parts: np.ndarray | None = None
+    pools: np.ndarray | None = None
     _rows: dict[tuple[int, int], list[Tensor]] = field(default_factory=dict, init=False, repr=False)
     _grams: dict[tuple[int, int], list[Tensor]] = field(default_factory=dict, init=False, repr=False)
     _keys_of_parts: list[slice | Tensor] | None = field(default=None, init=False, repr=False)
@@ -186,6 +194,14 @@ class AttentionRecorder(RowCollector):
         chosen = of_actions.index_select(0, wanted)
         if self.plan.queries == "mean":
             chosen = chosen.mean(dim=1, keepdim=True)
+        elif self.plan.queries == "steps":
+            if self.pools is None:
+                raise BadArgument(
+                    f"The queries of site '{self.plan.site}' do not stand for action steps; record their mean."
+                )
+            chosen = torch.matmul(torch.from_numpy(self.pools).to(chosen), chosen)
+        if chosen.numel() > _LARGE_ROWS:
+            chosen = chosen.cpu()
         self._rows.setdefault((layer, denoise_step), []).append(chosen)
 
     def finish(self) -> RecordedRows:

@@ -56,9 +56,8 @@ def estimate_disk(
     recording: Recording, sites: Sequence[SiteLayout], picture_sizes: Sequence[int], replans: int, episodes: int
 ) -> DiskEstimate:
     """Estimate a run's size; `picture_sizes` are the decoded bytes of each stored camera picture."""
-    queries = 1 if recording.queries == "mean" else recording.num_action_queries
     chunks = len(recording.layers) * len(recording.denoise_steps)
-    rows_of_site = chunks * len(recording.heads) * queries
+    rows_of_site = chunks * len(recording.heads) * recording.num_queries
     # A picture may be noise; those that simulators draw take about a third of this.
     total = float(_SMALL_PER_REPLAN) + (_INCOMPRESSIBLE * sum(picture_sizes) if recording.frames else 0)
     for site in sites:

@@ -14,7 +14,6 @@ from capture.attention import AttentionRecorder, RecordingPlan
 from capture.environments.base import Environment, Observation, Task
 from capture.environments.coverage import patch_coverage
 from capture.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
-from capture.noise import noise_seed
 from capture.policies.base import Policy
 from capture.store_writer import RunStore
 from schemas.errors import BadArgument
@@ -105,7 +104,10 @@ def run_episode(
 
 
 def make_recorders(
-    recording: Recording, sites: Sequence[SiteLayout], key_role: Mapping[str, NDArray[np.uint8]]
+    recording: Recording,
+    sites: Sequence[SiteLayout],
+    key_role: Mapping[str, NDArray[np.uint8]],
+    pools: NDArray[np.float64] | None = None,
 ) -> dict[str, AttentionRecorder]:
     """Fresh recorders for one replan, one per site; contributions are those of the replan's own segments."""
     recorders: dict[str, AttentionRecorder] = {}
@@ -113,7 +115,7 @@ def make_recorders(
         plan = RecordingPlan(recording.layers, recording.denoise_steps, recording.heads, recording.queries, site.name)
         roles = key_role[site.name]
         parts = segment_members(site, roles[None], segments_of(site, roles))[0] if recording.contributions else None
-        recorders[site.name] = AttentionRecorder(plan, site.num_keys, parts)
+        recorders[site.name] = AttentionRecorder(plan, site.num_keys, parts, pools)
     return recorders
 
 
@@ -138,8 +140,9 @@ def _replan(
 ) -> NDArray[np.float64]:
     protocol, recording = store.attributes.protocol, store.attributes.recording
     policy_input = policy.prepare(observation, task.instruction)
-    seed = noise_seed(protocol.seed, task.task_id, episode_index, len(writer.records))
-    recorders = make_recorders(recording, policy.sites, policy_input.key_role)
+    seed = policy.replan_noise_seed(protocol.seed, task.task_id, episode_index, len(writer.records))
+    pools = policy.query_pools() if recording.queries == "steps" else None
+    recorders = make_recorders(recording, policy.sites, policy_input.key_role, pools)
     actions = policy.act(policy_input, seed, recorders)
     coverage = {
         camera.slot: patch_coverage(
@@ -147,7 +150,9 @@ def _replan(
             len(environment.objects),
             camera.grid.rows,
             camera.grid.columns,
-            rotate_180=camera.rotate_180,
+            flip_rows=camera.flip_rows,
+            flip_columns=camera.flip_columns,
+            visible=camera.visible,
         )
         for camera in policy.cameras
     }

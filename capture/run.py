@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, cast
 
 import numpy as np
 from tqdm import tqdm
@@ -22,6 +23,8 @@ from capture.store_writer import RunStore, WriteMode, open_run
 from schemas.errors import BadArgument, listing
 from schemas.layers import select_layers
 from schemas.store import FORMAT_NAME, FORMAT_VERSION, Protocol, Recording, RootAttributes
+
+_QUERIES = {"mean": "the mean over", "steps": "the action steps' means over", "all": "each of"}
 
 
 @dataclass(frozen=True)
@@ -64,16 +67,17 @@ def plan_recording(settings: RecordingSettings, policy: Policy) -> tuple[Recordi
             raise BadArgument(f"There is no head {head}; expected 0 to {policy.num_heads - 1}.")
     if len(set(heads)) != len(heads):
         raise BadArgument(f"Heads {listing(heads)} name one of them twice.")
-    if settings.queries not in ("mean", "all"):
-        raise BadArgument(f"Cannot use --queries '{settings.queries}'; expected 'mean' or 'all'.")
+    if settings.queries not in ("mean", "steps", "all"):
+        raise BadArgument(f"Cannot use --queries '{settings.queries}'; expected 'mean', 'steps' or 'all'.")
     order = sorted(range(len(layers.blocks)), key=lambda i: layers.blocks[i])
     recording = Recording(
         layers=tuple(layers.blocks[i] for i in order),
         layer_labels=tuple(layers.labels[i] for i in order),
         denoise_steps=steps,
         heads=tuple(sorted(heads)),
-        queries="mean" if settings.queries == "mean" else "all",
+        queries=cast(Literal["mean", "steps", "all"], settings.queries),
         num_action_queries=policy.num_action_queries,
+        num_pools=len(policy.query_pools()) if settings.queries == "steps" else 0,
         mantissa_bits=settings.mantissa_bits,
         frames=settings.frames,
         contributions=settings.contributions,
@@ -157,7 +161,7 @@ def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int) -
     pictures = [np.prod((camera.grid.image_height, camera.grid.image_width, 3)).item() for camera in policy.cameras]
     say(
         f"Recording {len(recording.layers)} layers, denoise steps {listing(recording.denoise_steps)}, {len(recording.heads)} heads, "
-        f"{'the mean over' if recording.queries == 'mean' else 'each of'} {recording.num_action_queries} action queries, "
+        f"{_QUERIES[recording.queries]} {recording.num_action_queries} action queries, "
         f"{', '.join(str(site.num_keys) for site in store.attributes.sites)} keys."
     )
     estimate = estimate_disk(recording, store.attributes.sites, pictures, max_replans(protocol), num_todo)

@@ -31,8 +31,7 @@ class SiteWriter:
         self.layout = layout
         self.recording = recording
         self.bits = recording.mantissa_bits
-        queries = 1 if recording.queries == "mean" else recording.num_action_queries
-        self.shape = (len(recording.layers), len(recording.denoise_steps), len(recording.heads), queries)
+        self.shape = (len(recording.layers), len(recording.denoise_steps), len(recording.heads), recording.num_queries)
         self.bytes_per_replan = 4 * self.shape[2] * self.shape[3] * layout.num_keys
         self.block = replans_per_block(self.bytes_per_replan, max_replans)
         self.rows_array: zarr.Array | None = None

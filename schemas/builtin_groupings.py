@@ -20,12 +20,21 @@ _OTHERS = {
 }
 
 
+_TEXT_ROLES = {"bos", "template", "instruction", "text"}
+
+
+def _over_linguistic(vocabulary: Vocabulary, *numerator: str) -> Ratio | None:
+    """The ratio to the linguistic group, where a site has both kinds of keys: Cosmos's self-attention has no text."""
+    both = "image" in vocabulary.roles and _TEXT_ROLES & set(vocabulary.roles)
+    return Ratio(numerator, ("linguistic",)) if numerator and both else None
+
+
 def default(vocabulary: Vocabulary) -> Grouping:
     """Visual: every valid image key; linguistic: every valid text key that is not a state digit."""
     return Grouping(
         name="default",
         groups={"visual": ("role:image",), "linguistic": (_TEXT,), **_OTHERS},
-        ratio=Ratio(("visual",), ("linguistic",)),
+        ratio=_over_linguistic(vocabulary, "visual"),
         allow_empty=("visual", "linguistic", *_OTHERS),
         description="visual = every valid image key; linguistic = every valid text key that is not a state digit",
     )
@@ -41,8 +50,8 @@ def instruction(vocabulary: Vocabulary) -> Grouping:
             "template": ("role:bos | role:template | role:text",),
             **_OTHERS,
         },
-        ratio=Ratio(("visual",), ("linguistic",)),
-        allow_empty=("template", *_OTHERS),
+        ratio=_over_linguistic(vocabulary, "visual"),
+        allow_empty=("visual", "linguistic", "template", *_OTHERS),
         description="visual = every valid image key; linguistic = the words of the instruction only",
     )
 
@@ -53,7 +62,7 @@ def cameras(vocabulary: Vocabulary) -> Grouping:
     return Grouping(
         name="cameras",
         groups={**views, "linguistic": (_TEXT,), **_OTHERS},
-        ratio=Ratio(tuple(views), ("linguistic",)) if views else None,
+        ratio=_over_linguistic(vocabulary, *views),
         allow_empty=(*views, "linguistic", *_OTHERS),
         description="one group per camera; linguistic as in 'default'",
     )
@@ -65,7 +74,7 @@ def objects(vocabulary: Vocabulary) -> Grouping:
     return Grouping(
         name="objects",
         groups={**things, "linguistic": (_TEXT,), **_OTHERS},
-        ratio=Ratio(tuple(things), ("linguistic",)) if things else None,
+        ratio=_over_linguistic(vocabulary, *things),
         allow_empty=(*things, "linguistic", *_OTHERS),
         description="one group per scene object, weighted by the area of each patch that it covers; linguistic as in 'default'",
     )

@@ -143,6 +143,21 @@ class SiteLayout:
                 return span
         raise unknown_name("camera", camera, self.cameras)
 
+    def frame(self, name: str) -> Span:
+        """Return a latent frame by its name, by `frameN`, or as `curr_last`: the last camera picture of now (Cosmos's scripts)."""
+        frames = [span for span in self.spans if span.kind == "latent"]
+        for span in frames:
+            if span.name == name:
+                return span
+        number = name.removeprefix("frame")
+        if name.startswith("frame") and number.isdigit() and int(number) < len(frames):
+            return frames[int(number)]
+        seen = [span for span in frames if span.camera is not None]
+        if name == "curr_last" and seen:
+            return seen[-1]
+        aliases = [*(f"frame{i}" for i in range(len(frames))), "curr_last"] if frames else []
+        raise unknown_name("latent frame", name, [*(span.name for span in frames), *aliases])
+
     def span_of_key(self) -> NDArray[np.int32]:
         """Index into `spans` for each key, shape (key,)."""
         lengths = [span.num_keys for span in self.spans]

@@ -58,11 +58,12 @@ def check_names(grouping: Grouping, vocabulary: Vocabulary, layout: SiteLayout) 
         "camera": layout.cameras,
         "patch": layout.cameras,
         "span": vocabulary.spans,
-        "frame": vocabulary.frames,
     }
     for group, selectors in grouping.groups.items():
         for text in selectors:
             for atom in atoms_of(parse_selector(text)):
+                if atom.kind == "frame":
+                    layout.frame(atom.argument)
                 problem = _unknown(atom, known, vocabulary)
                 if problem:
                     raise SelectorError(f"Group '{group}', selector '{text}': {problem}")
@@ -211,6 +212,11 @@ def _span(argument: str, tokens: EpisodeTokens) -> Membership:
     return _key_range(tokens, span.start, span.stop)
 
 
+def _frame(argument: str, tokens: EpisodeTokens) -> Membership:
+    span = tokens.layout.frame(argument)
+    return _key_range(tokens, span.start, span.stop)
+
+
 def _word(argument: str, tokens: EpisodeTokens) -> Membership:
     by_prompt = np.zeros((max(1, len(tokens.prompts)), tokens.layout.num_keys), dtype=bool)
     for row, words in zip(by_prompt, tokens.words, strict=False):
@@ -274,7 +280,7 @@ _ATOMS = {
     "camera": _camera,
     "role": _role,
     "span": _span,
-    "frame": _span,
+    "frame": _frame,
     "word": _word,
     "object": _object,
     "patch": _patch,

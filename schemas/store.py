@@ -73,7 +73,8 @@ class Recording:
     """What of the attention is recorded.
 
     `layers` are block indices; `layer_labels` are the numbers that the user typed for them (the same unless the
-    reference's recorded-call numbers were used). `queries` is `mean` (over the action queries) or `all`.
+    reference's recorded-call numbers were used). `queries` is `mean` (over the action queries), `steps` (weighted means of them,
+    `num_pools` many, one per action step or per step and dimension) or `all`.
     `mantissa_bits` is the precision of the rows (23 = exact). `contributions`: the Gram matrix of value-weighted contributions,
     mean over the action queries, is recorded too.
     """
@@ -82,11 +83,17 @@ class Recording:
     layer_labels: tuple[int, ...]
     denoise_steps: tuple[int, ...]
     heads: tuple[int, ...]
-    queries: Literal["mean", "all"]
+    queries: Literal["mean", "steps", "all"]
     num_action_queries: int
     mantissa_bits: int
     frames: bool = True
     contributions: bool = False
+    num_pools: int = 0
+
+    @property
+    def num_queries(self) -> int:
+        """Length of the query axis."""
+        return {"mean": 1, "steps": self.num_pools, "all": self.num_action_queries}[self.queries]
 
 
 @dataclass(frozen=True)
@@ -104,15 +111,16 @@ class Protocol:
 class PolicyCameraView:
     """How a policy camera's picture came from the simulator's.
 
-    `rotated_180`: the model sees the simulator's image turned by 180 degrees. `upright`: row 0 of the stored frame is the
-    top of the scene. `mirrored`: column 0 of the stored frame is the scene's right edge.
+    The simulators deliver the bottom row first. `upright`: rows were reversed, so that row 0 of the stored frame is the top of
+    the scene. `mirrored`: columns were reversed, so that column 0 is the scene's right edge. `visible`: the model sees the
+    middle of the picture, this share of its side.
     """
 
     name: str
     source: str
-    rotated_180: bool
     upright: bool
     mirrored: bool
+    visible: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -99,5 +99,6 @@ def collect_vocabulary(episodes: Iterable[EpisodeTokens]) -> Vocabulary:
         roles.update({Role(code).label: None for code in np.unique(tokens.static_roles)})
         for line in tokens.words:
             words.update({word.text.casefold(): None for word in line})
-        objects.update({thing.name: None for thing in tokens.objects})
+        if tokens.coverage:
+            objects.update({thing.name: None for thing in tokens.objects})
     return Vocabulary(*(tuple(names) for names in (cameras, spans, frames, roles, words, objects)))

@@ -114,7 +114,7 @@ def denoise_times(spec: StoreSpec) -> np.ndarray:
 
 
 def root_attributes(spec: StoreSpec) -> RootAttributes:
-    cameras = tuple(PolicyCameraView(name, f"{name}_image", True, True, False) for name in spec.layout.cameras)
+    cameras = tuple(PolicyCameraView(name, f"{name}_image", True, False) for name in spec.layout.cameras)
     return RootAttributes(
         format=FORMAT_NAME,
         format_version=FORMAT_VERSION,

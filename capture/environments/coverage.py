@@ -8,25 +8,34 @@ from numpy.typing import NDArray
 from schemas.errors import BadArgument
 
 
-def overlap_lengths(pixels: int, cells: int) -> NDArray[np.float64]:
-    """Return (cells, pixels): which share of a cell's length each pixel fills, cells dividing the pixels evenly.
+def overlap_lengths(pixels: int, cells: int, visible: float = 1.0) -> NDArray[np.float64]:
+    """Return (cells, pixels): which share of a cell's length each pixel fills, cells dividing the visible middle evenly.
 
     A pixel on a border between two cells counts in both, by the part that lies in each. Rows sum to 1.
     """
-    # In units of 1 / (pixels * cells) of the side all borders are integers, so the overlaps are exact.
-    cell_start = np.arange(cells, dtype=np.int64)[:, None] * pixels
-    pixel_start = np.arange(pixels, dtype=np.int64)[None, :] * cells
-    overlap = np.minimum(cell_start + pixels, pixel_start + cells) - np.maximum(cell_start, pixel_start)
-    return np.clip(overlap, 0, None) / pixels
+    # In units of a cell, so that with everything visible borders that should coincide are the same number.
+    cell = np.arange(cells, dtype=np.float64)[:, None]
+    border = (np.arange(pixels + 1) / pixels - (1.0 - visible) / 2.0) * cells / visible
+    border = np.where(np.abs(border - np.round(border)) < 1e-9, np.round(border), border)
+    overlap = np.minimum(cell + 1, border[None, 1:]) - np.maximum(cell, border[None, :-1])
+    return np.clip(overlap, 0.0, None)
 
 
 def patch_coverage(
-    segmentation: NDArray[np.integer], num_objects: int, grid_rows: int, grid_columns: int, rotate_180: bool
+    segmentation: NDArray[np.integer],
+    num_objects: int,
+    grid_rows: int,
+    grid_columns: int,
+    *,
+    flip_rows: bool,
+    flip_columns: bool,
+    visible: float = 1.0,
 ) -> NDArray[np.float32]:
     """Return the area fraction of every object in every patch of the image as the model sees it.
 
     segmentation: (height, width) object index per pixel, in 0..num_objects-1, in the environment's orientation.
-    rotate_180: whether the model sees the picture rotated by 180 degrees.
+    flip_rows, flip_columns: whether the model sees the picture with its rows, its columns reversed (both: turned by 180°).
+    visible: side of what the model sees, as a share of the picture's side, around its middle.
     returns: (grid_rows * grid_columns, num_objects) float32, patches row by row; every row sums to 1.
 
     The patches divide the picture evenly whether or not its sides are multiples of the grid: a resize to the model's
@@ -40,9 +49,11 @@ def patch_coverage(
     if low < 0 or high >= num_objects:
         raise BadArgument(f"The segmentation holds indices {low} to {high}; with {num_objects} objects 0 to "
                           f"{num_objects - 1} are valid.")  # fmt: skip
-    seen = segmentation[::-1, ::-1] if rotate_180 else segmentation
-    row_share = overlap_lengths(seen.shape[0], grid_rows)
-    column_share = overlap_lengths(seen.shape[1], grid_columns)
+    if not 0.0 < visible <= 1.0:
+        raise BadArgument(f"The visible share of a picture's side is {visible}; it must be above 0 and at most 1.")
+    seen = segmentation[:: -1 if flip_rows else 1, :: -1 if flip_columns else 1]
+    row_share = overlap_lengths(seen.shape[0], grid_rows, visible)
+    column_share = overlap_lengths(seen.shape[1], grid_columns, visible)
     coverage = np.zeros((grid_rows, grid_columns, num_objects))
     for index in np.unique(seen):
         coverage[:, :, index] = row_share @ (seen == index) @ column_share.T

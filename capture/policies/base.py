@@ -26,13 +26,16 @@ from schemas.layout import PatchGrid, Prompt, SiteLayout
 class PolicyCamera:
     """A camera slot of the model that sees something, and where its picture comes from.
 
-    rotate_180: the model's image is the environment's raw one turned by 180°. grid: how patches tile the model's image.
+    flip_rows, flip_columns: the model's image is the environment's raw one (bottom row first) with these reversed. visible: side
+    of the part that the model sees, as a share of the picture's side, around its middle. grid: how patches tile that part.
     """
 
     slot: str
     environment_camera: str
-    rotate_180: bool
+    flip_rows: bool
+    flip_columns: bool
     grid: PatchGrid
+    visible: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,12 @@ class Policy(Protocol):
     @property
     def cameras(self) -> tuple[PolicyCamera, ...]:
         """The camera slots that see something, in key order."""
+
+    def query_pools(self) -> NDArray[np.float64]:
+        """Return the weights (pool, action query) of the means that stand for single action steps."""
+
+    def replan_noise_seed(self, run_seed: int, task_id: int, episode_index: int, replan: int) -> int:
+        """Return the seed of one replan's initial noise; it never depends on what ran before."""
 
     def denoise_times(self) -> NDArray[np.float64]:
         """Return the noise level or flow time of each denoise step, (denoise,)."""

@@ -27,10 +27,9 @@ def identify(policy: Policy) -> PolicyIdentity:
             PolicyCameraView(
                 name=camera.slot,
                 source=camera.environment_camera,
-                rotated_180=camera.rotate_180,
-                # The simulators deliver OpenGL's order, bottom row first: turning it by 180 degrees rights and mirrors it.
-                upright=camera.rotate_180,
-                mirrored=camera.rotate_180,
+                upright=camera.flip_rows,
+                mirrored=camera.flip_columns,
+                visible=camera.visible,
             )
             for camera in policy.cameras
         ),

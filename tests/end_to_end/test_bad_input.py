@@ -38,7 +38,7 @@ def run(command, arguments, capsys) -> str:
         (["--layers", "one"], "invalid int value"),
         (["--heads", "8"], "expected 0 to 7"),
         (["--denoise-steps", "3"], "expected numbers 0 to 2, 'first', 'last' or 'all'"),
-        (["--queries", "some"], "expected 'mean' or 'all'"),
+        (["--queries", "some"], "expected 'mean', 'steps' or 'all'"),
         (["--precision", "24"], "expected mantissa bits from 1 to 23, or 'exact'"),
         (["--replan-steps", "5"], "expected 1 to 4"),
         (["--max-steps", "0"], "expected at least 1"),

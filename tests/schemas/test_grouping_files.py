@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from schemas.builtin_groupings import find_grouping
@@ -17,7 +19,9 @@ from schemas.grouping import (
 from schemas.selectors import SelectorError
 from schemas.vocabulary import Vocabulary
 
-VOCABULARY = Vocabulary(("base", "wrist"), ("base", "wrist", "prompt"), (), ("image",), ("bowl",), ("bowl_1",))
+VOCABULARY = Vocabulary(
+    ("base", "wrist"), ("base", "wrist", "prompt"), (), ("image", "instruction"), ("bowl",), ("bowl_1",)
+)
 
 
 def read(tmp_path, text: str) -> Grouping:
@@ -69,6 +73,8 @@ def test_errors_in_a_file_name_it_and_the_place(tmp_path, text, said):
 def test_finding_a_grouping(tmp_path):
     assert find_grouping("cameras", VOCABULARY).ratio == Ratio(("base", "wrist"), ("linguistic",))
     assert "bowl_1" in find_grouping("objects", VOCABULARY).names
+    # A site without text (Cosmos's self-attention) has nothing to divide by.
+    assert find_grouping("default", replace(VOCABULARY, roles=("image", "blank"))).ratio is None
     with pytest.raises(GroupingNotFound, match="Did you mean 'cameras'"):
         find_grouping("camera", VOCABULARY)
     with pytest.raises(GroupingNotFound, match="Cannot read grouping file"):

@@ -36,6 +36,20 @@ def test_a_layout_finds_spans_and_cameras():
         layout.span("c")
 
 
+def test_latent_frames_by_name_number_and_as_the_published_scripts_call_them():
+    names = ("blank", "wrist", "primary", "action")
+    spans = [
+        Span(name, "latent", 2 * i, 2 * i + 2, camera=name if name in ("wrist", "primary") else None)
+        for i, name in enumerate(names)
+    ]
+    layout = SiteLayout("self", tuple(spans))
+    assert [layout.frame(name).name for name in ("wrist", "frame0", "curr_last")] == ["wrist", "blank", "primary"]
+    with pytest.raises(LookupError, match="Did you mean 'action'"):
+        layout.frame("actions")
+    with pytest.raises(LookupError, match="Existing: none"):
+        SiteLayout("joint", (span("a", 0, 2),)).frame("frame0")
+
+
 def test_role_codes_never_change():
     # They are written in stores: a changed number would give old stores a new meaning.
     assert {role.label: int(role) for role in Role} == {

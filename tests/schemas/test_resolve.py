@@ -115,12 +115,12 @@ def test_overlap_is_an_error_that_names_groups_key_and_word(tokens):
         ("object:bowl_2", "no object 'bowl_2'. Did you mean 'bowl_1'?"),
         ("object:@robots", "Did you mean '@robot'?"),
         ("patch:bas[0:1,0:1]", "no camera 'bas'"),
-        ("frame:frame0", "no frame 'frame0'"),
+        ("frame:frame0", "Unknown latent frame 'frame0'"),
     ],
 )
 def test_unknown_names_say_what_exists(tokens, selector, said):
     grouping = Grouping("g", {"g": (selector,)})
-    with pytest.raises(LookupError if selector.startswith("role") else SelectorError) as caught:
+    with pytest.raises(LookupError if selector.startswith(("role", "frame")) else SelectorError) as caught:
         check_names(grouping, collect_vocabulary([tokens]), tokens.layout)
     assert said in str(caught.value)
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from capture.attention import RowCollector
 from capture.environments.base import Observation
+from capture.noise import noise_seed
 from capture.policies.base import PolicyCamera, PolicyInput, camera_frame, initial_noise, weights_digest
 from capture.policies.pi.config import PiConfig
 from capture.policies.pi.flow_time import denoise_times
@@ -87,11 +88,21 @@ class PiPolicy:
         self.num_action_queries = config.action_horizon
         self.default_replan_steps = processing.default_replan_steps
         self.cameras = tuple(
-            PolicyCamera(slot, processing.environment_cameras[slot], rotate_180=True, grid=patch_grid(config))
+            PolicyCamera(
+                slot, processing.environment_cameras[slot], flip_rows=True, flip_columns=True, grid=patch_grid(config)
+            )
             for slot in config.cameras
             if slot in processing.environment_cameras
         )
         self._warned: set[str] = set()
+
+    def query_pools(self) -> NDArray[np.float64]:
+        """Return the weights (pool, action query): every query is one action step."""
+        return np.eye(self.num_action_queries)
+
+    def replan_noise_seed(self, run_seed: int, task_id: int, episode_index: int, replan: int) -> int:
+        """Return a seed of its own for every replan."""
+        return noise_seed(run_seed, task_id, episode_index, replan)
 
     def denoise_times(self) -> NDArray[np.float64]:
         """Return the flow time of each denoise step, (denoise,): 1 = noise, towards 0 = action."""

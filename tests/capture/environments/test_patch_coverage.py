@@ -11,6 +11,8 @@ from hypothesis.extra import numpy as arrays
 from capture.environments.coverage import overlap_lengths, patch_coverage
 from schemas.errors import BadArgument
 
+STRAIGHT = {"flip_rows": False, "flip_columns": False}
+TURNED = {"flip_rows": True, "flip_columns": True}
 NUM_OBJECTS = 4
 pictures = arrays.arrays(
     np.int32, st.tuples(st.integers(1, 13), st.integers(1, 13)), elements=st.integers(0, NUM_OBJECTS - 1)
@@ -28,7 +30,7 @@ def fine_grained(segmentation: np.ndarray, grid_rows: int, grid_columns: int) ->
 
 @given(pictures, grids)
 def test_equals_counting_in_an_enlarged_picture(segmentation: np.ndarray, grid: tuple[int, int]) -> None:
-    coverage = patch_coverage(segmentation, NUM_OBJECTS, *grid, rotate_180=False)
+    coverage = patch_coverage(segmentation, NUM_OBJECTS, *grid, **STRAIGHT)
     assert coverage.dtype == np.float32
     assert coverage.shape == (grid[0] * grid[1], NUM_OBJECTS)
     np.testing.assert_allclose(coverage, fine_grained(segmentation, *grid), atol=1e-6)
@@ -36,7 +38,7 @@ def test_equals_counting_in_an_enlarged_picture(segmentation: np.ndarray, grid: 
 
 @given(pictures, grids, st.booleans())
 def test_rows_sum_to_one_and_areas_are_kept(segmentation: np.ndarray, grid: tuple[int, int], rotate: bool) -> None:
-    coverage = patch_coverage(segmentation, NUM_OBJECTS, *grid, rotate_180=rotate)
+    coverage = patch_coverage(segmentation, NUM_OBJECTS, *grid, **(TURNED if rotate else STRAIGHT))
     np.testing.assert_allclose(coverage.sum(axis=1), 1, atol=1e-6)
     areas = np.bincount(segmentation.ravel(), minlength=NUM_OBJECTS) / segmentation.size
     np.testing.assert_allclose(coverage.mean(axis=0), areas, atol=1e-6)
@@ -44,11 +46,11 @@ def test_rows_sum_to_one_and_areas_are_kept(segmentation: np.ndarray, grid: tupl
 
 @given(pictures, grids)
 def test_rotation_reverses_the_order_of_the_patches(segmentation: np.ndarray, grid: tuple[int, int]) -> None:
-    straight = patch_coverage(segmentation, NUM_OBJECTS, *grid, rotate_180=False)
-    rotated = patch_coverage(segmentation, NUM_OBJECTS, *grid, rotate_180=True)
+    straight = patch_coverage(segmentation, NUM_OBJECTS, *grid, **STRAIGHT)
+    rotated = patch_coverage(segmentation, NUM_OBJECTS, *grid, **TURNED)
     np.testing.assert_allclose(rotated, straight[::-1], atol=1e-6)
     turned_picture = np.ascontiguousarray(segmentation[::-1, ::-1])
-    np.testing.assert_array_equal(rotated, patch_coverage(turned_picture, NUM_OBJECTS, *grid, rotate_180=False))
+    np.testing.assert_array_equal(rotated, patch_coverage(turned_picture, NUM_OBJECTS, *grid, **STRAIGHT))
 
 
 @given(st.integers(1, 300), st.integers(1, 40))
@@ -60,12 +62,12 @@ def test_overlaps_fill_cells_and_use_pixels_evenly(pixels: int, cells: int) -> N
 
 def test_patches_run_row_by_row() -> None:
     segmentation = np.array([[0, 1], [2, 3]])
-    np.testing.assert_array_equal(patch_coverage(segmentation, 4, 2, 2, rotate_180=False), np.eye(4))
-    np.testing.assert_array_equal(patch_coverage(segmentation, 4, 2, 2, rotate_180=True), np.eye(4)[::-1])
+    np.testing.assert_array_equal(patch_coverage(segmentation, 4, 2, 2, **STRAIGHT), np.eye(4))
+    np.testing.assert_array_equal(patch_coverage(segmentation, 4, 2, 2, **TURNED), np.eye(4)[::-1])
 
 
 def test_a_pixel_on_a_border_counts_by_its_parts() -> None:
-    coverage = patch_coverage(np.array([[0, 1, 0]]), 2, 1, 2, rotate_180=False)
+    coverage = patch_coverage(np.array([[0, 1, 0]]), 2, 1, 2, **STRAIGHT)
     np.testing.assert_allclose(coverage, [[2 / 3, 1 / 3], [2 / 3, 1 / 3]], rtol=1e-6)
 
 
@@ -81,4 +83,20 @@ def test_a_pixel_on_a_border_counts_by_its_parts() -> None:
 )
 def test_wrong_input_is_refused(segmentation: np.ndarray, rows: int, columns: int, says: str) -> None:
     with pytest.raises(BadArgument, match=says):
-        patch_coverage(segmentation, 2, rows, columns, rotate_180=False)
+        patch_coverage(segmentation, 2, rows, columns, **STRAIGHT)
+
+
+def test_rows_alone_can_be_reversed_and_only_the_middle_seen():
+    segmentation = np.zeros((8, 8), dtype=int)
+    segmentation[0, :] = 1  # an edge that half of the side does not reach
+    segmentation[2, 2:6] = 2
+    flipped = patch_coverage(segmentation, 3, 4, 4, flip_rows=True, flip_columns=False, visible=0.5)
+    assert flipped[:12].tolist() == [[1, 0, 0]] * 12
+    assert flipped[12:].tolist() == [[0, 0, 1]] * 4
+    with pytest.raises(BadArgument, match="visible share"):
+        patch_coverage(segmentation, 3, 4, 4, **STRAIGHT, visible=0.0)
+
+
+@given(pixels=st.integers(1, 40), cells=st.integers(1, 20), visible=st.floats(0.1, 1.0))
+def test_every_cell_is_filled_whatever_is_visible(pixels, cells, visible):
+    np.testing.assert_allclose(overlap_lengths(pixels, cells, visible).sum(axis=1), 1.0, rtol=1e-9)

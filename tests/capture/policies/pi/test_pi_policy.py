@@ -82,7 +82,8 @@ def test_frames_are_the_rotated_pictures_of_the_real_cameras(policy, observation
     size = policy.model.config.siglip.image_size
     assert list(given.frames) == [camera.slot for camera in policy.cameras] == ["base_0_rgb", "left_wrist_0_rgb"]
     for camera in policy.cameras:
-        assert camera.rotate_180
+        assert camera.flip_rows
+        assert camera.flip_columns
         expected = model_image(observation.images[camera.environment_camera], size)
         np.testing.assert_array_equal(given.frames[camera.slot], expected)
         tensor = given.tensors[f"image:{camera.slot}"]

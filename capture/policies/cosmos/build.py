@@ -1,0 +1,89 @@
+"""From what a user names on the command line to a Cosmos policy."""
+
+from __future__ import annotations
+
+import torch
+
+from capture.policies.cosmos.calls import select_call
+from capture.policies.cosmos.checkpoint import CosmosOptions, load_cosmos_policy
+from capture.policies.cosmos.config import DEFAULT_CONFIG_NAME, find_config
+from capture.policies.cosmos.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, random_policy
+from capture.policies.cosmos.policy import ACTION_FRAME, CosmosPolicy
+from schemas.errors import BadArgument, listing
+
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+_UNTRAINED = {"embedded": EMBEDDED_CONFIG, "dummy": DUMMY_CONFIG}
+
+
+def build_cosmos_policy(
+    checkpoint: str,
+    *,
+    device: str,
+    config_name: str = DEFAULT_CONFIG_NAME,
+    num_denoising_steps_action: int | None = None,
+    chunk_size: int | None = None,
+    num_open_loop_steps: int | None = None,
+    dataset_stats_path: str | None = None,
+    t5_text_embeddings_path: str | None = None,
+    t5_tokenizer: str | None = None,
+    t5_encoder: str | None = None,
+    vae_path: str | None = None,
+    dtype: str | None = None,
+    query_frame: str = ACTION_FRAME,
+    visual_frame: str = "curr_last",
+    text_frame: str = "frame0",
+    prefer_s: int | None = None,
+    prefer_call: str = "last",
+) -> CosmosPolicy:
+    """Build the policy and hold it against what the user says about it; parameters are the options of the command line.
+
+    `checkpoint` is a folder, a file of weights, a name on the hub, or one of the untrained policies that come with the
+    package: `embedded`, `dummy`. Frames and calls that do not exist are errors here, before anything runs.
+    """
+    if dtype is not None and dtype not in DTYPES:
+        raise BadArgument(f"Cannot use --dtype '{dtype}'; expected {listing(DTYPES)}.")
+    find_config(config_name)
+    options = CosmosOptions(
+        config_name=config_name,
+        num_denoising_steps=num_denoising_steps_action,
+        chunk_size=chunk_size,
+        num_open_loop_steps=num_open_loop_steps,
+        statistics_path=dataset_stats_path,
+        embeddings_path=t5_text_embeddings_path,
+        vae_path=vae_path,
+        t5_tokenizer=t5_tokenizer,
+        t5_encoder=t5_encoder,
+        query_frame=query_frame,
+        dtype=DTYPES[dtype] if dtype else None,
+    )
+    if checkpoint in _UNTRAINED:
+        policy = _untrained(checkpoint, options, device)
+    else:
+        policy = load_cosmos_policy(checkpoint, options=options, device=device)
+    for frame in (visual_frame, text_frame):
+        policy.config.frames.index(frame)
+    select_call(policy.config, prefer_s, prefer_call)
+    return policy
+
+
+def _untrained(name: str, options: CosmosOptions, device: str) -> CosmosPolicy:
+    files = (
+        options.statistics_path,
+        options.embeddings_path,
+        options.vae_path,
+        options.t5_tokenizer,
+        options.t5_encoder,
+    )
+    if any(files) or options.dtype == torch.bfloat16 or options.config_name != DEFAULT_CONFIG_NAME:
+        raise BadArgument(
+            f"The policy '{name}' comes with the program, in float32; --config-name, --dataset-stats-path, --t5-text-embeddings-path, "
+            "--t5-tokenizer, --t5-encoder, --vae-path and --dtype bfloat16 are for checkpoints."
+        )
+    config = options.apply(_UNTRAINED[name])
+    return random_policy(
+        name,
+        config,
+        device=device,
+        open_loop_steps=options.open_loop_steps(config),
+        query_frame=options.query_frame,
+    )

@@ -1,0 +1,132 @@
+"""Weights of the diffusion transformer: which of a checkpoint's entries are weights, the sizes they imply, strict loading."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from capture.policies.cosmos.config import DitConfig
+from capture.policies.cosmos.dit import Dit
+from capture.policies.cosmos.tensor_files import UnreadableTensors
+from schemas.errors import UserError, listing
+
+Shapes = dict[str, tuple[int, ...]]
+
+PREFIX = "net."
+#: Training counters: no weights.
+COUNTER_PREFIX = "accum_"
+#: Transformer Engine's extra state: no weights; absent when the checkpoint was written without it.
+EXTRA_STATE = "_extra_state"
+#: What activation checkpointing leaves in names.
+_WRAPPED = "_checkpoint_wrapped_module."
+_ROTARY_PREFIX = "pos_embedder."
+
+
+class CheckpointMismatch(UserError, ValueError):
+    """The checkpoint's tensors are not those of the model: names or shapes differ."""
+
+
+def dit_tensors(stored: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Return the weights of a stored state, by their names in the model.
+
+    The prefix `net.` and traces of activation checkpointing are taken off; counters, extra state and the averaged copy
+    (`net_ema.`) are left out. Nothing else is: what is unknown shows up when the model is filled.
+    """
+    weights: dict[str, Tensor] = {}
+    for name, value in stored.items():
+        if name.startswith("net_ema."):
+            continue
+        plain = name.removeprefix(PREFIX).replace(_WRAPPED, "")
+        if plain.startswith(COUNTER_PREFIX) or plain.endswith(EXTRA_STATE):
+            continue
+        if not isinstance(value, Tensor):
+            raise UnreadableTensors(f"'{name}' of the checkpoint is no tensor, but {type(value).__name__}.")
+        weights[plain] = value
+    return weights
+
+
+def infer_dit_config(weights: Mapping[str, Tensor], base: DitConfig | None = None) -> DitConfig:
+    """Return the sizes that the weights have; what no weight tells (rotary factors, patch size) is that of `base`."""
+    base = base or DitConfig()
+
+    def shape(name: str) -> tuple[int, ...]:
+        if name not in weights:
+            raise CheckpointMismatch(
+                f"The checkpoint has no '{name}', so it is no Cosmos transformer; it has {listing(sorted(weights), 4)}."
+            )
+        return tuple(weights[name].shape)
+
+    patch = base.patch_size**2
+    width, features = shape("x_embedder.proj.1.weight")
+    blocks = {
+        int(name.split(".")[1]) for name in weights if name.startswith("blocks.") and name.split(".")[1].isdigit()
+    }
+    head_dim = shape("blocks.0.self_attn.q_norm.weight")[0]
+    return DitConfig(
+        width=width,
+        num_blocks=max(blocks) + 1,
+        num_heads=width // head_dim,
+        mlp_dim=shape("blocks.0.mlp.layer1.weight")[0],
+        text_dim=shape("blocks.0.cross_attn.k_proj.weight")[1],
+        adaln_dim=shape("blocks.0.adaln_modulation_mlp.1.weight")[0],
+        in_channels=features // patch - 2,
+        out_channels=shape("final_layer.linear.weight")[0] // patch,
+        patch_size=base.patch_size,
+        max_positions=shape("pos_embedder.seq")[0],
+        rope_t_extrapolation=base.rope_t_extrapolation,
+        rope_h_extrapolation=base.rope_h_extrapolation,
+        rope_w_extrapolation=base.rope_w_extrapolation,
+    )
+
+
+def expected_shapes(config: DitConfig) -> Shapes:
+    """Return name -> shape of every tensor of `Dit(config)`, rotary buffers too, without allocating any."""
+    with torch.device("meta"):
+        state = Dit(config).state_dict()
+    return {name: tuple(tensor.shape) for name, tensor in state.items()}
+
+
+def check_shapes(found: Shapes, expected: Shapes, what: str) -> None:
+    """Raise `CheckpointMismatch` that lists missing, extra and misshapen tensors, if there are any."""
+    misshapen = [
+        f"{name} is {found[name]} instead of {expected[name]}"
+        for name in sorted(expected.keys() & found.keys())
+        if found[name] != expected[name]
+    ]
+    parts = [
+        f"{len(items)} {fault}: {listing(items)}"
+        for fault, items in (
+            ("missing", sorted(expected.keys() - found.keys())),
+            ("extra", sorted(found.keys() - expected.keys())),
+            ("of the wrong shape", misshapen),
+        )
+        if items
+    ]
+    if parts:
+        raise CheckpointMismatch(f"The checkpoint's tensors are not those of {what}; {'; '.join(parts)}.")
+
+
+def build_dit(
+    config: DitConfig,
+    weights: Mapping[str, Tensor],
+    *,
+    dtype: torch.dtype = torch.float32,
+    device: str | torch.device = "cpu",
+) -> Dit:
+    """Build the transformer from tensors by model name, strictly.
+
+    The rotary buffers are rounded to `dtype`, as the reference's are, but kept in float32: frequencies are computed there.
+    """
+    shapes = {name: tuple(tensor.shape) for name, tensor in weights.items()}
+    check_shapes(shapes, expected_shapes(config), "the Cosmos transformer")
+    with torch.device("meta"):
+        model = Dit(config)
+    filled = {}
+    for name, tensor in weights.items():
+        cast = tensor.to(device=device, dtype=dtype)
+        filled[name] = cast.float() if name.startswith(_ROTARY_PREFIX) else cast
+    model.load_state_dict(filled, strict=True, assign=True)
+    return model.requires_grad_(False).eval()

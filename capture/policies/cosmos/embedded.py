@@ -1,0 +1,155 @@
+"""Untrained Cosmos policies with seeded random weights, so that everything runs anywhere.
+
+They solve nothing. `embedded` has the published policy's depth, latent frames and sampler at a quarter of its picture
+area, so that layer and frame numbers exist; `dummy` is for tests. Weights are scaled such that attention has structure:
+rows are neither uniform nor on one key, and depend on pictures, words, noise and time.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from capture.policies.cosmos.config import CosmosConfig, DitConfig, SamplerConfig, VaeConfig
+from capture.policies.cosmos.dit_weights import build_dit, expected_shapes
+from capture.policies.cosmos.model import CosmosModel
+from capture.policies.cosmos.policy import ACTION_FRAME, CosmosPolicy, CosmosSource
+from capture.policies.cosmos.preprocess import Statistics, make_statistics
+from capture.policies.cosmos.text import PieceTokenizer, SeededText
+from capture.policies.cosmos.vae import build_encoder, expected_vae_shapes
+
+#: The small sentencepiece model that comes with this package.
+TOKENIZER_PATH = Path(__file__).parents[1] / "pi" / "embedded" / "tokenizer.model"
+
+EMBEDDED_CONFIG = CosmosConfig(
+    dit=DitConfig(width=96, num_blocks=28, num_heads=4, mlp_dim=192, text_dim=48, adaln_dim=16),
+    vae=VaeConfig(base_dim=4),
+    image_size=112,
+)
+
+#: The same code in milliseconds: 16 tokens a frame, three blocks.
+DUMMY_CONFIG = CosmosConfig(
+    dit=DitConfig(width=48, num_blocks=3, num_heads=2, mlp_dim=96, text_dim=24, adaln_dim=8),
+    vae=VaeConfig(base_dim=4),
+    sampler=SamplerConfig(num_steps=3),
+    image_size=64,
+    text_length=64,
+)
+
+#: Made-up ranges of LIBERO's actions and proprioception (not statistics of any data set).
+BUILTIN_RANGES: Mapping[str, object] = {
+    "actions_min": [-0.6, -0.6, -0.6, -0.12, -0.15, -0.15, -1.0],
+    "actions_max": [0.6, 0.6, 0.6, 0.12, 0.15, 0.15, 1.0],
+    "proprio_min": [0.0, -0.04, -0.4, -0.35, 0.0, -1.0, -1.0, -1.0, -1.0],
+    "proprio_max": [0.04, 0.0, 0.2, 0.35, 1.3, 1.0, 1.0, 1.0, 1.0],
+}
+
+#: Spread of the logits of the first and the last block: exp(-σ²/2) of the keys would effectively be looked at.
+_FLATTEST, _SHARPEST = 1.5, 4.0
+
+
+def builtin_statistics() -> Statistics:
+    """Return the made-up ranges as statistics."""
+    return make_statistics(BUILTIN_RANGES, "that come with the program", action_dim=7, proprio_dim=9)
+
+
+def _normal(seed: int, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Standard normal numbers from a stream of the tensor's own: the same on every machine."""
+    stream = np.random.Philox(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
+    return np.random.Generator(stream).standard_normal(shape, dtype=np.float32)
+
+
+def random_dit_weights(config: DitConfig, seed: int) -> dict[str, Tensor]:
+    """Return float32 weights of a `Dit(config)` by model name, drawn from `seed` alone."""
+    weights = {}
+    for name, shape in expected_shapes(config).items():
+        if name.startswith("pos_embedder."):
+            weights[name] = _rotary_buffer(name, shape[0], config)
+        else:
+            weights[name] = torch.from_numpy(_scaled(name, _normal(seed, name, shape), config))
+    return weights
+
+
+def _rotary_buffer(name: str, length: int, config: DitConfig) -> Tensor:
+    """The exponents of the rotary positions, rounded to bfloat16 like those of published checkpoints."""
+    if name.endswith("seq"):
+        return torch.arange(length, dtype=torch.float32)
+    dim = config.spatial_rotary_dim if "spatial" in name else config.temporal_rotary_dim
+    return (torch.arange(0, dim, 2, dtype=torch.float32) / dim).bfloat16().float()
+
+
+def _scaled(name: str, normal: np.ndarray, config: DitConfig) -> np.ndarray:
+    if name.endswith("q_norm.weight"):
+        share = int(name.split(".")[1]) / max(1, config.num_blocks - 1)
+        sharpness = _FLATTEST * (_SHARPEST / _FLATTEST) ** share
+        return np.full_like(normal, sharpness) * (1 + np.float32(0.1) * normal)
+    if "norm" in name:
+        return 1 + np.float32(0.1) * normal
+    weight = normal * np.float32(normal.shape[-1] ** -0.5)
+    if "adaln_modulation" in name or name == "t_embedder.1.linear_2.weight":
+        # Shift, scale, gate: a large shift is the same for all tokens of a frame and would make their keys alike.
+        if not name.endswith(".1.weight"):
+            for third, factor in enumerate((0.2, 0.4, 0.8)):
+                weight[third * config.width : (third + 1) * config.width] *= np.float32(factor)
+        return weight
+    if name == "x_embedder.proj.1.weight":
+        return weight * np.float32(2.0)
+    return weight
+
+
+def random_vae_weights(config: VaeConfig, seed: int) -> dict[str, Tensor]:
+    """Return float32 weights of a whole VAE by its published names, drawn from `seed` alone."""
+    weights = {}
+    for name, shape in expected_vae_shapes(config).items():
+        normal = _normal(seed, name, shape)
+        if name.endswith("gamma"):
+            scaled = np.ones_like(normal)
+        elif name.endswith("bias"):
+            scaled = normal * np.float32(0.02)
+        else:
+            scaled = normal * np.float32(1.4 * int(np.prod(shape[1:])) ** -0.5)
+        weights[name] = torch.from_numpy(scaled)
+    return weights
+
+
+def build_random_model(config: CosmosConfig, seed: int, device: str | torch.device = "cpu") -> CosmosModel:
+    """Build a model with random weights."""
+    dit = build_dit(config.dit, random_dit_weights(config.dit, seed), device=device)
+    encoder = build_encoder(config.vae, random_vae_weights(config.vae, seed), device=device)
+    return CosmosModel(config, dit, encoder)
+
+
+def random_policy(
+    name: str,
+    config: CosmosConfig,
+    seed: int = 0,
+    device: str | torch.device = "cpu",
+    *,
+    open_loop_steps: int | None = None,
+    query_frame: str = ACTION_FRAME,
+) -> CosmosPolicy:
+    """Build an untrained policy of any size; the seed draws its weights."""
+    text = SeededText(PieceTokenizer(TOKENIZER_PATH), config.text_length, config.dit.text_dim, seed)
+    return CosmosPolicy(
+        build_random_model(config, seed, device),
+        text,
+        builtin_statistics(),
+        CosmosSource(name=name, checkpoint=f"random weights, seed {seed}", checkpoint_format="seeded", untrained=True),
+        open_loop_steps=config.chunk_size if open_loop_steps is None else open_loop_steps,
+        query_frame=query_frame,
+    )
+
+
+def embedded_policy(seed: int = 0, device: str | torch.device = "cpu") -> CosmosPolicy:
+    """Build the policy that `vla-capture cosmos` runs without a checkpoint."""
+    return random_policy("embedded", EMBEDDED_CONFIG, seed, device)
+
+
+def dummy_policy(seed: int = 0, device: str | torch.device = "cpu") -> CosmosPolicy:
+    """Build the policy of test size."""
+    return random_policy("dummy", DUMMY_CONFIG, seed, device)

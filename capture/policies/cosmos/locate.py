@@ -1,0 +1,153 @@
+"""Find a checkpoint's files: in a folder, beside it, in the Hugging Face hub's cache, or through the hub's own client."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+from schemas.errors import BadArgument, MissingDependency, UserError, listing
+
+POLICY_REPOSITORY = "nvidia/Cosmos-Policy-LIBERO-Predict2-2B"
+#: Where the image encoder is published; the policy's own repository does not have it.
+VAE_REPOSITORY = "nvidia/Cosmos-Predict2-2B-Video2World"
+VAE_NAME = "tokenizer/tokenizer.pth"
+STATISTICS_NAME = "libero_dataset_statistics.json"
+EMBEDDINGS_NAME = "libero_t5_embeddings.pkl"
+#: T5's vocabulary is the same in all sizes.
+T5_REPOSITORIES = ("google-t5/t5-11b", "google-t5/t5-small", "google-t5/t5-base", "google-t5/t5-large")
+T5_TOKENIZER = "spiece.model"
+_HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
+
+
+class CheckpointNotFound(UserError, FileNotFoundError):
+    """There is no checkpoint, or not all of it."""
+
+
+class CheckpointUnavailable(UserError, ConnectionError):
+    """Files have to be fetched and cannot be."""
+
+
+class UnsupportedCheckpoint(UserError, ValueError):
+    """The checkpoint is in a form that is not read."""
+
+
+def hub_cache() -> Path:
+    """The folder that the Hugging Face hub's client downloads to."""
+    home = os.environ.get("HF_HOME") or Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "huggingface"
+    return Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub").expanduser()
+
+
+def in_hub_cache(repository: str, file: str) -> Path | None:
+    """Return a file of a repository that was downloaded before, or None."""
+    snapshots = hub_cache() / f"models--{repository.replace('/', '--')}" / "snapshots"
+    found = sorted(snapshots.glob(f"*/{file}"))
+    return found[-1] if found else None
+
+
+def find_checkpoint(name: str) -> Path:
+    """Return the folder (or the file of weights) that `--ckpt-path` names: a local path, or `ORG/NAME` of the hub.
+
+    What is not in the hub's cache is downloaded; `CheckpointUnavailable` says what to do when that fails.
+    """
+    path = Path(name).expanduser()
+    if path.exists():
+        return path
+    if _HUB_NAME.fullmatch(name):
+        return _from_hub(name, ["*.pt", STATISTICS_NAME, EMBEDDINGS_NAME])
+    raise CheckpointNotFound(
+        f"There is no checkpoint at '{path}'; give a folder with a .pt file, {STATISTICS_NAME} and {EMBEDDINGS_NAME}, or "
+        f"{POLICY_REPOSITORY}."
+    )
+
+
+def _from_hub(repository: str, patterns: list[str]) -> Path:
+    how = (
+        f"fetch {listing(patterns)} of it where there is a network (`hf download {repository}`), copy the folder here and give its "
+        "path (there is no such local folder)"
+    )
+    try:
+        from huggingface_hub import snapshot_download
+    except ImportError as error:
+        raise MissingDependency(
+            f"'{repository}' is a name on the Hugging Face hub, whose client is not installed; install it with "
+            f"`pip install 'vla-attention[hub]'`, or {how}."
+        ) from error
+    try:
+        return Path(snapshot_download(repository, allow_patterns=patterns))
+    except Exception as error:  # the client raises its own errors, those of its HTTP library, and OSError
+        text = str(error).strip()
+        first = f"{type(error).__name__}: {text.splitlines()[0].rstrip('.')}" if text else type(error).__name__
+        raise CheckpointUnavailable(
+            f"'{repository}' could not be fetched from the Hugging Face hub ({first}); {how}."
+        ) from error
+
+
+def find_weights(checkpoint: Path) -> Path:
+    """Return the transformer's file of a checkpoint folder: the one `.pt` file in it."""
+    if checkpoint.is_file():
+        return checkpoint
+    if (checkpoint / "model").is_dir():
+        raise UnsupportedCheckpoint(
+            f"'{checkpoint}' has its weights in the distributed form (folder 'model'), which the reference would read first and which "
+            "is not read here; convert it to one .pt file, and give that file as --ckpt-path."
+        )
+    found = sorted([*checkpoint.glob("*.pt"), *checkpoint.glob("*.safetensors")])
+    if len(found) != 1:
+        inside = listing(sorted(path.name for path in checkpoint.iterdir()))
+        what = "no .pt file" if not found else f"several files of weights ({listing(path.name for path in found)})"
+        raise CheckpointNotFound(
+            f"The checkpoint '{checkpoint}' has {what}; expected one, and found {inside}."
+            + (" Give one of them as --ckpt-path." if found else "")
+        )
+    return found[0]
+
+
+def find_vae(checkpoint: Path, given: str | None, *, from_hub: bool = False) -> Path:
+    """Return the image encoder's file: the one named, else in or beside the checkpoint, else from the hub or its cache."""
+    folder = checkpoint if checkpoint.is_dir() else checkpoint.parent
+    if given is not None:
+        named = Path(given).expanduser()
+        places = [named / VAE_NAME, named / Path(VAE_NAME).name] if named.is_dir() else [named]
+    else:
+        beside = folder.absolute().parent / VAE_REPOSITORY.split("/")[1]
+        places = [folder / VAE_NAME, folder / Path(VAE_NAME).name, beside / VAE_NAME]
+        cached = in_hub_cache(VAE_REPOSITORY, VAE_NAME)
+        places += [cached] if cached is not None else []
+    for place in places:
+        if place.is_file():
+            return place
+    if from_hub and given is None:
+        return _from_hub(VAE_REPOSITORY, [VAE_NAME]) / VAE_NAME
+    raise CheckpointNotFound(
+        f"The image encoder was not found at {listing(places)}; it is published apart from the policy: fetch it with "
+        f"`hf download {VAE_REPOSITORY} {VAE_NAME}` and give --vae-path."
+    )
+
+
+def find_beside(checkpoint: Path, given: str | None, name: str) -> Path:
+    """Return a file that comes with the checkpoint, or the one given instead (a path, or ORG/NAME/FILE in the hub's cache)."""
+    folder = checkpoint if checkpoint.is_dir() else checkpoint.parent
+    if given is None:
+        return folder / name
+    path = Path(given).expanduser()
+    if path.exists() or given.count("/") != 2:
+        return path
+    repository, _, file = given.rpartition("/")
+    cached = in_hub_cache(repository, file)
+    return cached if cached is not None else path
+
+
+def find_t5_tokenizer(checkpoint: Path, given: str | None) -> Path | None:
+    """Return T5's sentencepiece model: the one named, else the checkpoint's or that of the hub's cache; None if there is none."""
+    if given is not None:
+        path = Path(given).expanduser()
+        if path.is_dir():
+            path = path / T5_TOKENIZER
+        if not path.is_file():
+            raise BadArgument(f"There is no T5 tokenizer at '{path}'; expected {T5_TOKENIZER} of {T5_REPOSITORIES[0]}.")
+        return path
+    folder = checkpoint if checkpoint.is_dir() else checkpoint.parent
+    if (folder / T5_TOKENIZER).is_file():
+        return folder / T5_TOKENIZER
+    return next((found for name in T5_REPOSITORIES if (found := in_hub_cache(name, T5_TOKENIZER))), None)

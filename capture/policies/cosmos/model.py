@@ -1,0 +1,140 @@
+"""The whole model: pictures, proprioception and text in; a clean latent video with actions and value in it out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from capture.attention import RowCollector
+from capture.policies.cosmos.config import CosmosConfig
+from capture.policies.cosmos.dit import BlockObserver, Dit
+from capture.policies.cosmos.latents import condition_mask, fill_frame
+from capture.policies.cosmos.layout import cross_layout, self_layout
+from capture.policies.cosmos.observer import CallObserver
+from capture.policies.cosmos.preprocess import pixels
+from capture.policies.cosmos.sampler import flow_time, noise_levels, sample, seeded_noise
+from capture.policies.cosmos.vae import CausalEncoder
+
+PROPRIO_FRAME = "proprio"
+
+
+@dataclass
+class CallTrace:
+    """What the network took and gave in one evaluation; for comparing with a reference, not kept otherwise."""
+
+    noisy: list[Tensor] = field(default_factory=list)
+    net_input: list[Tensor] = field(default_factory=list)
+    times: list[Tensor] = field(default_factory=list)
+    net_output: list[Tensor] = field(default_factory=list)
+    clean: list[Tensor] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Recorders:
+    """Who wants to see what, while actions are sampled. Nothing that is sampled depends on them."""
+
+    rows: Mapping[str, RowCollector] = field(default_factory=dict)
+    query_frame: int = 4
+
+
+class CosmosModel(nn.Module):
+    """Transformer and image encoder with the sizes that fix how they are used."""
+
+    def __init__(self, config: CosmosConfig, dit: Dit, encoder: CausalEncoder):
+        super().__init__()
+        self.config = config
+        self.dit = dit
+        self.encoder = encoder
+        self.sites = (self_layout(config), cross_layout(config))
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of the transformer's weights."""
+        return self.dit.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return self.dit.device
+
+    @property
+    def levels(self) -> NDArray[np.float64]:
+        """The noise level of each network evaluation."""
+        return noise_levels(self.config.sampler)
+
+    @torch.no_grad()
+    def given_latents(self, pictures: Sequence[NDArray[np.uint8]], proprio: NDArray[np.float64]) -> Tensor:
+        """Return the given latent frames (1, channel, frame, row, column) float32; frames to be denoised are 0.
+
+        `pictures` in the order of the frames (wrist, primary); `proprio` is normalised, and rounded to bfloat16 here as
+        in the reference.
+        """
+        config = self.config
+        images = [pixels(picture, self.encoder.dtype, self.encoder.device) for picture in pictures]
+        encoded = self.encoder.encode(images)
+        latents = torch.zeros(config.latent_shape, device=self.device)
+        latents[:, :, : encoded.shape[2]] = encoded.to(self.device)
+        rounded = torch.from_numpy(np.asarray(proprio)).to(torch.bfloat16).float().to(self.device)
+        _, channels, _, height, width = config.latent_shape
+        latents[0, :, config.frames.index(PROPRIO_FRAME)] = fill_frame(rounded, (channels, height, width))
+        return latents
+
+    def denoise(
+        self,
+        noisy: Tensor,
+        sigma: float,
+        given: Tensor,
+        mask: Tensor,
+        text: Tensor,
+        observer: BlockObserver | None = None,
+        trace: CallTrace | None = None,
+    ) -> Tensor:
+        """Return the estimate of the clean latents (float32) from latents with noise `sigma`; given frames stay given."""
+        t = torch.tensor(flow_time(sigma), dtype=torch.float32, device=noisy.device)
+        net_input = mask * given + (1 - mask) * ((1 - t) * noisy)
+        times = t * (1 - mask[:, 0, :, 0, 0])
+        size = self.config.image_size
+        padding = torch.zeros(len(noisy), 1, size, size, device=noisy.device)
+        net_output = self.dit(net_input, times, mask, padding, text, observer).float()
+        clean: Tensor = (1 - t) * noisy - t * net_output
+        clean = mask * given + (1 - mask) * clean
+        if trace is not None:
+            trace.noisy.append(noisy)
+            trace.net_input.append(net_input)
+            trace.times.append(times.to(self.dtype).float())
+            trace.net_output.append(net_output)
+            trace.clean.append(clean)
+        return clean
+
+    @torch.no_grad()
+    def sample_latents(
+        self, given: Tensor, text: Tensor, seed: int, recorders: Recorders | None = None, trace: CallTrace | None = None
+    ) -> Tensor:
+        """Return the clean latent video (1, channel, frame, row, column) float32.
+
+        given: as from `given_latents`. text: (1, position, text width). seed: of the noise, made by numpy's legacy generator.
+        """
+        config = self.config
+        noise = torch.from_numpy(seeded_noise(seed, config.latent_shape)).to(self.device)
+        mask = condition_mask(config).to(self.device)
+        text = text.to(self.device)
+
+        def denoise(noisy: Tensor, sigma: float, step: int) -> Tensor:
+            return self.denoise(noisy, sigma, given, mask, text, self._observer(recorders, step), trace)
+
+        return sample(denoise, noise, self.levels)
+
+    def _observer(self, recorders: Recorders | None, step: int) -> CallObserver | None:
+        if recorders is None or not recorders.rows:
+            return None
+        return CallObserver(
+            denoise_step=step,
+            query_frame=recorders.query_frame,
+            tokens_per_frame=self.config.tokens_per_frame,
+            recorders=recorders.rows,
+        )

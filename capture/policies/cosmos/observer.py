@@ -1,0 +1,64 @@
+"""What is taken out of one network evaluation: rows of the recorded frame's queries, and what they add to the stream."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch.nn.functional as F
+from torch import Tensor
+
+from capture.attention import RowCollector, RowSink, UpdateSink
+from capture.contributions import Projection
+from capture.policies.cosmos.dit import Attention
+
+
+def projection(output_weight: Tensor, gate: Tensor) -> Projection:
+    """Return the map from mixed values (any, head · dim) to the gated update (any, width), in float32; gate is (1, width)."""
+    weight, factor = output_weight.float(), gate.float()
+    return lambda mixed: F.linear(mixed, weight) * factor
+
+
+@dataclass
+class CallObserver:
+    """Passes what one network evaluation shows of the queries of `query_frame` on to the recorders of the sites.
+
+    Rows and contributions come from the very probabilities that the model uses; nothing is computed twice.
+    """
+
+    denoise_step: int
+    query_frame: int
+    tokens_per_frame: int
+    recorders: Mapping[str, RowCollector]
+    #: site -> the values and the output weight of the block at hand; kept until its gates are known
+    _seen: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    def _queries(self) -> slice:
+        return slice(0, self.tokens_per_frame)
+
+    def _update_sinks(self, layer: int) -> dict[str, UpdateSink]:
+        found = {
+            site: recorder.update_sink(layer, self.denoise_step, self._queries)
+            for site, recorder in self.recorders.items()
+        }
+        return {site: sink for site, sink in found.items() if sink is not None}
+
+    def rows(self, site: str, layer: int, frame: int, attention: Attention, value: Tensor) -> RowSink | None:
+        """Return what takes the rows of these queries, or None when nobody wants them."""
+        recorder = self.recorders.get(site)
+        if frame != self.query_frame or recorder is None:
+            return None
+        if recorder.update_sink(layer, self.denoise_step, self._queries) is not None:
+            self._seen[site] = value, attention.output_proj.weight
+        return recorder.sink(layer, self.denoise_step, self._queries)
+
+    def wants_updates(self, layer: int) -> bool:
+        """Say whether some site's contributions are wanted of this block."""
+        return bool(self._update_sinks(layer))
+
+    def updates(self, layer: int, updates: dict[str, Tensor], gates: dict[str, Tensor], block_input: Tensor) -> None:
+        """Pass values, projection and update of the recorded queries on."""
+        for site, sink in self._update_sinks(layer).items():
+            value, weight = self._seen.pop(site)
+            sink(value, projection(weight, gates[site][0, self.query_frame]), updates[site][:, self.query_frame])

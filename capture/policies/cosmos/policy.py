@@ -1,0 +1,193 @@
+"""Cosmos Policy as the rollout sees it: observation in, action chunk out, two sites with their layouts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.attention import RowCollector
+from capture.environments.base import Observation
+from capture.policies.base import PolicyInput, camera_frame, weights_digest
+from capture.policies.cosmos.config import CosmosConfig
+from capture.policies.cosmos.latents import action_shares, query_pools, read_actions, read_value
+from capture.policies.cosmos.layout import CROSS, SELF, cameras, self_roles
+from capture.policies.cosmos.model import CosmosModel, Recorders
+from capture.policies.cosmos.preprocess import Statistics, model_picture, proprio_of, upright
+from capture.policies.cosmos.sampler import flow_time
+from capture.policies.cosmos.text import TextSource
+from schemas.errors import BadArgument
+
+ACTION_FRAME, VALUE_FRAME = "action", "value"
+
+
+@dataclass(frozen=True)
+class CosmosSource:
+    """Where a policy's weights come from: `checkpoint` is a path or a name, or a description of how they were made."""
+
+    name: str
+    checkpoint: str
+    checkpoint_format: str
+    untrained: bool
+    configuration: str = "built in"
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What one policy call gives: actions (step, dim) in the robot's units, and the value that the policy expects, 0..1."""
+
+    actions: NDArray[np.float64]
+    value: float
+
+
+class CosmosPolicy:
+    """Transformer, image encoder, text embeddings and statistics, for LIBERO-like observations.
+
+    query_frame: the latent frame whose tokens' rows are recorded: `action`, `curr_last`, `frameN` or a frame's name.
+    open_loop_steps: actions of a chunk that are executed before the policy is asked again.
+    """
+
+    def __init__(
+        self,
+        model: CosmosModel,
+        text: TextSource,
+        statistics: Statistics,
+        source: CosmosSource,
+        *,
+        open_loop_steps: int = 16,
+        query_frame: str = ACTION_FRAME,
+    ):
+        config = model.config
+        if not 1 <= open_loop_steps <= config.chunk_size:
+            raise BadArgument(
+                f"Cannot use --num-open-loop-steps {open_loop_steps}: the policy gives {config.chunk_size} actions a call; "
+                f"expected 1 to {config.chunk_size}."
+            )
+        self.model = model
+        self.text = text
+        self.statistics = statistics
+        self.source = source
+        self.name = source.name
+        self.query_frame = config.frames.names[config.frames.index(query_frame)]
+        self.sites = model.sites
+        self.num_layers = config.dit.num_blocks
+        self.num_heads = config.dit.num_heads
+        self.num_denoise_steps = len(model.levels)
+        self.action_horizon = config.chunk_size
+        self.default_replan_steps = open_loop_steps
+        self.num_action_queries = config.tokens_per_frame
+        self.cameras = cameras(config)
+
+    @property
+    def config(self) -> CosmosConfig:
+        """Sizes and conventions."""
+        return self.model.config
+
+    def denoise_times(self) -> NDArray[np.float64]:
+        """Return the network's time of each denoise step, (denoise,): 1 = noise, towards 0 = clean."""
+        return np.array([flow_time(level) for level in self.model.levels])
+
+    def replan_noise_seed(self, run_seed: int, task_id: int, episode_index: int, replan: int) -> int:
+        """Return the seed of a replan's noise: the run's own, always, as in the reference.
+
+        Every replan starts from the same noise, so that differences between replans come from their inputs only.
+        """
+        return run_seed
+
+    def action_shares(self) -> NDArray[np.float64]:
+        """Return what each recorded query stands for, (query, step, dim); only the action frame's queries do."""
+        if self.query_frame != ACTION_FRAME:
+            raise BadArgument(
+                f"Queries of latent frame '{self.query_frame}' do not stand for action steps; use --query-frame action."
+            )
+        return action_shares(self.config)
+
+    def query_pools(self) -> NDArray[np.float64]:
+        """Return weights (pool, query) that pool the recorded queries by action step and dimension, step-major."""
+        return query_pools(self.action_shares())
+
+    @cached_property
+    def _digest(self) -> str:
+        return weights_digest(self.model)
+
+    def provenance(self) -> dict[str, Any]:
+        """Return what identifies the policy, as plain JSON values; reading all weights, it is slow the first time."""
+        return {
+            "policy": self.name,
+            "family": "cosmos",
+            "checkpoint": self.source.checkpoint,
+            "checkpoint_format": self.source.checkpoint_format,
+            "weights_digest": self._digest,
+            "untrained": self.source.untrained,
+            "configuration": self.source.configuration,
+            "config": json.loads(json.dumps(asdict(self.config))),
+            "dtype": str(self.model.dtype).removeprefix("torch."),
+            "device": str(self.model.device),
+            "normalisation": "min-max",
+            "statistics": self.statistics.as_json(),
+            "query_frame": self.query_frame,
+            "noise": "the same at every replan",
+            **self.text.provenance(),
+        }
+
+    def prepare(self, observation: Observation, instruction: str) -> PolicyInput:
+        """Turn an observation and an instruction into the model's input (batch 1).
+
+        state: the 9 numbers of proprioception, not normalised. The prompt's pieces are keys of `cross`. tensors: `given`
+        (1, channel, frame, row, column) latents and `text` (1, position, width).
+        """
+        config = self.config
+        frames = {
+            camera.slot: model_picture(upright(camera_frame(observation, camera.environment_camera)), config.image_size)
+            for camera in self.cameras
+        }
+        proprio = proprio_of(observation.gripper_qpos, observation.eef_pos, observation.eef_quat)
+        encoded = self.text.encode(instruction)
+        expected = (1, config.text_length, config.dit.text_dim)
+        if tuple(encoded.embedding.shape) != expected:
+            raise BadArgument(
+                f"The text embedding of '{instruction}' has shape {tuple(encoded.embedding.shape)}, but the policy reads {expected}."
+            )
+        normalised = self.statistics.normalise_proprio(proprio)
+        return PolicyInput(
+            frames=frames,
+            key_role={SELF: self_roles(config), CROSS: encoded.roles},
+            prompt=encoded.prompt,
+            state=proprio,
+            tensors={
+                "given": self.model.given_latents(list(frames.values()), normalised),
+                "text": encoded.embedding.to(self.model.device),
+            },
+        )
+
+    def act(
+        self,
+        policy_input: PolicyInput,
+        noise_seed: int,
+        recorders: Mapping[str, RowCollector] | None = None,
+    ) -> NDArray[np.float64]:
+        """Return the action chunk (horizon, 7) for the environment; nothing of it depends on what is recorded."""
+        return self.predict(policy_input, noise_seed, recorders).actions
+
+    def predict(
+        self,
+        policy_input: PolicyInput,
+        noise_seed: int,
+        recorders: Mapping[str, RowCollector] | None = None,
+    ) -> Prediction:
+        """Return the action chunk and the expected value."""
+        config = self.config
+        wanted = Recorders(recorders or {}, config.frames.index(self.query_frame))
+        tensors = policy_input.tensors
+        clean = self.model.sample_latents(tensors["given"], tensors["text"], noise_seed, wanted)[0].cpu()
+        frame = clean[:, config.frames.index(ACTION_FRAME)]
+        actions = read_actions(frame, config.chunk_size, config.action_dim).numpy()
+        return Prediction(
+            actions=self.statistics.environment_actions(actions),
+            value=read_value(clean[:, config.frames.index(VALUE_FRAME)]),
+        )

@@ -1,0 +1,123 @@
+"""Reading precomputed T5 embeddings from their pickle, without running anything that the file says."""
+
+from __future__ import annotations
+
+import collections
+import difflib
+import hashlib
+import io
+import pickle
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+import torch
+import torch._utils
+from torch import Tensor
+
+from capture.policies.cosmos.tensor_files import RefusedPickle
+from schemas.errors import UnknownName, UserError, listing
+
+
+class EmbeddingsNotFound(UserError, FileNotFoundError):
+    """There is no file of text embeddings."""
+
+
+class BadEmbeddings(UserError, ValueError):
+    """The file of text embeddings is damaged, or does not hold instruction -> tensor."""
+
+
+def _load_storage(content: bytes) -> Any:
+    """What the pickle's `_load_from_bytes` becomes: PyTorch's own restricted reader, on the CPU."""
+    return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+
+
+#: The only things that such a file may ask for.
+_ALLOWED: dict[tuple[str, str], Callable[..., Any]] = {
+    ("collections", "OrderedDict"): collections.OrderedDict,
+    ("torch._utils", "_rebuild_tensor_v2"): torch._utils._rebuild_tensor_v2,
+    ("torch.storage", "_load_from_bytes"): _load_storage,
+}
+
+
+class _RestrictedUnpickler(pickle.Unpickler):
+    """Knows tensors and nothing else; whatever else a file names is refused before it could do anything."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Return one of the allowed functions, or refuse."""
+        allowed = _ALLOWED.get((module, name))
+        if allowed is None:
+            raise RefusedPickle(f"it asks for {module}.{name}")
+        return allowed
+
+    def persistent_load(self, identifier: Any) -> NoReturn:
+        """Refuse: a file of embeddings refers to nothing outside itself."""
+        raise RefusedPickle("it refers to something outside itself")
+
+
+@dataclass(frozen=True)
+class TextEmbeddings:
+    """Precomputed text embeddings: instruction -> (1, position, width), positions after the real tokens are 0."""
+
+    path: str
+    by_instruction: Mapping[str, Tensor]
+    digest: str
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Positions and width of every embedding."""
+        _, positions, width = next(iter(self.by_instruction.values())).shape
+        return positions, width
+
+    def find(self, instruction: str) -> Tensor:
+        """Return the embedding of an instruction; the error names the nearest ones that there are."""
+        if instruction in self.by_instruction:
+            return self.by_instruction[instruction]
+        near = difflib.get_close_matches(instruction, list(self.by_instruction), n=3, cutoff=0.5)
+        nearest = listing(f"'{name}'" for name in near) if near else "none of them is near"
+        raise UnknownName(
+            f"There is no text embedding of '{instruction}' among the {len(self.by_instruction)} of '{self.path}'; nearest: "
+            f"{nearest}. Precompute it and give the file as --t5-text-embeddings-path, or give --t5-encoder PATH."
+        )
+
+
+def read_embeddings(path: str | Path) -> TextEmbeddings:
+    """Read a pickle of text embeddings.
+
+    Raises `EmbeddingsNotFound`, `BadEmbeddings`, or `RefusedPickle` (nothing was executed) when it holds more than tensors.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise EmbeddingsNotFound(
+            f"There are no text embeddings at '{path}'; give --t5-text-embeddings-path (libero_t5_embeddings.pkl of the checkpoint)."
+        )
+    content = path.read_bytes()
+    try:
+        found = _RestrictedUnpickler(io.BytesIO(content)).load()
+    except RefusedPickle as error:
+        raise RefusedPickle(
+            f"'{path}' was refused: {error}, and text embeddings need tensors only; nothing of it was executed."
+        ) from error
+    except Exception as error:  # a damaged pickle raises almost anything
+        first = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise BadEmbeddings(f"'{path}' cannot be read as text embeddings ({first}).") from error
+    return TextEmbeddings(str(path), _checked(found, path), hashlib.sha256(content).hexdigest())
+
+
+def _checked(found: Any, path: Path) -> dict[str, Tensor]:
+    if not isinstance(found, dict) or not found:
+        raise BadEmbeddings(
+            f"'{path}' holds no text embeddings (a dictionary of instructions), but {type(found).__name__}."
+        )
+    shapes = set()
+    for name, value in found.items():
+        if not isinstance(name, str) or not isinstance(value, Tensor) or value.ndim != 3 or value.shape[0] != 1:
+            raise BadEmbeddings(
+                f"'{path}' should hold instruction -> tensor (1, position, width), but has an entry for {name!r} that is "
+                f"{tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__}."
+            )
+        shapes.add(tuple(value.shape))
+    if len(shapes) > 1:
+        raise BadEmbeddings(f"The embeddings of '{path}' have different shapes: {listing(sorted(shapes))}.")
+    return dict(found)

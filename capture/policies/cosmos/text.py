@@ -1,0 +1,184 @@
+"""An instruction as the policy reads it: its embedding, what each text position is, and the words that positions spell."""
+
+from __future__ import annotations
+
+import hashlib
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import sentencepiece
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from capture.policies.cosmos.t5_encoder import T5Encoder
+from capture.policies.cosmos.t5_pickle import BadEmbeddings, TextEmbeddings
+from schemas.errors import BadArgument, UserError
+from schemas.layout import ROLE_DTYPE, Piece, Prompt, Role
+
+#: T5 ends every text with this token, which has a position and no characters.
+END_TOKENS = 1
+
+
+class TokenizerUnusable(UserError, ValueError):
+    """The file is no sentencepiece model, or not the one that the embeddings were made with."""
+
+
+@dataclass(frozen=True)
+class EncodedText:
+    """An instruction for the model: embedding (1, position, width), roles (position,) uint8, and the prompt with its pieces."""
+
+    embedding: Tensor
+    roles: NDArray[np.uint8]
+    prompt: Prompt
+
+
+class TextSource(Protocol):
+    """Whatever turns instructions into embeddings."""
+
+    def encode(self, instruction: str) -> EncodedText:
+        """Return the embedding of an instruction and what its positions are."""
+
+    def provenance(self) -> dict[str, Any]:
+        """Return what identifies the source, as plain JSON values."""
+
+
+class PieceTokenizer:
+    """A sentencepiece model: a text's pieces and the characters that each covers."""
+
+    def __init__(self, path: str | Path):
+        path = Path(path)
+        if not path.is_file():
+            raise TokenizerUnusable(f"There is no tokenizer file at '{path}'; give T5's spiece.model.")
+        content = path.read_bytes()
+        self.path = str(path)
+        #: SHA-256 (hex) of the file
+        self.digest = hashlib.sha256(content).hexdigest()
+        self._processor = sentencepiece.SentencePieceProcessor()
+        try:
+            self._processor.LoadFromSerializedProto(content)
+        except (RuntimeError, OSError) as error:
+            raise TokenizerUnusable(f"'{path}' is not a sentencepiece model, or it is damaged.") from error
+
+    def token_ids(self, text: str) -> list[int]:
+        """Return the ids of a text's pieces, and T5's end token."""
+        return [*(int(token) for token in self._processor.encode(text)), int(self._processor.eos_id())]
+
+    def pieces(self, text: str) -> tuple[Piece, ...]:
+        """Return the pieces of a text, keys counted from 0, without the end token."""
+        if hasattr(self._processor, "EncodeAsOffsetMapping"):
+            found = self._processor.EncodeAsOffsetMapping(text)
+            spans = zip(found["pieces"], found["offsets"], strict=True)
+            return tuple(Piece(key, piece, start, stop) for key, (piece, (start, stop)) in enumerate(spans))
+        encode = getattr(self._processor, "EncodeAsImmutableProto")  # noqa: B009 - newer type stubs lack it
+        return tuple(Piece(key, p.piece, p.begin, p.end) for key, p in enumerate(encode(text).pieces))
+
+
+def text_roles(is_real: NDArray[np.bool_], num_pieces: int | None) -> NDArray[np.uint8]:
+    """Return the role of each position: padded ones are an exact null sink.
+
+    With known pieces the instruction's are `instruction` and what follows (T5's end token) is `template`; without, every
+    real position is `text`.
+    """
+    roles = np.full(len(is_real), Role.NULL, dtype=ROLE_DTYPE)
+    if num_pieces is None:
+        roles[is_real] = Role.TEXT
+        return roles
+    roles[is_real] = Role.TEMPLATE
+    roles[:num_pieces] = Role.INSTRUCTION
+    return roles
+
+
+class PrecomputedText:
+    """Embeddings from a file, and T5's tokenizer when it is at hand: without it, no position can be told to be a word.
+
+    With an encoder (and the tokenizer), instructions that the file lacks are encoded.
+    """
+
+    def __init__(
+        self, embeddings: TextEmbeddings, tokenizer: PieceTokenizer | None = None, encoder: T5Encoder | None = None
+    ):
+        if encoder is not None and tokenizer is None:
+            raise TokenizerUnusable("--t5-encoder needs T5's tokenizer; give --t5-tokenizer PATH (spiece.model).")
+        self.embeddings = embeddings
+        self.tokenizer = tokenizer
+        self.encoder = encoder
+        self._encoded: dict[str, Tensor] = {}
+
+    def _embedding(self, instruction: str) -> Tensor:
+        if instruction in self.embeddings.by_instruction or self.encoder is None or self.tokenizer is None:
+            return self.embeddings.find(instruction)
+        if instruction not in self._encoded:
+            ids = self.tokenizer.token_ids(instruction)
+            self._encoded[instruction] = self.encoder.encode(ids, *self.embeddings.shape)
+        return self._encoded[instruction]
+
+    def encode(self, instruction: str) -> EncodedText:
+        """Return the stored embedding; `UnknownName` names near instructions, `TokenizerUnusable` a tokenizer that disagrees."""
+        embedding = self._embedding(instruction)
+        is_real = embedding[0].ne(0).any(dim=-1).numpy()
+        count = int(is_real.sum())
+        if not is_real[:count].all():
+            raise BadEmbeddings(
+                f"The text embedding of '{instruction}' in '{self.embeddings.path}' has zero positions between real ones; expected "
+                "the real tokens first and zeros after them."
+            )
+        whole = (0, len(instruction))
+        if self.tokenizer is None:
+            return EncodedText(embedding, text_roles(is_real, None), Prompt(instruction, (), whole))
+        pieces = self.tokenizer.pieces(instruction)
+        # An all-zero embedding is a text left out on purpose.
+        if count and count != len(pieces) + END_TOKENS:
+            raise TokenizerUnusable(
+                f"The tokenizer '{self.tokenizer.path}' cuts '{instruction}' into {len(pieces)} pieces and an end token, but its "
+                f"embedding has {count} real positions: it is another model's tokenizer."
+            )
+        known = pieces if count else ()
+        return EncodedText(embedding, text_roles(is_real, len(known)), Prompt(instruction, known, whole))
+
+    def provenance(self) -> dict[str, Any]:
+        """Return the digests of the embeddings and of the tokenizer."""
+        return {
+            "prompt_format": "t5-embedding",
+            "text_embeddings_digest": self.embeddings.digest,
+            "tokenizer_digest": self.tokenizer.digest if self.tokenizer is not None else None,
+            "text_encoder": str(self.encoder.folder) if self.encoder is not None else None,
+        }
+
+
+class SeededText:
+    """Made-up embeddings for untrained policies: every piece has a random vector of its own, whatever the instruction."""
+
+    def __init__(self, tokenizer: PieceTokenizer, positions: int, width: int, seed: int):
+        self.tokenizer = tokenizer
+        self.positions, self.width, self.seed = positions, width, seed
+
+    def encode(self, instruction: str) -> EncodedText:
+        """Return the embedding of any instruction that fits into the positions."""
+        pieces = self.tokenizer.pieces(instruction)
+        count = len(pieces) + END_TOKENS
+        if count > self.positions:
+            raise BadArgument(
+                f"The instruction '{instruction}' has {count} tokens, but the policy has room for {self.positions}."
+            )
+        embedding = np.zeros((1, self.positions, self.width), dtype=np.float32)
+        for key, name in enumerate([*(piece.text for piece in pieces), "</s>"]):
+            words = [self.seed, zlib.crc32(name.encode()), zlib.crc32(b"text")]
+            embedding[0, key] = np.random.Generator(np.random.Philox(np.random.SeedSequence(words))).standard_normal(
+                self.width, dtype=np.float32
+            )
+        is_real = np.arange(self.positions) < count
+        prompt = Prompt(instruction, pieces, (0, len(instruction)))
+        # bfloat16, as the published embeddings are
+        return EncodedText(torch.from_numpy(embedding).bfloat16(), text_roles(is_real, len(pieces)), prompt)
+
+    def provenance(self) -> dict[str, Any]:
+        """Return the seed and the tokenizer's digest."""
+        return {
+            "prompt_format": "made-up embeddings",
+            "text_embeddings_digest": f"seed {self.seed}",
+            "tokenizer_digest": self.tokenizer.digest,
+        }

@@ -1,0 +1,38 @@
+"""Fixtures of the Cosmos tests: policies of test size, built once."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, make_observation
+
+from capture.policies.cosmos.dummy_folder import write_dummy_folder
+from capture.policies.cosmos.embedded import DUMMY_CONFIG, dummy_policy
+
+
+@pytest.fixture(scope="package", autouse=True)
+def one_thread():
+    """Threads that wait for each other on busy cores make these small models ten times slower."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def dummy():
+    pytest.importorskip("diffusers")
+    return dummy_policy()
+
+
+@pytest.fixture(scope="session")
+def prepared(dummy):
+    return dummy.prepare(make_observation(0), INSTRUCTION)
+
+
+@pytest.fixture(scope="session")
+def dummy_folder(tmp_path_factory):
+    """A checkpoint folder in float32; tests that change it copy it."""
+    pytest.importorskip("diffusers")
+    folder = tmp_path_factory.mktemp("cosmos") / "checkpoint"
+    return write_dummy_folder(folder, DUMMY_CONFIG, [INSTRUCTION, OTHER_INSTRUCTION], dtype=torch.float32)

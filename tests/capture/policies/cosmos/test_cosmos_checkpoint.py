@@ -1,0 +1,169 @@
+"""A checkpoint folder laid out as the published repository: loaded, or refused with a sentence."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, make_observation
+
+from capture.policies.cosmos.build import build_cosmos_policy
+from capture.policies.cosmos.checkpoint import CosmosOptions, load_cosmos_policy
+from capture.policies.cosmos.dummy_folder import WEIGHTS_NAME
+from capture.policies.cosmos.embedded import TOKENIZER_PATH, random_policy
+from capture.policies.cosmos.locate import (
+    EMBEDDINGS_NAME,
+    POLICY_REPOSITORY,
+    STATISTICS_NAME,
+    VAE_NAME,
+    VAE_REPOSITORY,
+    CheckpointNotFound,
+    CheckpointUnavailable,
+    UnsupportedCheckpoint,
+)
+from capture.policies.cosmos.preprocess import StatisticsNotFound
+from capture.policies.cosmos.t5_pickle import EmbeddingsNotFound
+from schemas.errors import BadArgument, UnknownName
+from schemas.layout import Role
+
+#: The dummy's pictures are smaller than the published configuration says.
+SMALL = CosmosOptions(image_size=64, num_denoising_steps=3)
+
+
+@pytest.fixture(autouse=True)
+def no_hub(monkeypatch, tmp_path):
+    """What is in this machine's own cache must not decide."""
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
+
+
+@pytest.fixture
+def folder(dummy_folder, tmp_path):
+    return shutil.copytree(dummy_folder, tmp_path / "checkpoint")
+
+
+def test_a_folder_gives_the_policy_that_was_written(folder, dummy, capsys):
+    policy = load_cosmos_policy(str(folder), options=SMALL)
+    assert policy.config == dummy.config
+    assert "T5's tokenizer (spiece.model) is not at hand" in capsys.readouterr().err
+    observation = make_observation(0)
+    ours = policy.act(policy.prepare(observation, INSTRUCTION), 195)
+    assert np.array_equal(ours, dummy.act(dummy.prepare(observation, INSTRUCTION), 195))
+    facts = policy.provenance()
+    assert facts["untrained"] is False
+    assert facts["checkpoint_format"] == "pt"
+    assert facts["weights_digest"] == dummy.provenance()["weights_digest"]
+
+
+def test_the_file_of_weights_may_be_named_itself(folder):
+    shutil.copyfile(folder / WEIGHTS_NAME, folder / "another.pt")
+    with pytest.raises(CheckpointNotFound, match=r"several files of weights.*Give one of them as --ckpt-path"):
+        load_cosmos_policy(str(folder), options=SMALL)
+    assert load_cosmos_policy(str(folder / "another.pt"), options=SMALL).num_layers == 3
+
+
+def test_bfloat16_stays_close(folder, dummy):
+    policy = load_cosmos_policy(
+        str(folder), options=CosmosOptions(image_size=64, num_denoising_steps=3, dtype=torch.bfloat16)
+    )
+    assert policy.model.dtype == torch.bfloat16
+    observation = make_observation(0)
+    ours = policy.act(policy.prepare(observation, INSTRUCTION), 195)
+    theirs = dummy.act(dummy.prepare(observation, INSTRUCTION), 195)
+    assert 0 < np.abs(ours - theirs).max() < 0.1
+
+
+def test_with_t5s_tokenizer_the_words_are_known(folder):
+    shutil.copyfile(TOKENIZER_PATH, folder / "spiece.model")
+    policy = load_cosmos_policy(str(folder), options=SMALL)
+    prepared = policy.prepare(make_observation(0), OTHER_INSTRUCTION)
+    assert (prepared.key_role["cross"] == Role.INSTRUCTION).sum() == len(prepared.prompt.pieces) > 0
+
+
+def test_the_published_configuration_is_the_default(folder):
+    policy = build_cosmos_policy(str(folder), device="cpu", prefer_s=1764)
+    assert policy.sites[0].num_keys == 1764
+    assert policy.num_denoise_steps == 5
+
+
+def test_an_instruction_without_embedding_names_the_near_ones(folder):
+    policy = load_cosmos_policy(str(folder), options=SMALL)
+    with pytest.raises(UnknownName, match=f"nearest: '{INSTRUCTION}'"):
+        policy.prepare(make_observation(0), INSTRUCTION + "s")
+
+
+@pytest.mark.parametrize(
+    ("missing", "error", "message"),
+    [
+        (STATISTICS_NAME, StatisticsNotFound, "--dataset-stats-path"),
+        (EMBEDDINGS_NAME, EmbeddingsNotFound, "--t5-text-embeddings-path"),
+        (WEIGHTS_NAME, CheckpointNotFound, "has no .pt file"),
+        (VAE_NAME, CheckpointNotFound, f"hf download {VAE_REPOSITORY} {VAE_NAME}.*--vae-path"),
+    ],
+)
+def test_missing_files_are_named(folder, missing, error, message):
+    (folder / missing).unlink()
+    with pytest.raises(error, match=message):
+        load_cosmos_policy(str(folder), options=SMALL)
+
+
+def test_files_may_lie_elsewhere(folder, tmp_path):
+    for name in (STATISTICS_NAME, EMBEDDINGS_NAME):
+        shutil.move(folder / name, tmp_path / name)
+    shutil.move(folder / "tokenizer", tmp_path / "vae")
+    policy = build_cosmos_policy(
+        str(folder),
+        device="cpu",
+        dataset_stats_path=str(tmp_path / STATISTICS_NAME),
+        t5_text_embeddings_path=str(tmp_path / EMBEDDINGS_NAME),
+        vae_path=str(tmp_path / "vae"),
+    )
+    assert policy.num_layers == 3
+
+
+def test_the_image_encoder_is_found_beside_the_checkpoint_and_in_the_cache(folder, tmp_path):
+    beside = tmp_path / "Cosmos-Predict2-2B-Video2World"
+    beside.mkdir()
+    shutil.move(folder / "tokenizer", beside / "tokenizer")
+    assert load_cosmos_policy(str(folder), options=SMALL).num_layers == 3
+    cached = tmp_path / "hub" / "models--nvidia--Cosmos-Predict2-2B-Video2World" / "snapshots" / "abc"
+    cached.parent.mkdir(parents=True)
+    shutil.move(beside, cached)
+    assert load_cosmos_policy(str(folder), options=SMALL).num_layers == 3
+
+
+def test_the_distributed_form_is_refused(folder):
+    (folder / "model").mkdir()
+    with pytest.raises(UnsupportedCheckpoint, match=r"convert it to one \.pt file"):
+        load_cosmos_policy(str(folder), options=SMALL)
+
+
+def test_embeddings_of_another_model_are_refused(folder, tmp_path):
+    import pickle
+
+    with open(folder / EMBEDDINGS_NAME, "wb") as file:
+        pickle.dump({INSTRUCTION: torch.ones(1, 64, 7)}, file)
+    with pytest.raises(BadArgument, match="7 numbers a position, but the policy reads 24"):
+        load_cosmos_policy(str(folder), options=SMALL)
+
+
+def test_a_name_on_the_hub_without_a_network(monkeypatch):
+    pytest.importorskip("huggingface_hub")
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    with pytest.raises(
+        CheckpointUnavailable, match=rf"'{POLICY_REPOSITORY}' could not be fetched.*copy the folder here"
+    ):
+        load_cosmos_policy(POLICY_REPOSITORY)
+    with pytest.raises(CheckpointNotFound, match="There is no checkpoint at 'no/such/folder'"):
+        load_cosmos_policy("no/such/folder")
+
+
+def test_untrained_policies_of_one_seed_are_the_same():
+    pytest.importorskip("diffusers")
+    policy = build_cosmos_policy("embedded", device="cpu")
+    assert policy.num_layers == 28
+    again = random_policy("embedded", policy.config)
+    assert again.provenance()["weights_digest"] == policy.provenance()["weights_digest"]

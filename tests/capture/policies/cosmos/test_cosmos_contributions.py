@@ -1,0 +1,67 @@
+"""Contributions of Cosmos's two sites: add up to what the model computed, meet the reference, and are nothing without text."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from cosmos_helpers import GOLDEN, recorders_of
+
+from capture.attention import AttentionRecorder, RecordingPlan
+from capture.policies.cosmos.case import read_case
+from capture.policies.cosmos.observer import CallObserver
+from schemas.segments import segments_of
+
+
+def grams_of(policy, prepared):
+    recorders = recorders_of(policy, prepared)
+    policy.act(prepared, 3, recorders)
+    return {site: recorder.finish().contribution.astype(np.float64) for site, recorder in recorders.items()}
+
+
+def norm(gram, members):
+    return np.sqrt(gram[..., members, :][..., members].sum(axis=(-2, -1)))
+
+
+def test_parts_add_up_to_the_gated_update_of_each_site(dummy, prepared):
+    for site, gram in grams_of(dummy, prepared).items():
+        whole = gram.shape[-1] - 1
+        # The sum of the parts is the update itself, not only as long: their inner product is the update's square.
+        np.testing.assert_allclose(gram[..., :whole, whole].sum(axis=-1), gram[..., whole, whole], rtol=1e-4)
+        np.testing.assert_allclose(norm(gram, range(whole)), norm(gram, [whole]), rtol=1e-4, err_msg=site)
+
+
+def test_parts_are_the_latent_frames_and_the_kinds_of_text(dummy, prepared):
+    found = {site.name: segments_of(site, prepared.key_role[site.name]) for site in dummy.sites}
+    assert [segment.span for segment in found["self"]] == [span.name for span in dummy.sites[0].spans]
+    assert [segment.role for segment in found["cross"]] == ["template", "instruction", "null"]
+    for site, gram in grams_of(dummy, prepared).items():
+        assert gram.shape == (3, 3, len(found[site]) + 1, len(found[site]) + 1)
+
+
+def test_padded_text_contributes_exactly_nothing(dummy, prepared):
+    gram = grams_of(dummy, prepared)["cross"]
+    assert (gram[..., 2, :] == 0).all()
+    assert (norm(gram, [0, 1]) > 0).all()
+    silent = dict(prepared.tensors, text=torch.zeros_like(prepared.tensors["text"]))
+    assert (grams_of(dummy, type(prepared)(**{**vars(prepared), "tensors": silent}))["cross"] == 0).all()
+
+
+def test_norms_of_frames_are_those_of_the_reference():
+    """Root mean squares over a frame's queries from the recorded Gram matrix, against the reference's norm of each query."""
+    case = read_case(GOLDEN / "dit_batch2_T5_rect")
+    dit, tokens, frames = case.build_dit("cpu"), 15, 5
+    parts = np.repeat(np.eye(frames, dtype=bool), tokens, axis=0)
+    names = ("latents", "timesteps", "condition_mask", "padding_mask", "text_embeddings")
+    for entry, frame in [(0, 2), (1, 4)]:
+        plan = RecordingPlan((0, 1), (0,), (0, 1), "mean", "self")
+        recorder = AttentionRecorder(plan, frames * tokens, parts)
+        observer = CallObserver(0, frame, tokens, {"self": recorder})
+        with torch.no_grad():
+            dit(*(torch.from_numpy(case.inputs[name][entry : entry + 1]) for name in names), observer)
+        grams = recorder.finish().contribution[:, 0].astype(np.float64)
+        for layer, gram in enumerate(grams):
+            norms = case.expected[f"frame_contrib_norms_{layer:02d}"][entry, frame * tokens : (frame + 1) * tokens]
+            expected = np.sqrt((norms.astype(np.float64) ** 2).mean(axis=0))
+            np.testing.assert_allclose(np.sqrt(np.diag(gram))[:frames], expected[:frames], rtol=1e-5)
+            whole = case.expected[f"residual_norms_{layer:02d}"][entry, frame * tokens : (frame + 1) * tokens, 0]
+            np.testing.assert_allclose(gram[-1, -1], (whole.astype(np.float64) ** 2).mean(), rtol=1e-5)

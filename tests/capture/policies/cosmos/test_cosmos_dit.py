@@ -1,0 +1,185 @@
+"""The transformer: names and shapes of the published checkpoint, text as a null sink, rotary buffers, precision."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+
+import pytest
+import torch
+from cosmos_helpers import GOLDEN
+
+from capture.policies.cosmos.config import DitConfig, VaeConfig
+from capture.policies.cosmos.dit import Dit, rotate
+from capture.policies.cosmos.dit_weights import (
+    CheckpointMismatch,
+    build_dit,
+    check_shapes,
+    dit_tensors,
+    expected_shapes,
+    infer_dit_config,
+)
+from capture.policies.cosmos.embedded import DUMMY_CONFIG, random_dit_weights
+from capture.policies.cosmos.parity import EverythingObserver
+from capture.policies.cosmos.vae import expected_vae_shapes, infer_vae_config
+
+
+@pytest.fixture(scope="module")
+def manifest():
+    with gzip.open(GOLDEN / "key_manifest_2b.json.gz") as file:
+        return json.load(file)
+
+
+@pytest.fixture(scope="module")
+def weights():
+    return random_dit_weights(DUMMY_CONFIG.dit, seed=1)
+
+
+@pytest.fixture(scope="module")
+def dit(weights):
+    return build_dit(DUMMY_CONFIG.dit, weights)
+
+
+def make_inputs(frames=5, height=4, width=6, batch=1, seed=0):
+    draw = torch.Generator().manual_seed(seed)
+    text = torch.zeros(batch, 10, DUMMY_CONFIG.dit.text_dim)
+    text[:, :3] = torch.randn(batch, 3, DUMMY_CONFIG.dit.text_dim, generator=draw)
+    mask = torch.zeros(batch, 1, frames, height, width)
+    mask[:, :, :2] = 1
+    return {
+        "latents": torch.randn(batch, 16, frames, height, width, generator=draw),
+        "times": 0.9 * (1 - mask[:, 0, :, 0, 0]),
+        "condition_mask": mask,
+        "padding_mask": torch.zeros(batch, 1, 8 * height, 8 * width),
+        "text": text,
+    }
+
+
+def test_the_published_checkpoint_loads_strictly(manifest):
+    stored = {name: torch.empty(shape, device="meta") for name, (shape, _) in manifest["dit"].items()}
+    assert len(stored) == 574
+    weights = dit_tensors(stored)
+    assert len(stored) - len(weights) == 4
+    config = infer_dit_config(weights)
+    assert config == DitConfig()
+    with torch.device("meta"):
+        model = Dit(config)
+    model.load_state_dict(weights, strict=True, assign=True)
+    assert sum(parameter.numel() for parameter in model.parameters()) == 1_956_413_440
+
+
+def test_the_published_image_encoder_has_our_names_and_shapes(manifest):
+    pytest.importorskip("diffusers")
+    stored = {name: torch.empty(shape, device="meta") for name, shape in manifest["vae"].items()}
+    config = infer_vae_config(stored)
+    assert config == VaeConfig()
+    found = {name: tuple(tensor.shape) for name, tensor in stored.items()}
+    assert len(found) == 194
+    assert found == expected_vae_shapes(config)
+
+
+def test_counters_extra_state_and_wrappers_are_no_weights(weights):
+    stored = {
+        f"net.{name}".replace("blocks.0.", "blocks.0._checkpoint_wrapped_module."): x for name, x in weights.items()
+    }
+    stored |= {"net.accum_iteration": torch.tensor(3), "net_ema.x_embedder.proj.1.weight": torch.zeros(1)}
+    stored |= {"net.blocks.0.self_attn.q_norm._extra_state": io.BytesIO(b"x")}
+    assert dit_tensors(stored).keys() == weights.keys()
+
+
+def test_a_checkpoint_that_differs_is_refused_with_every_difference(weights):
+    wrong = dict(weights)
+    del wrong["blocks.1.mlp.layer1.weight"]
+    wrong["blocks.1.mlp.layer3.weight"] = torch.zeros(2)
+    wrong["final_layer.linear.weight"] = torch.zeros(3, 3)
+    with pytest.raises(CheckpointMismatch) as error:
+        build_dit(DUMMY_CONFIG.dit, wrong)
+    for part in (
+        "1 missing: blocks.1.mlp.layer1.weight",
+        "1 extra: blocks.1.mlp.layer3.weight",
+        "is (3, 3) instead of",
+    ):
+        assert part in str(error.value)
+    with pytest.raises(CheckpointMismatch, match="no Cosmos transformer"):
+        infer_dit_config({"weight": torch.zeros(1)})
+    check_shapes(expected_shapes(DUMMY_CONFIG.dit), expected_shapes(DUMMY_CONFIG.dit), "the model")
+
+
+def test_rotary_buffers_come_from_the_checkpoint(weights):
+    changed = dict(weights)
+    changed["pos_embedder.dim_temporal_range"] = weights["pos_embedder.dim_temporal_range"] * 1.01
+    cosine, _ = build_dit(DUMMY_CONFIG.dit, weights).pos_embedder(3, 2, 2)
+    other, _ = build_dit(DUMMY_CONFIG.dit, changed).pos_embedder(3, 2, 2)
+    assert not torch.equal(cosine, other)
+    rounded = build_dit(DUMMY_CONFIG.dit, changed, dtype=torch.bfloat16).pos_embedder.dim_temporal_range
+    assert rounded.dtype == torch.float32
+    assert torch.equal(rounded, changed["pos_embedder.dim_temporal_range"].bfloat16().float())
+
+
+def test_a_rotation_keeps_lengths_and_sees_only_distances(dit):
+    cosine, sine = dit.pos_embedder(4, 1, 1)
+    x = torch.randn(1, 1, 4, DUMMY_CONFIG.dit.head_dim, generator=torch.Generator().manual_seed(0))
+    same = x[:, :, :1].expand_as(x)
+    turned = rotate(same, cosine, sine)
+    torch.testing.assert_close(turned.norm(dim=-1), same.norm(dim=-1))
+    products = turned[0, 0] @ turned[0, 0].T
+    torch.testing.assert_close(products[0, 1], products[2, 3])
+
+
+def test_padded_text_is_an_exact_null_sink(dit):
+    observer, inputs = EverythingObserver(), make_inputs()
+    dit(**inputs, observer=observer)
+    rows = observer.probabilities("cross", 0)
+    assert (rows[..., 3:] == rows[..., 3:4]).all()
+    shorter = dict(inputs, text=torch.zeros_like(inputs["text"]))
+    empty = EverythingObserver()
+    dit(**shorter, observer=empty)
+    for layer in range(DUMMY_CONFIG.dit.num_blocks):
+        assert (empty.residual_norms[layer][..., 1] == 0).all()
+        assert (observer.residual_norms[layer][..., 1] > 0).all()
+
+
+def test_entries_of_a_batch_do_not_mix(dit):
+    two = make_inputs(batch=2)
+    two["condition_mask"][1, :, 2] = 1
+    two["times"][1] = torch.tensor([0.0, 0.0, 0.0, 0.5, 0.5])
+    together = dit(**two)
+    for entry in range(2):
+        alone = dit(**{name: tensor[entry : entry + 1] for name, tensor in two.items()})
+        torch.testing.assert_close(together[entry : entry + 1], alone, rtol=1e-4, atol=1e-5)
+
+
+def test_one_time_serves_all_frames(dit):
+    inputs = make_inputs()
+    each = dit(**dict(inputs, times=torch.full((1, 5), 0.7)))
+    assert torch.equal(dit(**dict(inputs, times=torch.full((1, 1), 0.7))), each)
+
+
+def test_bfloat16_rounds_the_times(weights):
+    model = build_dit(DUMMY_CONFIG.dit, weights, dtype=torch.bfloat16)
+    inputs = make_inputs()
+    t = 0.98765
+    exact = model(**dict(inputs, times=torch.full((1, 5), t)))
+    rounded = model(**dict(inputs, times=torch.full((1, 5), 0.98828125)))
+    assert exact.dtype == torch.bfloat16
+    assert torch.equal(exact, rounded)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "message"),
+    [
+        ({"width": 50, "num_heads": 4}, "width of 50 cannot be split into 4 heads"),
+        ({"width": 32, "num_heads": 4}, "head of 8 numbers is too narrow"),
+    ],
+)
+def test_impossible_sizes_are_refused(sizes, message):
+    with pytest.raises(ValueError, match=message):
+        DitConfig(**sizes)
+
+
+def test_latents_must_be_whole_patches_within_the_positions():
+    with pytest.raises(ValueError, match="7 x 8 cannot be cut into patches of 2 x 2"):
+        DitConfig().grid(7, 8)
+    with pytest.raises(ValueError, match="larger than the 128 positions"):
+        DitConfig().grid(258, 2)

@@ -1,0 +1,215 @@
+"""The policy as the rollout sees it: two sites, layouts, and actions that do not depend on what is recorded."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import torch
+from cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, KeepAll, make_observation, recorders_of
+
+from capture.attention import AttentionRecorder, RecordingPlan
+from capture.policies.base import PolicyCamera
+from capture.policies.cosmos.build import build_cosmos_policy
+from capture.policies.cosmos.calls import select_call
+from capture.policies.cosmos.config import LIBERO_FRAMES, CosmosConfig, FrameConfig
+from capture.policies.cosmos.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, random_policy
+from capture.policies.cosmos.layout import cross_layout, self_layout
+from schemas.errors import BadArgument, MissingDependency, UnknownName
+from schemas.layout import Role
+
+
+def recorders_for(policy, queries="mean"):
+    layers, heads = tuple(range(policy.num_layers)), tuple(range(policy.num_heads))
+    steps = tuple(range(policy.num_denoise_steps))
+    return {
+        site.name: AttentionRecorder(RecordingPlan(layers, steps, heads, queries, site.name), site.num_keys)
+        for site in policy.sites
+    }
+
+
+def test_actions_are_bit_equal_with_and_without_recording(dummy, prepared):
+    plain = dummy.predict(prepared, 195)
+    recorded = dummy.predict(prepared, 195, recorders_for(dummy))
+    with_contributions = dummy.predict(prepared, 195, recorders_of(dummy, prepared))
+    assert np.array_equal(plain.actions, with_contributions.actions)
+    assert np.array_equal(plain.actions, recorded.actions)
+    assert plain.value == recorded.value
+    assert plain.actions.shape == (16, 7)
+
+
+def test_rows_of_both_sites_are_probabilities_over_their_keys(dummy, prepared):
+    recorders = recorders_for(dummy, "all")
+    dummy.act(prepared, 195, recorders)
+    for site in dummy.sites:
+        rows = recorders[site.name].finish()
+        assert rows.rows.shape == (3, 3, 2, dummy.num_action_queries, site.num_keys)
+        np.testing.assert_allclose(rows.row_sum, 1.0, atol=1e-5)
+
+
+def test_queries_are_pooled_by_action_step(dummy, prepared):
+    plan = RecordingPlan((1,), (0,), (0, 1), "steps", "self")
+    pools, keep = dummy.query_pools(), KeepAll()
+    recorder = AttentionRecorder(plan, dummy.sites[0].num_keys, pools=pools)
+    dummy.act(prepared, 195, {"self": recorder})
+    dummy.act(prepared, 195, {"self": keep})
+    rows = recorder.finish().rows
+    assert rows.shape == (1, 1, 2, 16 * 7, 144)
+    np.testing.assert_allclose(rows[0, 0], pools @ keep.rows[1, 0][0].numpy(), atol=1e-6)
+    with pytest.raises(BadArgument, match="do not stand for action steps"):
+        dummy.act(prepared, 195, {"self": AttentionRecorder(plan, dummy.sites[0].num_keys)})
+
+
+def test_rows_are_those_of_the_action_frame_only(dummy, prepared):
+    keep = {"self": KeepAll(), "cross": KeepAll()}
+    dummy.act(prepared, 195, keep)
+    tokens = dummy.config.tokens_per_frame
+    for collector in keep.values():
+        assert {rows.shape[2] for rows in collector.rows.values()} == {tokens}
+        assert collector.queries == {(0, tokens)}
+
+
+def test_another_query_frame_has_other_rows(dummy, prepared):
+    other = random_policy("dummy", DUMMY_CONFIG, query_frame="curr_last")
+    assert other.query_frame == "primary"
+    ours, theirs = recorders_for(dummy), recorders_for(other)
+    actions = dummy.act(prepared, 195, ours)
+    assert np.array_equal(other.act(prepared, 195, theirs), actions)
+    assert not np.array_equal(ours["self"].finish().rows, theirs["self"].finish().rows)
+    with pytest.raises(BadArgument, match="latent frame 'primary' do not stand for action steps"):
+        other.action_shares()
+    assert dummy.action_shares().shape == (16, 16, 7)
+
+
+def test_words_and_pictures_and_noise_change_the_actions(dummy, prepared):
+    actions = dummy.act(prepared, 195)
+    assert np.array_equal(dummy.act(prepared, 195), actions)
+    assert not np.array_equal(dummy.act(prepared, 196), actions)
+    assert not np.array_equal(dummy.act(dummy.prepare(make_observation(0), OTHER_INSTRUCTION), 195), actions)
+    assert not np.array_equal(dummy.act(dummy.prepare(make_observation(1), INSTRUCTION), 195), actions)
+
+
+def test_text_reaches_the_action_only_through_cross_attention(dummy, prepared):
+    """With all-zero text every cross-attention row is uniform over exact nothing; swapping such texts changes nothing."""
+    silent = type(prepared)(
+        **{**vars(prepared), "tensors": dict(prepared.tensors, text=torch.zeros_like(prepared.tensors["text"]))}
+    )
+    collector = KeepAll()
+    actions = dummy.act(silent, 195, {"cross": collector})
+    assert not np.array_equal(actions, dummy.act(prepared, 195))
+    uniform = 1 / dummy.config.text_length
+    assert all(torch.allclose(rows, torch.tensor(uniform)) for rows in collector.rows.values())
+
+
+def test_the_published_layout():
+    layout = self_layout(CosmosConfig())
+    assert layout.num_keys == 1764
+    assert tuple(span.name for span in layout.spans) == LIBERO_FRAMES
+    assert {span.kind for span in layout.spans} == {"latent"}
+    action = layout.span("action")
+    assert (action.start, action.stop) == (784, 980)
+    assert layout.cameras == ("wrist", "primary")
+    grid = layout.camera_span("primary").grid
+    assert (grid.rows, grid.columns, grid.image_height) == (14, 14, 224)
+    assert cross_layout(CosmosConfig()).num_keys == 512
+    assert self_layout(EMBEDDED_CONFIG).num_keys == 441
+
+
+def test_roles_of_every_key(dummy, prepared):
+    layout = dummy.sites[0]
+    expected = [Role.BLANK, Role.PROPRIO, Role.IMAGE, Role.IMAGE, Role.ACTION]
+    expected += [Role.FUTURE, Role.FUTURE, Role.FUTURE, Role.VALUE]
+    for span, role in zip(layout.spans, expected, strict=True):
+        assert (prepared.key_role["self"][span.start : span.stop] == role).all(), span.name
+    cross = prepared.key_role["cross"]
+    real = prepared.tensors["text"][0].ne(0).any(dim=-1).numpy()
+    assert ((cross != Role.NULL) == real).all()
+    assert prepared.prompt.instruction_text == INSTRUCTION
+
+
+def test_frames_are_what_the_model_sees(dummy, prepared):
+    assert list(prepared.frames) == ["wrist", "primary"]
+    assert {frame.shape for frame in prepared.frames.values()} == {(64, 64, 3)}
+    assert prepared.state.shape == (9,)
+    for camera in dummy.cameras:
+        assert isinstance(camera, PolicyCamera)
+        assert camera.flip_rows
+        assert camera.flip_rows
+        assert not camera.flip_columns
+        assert camera.visible == pytest.approx(212 / 224)
+
+
+def test_frames_are_found_by_name_and_number():
+    frames = FrameConfig()
+    assert [frames.index(name) for name in ("action", "frame4", "curr_last", "primary", "frame0")] == [4, 4, 3, 3, 0]
+    for wrong in ("acton", "frame9", "frame", "9"):
+        with pytest.raises(UnknownName, match=rf"latent frame '{wrong}'.*blank, proprio, wrist.*frame0 to frame8"):
+            frames.index(wrong)
+
+
+def test_without_diffusers_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "diffusers.models.autoencoders.autoencoder_kl_wan", None)
+    with pytest.raises(MissingDependency, match=r"vla-attention\[cosmos\]"):
+        build_cosmos_policy("dummy", device="cpu")
+
+
+def test_a_call_that_never_was_is_an_error():
+    config = CosmosConfig()
+    assert select_call(config, 1764, "last") == 4
+    assert select_call(config, None, "first") == 0
+    with pytest.raises(BadArgument, match="No call has --prefer-S 1000: all 5 calls of this policy have S = 1764"):
+        select_call(config, 1000, "last")
+    with pytest.raises(BadArgument, match="--prefer-call 'middle'"):
+        select_call(config, None, "middle")
+
+
+def test_provenance_is_plain_and_names_what_matters(dummy):
+    facts = dummy.provenance()
+    assert json.loads(json.dumps(facts)) == facts
+    assert facts["family"] == "cosmos"
+    assert facts["untrained"] is True
+    for name in ("dtype", "configuration", "normalisation", "prompt_format", "weights_digest", "query_frame"):
+        assert name in facts
+    assert random_policy("dummy", DUMMY_CONFIG, 1).provenance()["weights_digest"] != facts["weights_digest"]
+
+
+def test_denoise_times_and_noise_seeds(dummy):
+    times = dummy.denoise_times()
+    assert len(times) == dummy.num_denoise_steps == 3
+    assert times[0] == pytest.approx(80 / 81)
+    assert times[-1] == pytest.approx(0.8)
+    assert dummy.replan_noise_seed(195, 3, 2, 7) == 195
+
+
+def test_options_reach_the_policy():
+    pytest.importorskip("diffusers")
+    policy = build_cosmos_policy(
+        "dummy", device="cpu", num_denoising_steps_action=4, chunk_size=8, num_open_loop_steps=5, query_frame="frame4"
+    )
+    assert policy.num_denoise_steps == 4
+    assert policy.action_horizon == 8
+    assert policy.default_replan_steps == 5
+    assert policy.act(policy.prepare(make_observation(0), INSTRUCTION), 0).shape == (8, 7)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"num_denoising_steps_action": 0}, "--num-denoising-steps-action 0; expected at least 1"),
+        ({"chunk_size": 0}, "--chunk-size 0; expected at least 1"),
+        ({"chunk_size": 1000}, "1000 actions of 7 numbers do not fit"),
+        ({"num_open_loop_steps": 17}, "--num-open-loop-steps 17: the policy gives 16 actions"),
+        ({"query_frame": "acton"}, "latent frame 'acton'. Did you mean 'action'"),
+        ({"visual_frame": "frame9"}, "latent frame 'frame9'"),
+        ({"prefer_s": 1764}, "No call has --prefer-S 1764: all 3 calls of this policy have S = 144"),
+        ({"config_name": "cosmos"}, "Unknown Cosmos configuration 'cosmos'"),
+        ({"dtype": "float16"}, "--dtype 'float16'; expected float32, bfloat16"),
+        ({"dataset_stats_path": "x.json"}, "comes with the program"),
+    ],
+)
+def test_options_that_cannot_be_are_one_sentence(options, message):
+    pytest.importorskip("diffusers")
+    with pytest.raises((BadArgument, UnknownName), match=message):
+        build_cosmos_policy("dummy", device="cpu", **options)

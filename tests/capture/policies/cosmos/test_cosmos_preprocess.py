@@ -1,0 +1,140 @@
+"""Pictures, ranges, and the image encoder's shortcuts."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from capture.policies.cosmos.config import VaeConfig
+from capture.policies.cosmos.dit_weights import CheckpointMismatch
+from capture.policies.cosmos.embedded import BUILTIN_RANGES, builtin_statistics, random_vae_weights
+from capture.policies.cosmos.preprocess import (
+    BadStatistics,
+    StatisticsNotFound,
+    crop_and_enlarge,
+    crop_size,
+    model_picture,
+    pixels,
+    read_statistics,
+    upright,
+)
+
+
+def test_only_rows_are_reversed():
+    picture = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
+    assert np.array_equal(upright(picture), picture[::-1])
+
+
+def test_the_middle_is_cut_out_and_enlarged():
+    assert crop_size(224) == 212
+    picture = np.zeros((224, 224, 3), dtype=np.uint8)
+    picture[:6] = picture[-6:] = 255
+    assert crop_and_enlarge(picture).max() == 0
+    picture[6] = 255
+    enlarged = crop_and_enlarge(picture)
+    assert enlarged[0].min() > 200
+    assert enlarged[3:].max() == 0
+
+
+@pytest.mark.parametrize("size", [64, 112, 224])
+def test_pictures_get_the_models_size(size):
+    picture = np.random.default_rng(0).integers(0, 255, (256, 256, 3), dtype=np.uint8)
+    assert model_picture(picture, size).shape == (size, size, 3)
+
+
+def test_ranges_are_applied_and_undone():
+    statistics = builtin_statistics()
+    assert statistics.normalise_proprio(statistics.proprio_min).tolist() == [-1.0] * 9
+    assert statistics.normalise_proprio(statistics.proprio_max).tolist() == [1.0] * 9
+    beyond = statistics.environment_actions(np.full((2, 7), 1.5))
+    assert (beyond > statistics.actions_max).all()  # not cut
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"actions_min": None}, "have no 'actions_min'"),
+        ({"actions_min": [0.0] * 6}, r"'actions_min' .* has shape \(6,\); expected 7 finite numbers"),
+        ({"proprio_max": ["x"] * 9}, "'proprio_max' .* is no list of numbers"),
+        ({"proprio_max": [-9.0] * 9}, "'proprio_max' that is not above"),
+        ({"actions_max": [-9.0] * 7}, "'actions_max' below"),
+        ({"actions_max": [float("nan")] * 7}, "expected 7 finite numbers"),
+    ],
+)
+def test_bad_statistics_are_one_sentence(tmp_path, change, message):
+    content = {**BUILTIN_RANGES, **change}
+    path = tmp_path / "statistics.json"
+    path.write_text(json.dumps({name: value for name, value in content.items() if value is not None}))
+    with pytest.raises(BadStatistics, match=message):
+        read_statistics(path)
+
+
+def test_missing_or_broken_statistics(tmp_path):
+    with pytest.raises(StatisticsNotFound, match="--dataset-stats-path"):
+        read_statistics(tmp_path / "no.json")
+    (tmp_path / "a.json").write_text("{")
+    with pytest.raises(BadStatistics, match="cannot be read as JSON"):
+        read_statistics(tmp_path / "a.json")
+    (tmp_path / "a.json").write_text("[]")
+    with pytest.raises(BadStatistics, match="but a list"):
+        read_statistics(tmp_path / "a.json")
+
+
+SMALL_VAE = VaeConfig(base_dim=4)
+
+
+@pytest.fixture(scope="module")
+def state():
+    pytest.importorskip("diffusers")
+    return random_vae_weights(SMALL_VAE, seed=0)
+
+
+def test_thirteen_frames_give_what_all_thirty_three_do(state):
+    from diffusers import AutoencoderKLWan
+
+    from capture.policies.cosmos.vae import build_encoder, vae_names
+
+    names = vae_names(SMALL_VAE)
+    whole = AutoencoderKLWan(base_dim=4)
+    whole.load_state_dict({names[name][0]: tensor for name, tensor in state.items()})
+    rng = np.random.default_rng(0)
+    shown = [
+        pixels(rng.integers(0, 255, (32, 32, 3), dtype=np.uint8), torch.float32, torch.device("cpu")) for _ in range(4)
+    ]
+    black = torch.full((1, 3, 1, 32, 32), -1.0)
+    copies = [1, 4, 4, 4, 8, 12]
+    video = torch.cat(
+        [frame.expand(-1, -1, n, -1, -1) for frame, n in zip([black, black, *shown], copies, strict=True)], dim=2
+    )
+    assert video.shape[2] == 33
+    with torch.no_grad():
+        posterior = whole.encode(video).latent_dist.mean
+    mean = torch.tensor(whole.config.latents_mean).view(1, -1, 1, 1, 1)
+    std = torch.tensor(whole.config.latents_std).view(1, -1, 1, 1, 1)
+    encoder = build_encoder(SMALL_VAE, state)
+    first = encoder.encode(shown[:2])
+    assert first.shape == (1, 16, 4, 4, 4)
+    torch.testing.assert_close(first, ((posterior - mean) / std)[:, :, :4], rtol=1e-4, atol=1e-5)
+    # What the black frames leave behind is kept, and not changed by what came after.
+    assert torch.equal(encoder.encode(shown[2:])[:, :, :2], first[:, :, :2])
+    assert torch.equal(encoder.encode(shown[:2]), first)
+
+
+def test_the_picture_before_shows_in_the_next_latent(state):
+    from capture.policies.cosmos.vae import build_encoder
+
+    encoder = build_encoder(SMALL_VAE, state)
+    one, two, other = (torch.full((1, 3, 1, 32, 32), level) for level in (0.1, -0.4, 0.9))
+    assert not torch.equal(encoder.encode([one, two])[:, :, 3], encoder.encode([other, two])[:, :, 3])
+    assert torch.equal(encoder.encode([one, two])[:, :, 2], encoder.encode([one, other])[:, :, 2])
+
+
+def test_another_models_encoder_is_refused(state):
+    from capture.policies.cosmos.vae import build_encoder
+
+    wrong = {name: tensor for name, tensor in state.items() if name != "decoder.head.2.bias"}
+    with pytest.raises(CheckpointMismatch, match=r"the image encoder; 1 missing: decoder\.head\.2\.bias"):
+        build_encoder(SMALL_VAE, wrong)

@@ -1,0 +1,234 @@
+"""Text embeddings: read without running anything, found by instruction, positions that are words or nothing."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import sys
+
+import pytest
+import torch
+from cosmos_helpers import INSTRUCTION
+
+from capture.policies.cosmos.embedded import TOKENIZER_PATH
+from capture.policies.cosmos.t5_encoder import EncoderUnusable, T5Encoder
+from capture.policies.cosmos.t5_pickle import BadEmbeddings, EmbeddingsNotFound, TextEmbeddings, read_embeddings
+from capture.policies.cosmos.tensor_files import (
+    RefusedPickle,
+    TensorFileNotFound,
+    UnreadableTensors,
+    read_tensors,
+)
+from capture.policies.cosmos.text import PieceTokenizer, PrecomputedText, SeededText, TokenizerUnusable
+from schemas.errors import BadArgument, MissingDependency, UnknownName
+from schemas.layout import Role
+from schemas.words import words_of
+
+
+class Malicious:
+    """Runs a command when it is unpickled by something careless."""
+
+    def __init__(self, command):
+        self.command = command
+
+    def __reduce__(self):
+        return os.system, (self.command,)
+
+
+def save(path, content):
+    with open(path, "wb") as file:
+        pickle.dump(content, file)
+    return path
+
+
+def made_up(count, positions=8, width=4):
+    tensor = torch.zeros(1, positions, width, dtype=torch.bfloat16)
+    tensor[:, :count] = 1.0
+    return tensor
+
+
+def test_a_malicious_pickle_is_refused_and_nothing_is_executed(tmp_path):
+    trace = tmp_path / "executed"
+    path = save(tmp_path / "text.pkl", {INSTRUCTION: made_up(3), "other": Malicious(f"touch {trace}")})
+    with pytest.raises(
+        RefusedPickle, match=r"text.pkl' was refused: it asks for \w+.system.*nothing of it was executed"
+    ):
+        read_embeddings(path)
+    torch.save({"net.weight": torch.zeros(1), "x": Malicious(f"touch {trace}")}, tmp_path / "weights.pt")
+    with pytest.raises(RefusedPickle, match="nothing of it was executed"):
+        read_tensors(tmp_path / "weights.pt")
+    assert not trace.exists()
+    pickle.loads(path.read_bytes())  # the file really is malicious
+    assert trace.exists()
+
+
+@pytest.mark.parametrize("name", ["builtins.eval", "torch.load", "torch._utils._rebuild_tensor", "os.system"])
+def test_nothing_but_tensors_is_looked_up(tmp_path, name):
+    module, _, attribute = name.rpartition(".")
+    (tmp_path / "text.pkl").write_bytes(b"c" + module.encode() + b"\n" + attribute.encode() + b"\n.")
+    with pytest.raises(RefusedPickle, match=name.replace(".", r"\.")):
+        read_embeddings(tmp_path / "text.pkl")
+
+
+def test_embeddings_are_read_as_saved(tmp_path):
+    saved = {"a": torch.randn(1, 8, 4).bfloat16(), "b": made_up(2)}
+    found = read_embeddings(save(tmp_path / "text.pkl", saved))
+    assert found.shape == (8, 4)
+    for name, tensor in saved.items():
+        assert torch.equal(found.find(name), tensor)
+        assert found.find(name).dtype == torch.bfloat16
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([1], "but list"),
+        ({}, "but dict"),
+        ({"a": 1}, "entry for 'a' that is int"),
+        ({"a": torch.zeros(2, 3)}, r"entry for 'a' that is \(2, 3\)"),
+        ({"a": torch.zeros(1, 2, 3), "b": torch.zeros(1, 3, 3)}, "different shapes"),
+    ],
+)
+def test_what_is_no_table_of_embeddings_is_refused(tmp_path, content, message):
+    with pytest.raises(BadEmbeddings, match=message):
+        read_embeddings(save(tmp_path / "text.pkl", content))
+
+
+def test_missing_and_damaged_files(tmp_path):
+    with pytest.raises(EmbeddingsNotFound, match="--t5-text-embeddings-path"):
+        read_embeddings(tmp_path / "no.pkl")
+    path = save(tmp_path / "text.pkl", {"a": made_up(2)})
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(BadEmbeddings, match="cannot be read as text embeddings"):
+        read_embeddings(path)
+    with pytest.raises(TensorFileNotFound):
+        read_tensors(tmp_path / "no.pt")
+    (tmp_path / "bad.pt").write_bytes(b"nothing")
+    with pytest.raises(UnreadableTensors, match="damaged or something else"):
+        read_tensors(tmp_path / "bad.pt")
+    torch.save([1], tmp_path / "bad.pt")
+    with pytest.raises(UnreadableTensors, match="holds no tensors by name, but list"):
+        read_tensors(tmp_path / "bad.pt")
+
+
+def test_wrapped_and_old_files_are_read(tmp_path):
+    torch.save({"model": {"net.a": torch.ones(2)}}, tmp_path / "a.pt")
+    assert torch.equal(read_tensors(tmp_path / "a.pt")["net.a"], torch.ones(2))
+    torch.save({"net.a": torch.ones(2)}, tmp_path / "b.pt", _use_new_zipfile_serialization=False)
+    assert torch.equal(read_tensors(tmp_path / "b.pt")["net.a"], torch.ones(2))
+
+
+def test_an_unknown_instruction_names_the_near_ones():
+    table = TextEmbeddings("x.pkl", {name: made_up(2) for name in (INSTRUCTION, "close the drawer")}, "")
+    with pytest.raises(UnknownName, match=f"'pick up the blck bowl' among the 2 of 'x.pkl'; nearest: '{INSTRUCTION}'"):
+        table.find("pick up the blck bowl")
+    with pytest.raises(UnknownName, match="none of them is near"):
+        table.find("zzz")
+
+
+def test_without_a_tokenizer_positions_are_text_or_nothing():
+    text = PrecomputedText(TextEmbeddings("x", {INSTRUCTION: made_up(5)}, ""))
+    encoded = text.encode(INSTRUCTION)
+    assert encoded.roles.tolist() == [Role.TEXT] * 5 + [Role.NULL] * 3
+    assert encoded.prompt.pieces == ()
+    assert encoded.prompt.instruction_text == INSTRUCTION
+
+
+def test_with_a_tokenizer_words_have_positions():
+    tokenizer = PieceTokenizer(TOKENIZER_PATH)
+    count = len(tokenizer.pieces(INSTRUCTION))
+    table = TextEmbeddings("x", {INSTRUCTION: made_up(count + 1, count + 4), "wrong": made_up(1, count + 4)}, "")
+    encoded = PrecomputedText(table, tokenizer).encode(INSTRUCTION)
+    assert encoded.roles.tolist() == [Role.INSTRUCTION] * count + [Role.TEMPLATE] + [Role.NULL] * 3
+    words = words_of(encoded.prompt)
+    assert [word.text for word in words] == INSTRUCTION.split()
+    assert sorted({key for word in words for key in word.keys}) == list(range(count))
+    with pytest.raises(TokenizerUnusable, match="1 real positions: it is another model's tokenizer"):
+        PrecomputedText(table, tokenizer).encode("wrong")
+
+
+def test_an_empty_text_is_all_null():
+    table = TextEmbeddings("x", {INSTRUCTION: made_up(0)}, "")
+    for tokenizer in (None, PieceTokenizer(TOKENIZER_PATH)):
+        encoded = PrecomputedText(table, tokenizer).encode(INSTRUCTION)
+        assert (encoded.roles == Role.NULL).all()
+        assert encoded.prompt.pieces == ()
+
+
+def test_zeros_between_real_positions_are_refused():
+    holed = made_up(5)
+    holed[:, 2] = 0
+    with pytest.raises(BadEmbeddings, match="zero positions between real ones"):
+        PrecomputedText(TextEmbeddings("x", {"a": holed}, "")).encode("a")
+
+
+def test_made_up_embeddings_depend_on_the_words():
+    text = SeededText(PieceTokenizer(TOKENIZER_PATH), 16, 4, seed=0)
+    one, two = text.encode(INSTRUCTION), text.encode(INSTRUCTION + "s")
+    assert torch.equal(one.embedding, text.encode(INSTRUCTION).embedding)
+    assert not torch.equal(one.embedding, two.embedding)
+    with pytest.raises(BadArgument, match="the policy has room for 16"):
+        text.encode(" ".join(["word"] * 40))
+
+
+def test_a_tokenizer_that_is_none(tmp_path):
+    (tmp_path / "spiece.model").write_bytes(b"nothing")
+    with pytest.raises(TokenizerUnusable, match="not a sentencepiece model"):
+        PieceTokenizer(tmp_path / "spiece.model")
+
+
+class StubEncoder:
+    """Stands in for T5: every token's embedding is its id."""
+
+    folder = "t5"
+
+    def __init__(self):
+        self.calls = 0
+
+    def encode(self, ids, positions, width):
+        self.calls += 1
+        embedding = torch.zeros(1, positions, width)
+        embedding[0, : len(ids)] = torch.tensor(ids)[:, None]
+        return embedding
+
+
+def test_what_the_file_lacks_is_encoded_once_and_what_it_has_is_not():
+    tokenizer, encoder = PieceTokenizer(TOKENIZER_PATH), StubEncoder()
+    count = len(tokenizer.pieces(INSTRUCTION)) + 1
+    text = PrecomputedText(TextEmbeddings("x", {INSTRUCTION: made_up(count, 32)}, ""), tokenizer, encoder)
+    text.encode(INSTRUCTION)
+    assert encoder.calls == 0
+    for _ in range(2):
+        encoded = text.encode("open the drawer")
+    assert encoder.calls == 1
+    assert encoded.embedding[0, :, 0].ne(0).sum() == len(encoded.prompt.pieces) + 1
+    with pytest.raises(TokenizerUnusable, match="--t5-tokenizer"):
+        PrecomputedText(text.embeddings, None, encoder)
+
+
+def test_a_folder_without_t5_is_refused(tmp_path):
+    with pytest.raises(EncoderUnusable, match="There is no T5 encoder at"):
+        T5Encoder(tmp_path)
+
+
+def test_the_encoder_library_is_optional(tmp_path, monkeypatch):
+    (tmp_path / "config.json").write_text("{}")
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(MissingDependency, match="--t5-encoder needs the transformers library"):
+        T5Encoder(tmp_path).encode([5, 1], 8, 4)
+
+
+def test_a_small_t5_gives_zeros_after_the_text(tmp_path):
+    transformers = pytest.importorskip("transformers")
+    config = transformers.T5Config(vocab_size=1024, d_model=8, d_kv=4, d_ff=16, num_layers=1, num_heads=2)
+    model = transformers.T5EncoderModel(config).eval()
+    model.save_pretrained(tmp_path)
+    found = T5Encoder(tmp_path).encode([7, 9, 1], 6, 8)
+    assert found.shape == (1, 6, 8)
+    assert (found[:, 3:] == 0).all()
+    mask = torch.tensor([[1, 1, 1, 0, 0, 0]])
+    with torch.no_grad():
+        padded = model(input_ids=torch.tensor([[7, 9, 1, 0, 0, 0]]), attention_mask=mask).last_hidden_state
+    torch.testing.assert_close(found[:, :3], padded[:, :3].bfloat16())
+    with pytest.raises(EncoderUnusable, match="gives 8 numbers a position, but the policy reads 16"):
+        T5Encoder(tmp_path).encode([7, 1], 6, 16)
