@@ -11,6 +11,7 @@ import polars as pl
 
 from analyze.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
 from analyze.atomic_file import replacing
+from analyze.contributions import contribution_table, summarise_contributions
 from analyze.reader import Store
 from analyze.results_file import write_results_of_suites
 from analyze.selection import Selection, check_combinable, choose_site, select, select_episodes
@@ -46,7 +47,8 @@ class AnalysisSettings:
 class Analysis:
     """The tables of one grouping over one selection of episodes.
 
-    `steps` is described in `analyze.tables`; `replans`, `episodes` and `tasks` in `analyze.aggregate`.
+    `steps` is described in `analyze.tables`; `replans`, `episodes` and `tasks` in `analyze.aggregate`; `contributions` (None
+    when they were not recorded) in `analyze.contributions`.
     """
 
     stores: tuple[Store, ...]
@@ -56,6 +58,7 @@ class Analysis:
     replans: pl.DataFrame
     episodes: pl.DataFrame
     tasks: pl.DataFrame
+    contributions: pl.DataFrame | None
     summary: str
 
 
@@ -112,7 +115,10 @@ def analyse(stores: Sequence[Store], settings: AnalysisSettings) -> Analysis:
         notes=_notes(root, selection, site),
     )
     text = summary_text(run, grouping, episodes, tasks)
-    return Analysis(tuple(stores), grouping, selection, steps, replans, episodes, tasks, text)
+    contributions = contribution_table(chosen, selection)
+    if contributions is not None:
+        text += "\n" + summarise_contributions(contributions, settings.seed)
+    return Analysis(tuple(stores), grouping, selection, steps, replans, episodes, tasks, contributions, text)
 
 
 def write_tables(analysis: Analysis, folder: Path) -> WrittenFiles:
@@ -122,11 +128,13 @@ def write_tables(analysis: Analysis, folder: Path) -> WrittenFiles:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK):
             raise PermissionError(13, "Permission denied")
-        for name in ("steps", "episodes", "tasks"):
-            path = folder / f"{name}.parquet"
-            with replacing(path) as temporary:
-                getattr(analysis, name).write_parquet(temporary)
-            written.files.append(path)
+        for name in ("steps", "episodes", "tasks", "contributions"):
+            table: pl.DataFrame | None = getattr(analysis, name)
+            if table is not None:
+                path = folder / f"{name}.parquet"
+                with replacing(path) as temporary:
+                    table.write_parquet(temporary)
+                written.files.append(path)
         if analysis.grouping.ratio is not None:
             written.files += write_results_of_suites(folder, analysis.replans, analysis.grouping)
         path = folder / "summary.txt"

@@ -15,6 +15,7 @@ from capture.attention import RecordedRows
 from capture.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
 from capture.store_writer import RunStore, WriteMode, open_run
 from schemas.layout import INVALID_ROLES, PatchGrid, Piece, Prompt, Role, SiteLayout, Span
+from schemas.segments import segments_of
 from schemas.store import (
     FORMAT_NAME,
     FORMAT_VERSION,
@@ -60,6 +61,7 @@ class StoreSpec:
     num_action_queries: int = 3
     mantissa_bits: int = 10
     frames: bool = True
+    contributions: bool = False
     coverage: bool = True
     prompts: Literal["changing", "same"] = "changing"
     policy: str = "made-up"
@@ -144,6 +146,7 @@ def root_attributes(spec: StoreSpec) -> RootAttributes:
             num_action_queries=spec.num_action_queries,
             mantissa_bits=spec.mantissa_bits,
             frames=spec.frames,
+            contributions=spec.contributions,
         ),
         sites=(spec.layout,),
         provenance={"numpy": np.__version__},
@@ -173,7 +176,11 @@ def episode_records(spec: StoreSpec, task: int, episode: int) -> tuple[EpisodeSt
                 env_step=10 + 5 * replan,
                 noise_seed=int(generator.integers(2**63 - 1)),
                 rows={
-                    "joint": RecordedRows(rows[replan], rows[replan].sum(axis=-1, dtype=np.float64).astype(np.float32))
+                    "joint": RecordedRows(
+                        rows[replan],
+                        rows[replan].sum(axis=-1, dtype=np.float64).astype(np.float32),
+                        gram_of(contribution_vectors(spec, tokens, seed, replan)) if spec.contributions else None,
+                    )
                 },
                 key_role={"joint": tokens.key_role[replan]},
                 prompt=tokens.prompts[tokens.prompt_index[replan]],
@@ -194,6 +201,19 @@ def episode_records(spec: StoreSpec, task: int, episode: int) -> tuple[EpisodeSt
         provenance={"host": "made-up"},
     )
     return start, records
+
+
+def contribution_vectors(spec: StoreSpec, tokens: EpisodeTokens, seed: list[int], replan: int) -> np.ndarray:
+    """Made-up contributions (layer, denoise, query, segment, width) of a replan's segments."""
+    segments = segments_of(tokens.layout, tokens.key_role[replan])
+    shape = (*spec.cells[:2], spec.num_action_queries, len(segments), 4)
+    return np.random.default_rng([*seed, replan, 1]).normal(size=shape)
+
+
+def gram_of(vectors: np.ndarray) -> np.ndarray:
+    """Gram matrix (layer, denoise, part, part) of segments and their sum, mean over queries."""
+    parts = np.concatenate([vectors, vectors.sum(axis=3, keepdims=True)], axis=3)
+    return np.einsum("ldqaw,ldqbw->ldab", parts, parts).astype(np.float32) / vectors.shape[2]
 
 
 def small_layout(text_keys: int = 14) -> SiteLayout:

@@ -1,0 +1,139 @@
+"""What seeing and reading really add to the residual stream: norms of value-weighted contributions, from stored Gram matrices.
+
+A mass says how much attention keys get, not what they do with it. The contribution of a set of keys is a vector (probabilities x
+values, through the output projection and gate; Kobayashi et al. 2020), and its norm follows from the Gram matrix of the
+parts: |sum of the chosen parts| = sqrt(wᵀ G w). Unlike masses, norms of different sites are lengths in the same space, so one of
+self-attention may be divided by one of cross-attention.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from analyze.aggregate import LAYERS_AVG
+from analyze.masses import ratio
+from analyze.reader import Store, StoredEpisode
+from analyze.selection import Selection
+from analyze.statistics import bootstrap_interval, mean_over_episodes
+from analyze.summary import WIDTH
+from analyze.text_table import format_interval, format_number, text_table
+from schemas.segments import Segment
+from schemas.store import RootAttributes
+
+#: Roles on each side of the headline: what is seen now, and what is read.
+VISUAL_ROLES = ("image",)
+LINGUISTIC_ROLES = ("bos", "template", "instruction", "text")
+
+
+def joint_norm(gram: NDArray[np.floating], chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Norm of the chosen parts' summed contribution (root mean square over the queries): sqrt(wᵀ G w).
+
+    gram: (..., part, part); chosen: (part,) bool. Returns (...). Rounding may leave tiny negative squares: they are 0.
+    """
+    weights = chosen.astype(np.float64)
+    squared = np.einsum("...ab,a,b->...", gram.astype(np.float64), weights, weights)
+    return np.sqrt(np.clip(squared, 0.0, None))
+
+
+def contribution_table(chosen: Sequence[tuple[Store, StoredEpisode]], selection: Selection) -> pl.DataFrame | None:
+    """Norms of both sides for every (episode, replan, layer, denoise step), or None when no contributions were recorded.
+
+    Columns: suite, task_id, episode_index, replan, env_step, layer, block, denoise_step, visual_norm, linguistic_norm,
+    contribution_ratio (visual / linguistic; infinite or null where the denominator is 0). A side is read at the site that has
+    such keys: both at `joint` for pi, `self` and `cross` for Cosmos. None also when a run has no such keys at all.
+    """
+    frames = []
+    for store, episode in chosen:
+        root = store.attributes
+        if not root.recording.contributions:
+            return None
+        visual = _side_norm(root, episode, selection, VISUAL_ROLES)
+        linguistic = _side_norm(root, episode, selection, LINGUISTIC_ROLES)
+        if visual is None or linguistic is None:
+            return None
+        frames.append(_episode_frame(store, episode, selection, visual, linguistic))
+    return pl.concat(frames)
+
+
+def _side_norm(
+    root: RootAttributes, episode: StoredEpisode, selection: Selection, roles: Sequence[str]
+) -> NDArray[np.float64] | None:
+    """Norm (replan, layer, denoise) of all segments with these roles, at the first site that has any."""
+    for site in root.sites:
+        segments: tuple[Segment, ...] = episode.attributes.segments[site.name]
+        # The last part is the whole update of the block, and belongs to no side.
+        parts = np.array([*(segment.role in roles for segment in segments), False])
+        if parts.any():
+            gram = episode.read(f"{site.name}/contribution")
+            return joint_norm(gram[:, list(selection.layers)][:, :, list(selection.denoise)], parts)
+    return None
+
+
+def _episode_frame(
+    store: Store,
+    episode: StoredEpisode,
+    selection: Selection,
+    visual: NDArray[np.float64],
+    linguistic: NDArray[np.float64],
+) -> pl.DataFrame:
+    def along(values: Any, axis: int) -> NDArray[Any]:
+        expanded = np.asarray(values).reshape([-1 if i == axis else 1 for i in range(3)])
+        return np.broadcast_to(expanded, visual.shape).ravel()
+
+    columns = {
+        "replan": along(np.arange(visual.shape[0]), 0),
+        "env_step": along(episode.read("env_step").astype(np.int64), 0),
+        "layer": along(np.array(selection.layer_labels, dtype=np.int64), 1),
+        "block": along(np.array(selection.blocks, dtype=np.int64), 1),
+        "denoise_step": along(np.array(selection.denoise_steps, dtype=np.int64), 2),
+        "visual_norm": visual.ravel(),
+        "linguistic_norm": linguistic.ravel(),
+        "contribution_ratio": ratio(visual, linguistic).ravel(),
+    }
+    attributes = episode.attributes
+    return pl.DataFrame(columns).select(
+        pl.lit(store.suite).alias("suite"),
+        pl.lit(attributes.task_id).cast(pl.Int64).alias("task_id"),
+        pl.lit(attributes.episode_index).cast(pl.Int64).alias("episode_index"),
+        pl.all().exclude("suite", "task_id", "episode_index").fill_nan(None),
+    )
+
+
+def summarise_contributions(table: pl.DataFrame, seed: int) -> str:
+    """The summary's section: per layer the mean norms over episodes and their ratio with a two-level interval (95 %)."""
+    rows = [
+        _summary_row(table.filter(layer=layer), str(layer), seed)
+        for layer in table["layer"].unique(maintain_order=True)
+    ]
+    rows.append(_summary_row(table, LAYERS_AVG, seed))
+    title = "CONTRIBUTIONS  |visual| / |linguistic|, norms of what the keys add to the residual stream"
+    note = (
+        "Value-weighted, through output projection and gate; root mean square over action queries, mean over replans and denoise "
+        "steps. ratio: mean over episodes of the mean ratio of norms. Norms of different sites may be divided; masses may not."
+    )
+    header = ["layer", "|visual|", "|linguistic|", "ratio", "95% interval"]
+    return "\n".join([title, "-" * WIDTH, text_table(header, rows, left=(0,)), "", textwrap.fill(note, WIDTH), ""])
+
+
+def _summary_row(part: pl.DataFrame, label: str, seed: int) -> list[str]:
+    finite = pl.col("contribution_ratio").filter(pl.col("contribution_ratio").is_finite())
+    episodes = part.group_by("suite", "task_id", "episode_index", maintain_order=True).agg(
+        pl.col("visual_norm", "linguistic_norm").mean(), finite.mean().alias("ratio")
+    )
+    values = mean_over_episodes(episodes["ratio"].cast(pl.Float64).fill_null(float("nan")).to_numpy())
+    tasks = episodes.select(pl.struct("suite", "task_id").rank("dense")).to_series().to_numpy()
+    interval = bootstrap_interval(values, tasks, seed=seed)
+    norms = [episodes[f"{side}_norm"].cast(pl.Float64).mean() for side in ("visual", "linguistic")]
+    bounds = (None, None) if interval is None else (interval.low, interval.high)
+    return [
+        label,
+        *(format_number(norm if isinstance(norm, float) else None) for norm in norms),
+        format_number(values.value),
+        format_interval(*bounds),
+    ]
