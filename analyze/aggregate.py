@@ -75,8 +75,10 @@ def add_layers_avg(replans: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
         if grouping.ratio
         else []
     )
+    # A block that was named both ways (as 8 and as the recorded call 26) is one layer, not two.
     average = (
-        replans.group_by(*_REPLAN_KEYS)
+        replans.unique([*_REPLAN_KEYS, "block"], keep="first", maintain_order=True)
+        .group_by(*_REPLAN_KEYS)
         .agg(*(pl.col(column).mean() for column in means), *ratio)
         .with_columns(
             pl.lit(LAYERS_AVG).alias("layer"),

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from analyze.reader import Store, StoredEpisode
 from analyze.selection import select_episodes
 from schemas.errors import listing
+from schemas.layers import block_of_labels
 from schemas.layout import Role, Span
 from schemas.precision import FLOAT32_MANTISSA_BITS, mass_error_bound
 from schemas.selectors import SELECTOR_KINDS
@@ -34,7 +35,9 @@ def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
     yield f"  episodes   {len(episodes)} ({solved} solved), tasks {listing(store.task_ids, 100)}"
     labels = [
         f"{label} (block {block})" if label != block else str(block)
-        for block, label in zip(recording.layers, recording.layer_labels, strict=True)
+        for label, block in zip(
+            recording.layer_labels, block_of_labels(recording.layer_labels, policy.num_layers), strict=True
+        )
     ]
     yield f"  layers     {listing(labels, 40)} of {policy.num_layers}"
     yield f"  denoise    steps {listing(recording.denoise_steps, 40)} of {policy.num_denoise_steps}"

@@ -111,7 +111,8 @@ def summarise_contributions(table: pl.DataFrame, seed: int) -> str:
         _summary_row(table.filter(layer=layer), str(layer), seed)
         for layer in table["layer"].unique(maintain_order=True)
     ]
-    rows.append(_summary_row(table, LAYERS_AVG, seed))
+    once = table.unique(["suite", "task_id", "episode_index", "replan", "block", "denoise_step"], maintain_order=True)
+    rows.append(_summary_row(once, LAYERS_AVG, seed))
     title = "CONTRIBUTIONS  |visual| / |linguistic|, norms of what the keys add to the residual stream"
     note = (
         "Value-weighted, through output projection and gate; root mean square over action queries, mean over replans and denoise "

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from analyze.reader import Store, StoredEpisode
 from schemas.errors import BadArgument, listing, unknown_name
-from schemas.layers import LayerSelection, select_layers
+from schemas.layers import LayerSelection, block_of_labels, select_layers
 from schemas.store import RootAttributes, StoreError, parse_episode_name
 
 
@@ -41,7 +41,8 @@ def select(
     """Check the wanted layers, denoise steps and heads against what was recorded; None means all of it."""
     recording = root.recording
     if layers is None:
-        wanted = LayerSelection(recording.layers, recording.layer_labels)
+        blocks = block_of_labels(recording.layer_labels, root.policy.num_layers)
+        wanted = LayerSelection(blocks, recording.layer_labels)
     else:
         wanted = select_layers(layers, root.policy.num_layers, root.policy.family)
     missing = [

@@ -69,10 +69,9 @@ def plan_recording(settings: RecordingSettings, policy: Policy) -> tuple[Recordi
         raise BadArgument(f"Heads {listing(heads)} name one of them twice.")
     if settings.queries not in ("mean", "steps", "all"):
         raise BadArgument(f"Cannot use --queries '{settings.queries}'; expected 'mean', 'steps' or 'all'.")
-    order = sorted(range(len(layers.blocks)), key=lambda i: layers.blocks[i])
     recording = Recording(
-        layers=tuple(layers.blocks[i] for i in order),
-        layer_labels=tuple(layers.labels[i] for i in order),
+        layers=tuple(sorted(set(layers.blocks))),
+        layer_labels=tuple(sorted(layers.labels, key=lambda label: (label % policy.num_layers, label))),
         denoise_steps=steps,
         heads=tuple(sorted(heads)),
         queries=cast(Literal["mean", "steps", "all"], settings.queries),

@@ -26,7 +26,8 @@ def select_layers(numbers: Sequence[int] | None, num_layers: int, family: str) -
     The published pi0 scripts number attention *calls* of one inference: 0..n-1 are the prefix pass (without action queries), n..2n-1
     the first denoise step. Their numbers n..2n-1 are accepted for the families above, and mean block number - n.
 
-    Raises `BadArgument` for any other number, or when two numbers mean the same block.
+    A block may be named both ways (the published example `0 8 17 25 26 27` names block 8 twice): results then carry both numbers.
+    Raises `BadArgument` for any other number, or for the same number twice.
     """
     if numbers is None:
         return LayerSelection(tuple(range(num_layers)), tuple(range(num_layers)))
@@ -36,15 +37,27 @@ def select_layers(numbers: Sequence[int] | None, num_layers: int, family: str) -
         if not 0 <= number <= last:
             also = f", or recorded-call numbers {num_layers} to {last}" if accepts_call_numbers else ""
             raise BadArgument(f"There is no layer {number}; expected block indices 0 to {num_layers - 1}{also}.")
-    blocks = [number % num_layers for number in numbers]
-    for block in blocks:
-        same = [number for number, its in zip(numbers, blocks, strict=True) if its == block]
-        if len(same) > 1:
-            raise BadArgument(f"Layers {listing(same)} are the same block {block}; give each block once.")
-    translated = [f"{number} = block {number - num_layers}" for number in numbers if number >= num_layers]
+    if len(set(numbers)) != len(numbers):
+        raise BadArgument(f"Layers {listing(numbers, 40)} name one of them twice; give each number once.")
+    return LayerSelection(block_of_labels(numbers, num_layers), tuple(numbers), _translation_note(numbers, num_layers))
+
+
+def block_of_labels(numbers: Sequence[int], num_layers: int) -> tuple[int, ...]:
+    """The block of each layer number that `select_layers` has accepted."""
+    return tuple(number % num_layers for number in numbers)
+
+
+def _translation_note(numbers: Sequence[int], num_layers: int) -> str | None:
+    calls = [number for number in numbers if number >= num_layers]
+    if not calls:
+        return None
+    translated = ", ".join(f"{number} = block {number - num_layers}" for number in calls)
     note = (
-        f"Layers {', '.join(translated)}: numbers from {num_layers} on are read as the published scripts' recorded-call numbers."
-        if translated
-        else None
+        f"Layers {translated}: numbers from {num_layers} on are read as the published scripts' recorded-call numbers (first denoise "
+        "step there; here the block at every selected denoise step)."
     )
-    return LayerSelection(tuple(blocks), tuple(numbers), note)
+    twice = [number for number in calls if number - num_layers in numbers]
+    if twice:
+        pairs = listing([f"{number - num_layers} and {number}" for number in twice])
+        note += f" {pairs} are the same block, and count once in layers_avg."
+    return note

@@ -73,8 +73,8 @@ class Recording:
     """What of the attention is recorded.
 
     `layers` are block indices; `layer_labels` are the numbers that the user typed for them (the same unless the
-    reference's recorded-call numbers were used). `queries` is `mean` (over the action queries), `steps` (weighted means of them,
-    `num_pools` many, one per action step or per step and dimension) or `all`.
+    reference's recorded-call numbers were used; a block named both ways has two). `queries` is `mean` (over the action
+    queries), `steps` (weighted means of them, `num_pools` many, one per action step or per step and dimension) or `all`.
     `mantissa_bits` is the precision of the rows (23 = exact). `contributions`: the Gram matrix of value-weighted contributions,
     mean over the action queries, is recorded too.
     """

@@ -34,7 +34,7 @@ def run(command, arguments, capsys) -> str:
         (["--task-id", "-1"], "its tasks are 0 to 7"),
         (["--task-suite", "libero_10", "--task-id", "10"], "its tasks are 0 to 9"),
         (["--layers", "6"], "expected block indices 0 to 2, or recorded-call numbers 3 to 5"),
-        (["--layers", "1", "4"], "the same block 1"),
+        (["--layers", "1", "4", "1"], "name one of them twice"),
         (["--layers", "one"], "invalid int value"),
         (["--heads", "8"], "expected 0 to 7"),
         (["--denoise-steps", "3"], "expected numbers 0 to 2, 'first', 'last' or 'all'"),

@@ -109,6 +109,18 @@ def test_results_file_has_the_published_structure(captured_store, tmp_path):
     assert summary["median"] == pytest.approx(np.median(ratios))
 
 
+def test_a_block_named_both_ways_is_stored_once_and_reported_twice(run_capture, tmp_path):
+    """As in the published example, whose layers 8 and 26 are one block of a model with 18."""
+    run_capture("--task-id", 0, "--num-episodes", 1, "--layers", 2, 0, 5, "--output-dir", tmp_path)
+    rows = zarr.open_group(tmp_path / "robosuite.zarr/episodes/task000_episode000", mode="r")["joint/rows"]
+    assert rows.shape[1] == 2
+    (episode,) = json.loads((tmp_path / "attention_ratio_results_robosuite.json").read_text())
+    assert set(episode["summary"]) == {"layer_0", "layer_2", "layer_5", "layers_avg"}
+    assert episode["summary"]["layer_2"] == episode["summary"]["layer_5"]
+    each = [episode["per_step_ratios"][f"layer_{layer}"][0]["visual_mass"] for layer in (0, 2)]
+    assert episode["per_step_ratios"]["layers_avg"][0]["visual_mass"] == pytest.approx(np.mean(each))
+
+
 def test_three_groupings_of_one_store_need_no_model(captured_store, tmp_path, monkeypatch):
     # Stage two must work where torch and the simulators are not installed.
     for module in ("torch", "mujoco", "robosuite", "capture"):

@@ -89,6 +89,9 @@ def test_layer_numbers_of_the_published_scripts():
     assert chosen.labels == (25, 0, 17)
     assert "25 = block 7" in (chosen.note or "")
     assert select_layers([0, 8, 17], 18, "pi0").note is None
+    published = select_layers([0, 8, 17, 25, 26, 27], 18, "pi05")
+    assert published.blocks == (0, 8, 17, 7, 8, 9)
+    assert "8 and 26 are the same block" in (published.note or "")
     assert select_layers(None, 3, "pi05").blocks == (0, 1, 2)
     with pytest.raises(BadArgument, match=r"expected block indices 0 to 27\.$"):
         select_layers([28], 28, "cosmos")
