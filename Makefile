@@ -5,7 +5,7 @@
 #   make test        formatting, types and all tests
 #   make setup       the whole environment        make setup-analyze   the laptop's part of it
 #
-# Options, as in: make capture SUITE=libero_10 TASK_ID=0 CHECKPOINT=~/pi05_libero
+# Options, as in: make capture SUITE=libero_10 TASK_ID=0 CHECKPOINT=~/pi05_libero, or make capture POLICY=cosmos
 POLICY     ?= pi
 CHECKPOINT ?= embedded
 SUITE      ?= robosuite
@@ -13,7 +13,7 @@ TASK_ID    ?=
 EPISODES   ?=
 LAYERS     ?=
 SEED       ?= 7
-STORE      ?= runs/$(SUITE).zarr
+STORE      ?= runs/$(if $(filter cosmos,$(POLICY)),cosmos_)$(SUITE).zarr
 GROUPING   ?= default
 OUTPUT     ?= results/$(basename $(notdir $(STORE)))/$(basename $(notdir $(GROUPING)))
 # Anything else that the command lines accept, as in: make capture ARGS="--max-steps 100 --resume"

@@ -229,7 +229,12 @@ def _add_recording_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_store_arguments(parser: argparse.ArgumentParser) -> None:
     output = parser.add_argument_group("output")
-    output.add_argument("--store", type=Path, metavar="NAME.zarr", help="store to write (default: runs/SUITE.zarr)")
+    output.add_argument(
+        "--store",
+        type=Path,
+        metavar="NAME.zarr",
+        help="store to write (default: runs/SUITE.zarr, for cosmos runs/cosmos_SUITE.zarr)",
+    )
     output.add_argument(
         "--output-dir",
         type=Path,
@@ -277,4 +282,6 @@ def store_path(arguments: argparse.Namespace) -> Path:
     """Where the store goes: --store, else a name made of the suite in --output-dir or `runs`."""
     if arguments.store is not None:
         return Path(arguments.store)
-    return (arguments.output_dir or Path("runs")) / f"{arguments.task_suite}{STORE_SUFFIX}"
+    # Runs of two policies on one suite must not meet in one store.
+    prefix = "" if arguments.policy == "pi" else f"{arguments.policy}_"
+    return (arguments.output_dir or Path("runs")) / f"{prefix}{arguments.task_suite}{STORE_SUFFIX}"
