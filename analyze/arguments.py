@@ -32,7 +32,7 @@ def build_parser() -> argparse.ArgumentParser:
     grouping.add_argument(
         "--grouping",
         metavar="NAME|FILE",
-        help="default, instruction, cameras, objects, or a TOML file (default: default)",
+        help="default, instruction, cameras, objects, reference, or a TOML file (default: default)",
     )
     grouping.add_argument(
         "--group",

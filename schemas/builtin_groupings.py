@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from schemas.errors import did_you_mean, listing
-from schemas.grouping import Grouping, GroupingNotFound, Ratio, read_grouping_file
+from schemas.grouping import Grouping, GroupingError, GroupingNotFound, Ratio, read_grouping_file
 from schemas.vocabulary import Vocabulary
 
 _TEXT = "role:bos | role:template | role:instruction | role:text"
@@ -80,11 +80,44 @@ def objects(vocabulary: Vocabulary) -> Grouping:
     )
 
 
+def reference(vocabulary: Vocabulary) -> Grouping:
+    """The published scripts' arithmetic on our rows, to compare with old numbers; its labels do not say what its keys are.
+
+    pi: "visual" is the first camera, "linguistic" as many keys after it as the prompt has slots (in truth the next camera's
+    patches), "action" all the rest. Cosmos: frame `curr_last` over frame `frame0`, a blank picture. The scripts' query rows
+    differ too: theirs is one token of the prefix pass for pi, and for Cosmos a sum over the queries where ours is their mean.
+    """
+    spans = vocabulary.layout.spans if vocabulary.layout is not None else ()
+    if any(span.kind == "latent" for span in spans):
+        groups = {"visual": ("frame:curr_last",), "linguistic": ("frame:frame0",)}
+        return Grouping(
+            name="reference",
+            groups=groups,
+            ratio=Ratio(("visual",), ("linguistic",)),
+            description="the published Cosmos scripts' frames: 'linguistic' is a blank picture, and holds no language",
+        )
+    images = [span.num_keys for span in spans if span.kind == "image"]
+    texts = [span.num_keys for span in spans if span.kind == "text"]
+    if not images or not texts:
+        raise GroupingError(
+            "The grouping 'reference' is defined for the sites 'joint' (pi) and 'self' (Cosmos) only; choose with --site."
+        )
+    first, last = images[0], images[0] + texts[0] - 1
+    return Grouping(
+        name="reference",
+        groups={"visual": (f"keys:0-{first - 1}",), "linguistic": (f"keys:{first}-{last}",), "action": ("*",)},
+        ratio=Ratio(("visual",), ("linguistic",)),
+        allow_empty=("action",),
+        description=f"the published pi scripts' key ranges: 'linguistic' is keys {first} to {last}, wherever the prompt really is",
+    )
+
+
 BUILTIN_GROUPINGS: dict[str, Callable[[Vocabulary], Grouping]] = {
     "default": default,
     "instruction": instruction,
     "cameras": cameras,
     "objects": objects,
+    "reference": reference,
 }
 
 

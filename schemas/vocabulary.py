@@ -71,7 +71,10 @@ class EpisodeTokens:
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """The names that selectors may use over a selection of episodes, for validation and for "did you mean"."""
+    """The names that selectors may use over a selection of episodes, for validation and for "did you mean".
+
+    `layout` is the site's, which all episodes of a selection share.
+    """
 
     cameras: tuple[str, ...]
     spans: tuple[str, ...]
@@ -79,6 +82,7 @@ class Vocabulary:
     roles: tuple[str, ...]
     words: tuple[str, ...]
     objects: tuple[str, ...]
+    layout: SiteLayout | None = None
 
 
 def collect_vocabulary(episodes: Iterable[EpisodeTokens]) -> Vocabulary:
@@ -89,7 +93,9 @@ def collect_vocabulary(episodes: Iterable[EpisodeTokens]) -> Vocabulary:
     roles: dict[str, None] = {}
     words: dict[str, None] = {}
     objects: dict[str, None] = {}
+    layout: SiteLayout | None = None
     for tokens in episodes:
+        layout = tokens.layout
         for span in tokens.layout.spans:
             spans[span.name] = None
             if span.kind == "latent":
@@ -101,4 +107,4 @@ def collect_vocabulary(episodes: Iterable[EpisodeTokens]) -> Vocabulary:
             words.update({word.text.casefold(): None for word in line})
         if tokens.coverage:
             objects.update({thing.name: None for thing in tokens.objects})
-    return Vocabulary(*(tuple(names) for names in (cameras, spans, frames, roles, words, objects)))
+    return Vocabulary(tuple(cameras), tuple(spans), tuple(frames), tuple(roles), tuple(words), tuple(objects), layout)

@@ -200,6 +200,30 @@ def test_union_and_difference_partition(data):
     np.testing.assert_allclose(union, only_a + only_b + both, atol=1e-6)
 
 
+def test_reference_takes_the_published_key_ranges(tokens):
+    grouping = BUILTIN_GROUPINGS["reference"](collect_vocabulary([tokens]))
+    resolved = resolve(grouping, tokens)
+    # One camera of 4 patches, then as many keys as the prompt has slots (12), whatever they are; the rest is "action".
+    assert resolved.num_keys.tolist() == [[4, 12, 6]]
+    assert resolved.weights[0, 4:16, 1].all()
+
+
+def test_reference_on_latent_frames_and_where_it_makes_no_sense():
+    frames = tuple(
+        Span(name, "latent", i, i + 1, camera="primary" if name == "primary" else None)
+        for i, name in enumerate(("blank", "primary", "action"))
+    )
+    roles = np.array([[Role.BLANK, Role.IMAGE, Role.ACTION]], dtype=np.uint8)
+    latent = EpisodeTokens(SiteLayout("self", frames), roles)
+    resolved = resolve(BUILTIN_GROUPINGS["reference"](collect_vocabulary([latent])), latent)
+    assert resolved.weights[0].T.tolist() == [[0, 1, 0], [1, 0, 0]]
+    text = EpisodeTokens(
+        SiteLayout("cross", (Span("text", "text", 0, 1),)), np.array([[Role.INSTRUCTION]], dtype=np.uint8)
+    )
+    with pytest.raises(GroupingError, match="choose with --site"):
+        BUILTIN_GROUPINGS["reference"](collect_vocabulary([text]))
+
+
 def test_names_of_groups_and_ratios_are_checked():
     for groups, said in [
         ({}, "no groups"),
