@@ -16,9 +16,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-#: The name of the last part.
-UPDATE = "update"
-
 #: Maps mixed values (any, head · dim) to the residual stream (any, width): output projection, and gate if there is one.
 Projection = Callable[[Tensor], Tensor]
 

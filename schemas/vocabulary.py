@@ -78,7 +78,6 @@ class Vocabulary:
 
     cameras: tuple[str, ...]
     spans: tuple[str, ...]
-    frames: tuple[str, ...]
     roles: tuple[str, ...]
     words: tuple[str, ...]
     objects: tuple[str, ...]
@@ -89,7 +88,6 @@ def collect_vocabulary(episodes: Iterable[EpisodeTokens]) -> Vocabulary:
     """Union of the names in the given episodes, in order of first appearance. Cameras that are always masked are left out."""
     cameras: dict[str, None] = {}
     spans: dict[str, None] = {}
-    frames: dict[str, None] = {}
     roles: dict[str, None] = {}
     words: dict[str, None] = {}
     objects: dict[str, None] = {}
@@ -98,8 +96,6 @@ def collect_vocabulary(episodes: Iterable[EpisodeTokens]) -> Vocabulary:
         layout = tokens.layout
         for span in tokens.layout.spans:
             spans[span.name] = None
-            if span.kind == "latent":
-                frames[span.name] = None
             if span.camera is not None and (tokens.static_roles[:, span.start : span.stop] != Role.MASKED_IMAGE).any():
                 cameras[span.camera] = None
         roles.update({Role(code).label: None for code in np.unique(tokens.static_roles)})
@@ -107,4 +103,4 @@ def collect_vocabulary(episodes: Iterable[EpisodeTokens]) -> Vocabulary:
             words.update({word.text.casefold(): None for word in line})
         if tokens.coverage:
             objects.update({thing.name: None for thing in tokens.objects})
-    return Vocabulary(tuple(cameras), tuple(spans), tuple(frames), tuple(roles), tuple(words), tuple(objects), layout)
+    return Vocabulary(tuple(cameras), tuple(spans), tuple(roles), tuple(words), tuple(objects), layout)

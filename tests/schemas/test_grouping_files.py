@@ -20,7 +20,7 @@ from schemas.selectors import SelectorError
 from schemas.vocabulary import Vocabulary
 
 VOCABULARY = Vocabulary(
-    ("base", "wrist"), ("base", "wrist", "prompt"), (), ("image", "instruction"), ("bowl",), ("bowl_1",)
+    ("base", "wrist"), ("base", "wrist", "prompt"), ("image", "instruction"), ("bowl",), ("bowl_1",)
 )
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import re
 from pathlib import Path
 
-from schemas.errors import BadArgument, MissingDependency, UserError, listing
+from capture.policies.hub import HUB_NAME, fetch_from_hub, snapshots_folder
+from schemas.errors import BadArgument, UserError, listing
 
 POLICY_REPOSITORY = "nvidia/Cosmos-Policy-LIBERO-Predict2-2B"
 #: Where the image encoder is published; the policy's own repository does not have it.
@@ -17,31 +16,19 @@ EMBEDDINGS_NAME = "libero_t5_embeddings.pkl"
 #: T5's vocabulary is the same in all sizes.
 T5_REPOSITORIES = ("google-t5/t5-11b", "google-t5/t5-small", "google-t5/t5-base", "google-t5/t5-large")
 T5_TOKENIZER = "spiece.model"
-_HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 
 
 class CheckpointNotFound(UserError, FileNotFoundError):
     """There is no checkpoint, or not all of it."""
 
 
-class CheckpointUnavailable(UserError, ConnectionError):
-    """Files have to be fetched and cannot be."""
-
-
 class UnsupportedCheckpoint(UserError, ValueError):
     """The checkpoint is in a form that is not read."""
 
 
-def hub_cache() -> Path:
-    """The folder that the Hugging Face hub's client downloads to."""
-    home = os.environ.get("HF_HOME") or Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "huggingface"
-    return Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub").expanduser()
-
-
 def in_hub_cache(repository: str, file: str) -> Path | None:
     """Return a file of a repository that was downloaded before, or None."""
-    snapshots = hub_cache() / f"models--{repository.replace('/', '--')}" / "snapshots"
-    found = sorted(snapshots.glob(f"*/{file}"))
+    found = sorted(snapshots_folder(repository).glob(f"*/{file}"))
     return found[-1] if found else None
 
 
@@ -53,7 +40,7 @@ def find_checkpoint(name: str) -> Path:
     path = Path(name).expanduser()
     if path.exists():
         return path
-    if _HUB_NAME.fullmatch(name):
+    if HUB_NAME.fullmatch(name):
         return _from_hub(name, ["*.pt", STATISTICS_NAME, EMBEDDINGS_NAME])
     raise CheckpointNotFound(
         f"There is no checkpoint at '{path}'; give a folder with a .pt file, {STATISTICS_NAME} and {EMBEDDINGS_NAME}, or "
@@ -66,21 +53,7 @@ def _from_hub(repository: str, patterns: list[str]) -> Path:
         f"fetch {listing(patterns)} of it where there is a network (`hf download {repository}`), copy the folder here and give its "
         "path (there is no such local folder)"
     )
-    try:
-        from huggingface_hub import snapshot_download
-    except ImportError as error:
-        raise MissingDependency(
-            f"'{repository}' is a name on the Hugging Face hub, whose client is not installed; install it with "
-            f"`pip install 'vla-attention[hub]'`, or {how}."
-        ) from error
-    try:
-        return Path(snapshot_download(repository, allow_patterns=patterns))
-    except Exception as error:  # the client raises its own errors, those of its HTTP library, and OSError
-        text = str(error).strip()
-        first = f"{type(error).__name__}: {text.splitlines()[0].rstrip('.')}" if text else type(error).__name__
-        raise CheckpointUnavailable(
-            f"'{repository}' could not be fetched from the Hugging Face hub ({first}); {how}."
-        ) from error
+    return fetch_from_hub(repository, patterns, how)
 
 
 def find_weights(checkpoint: Path) -> Path:

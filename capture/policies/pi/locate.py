@@ -7,14 +7,13 @@ client, the error says what to fetch and where to put it.
 from __future__ import annotations
 
 import os
-import re
 import shutil
 from pathlib import Path
 from typing import Any
 
-from schemas.errors import BadArgument, MissingDependency, UserError, listing
+from capture.policies.hub import HUB_NAME, CheckpointUnavailable, fetch_from_hub, first_line, snapshots_folder
+from schemas.errors import BadArgument, MissingDependency, listing
 
-_HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 #: What a policy needs of a hub repository; nothing else is fetched.
 HUB_FILES = (
     "config.json",
@@ -34,10 +33,6 @@ TOKENIZER_URL = "gs://big_vision/paligemma_tokenizer.model"
 TOKENIZER_REPOSITORY = "google/paligemma-3b-pt-224"
 
 
-class CheckpointUnavailable(UserError, ConnectionError):
-    """A checkpoint has to be fetched and cannot be."""
-
-
 def find_checkpoint(name: str) -> Path:
     """Return the folder of a checkpoint: a local folder, `gs://...` in openpi's cache, or `ORG/NAME` of the hub.
 
@@ -46,7 +41,7 @@ def find_checkpoint(name: str) -> Path:
     if name.startswith("gs://"):
         return _from_openpi_cache(name.rstrip("/"))
     path = Path(name).expanduser()
-    if not path.exists() and _HUB_NAME.fullmatch(name):
+    if not path.exists() and HUB_NAME.fullmatch(name):
         return _from_hub(name)
     return path
 
@@ -56,30 +51,12 @@ def openpi_cache() -> Path:
     return Path(os.environ.get("OPENPI_DATA_HOME", "~/.cache/openpi")).expanduser()
 
 
-def hub_cache() -> Path:
-    """The folder that the Hugging Face hub's client downloads to."""
-    home = os.environ.get("HF_HOME") or Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "huggingface"
-    return Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub").expanduser()
-
-
 def _from_hub(name: str) -> Path:
     how = (
         f"fetch it where there is a network with `hf download {name}`, copy the folder here and give its path "
         "(there is no such local folder)"
     )
-    try:
-        from huggingface_hub import snapshot_download
-    except ImportError as error:
-        raise MissingDependency(
-            f"'{name}' is a name on the Hugging Face hub, whose client is not installed; install it with "
-            f"`pip install 'vla-attention[hub]'`, or {how}."
-        ) from error
-    try:
-        return Path(snapshot_download(name, allow_patterns=list(HUB_FILES)))
-    except Exception as error:  # the client raises its own errors, those of its HTTP library, and OSError
-        raise CheckpointUnavailable(
-            f"'{name}' could not be fetched from the Hugging Face hub ({_first_line(error)}); {how}."
-        ) from error
+    return fetch_from_hub(name, HUB_FILES, how)
 
 
 def _from_openpi_cache(url: str) -> Path:
@@ -99,7 +76,7 @@ def _from_openpi_cache(url: str) -> Path:
         _download(gcsfs.GCSFileSystem(token="anon"), url, partial)
     except Exception as error:
         shutil.rmtree(partial, ignore_errors=True)
-        raise CheckpointUnavailable(f"'{url}' could not be fetched ({_first_line(error)}); {how}.") from error
+        raise CheckpointUnavailable(f"'{url}' could not be fetched ({first_line(error)}); {how}.") from error
     partial.rename(target)
     return target
 
@@ -116,11 +93,6 @@ def _download(files: Any, url: str, partial: Path) -> None:
         files.get(f"{source}/{folder}", str(partial / folder), recursive=True)
 
 
-def _first_line(error: BaseException) -> str:
-    text = str(error).strip()
-    return f"{type(error).__name__}: {text.splitlines()[0].rstrip('.')}" if text else type(error).__name__
-
-
 def find_tokenizer(checkpoint: Path, given: str | None) -> Path:
     """Return the sentencepiece model: the one named, else the checkpoint's own, else that of openpi's or the hub's cache."""
     if given is not None:
@@ -131,7 +103,7 @@ def find_tokenizer(checkpoint: Path, given: str | None) -> Path:
         checkpoint / TOKENIZER_NAME,
         openpi_cache() / TOKENIZER_URL.removeprefix("gs://"),
     ]
-    snapshots = hub_cache() / f"models--{TOKENIZER_REPOSITORY.replace('/', '--')}" / "snapshots"
+    snapshots = snapshots_folder(TOKENIZER_REPOSITORY)
     places += sorted(snapshots.glob("*/tokenizer.model"))
     for place in places:
         if place.is_file():

@@ -20,11 +20,11 @@ from capture.policies.cosmos.locate import (
     VAE_NAME,
     VAE_REPOSITORY,
     CheckpointNotFound,
-    CheckpointUnavailable,
     UnsupportedCheckpoint,
 )
 from capture.policies.cosmos.preprocess import StatisticsNotFound
 from capture.policies.cosmos.t5_pickle import EmbeddingsNotFound
+from capture.policies.hub import CheckpointUnavailable
 from schemas.errors import BadArgument, UnknownName
 from schemas.layout import Role
 

@@ -6,13 +6,12 @@ import types
 import pytest
 from pi_golden import GOLDEN
 
+from capture.policies.hub import CheckpointUnavailable, hub_cache
 from capture.policies.pi.embedded import TOKENIZER_PATH
 from capture.policies.pi.locate import (
     HUB_FILES,
-    CheckpointUnavailable,
     find_checkpoint,
     find_tokenizer,
-    hub_cache,
     openpi_cache,
 )
 from schemas.errors import BadArgument, MissingDependency, UserError
