@@ -4,83 +4,52 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
-from typing import Any
 
+from analyze.commands import COMMANDS, WHOLE
 from schemas.command_line import run_command
+from schemas.errors import UnknownName, UserError, did_you_mean, listing
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code (2: a mistake in what was given, said in one sentence)."""
     words = sys.argv[1:] if argv is None else list(argv)
-    name, command = ("verify", _verify) if words[:1] == ["verify"] else ("", _analyze)
-    rest = words[1:] if name else words
-    return run_command(f"vla-analyze {name}".strip(), lambda: command(rest), "nothing was left half written.")
+    name = words[0] if words[:1] and words[0] in COMMANDS else ""
+    prog = f"vla-analyze {name}".strip()
+    return run_command(prog, lambda: _run(name, words[1:] if name else words), "nothing was left half written.")
 
 
-def _analyze(argv: Sequence[str]) -> int:
-    from analyze.arguments import build_parser
+def _run(name: str, words: Sequence[str]) -> int:
+    if not name:
+        _refuse_misspelt_command(words)
+    command = import_module(f"analyze.commands.{COMMANDS[name or WHOLE][0]}")
+    parser = command.build_parser(prog=f"vla-analyze {name}") if name == WHOLE else command.build_parser()
+    try:
+        return command.run(parser.parse_args(words))
+    except UserError as error:
+        raise _with_way_out(error) from error.__cause__
 
-    arguments = build_parser().parse_args(argv)
 
-    # Imported after the arguments were read: `--help` must not wait for polars and zarr.
-    from analyze.contents import describe_store
-    from analyze.pipeline import AnalysisSettings, analyse, write_tables
-    from analyze.reader import open_store
+def _with_way_out(error: UserError) -> UserError:
+    """Add to the error of a damaged episode what can be done about it."""
+    from schemas.store import CorruptEpisode
 
-    stores = [open_store(path) for path in arguments.stores]
-    if arguments.list:
-        print("\n\n".join(describe_store(store, arguments.tasks) for store in stores))
-        return 0
-    settings = AnalysisSettings(
-        grouping=arguments.grouping,
-        groups=tuple(arguments.group),
-        ratio=arguments.ratio,
-        layers=_tuple(arguments.layers),
-        denoise=_tuple(arguments.denoise),
-        heads=_tuple(arguments.heads),
-        per_head=arguments.per_head,
-        tasks=_tuple(arguments.tasks),
-        site=arguments.site,
-        seed=arguments.seed,
+    if not isinstance(error, CorruptEpisode):
+        return error
+    return CorruptEpisode(
+        f"{error} See all faults with vla-analyze verify; leave such episodes out with --skip-corrupt."
     )
-    analysis = analyse(stores, settings)
-    folder = arguments.output or Path("results") / arguments.stores[0].stem / analysis.grouping.name
-    written = write_tables(analysis, folder)
-    print(analysis.summary)
-    if not arguments.no_plots:
-        from analyze.plots.write import write_plots
-
-        written.files += write_plots(analysis, folder, arguments.save_viz)
-    print(f"{len(written.files)} files in {folder}:")
-    for file in written.files:
-        print(f"  {file.relative_to(folder)}")
-    return 0
 
 
-def _verify(argv: Sequence[str]) -> int:
-    from analyze.arguments import build_verify_parser
-
-    arguments = build_verify_parser().parse_args(argv)
-
-    from analyze.reader import open_store
-    from analyze.terminal import progress_bar
-    from analyze.verify import verify_store
-
-    faulty = False
-    for path in arguments.stores:
-        store = open_store(path)
-        with progress_bar(len(store.episodes), "episodes") as advance:
-            faults = verify_store(store, advance)
-        for fault in faults:
-            print(f"{path}: {fault.episode}: {fault.problem}")
-        print(f"{path}: {len(store.episodes)} episodes, {'all whole' if not faults else f'{len(faults)} faults'}.")
-        faulty = faulty or bool(faults)
-    return 1 if faulty else 0
-
-
-def _tuple(values: list[Any] | None) -> tuple[Any, ...] | None:
-    return None if values is None else tuple(values)
+def _refuse_misspelt_command(words: Sequence[str]) -> None:
+    """A first word that is like a command and is no path is a slip, not a store."""
+    if len(words) > 1 and not words[0].startswith("-") and not Path(words[0]).exists():
+        near = did_you_mean(words[0], COMMANDS)
+        if near:
+            raise UnknownName(
+                f"There is neither a command nor a store '{words[0]}'.{near} Commands: {listing(COMMANDS, 40)}."
+            )
 
 
 if __name__ == "__main__":

@@ -1,33 +1,23 @@
-"""Command-line arguments of `vla-analyze`."""
+"""Command-line arguments that the commands of `vla-analyze` share, and what they mean. Imports nothing heavy."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from schemas.command_line import OneSentenceParser
-
-_EXAMPLES = """examples:
-  vla-analyze runs/libero_10.zarr
-  vla-analyze runs/libero_10.zarr --list
-  vla-analyze runs/libero_10.zarr --grouping cameras --layers 25 26 27
-  vla-analyze runs/libero_10.zarr --group bowl='object:akita_black_bowl_1' --group noun=word:bowl --ratio bowl/noun
-  vla-analyze verify runs/libero_10.zarr
-"""
+if TYPE_CHECKING:
+    from analyze.question import AnalysisSettings
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-analyze STORE ...`."""
-    parser = OneSentenceParser(
-        prog="vla-analyze",
-        description="Masses, fractions and ratios from stored attention rows, for any grouping of tokens. Without the model.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_stores(parser: argparse.ArgumentParser) -> None:
+    """STORE ..., one or several, analysed as one."""
     parser.add_argument("stores", nargs="+", type=Path, metavar="STORE", help="one or several NAME.zarr")
-    parser.add_argument(
-        "--list", action="store_true", help="say what the stores hold (layout, words, objects) and stop"
-    )
+
+
+def add_grouping(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
+    """--grouping, --group and --ratio."""
     grouping = parser.add_argument_group("grouping")
     grouping.add_argument(
         "--grouping",
@@ -35,13 +25,14 @@ def build_parser() -> argparse.ArgumentParser:
         help="default, instruction, cameras, objects, reference, or a TOML file (default: default)",
     )
     grouping.add_argument(
-        "--group",
-        action="append",
-        default=[],
-        metavar="NAME=SELECTOR",
-        help="a group of your own; may be repeated. Added to --grouping if that is given, else the rest is one more group",
+        "--group", action="append", default=[], metavar="NAME=SELECTOR", help="one more group; may be repeated"
     )
     grouping.add_argument("--ratio", metavar="A,B/C", help="groups of the ratio's numerator and denominator")
+    return grouping
+
+
+def add_selection(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
+    """--site, --layers, --denoise, --heads, --tasks and --skip-corrupt."""
     chosen = parser.add_argument_group("selection")
     chosen.add_argument(
         "--site", metavar="NAME", help="softmax family: joint (pi), self or cross (Cosmos); default: the first one"
@@ -51,21 +42,47 @@ def build_parser() -> argparse.ArgumentParser:
         "--denoise", nargs="+", metavar="STEP", help="denoise steps, first, last or all (default: all recorded)"
     )
     chosen.add_argument("--heads", type=int, nargs="+", metavar="N", help="heads (default: all recorded)")
-    chosen.add_argument("--per-head", action="store_true", help="keep heads apart in the steps table")
     chosen.add_argument("--tasks", type=int, nargs="+", metavar="N", help="task ids (default: all)")
+    chosen.add_argument(
+        "--skip-corrupt",
+        action="store_true",
+        help="check every episode first, and leave out, by name, those that are damaged or hold no replan",
+    )
+    return chosen
+
+
+def add_output(parser: argparse.ArgumentParser, default: str = "results/STORE/GROUPING") -> argparse._ArgumentGroup:
+    """--output, --no-plots and --seed."""
     output = parser.add_argument_group("output")
-    output.add_argument("--output", type=Path, metavar="PATH", help="folder (default: results/STORE/GROUPING)")
-    output.add_argument("--save-viz", action="store_true", help="also a picture per episode and layer")
+    output.add_argument("--output", type=Path, metavar="PATH", help=f"folder (default: {default})")
     output.add_argument("--no-plots", action="store_true", help="numbers only")
     output.add_argument("--seed", type=int, default=0, help="seed of the bootstrap (default: 0)")
-    return parser
+    return output
 
 
-def build_verify_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-analyze verify STORE ...`."""
-    parser = OneSentenceParser(
-        prog="vla-analyze verify",
-        description="Read everything back and check counts, missing chunks, digests and row sums. Exit code 1 if anything is wrong.",
-    )
-    parser.add_argument("stores", nargs="+", type=Path, metavar="STORE", help="one or several NAME.zarr")
-    return parser
+def settings_of(arguments: argparse.Namespace) -> AnalysisSettings:
+    """What the parsed arguments ask for; arguments that a command does not have keep their defaults."""
+    from dataclasses import fields
+
+    from analyze.question import AnalysisSettings
+
+    given = {"groups": "group"}
+    values: dict[str, Any] = {}
+    for field in fields(AnalysisSettings):
+        name = given.get(field.name, field.name)
+        if hasattr(arguments, name):
+            value = getattr(arguments, name)
+            values[field.name] = tuple(value) if isinstance(value, list) else value
+    return AnalysisSettings(**values)
+
+
+def output_folder(arguments: argparse.Namespace, name: str) -> Path:
+    """Where results go: `--output`, or results/STORE/NAME."""
+    return arguments.output or Path("results") / arguments.stores[0].stem / name
+
+
+def report_files(folder: Path, files: Sequence[Path]) -> None:
+    """Say where results went."""
+    print(f"{len(files)} files in {folder}:")
+    for file in files:
+        print(f"  {file.relative_to(folder)}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,35 +11,15 @@ import polars as pl
 from analyze.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
 from analyze.atomic_file import replacing
 from analyze.contributions import contribution_table, summarise_contributions
-from analyze.reader import Store
+from analyze.question import Question
 from analyze.results_file import write_results_of_suites
-from analyze.selection import Selection, check_combinable, choose_site, select, select_episodes
+from analyze.selection import Selection
 from analyze.summary import AnalysedRun, summary_text, write_summary
-from analyze.tables import load_tokens, steps_table, vocabulary_of
+from analyze.tables import steps_table
 from analyze.terminal import progress_bar
-from schemas.builtin_groupings import find_grouping
 from schemas.errors import BadArgument, listing
-from schemas.grouping import Grouping, parse_group_argument, parse_ratio_argument, with_groups
+from schemas.grouping import Grouping
 from schemas.store import RootAttributes
-from schemas.vocabulary import Vocabulary
-
-DEFAULT_GROUPING = "default"
-
-
-@dataclass(frozen=True)
-class AnalysisSettings:
-    """What a user asks for; None means the default (see `analyze.arguments`)."""
-
-    grouping: str | None = None
-    groups: tuple[str, ...] = ()
-    ratio: str | None = None
-    layers: tuple[int, ...] | None = None
-    denoise: tuple[str, ...] | None = None
-    heads: tuple[int, ...] | None = None
-    per_head: bool = False
-    tasks: tuple[int, ...] | None = None
-    site: str | None = None
-    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -51,15 +30,18 @@ class Analysis:
     when they were not recorded) in `analyze.contributions`.
     """
 
-    stores: tuple[Store, ...]
-    grouping: Grouping
-    selection: Selection
+    question: Question
     steps: pl.DataFrame
     replans: pl.DataFrame
     episodes: pl.DataFrame
     tasks: pl.DataFrame
     contributions: pl.DataFrame | None
     summary: str
+
+    @property
+    def grouping(self) -> Grouping:
+        """The groups of keys that everything is about."""
+        return self.question.grouping
 
 
 @dataclass
@@ -70,38 +52,12 @@ class WrittenFiles:
     files: list[Path] = field(default_factory=list)
 
 
-def choose_grouping(settings: AnalysisSettings, vocabulary: Vocabulary) -> Grouping:
-    """The grouping that the settings name, with command-line groups added and the ratio replaced if asked."""
-    base = None
-    if settings.grouping is not None or not settings.groups:
-        base = find_grouping(settings.grouping or DEFAULT_GROUPING, vocabulary)
-    grouping = base
-    if settings.groups:
-        grouping = with_groups(base, [parse_group_argument(text) for text in settings.groups])
-    assert grouping is not None
-    if settings.ratio is None:
-        return grouping
-    return Grouping(
-        name=grouping.name,
-        groups=grouping.groups,
-        ratio=parse_ratio_argument(settings.ratio),
-        overlap=grouping.overlap,
-        allow_empty=grouping.allow_empty,
-        description=grouping.description,
-    )
-
-
-def analyse(stores: Sequence[Store], settings: AnalysisSettings) -> Analysis:
+def analyse(question: Question) -> Analysis:
     """Compute all tables. Shows progress at a terminal when it takes longer than a moment."""
-    check_combinable(stores)
+    stores, settings, grouping = question.stores, question.settings, question.grouping
     root = stores[0].attributes
-    selection = select(root, settings.layers, settings.denoise, settings.heads, settings.per_head)
-    chosen = [(store, episode) for store in stores for episode in select_episodes(store, settings.tasks)]
-    site = choose_site(root, settings.site)
-    selected = load_tokens(chosen, site)
-    grouping = choose_grouping(settings, vocabulary_of(selected))
-    with progress_bar(len(selected), "episodes") as advance:
-        steps = steps_table(selected, grouping, selection, site, advance)
+    with progress_bar(len(question.selected), "episodes") as advance:
+        steps = steps_table(question.selected, grouping, question.selection, question.site, advance)
     replans = add_layers_avg(per_replan(steps, grouping), grouping)
     episodes = episodes_table(replans, grouping)
     tasks = tasks_table(episodes, grouping, seed=settings.seed)
@@ -110,15 +66,15 @@ def analyse(stores: Sequence[Store], settings: AnalysisSettings) -> Analysis:
         stores=[str(store.path) for store in stores],
         policy=f"{policy.name} ({policy.checkpoint_format}: {policy.checkpoint})",
         untrained=policy.untrained,
-        denoise_steps=selection.denoise_steps,
-        heads=_describe_heads(selection, root.policy.num_heads),
-        notes=_notes(root, selection, site),
+        denoise_steps=question.selection.denoise_steps,
+        heads=_describe_heads(question.selection, root.policy.num_heads),
+        notes=[*_notes(root, question.selection, question.site), *question.skipped],
     )
     text = summary_text(run, grouping, episodes, tasks)
-    contributions = contribution_table(chosen, selection)
+    contributions = contribution_table(question.episodes, question.selection)
     if contributions is not None:
         text += "\n" + summarise_contributions(contributions, settings.seed)
-    return Analysis(tuple(stores), grouping, selection, steps, replans, episodes, tasks, contributions, text)
+    return Analysis(question, steps, replans, episodes, tasks, contributions, text)
 
 
 def write_tables(analysis: Analysis, folder: Path) -> WrittenFiles:

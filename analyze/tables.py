@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from analyze.masses import group_measures, masses, ratio
 from analyze.reader import Store, StoredEpisode
+from analyze.rows import layer_rows
 from analyze.selection import Selection
 from schemas.grouping import Grouping
 from schemas.resolve import EmptyGroup, ResolvedGrouping, check_names, resolve
@@ -96,10 +97,9 @@ def episode_masses(
         return masses(_reduce(atoms, selection, axis=-2), on_segments), row_sum
     shape = (*row_sum.shape, weights.shape[2])
     result = np.empty(shape)
-    for i, layer in enumerate(selection.layers):
-        for j, step in enumerate(selection.denoise):
-            rows = episode.read(f"{site}/rows", (slice(None), layer, step))[:, None, None, list(selection.heads)]
-            result[:, i, j] = masses(_reduce(rows, selection, axis=-2), weights)[:, 0, 0]
+    for part in layer_rows(episode, selection, site):
+        rows = part.rows if selection.per_head else part.rows.mean(axis=1, keepdims=True)
+        result[:, part.layer, part.denoise] = masses(rows, weights)
     return result, row_sum
 
 

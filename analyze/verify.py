@@ -26,11 +26,16 @@ def verify_store(store: Store, progress: Callable[[int], object] | None = None) 
     """Check every episode; `progress` is called with 1 after each. An empty list means the store is whole."""
     faults = []
     for episode in store.episodes:
-        problems = dict.fromkeys(_problems(store.attributes, episode))  # several checks may stumble over one fault
-        faults += [Fault(episode.name, problem) for problem in problems]
+        faults += episode_faults(store, episode)
         if progress is not None:
             progress(1)
     return faults
+
+
+def episode_faults(store: Store, episode: StoredEpisode) -> list[Fault]:
+    """Everything that is wrong with one episode of a store; reads all of it."""
+    problems = dict.fromkeys(_problems(store.attributes, episode))  # several checks may stumble over one fault
+    return [Fault(episode.name, problem) for problem in problems]
 
 
 def _problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable
 from typing import NoReturn
@@ -25,6 +26,9 @@ def run_command(program: str, command: Callable[[], int], if_stopped: str) -> in
     except UserError as error:
         print(f"{program}: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # `| head` has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter complains when it flushes
+        return 141
     except KeyboardInterrupt:
         print(f"\n{program}: stopped; {if_stopped}", file=sys.stderr)
         return 130

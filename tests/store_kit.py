@@ -5,6 +5,7 @@ What a store must contain is recomputed from its `StoreSpec` with `episode_recor
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -66,6 +67,9 @@ class StoreSpec:
     prompts: Literal["changing", "same"] = "changing"
     policy: str = "made-up"
     tokens: EpisodeTokens | None = None
+    plant_rows: Callable[[int, int, EpisodeTokens, np.ndarray], np.ndarray] | None = None
+    plant_actions: Callable[[int, int, int], np.ndarray] | None = None
+    plant_success: Callable[[int, int], bool] | None = None
 
     @property
     def layout(self) -> SiteLayout:
@@ -107,8 +111,9 @@ def write_episode(store: RunStore, spec: StoreSpec, task: int, episode: int) -> 
 
 
 def commit(writer: EpisodeWriter, spec: StoreSpec, task: int, episode: int) -> Path:
-    """Commit with the outcome that belongs to the episode: those of odd numbers are solved."""
-    return writer.commit(success=episode % 2 == 1, num_steps=5 * spec.num_replans - episode % 2)
+    """Commit with the outcome that belongs to the episode: unless planted, those of odd numbers are solved."""
+    success = spec.plant_success(task, episode) if spec.plant_success else episode % 2 == 1
+    return writer.commit(success=success, num_steps=5 * spec.num_replans - episode % 2)
 
 
 def denoise_times(spec: StoreSpec) -> np.ndarray:
@@ -159,6 +164,9 @@ def episode_records(spec: StoreSpec, task: int, episode: int) -> tuple[EpisodeSt
     tokens = spec.tokens or make_tokens(spec.replans, task, seed, changing=spec.prompts == "changing")
     generator = np.random.default_rng(seed)
     rows = random_rows(tokens, spec.cells, int(generator.integers(2**31)))
+    if spec.plant_rows is not None:
+        rows = spec.plant_rows(task, episode, tokens, rows).astype(np.float32)
+    actions = None if spec.plant_actions is None else spec.plant_actions(task, episode, tokens.num_replans)
     assert tokens.prompt_index is not None
     seen = [span for span in tokens.layout.spans if span.camera in (tokens.coverage or {})]
     records = []
@@ -185,7 +193,7 @@ def episode_records(spec: StoreSpec, task: int, episode: int) -> tuple[EpisodeSt
                 key_role={"joint": tokens.key_role[replan]},
                 prompt=tokens.prompts[tokens.prompt_index[replan]],
                 state=generator.normal(size=8),
-                actions=generator.normal(size=(5, 7)),
+                actions=generator.normal(size=(5, 7)) if actions is None else actions[replan],
                 frames=frames if spec.frames else {},
                 coverage=coverage if spec.coverage else {},
             )

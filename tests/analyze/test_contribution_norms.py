@@ -14,7 +14,8 @@ from analyze.contributions import (
     joint_norm,
     summarise_contributions,
 )
-from analyze.pipeline import AnalysisSettings, analyse
+from analyze.pipeline import analyse
+from analyze.question import AnalysisSettings, ask
 from analyze.reader import open_store
 from analyze.selection import select
 from analyze.verify import verify_store
@@ -54,7 +55,7 @@ def test_both_sides_and_their_ratio_equal_a_direct_computation(tmp_path):
 
 
 def test_the_summary_has_a_line_per_layer_and_an_interval(tmp_path):
-    analysis = analyse([open_store(write_store(tmp_path / "a.zarr", spec=SPEC))], AnalysisSettings())
+    analysis = analyse(ask([open_store(write_store(tmp_path / "a.zarr", spec=SPEC))], AnalysisSettings()))
     assert analysis.contributions is not None
     section = summarise_contributions(analysis.contributions, seed=0)
     assert section in analysis.summary
@@ -65,6 +66,6 @@ def test_the_summary_has_a_line_per_layer_and_an_interval(tmp_path):
 
 
 def test_a_store_without_contributions_has_no_section(tmp_path):
-    analysis = analyse([open_store(write_store(tmp_path / "a.zarr"))], AnalysisSettings())
+    analysis = analyse(ask([open_store(write_store(tmp_path / "a.zarr"))], AnalysisSettings()))
     assert analysis.contributions is None
     assert "CONTRIBUTIONS" not in analysis.summary

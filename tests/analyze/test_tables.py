@@ -13,7 +13,8 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
-from analyze.pipeline import AnalysisSettings, analyse
+from analyze.pipeline import analyse
+from analyze.question import AnalysisSettings, ask
 from analyze.reader import open_store
 from analyze.selection import parse_denoise_steps, select
 from analyze.tables import load_tokens, steps_table, vocabulary_of
@@ -144,18 +145,18 @@ def test_a_word_of_one_task_only_gives_empty_groups_elsewhere(tmp_path):
 def test_several_stores_are_analysed_as_one_when_they_fit(tmp_path):
     first = open_store(write_store(tmp_path / "a.zarr", suite="one"))
     second = open_store(write_store(tmp_path / "b.zarr", suite="two"))
-    together = analyse([first, second], AnalysisSettings())
+    together = analyse(ask([first, second], AnalysisSettings()))
     assert together.steps["suite"].unique().sort().to_list() == ["one", "two"]
     assert "two" in together.summary
     other = open_store(write_store(tmp_path / "c.zarr", suite="three", layers=(1,)))
     with pytest.raises(StoreError, match="differ in their recording"):
-        analyse([first, other], AnalysisSettings())
+        analyse(ask([first, other], AnalysisSettings()))
 
 
 def test_a_store_without_episodes_says_so(tmp_path):
     store = open_store(write_store(tmp_path / "a.zarr", tasks=()))
     with pytest.raises(StoreError, match="holds no complete episode yet"):
-        analyse([store], AnalysisSettings())
+        analyse(ask([store], AnalysisSettings()))
 
 
 def test_call_numbers_are_translated_and_kept_as_labels():

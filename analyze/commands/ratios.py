@@ -1,0 +1,75 @@
+"""`vla-analyze ratios`, and `vla-analyze STORE` alone: masses, fractions and ratios, with intervals, tables and pictures."""
+
+from __future__ import annotations
+
+import argparse
+
+from analyze.arguments import (
+    add_grouping,
+    add_output,
+    add_selection,
+    add_stores,
+    output_folder,
+    report_files,
+    settings_of,
+)
+from analyze.commands import list_of_commands
+from schemas.command_line import OneSentenceParser
+
+_EXAMPLES = """examples:
+  vla-analyze runs/libero_10.zarr
+  vla-analyze runs/libero_10.zarr --list
+  vla-analyze runs/libero_10.zarr --grouping cameras --layers 25 26 27
+  vla-analyze runs/libero_10.zarr --group bowl='object:akita_black_bowl_1' --group noun=word:bowl --ratio bowl/noun
+  vla-analyze heads runs/libero_10.zarr
+  vla-analyze compare runs/base.zarr runs/finetuned.zarr
+
+`vla-analyze COMMAND --help` has more of each.
+"""
+
+
+def build_parser(prog: str = "vla-analyze") -> argparse.ArgumentParser:
+    """The parser of `vla-analyze STORE ...` and `vla-analyze ratios STORE ...`."""
+    parser = OneSentenceParser(
+        prog=prog,
+        usage=f"{prog} [COMMAND] STORE [STORE ...] [options]" if prog == "vla-analyze" else None,
+        description="Masses, fractions and ratios from stored attention rows, for any grouping of tokens. Without the model.",
+        epilog=f"commands (without one: ratios):\n{list_of_commands()}\n\n{_EXAMPLES}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_stores(parser)
+    parser.add_argument(
+        "--list", action="store_true", help="say what the stores hold (layout, words, objects) and stop"
+    )
+    add_grouping(parser)
+    selection = add_selection(parser)
+    selection.add_argument("--per-head", action="store_true", help="keep heads apart in the steps table")
+    output = add_output(parser)
+    output.add_argument("--save-viz", action="store_true", help="also a picture per episode and layer")
+    return parser
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Analyse, print the summary, and write tables and pictures."""
+    # Imported after the arguments were read: `--help` must not wait for polars and zarr.
+    from analyze.pipeline import analyse, write_tables
+    from analyze.question import ask
+    from analyze.reader import open_store
+
+    stores = [open_store(path) for path in arguments.stores]
+    if arguments.list:
+        from analyze.contents import describe_store
+
+        print("\n\n".join(describe_store(store, arguments.tasks) for store in stores))
+        return 0
+    question = ask(stores, settings_of(arguments))
+    analysis = analyse(question)
+    folder = output_folder(arguments, question.grouping.name)
+    written = write_tables(analysis, folder)
+    print(analysis.summary)
+    if not arguments.no_plots:
+        from analyze.plots.write import write_plots
+
+        written.files += write_plots(analysis, folder, arguments.save_viz)
+    report_files(folder, written.files)
+    return 0
