@@ -7,10 +7,11 @@ languages check against. Decoding is strict (unknown and missing fields are erro
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 from schemas.errors import UserError, did_you_mean, listing
@@ -24,16 +25,18 @@ class MalformedDocument(UserError, ValueError):
 
 def to_json(value: Any) -> Any:
     """Turn dataclasses, tuples and mappings into plain JSON values; a non-finite number is an error (JSON has none)."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: to_json(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): to_json(item) for key, item in value.items()}
+    if value is None or isinstance(value, (str, bool, int)):
+        return value
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            raise ValueError(f"{value!r} has no JSON representation")
+        return value
     if isinstance(value, (list, tuple)):
         return [to_json(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(f"{value!r} has no JSON representation")
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return value
+    if isinstance(value, Mapping):
+        return {str(key): to_json(item) for key, item in value.items()}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {name: to_json(getattr(value, name)) for name in _fields(type(value))}
     raise TypeError(f"no JSON representation for {type(value).__name__}")
 
 
@@ -42,7 +45,10 @@ def from_json(declared: type[T], data: Any, where: str = "$") -> T:
 
     Raises `MalformedDocument` with the path of the first value that does not fit.
     """
-    return typing.cast(T, _decode(declared, data, where))
+    try:
+        return typing.cast(T, _decoder(typing.cast(Any, declared))(data))
+    except _Misfit as misfit:
+        raise MalformedDocument(f"{where}{''.join(reversed(misfit.path))} {misfit.problem}") from None
 
 
 def json_schema(declared: type, title: str, description: str) -> dict[str, Any]:
@@ -58,6 +64,7 @@ def json_schema(declared: type, title: str, description: str) -> dict[str, Any]:
     }
 
 
+@functools.cache
 def _fields(declared: type) -> dict[str, tuple[Any, bool]]:
     """Field name -> (type, required)."""
     hints = typing.get_type_hints(declared)
@@ -70,61 +77,149 @@ def _fields(declared: type) -> dict[str, tuple[Any, bool]]:
     }
 
 
-def _decode(declared: Any, data: Any, where: str) -> Any:
+class _Misfit(Exception):
+    """A value that does not fit; every level that it passes on its way out adds its part of the path."""
+
+    def __init__(self, problem: str) -> None:
+        super().__init__(problem)
+        self.problem = problem
+        self.path: list[str] = []
+
+    def inside(self, part: str) -> _Misfit:
+        self.path.append(part)
+        return self
+
+
+@functools.cache
+def _decoder(declared: Any) -> Callable[[Any], Any]:
+    """The function that decodes one declared type, made once: an episode holds ten thousands of token pieces."""
     origin, arguments = get_origin(declared), get_args(declared)
     if declared is Any:
-        return data
+        return lambda data: data
     if origin in (Union, types.UnionType):
-        if data is None and type(None) in arguments:
-            return None
-        choices = [choice for choice in arguments if choice is not type(None)]
-        for choice in choices:
-            try:
-                return _decode(choice, data, where)
-            except MalformedDocument:
-                if choice is choices[-1]:
-                    raise
+        return _union_decoder(arguments)
     if origin is Literal:
+        return _literal_decoder(arguments)
+    if dataclasses.is_dataclass(declared):
+        return _dataclass_decoder(typing.cast(type, declared))
+    if origin is tuple and not (len(arguments) == 2 and arguments[1] is Ellipsis):
+        return _fixed_tuple_decoder(arguments)
+    if origin in (tuple, list):
+        return _sequence_decoder(origin, arguments[0])
+    if origin is dict:
+        return _dict_decoder(arguments[1])
+    return _primitive_decoder(declared)
+
+
+def _union_decoder(arguments: tuple[Any, ...]) -> Callable[[Any], Any]:
+    optional = type(None) in arguments
+    decoders = [_decoder(choice) for choice in arguments if choice is not type(None)]
+
+    def decode(data: Any) -> Any:
+        if data is None and optional:
+            return None
+        for decoder in decoders[:-1]:
+            try:
+                return decoder(data)
+            except _Misfit:
+                continue
+        return decoders[-1](data)
+
+    return decode
+
+
+def _literal_decoder(arguments: tuple[Any, ...]) -> Callable[[Any], Any]:
+    def decode(data: Any) -> Any:
         if data in arguments:
             return data
-        raise MalformedDocument(f"{where} is {data!r}; expected one of {listing(map(repr, arguments))}.")
-    if dataclasses.is_dataclass(declared):
-        return _decode_dataclass(typing.cast(type, declared), data, where)
-    if origin is tuple:
-        items = _expect(list, data, where)
-        if len(arguments) == 2 and arguments[1] is Ellipsis:
-            return tuple(_decode(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(items))
-        if len(items) != len(arguments):
-            raise MalformedDocument(f"{where} has {len(items)} items; expected {len(arguments)}.")
+        raise _Misfit(f"is {data!r}; expected one of {listing(map(repr, arguments))}.")
+
+    return decode
+
+
+def _sequence_decoder(made: type, declared: Any) -> Callable[[Any], Any]:
+    decoder = _decoder(declared)
+
+    def decode(data: Any) -> Any:
+        items: list[Any] = []
+        try:
+            for item in _expect(list, data):
+                items.append(decoder(item))  # noqa: PERF401 - the length says which item did not fit
+        except _Misfit as misfit:
+            raise misfit if not isinstance(data, list) else misfit.inside(f"[{len(items)}]") from None
+        return items if made is list else tuple(items)
+
+    return decode
+
+
+def _fixed_tuple_decoder(arguments: tuple[Any, ...]) -> Callable[[Any], Any]:
+    decoders = [_decoder(argument) for argument in arguments]
+
+    def decode(data: Any) -> Any:
+        items = _expect(list, data)
+        if len(items) != len(decoders):
+            raise _Misfit(f"has {len(items)} items; expected {len(decoders)}.")
         return tuple(
-            _decode(kind, item, f"{where}[{i}]") for i, (kind, item) in enumerate(zip(arguments, items, strict=True))
+            _at(f"[{i}]", decoder, item) for i, (decoder, item) in enumerate(zip(decoders, items, strict=True))
         )
-    if origin is list:
-        return [_decode(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(_expect(list, data, where))]
-    if origin is dict:
-        return {key: _decode(arguments[1], item, f"{where}.{key}") for key, item in _expect(dict, data, where).items()}
-    if declared is float and isinstance(data, int) and not isinstance(data, bool):
-        return float(data)
-    return _expect(declared, data, where)
+
+    return decode
 
 
-def _decode_dataclass(declared: type, data: Any, where: str) -> Any:
-    given = _expect(dict, data, where)
+def _dict_decoder(declared: Any) -> Callable[[Any], Any]:
+    decoder = _decoder(declared)
+    return lambda data: {key: _at(f".{key}", decoder, item) for key, item in _expect(dict, data).items()}
+
+
+def _dataclass_decoder(declared: type) -> Callable[[Any], Any]:
     fields = _fields(declared)
-    for name in given:
-        if name not in fields:
-            raise MalformedDocument(
-                f"{where} has an unknown field '{name}'.{did_you_mean(name, fields)} Existing: {listing(fields)}."
-            )
-    for name, (_, required) in fields.items():
-        if required and name not in given:
-            raise MalformedDocument(f"{where} lacks the field '{name}'.")
-    return declared(**{name: _decode(fields[name][0], item, f"{where}.{name}") for name, item in given.items()})
+    # Fields are looked up when the first value comes: a dataclass may hold itself.
+    decoders: dict[str, Callable[[Any], Any]] = {}
+    needed = {name for name, (_, required) in fields.items() if required}
+
+    def decode(data: Any) -> Any:
+        given = _expect(dict, data)
+        if not decoders:
+            decoders.update({name: _decoder(kind) for name, (kind, _) in fields.items()})
+        values = {}
+        for name, item in given.items():
+            decoder = decoders.get(name)
+            if decoder is None:
+                raise _Misfit(
+                    f"has an unknown field '{name}'.{did_you_mean(name, fields)} Existing: {listing(fields)}."
+                )
+            try:
+                values[name] = decoder(item)
+            except _Misfit as misfit:
+                raise misfit.inside(f".{name}") from None
+        if not needed <= values.keys():
+            missing = next(name for name in fields if name in needed and name not in values)
+            raise _Misfit(f"lacks the field '{missing}'.")
+        return declared(**values)
+
+    return decode
 
 
-def _expect(kind: type, data: Any, where: str) -> Any:
+def _primitive_decoder(declared: type) -> Callable[[Any], Any]:
+    if declared is not float:
+        return lambda data: _expect(declared, data)
+
+    def decode(data: Any) -> float:
+        return float(data) if isinstance(data, int) and not isinstance(data, bool) else _expect(float, data)
+
+    return decode
+
+
+def _at(part: str, decoder: Callable[[Any], Any], data: Any) -> Any:
+    try:
+        return decoder(data)
+    except _Misfit as misfit:
+        raise misfit.inside(part) from None
+
+
+def _expect(kind: type, data: Any) -> Any:
     if not isinstance(data, kind) or (isinstance(data, bool) and kind is not bool):
-        raise MalformedDocument(f"{where} is {type(data).__name__}; expected {kind.__name__}.")
+        raise _Misfit(f"is {type(data).__name__}; expected {kind.__name__}.")
     return data
 
 

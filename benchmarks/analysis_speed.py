@@ -1,0 +1,172 @@
+"""How long does an analysis of fifty episodes take on a laptop, and how much memory? Side by side with plain zarr-python and xarray + dask.
+
+Usage: python benchmarks/analysis_speed.py [--store PATH] [--episodes 50] [--replans 52] [--only NAME ...]
+
+Writes a store of the shape of pi0.5 in LIBERO (ten tasks; 18 layers, 8 heads, first and last denoise step, 978 keys, rows
+averaged over the queries; made-up rows with sinks and heavy tails) with the real writer, unless it is there already. Each
+measurement is a process of its own: wall time from its start to its end and peak resident memory. Whether they hold what the
+README says is for the reader to see; nothing is asserted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+
+WORDS = "put both the alphabet soup and the tomato sauce in the basket".split()
+NAMES = ("alphabet_soup_1", "tomato_sauce_1", "basket_1", "cream_cheese_1", "milk_1", "robot", "background")
+PYTHON_LOOP = """
+import sys, numpy as np, zarr
+from pathlib import Path
+weights = np.load(sys.argv[2])
+out = []
+for episode in sorted(Path(sys.argv[1], "episodes").iterdir()):
+    rows = zarr.open_array(episode / "joint/rows", mode="r")
+    for layer in range(rows.shape[1]):
+        for denoise in range(rows.shape[2]):
+            out.append(rows[:, layer, denoise].mean(axis=(1, 2)) @ weights)
+print(np.concatenate(out).shape)
+"""
+XARRAY_DASK = """
+import sys, numpy as np, xarray as xr
+from pathlib import Path
+weights = xr.DataArray(np.load(sys.argv[2]), dims=("key", "group"))
+out = []
+for episode in sorted(Path(sys.argv[1], "episodes").iterdir()):
+    data = xr.open_zarr(episode / "joint", consolidated=False, zarr_format=3, chunks={})
+    out.append(data["rows"].mean(("head", "query")).dot(weights, dim="key").compute())
+print(sum(part.size for part in out))
+"""
+
+
+def make_store(path: Path, episodes: int, replans: int) -> None:
+    """Write the store; fifty episodes take a minute or two."""
+    from schemas.layout import PatchGrid, Piece, Prompt, Role, SiteLayout, Span
+    from schemas.vocabulary import EpisodeTokens, SceneObject
+    from tests.store_kit import StoreSpec, write_store
+
+    spans = []
+    for i, camera in enumerate(("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")):
+        grid = PatchGrid(16, 16, 224, 224)
+        spans.append(Span(camera, "image", 256 * i, 256 * (i + 1), camera=camera, grid=grid))
+    spans += [Span("prompt", "text", 768, 968), Span("actions", "action", 968, 978)]
+    layout = SiteLayout("joint", tuple(spans))
+    generator = np.random.default_rng(0)
+    prompts, roles = [], np.zeros((replans, 978), dtype=np.uint8)
+    for replan in range(replans):  # the state is written into the prompt: another prompt at every replan
+        roles[replan, :512], roles[replan, 512:768], roles[replan, 968:] = Role.IMAGE, Role.MASKED_IMAGE, Role.ACTION
+        roles[replan, 768:968], roles[replan, 768] = Role.PADDING, Role.BOS
+        pieces, position = [], 0
+        digits = [str(generator.integers(256)) for _ in range(8)]
+        for i, text in enumerate([*WORDS, *digits]):
+            length = len(text) + (i > 0)
+            pieces.append(Piece(769 + i, (" " if i else "") + text, position, position + length))
+            roles[replan, 769 + i] = Role.INSTRUCTION if i < len(WORDS) else Role.STATE
+            position += length
+        prompts.append(Prompt(" ".join([*WORDS, *digits]), tuple(pieces), (0, len(" ".join(WORDS)))))
+    kinds = {"robot": "robot", "background": "background"}
+    objects = tuple(SceneObject(name, kinds.get(name, "object"), i < 3) for i, name in enumerate(NAMES))  # type: ignore[arg-type]
+    coverage = {
+        camera: generator.dirichlet(np.full(len(objects), 0.2), (replans, 256)).astype(np.float32)
+        for camera in layout.cameras[:2]
+    }
+    tokens = EpisodeTokens(layout, roles, tuple(prompts), np.arange(replans), objects, coverage)
+    spec = StoreSpec(
+        suite="libero_10",
+        tasks=tuple(range(10)),
+        episodes=episodes // 10,
+        layers=tuple(range(18)),
+        num_layers=18,
+        heads=tuple(range(8)),
+        frames=False,
+        contributions=True,
+        num_action_queries=10,
+        tokens=tokens,
+    )
+    began = time.perf_counter()
+    write_store(path, spec=spec)
+    print(f"wrote {path} in {time.perf_counter() - began:.0f} s")
+
+
+def measured(command: list[str]) -> tuple[float, float]:
+    """Wall seconds and peak resident megabytes of a process."""
+    began = time.perf_counter()
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, cwd=ROOT)
+    _, status, usage = os.wait4(process.pid, 0)
+    if status:
+        raise SystemExit(f"failed: {' '.join(command)}")
+    return time.perf_counter() - began, usage.ru_maxrss / 1024
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--store", type=Path, help="made when it is not there (default: a temporary one, deleted afterwards)")
+    parser.add_argument("--episodes", type=int, default=50)
+    parser.add_argument("--replans", type=int, default=52)
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="measure only these")
+    parser.add_argument("--repeats", type=int, default=3, help="the fastest of so many runs is printed (default: 3)")
+    arguments = parser.parse_args()
+    scratch = Path(tempfile.mkdtemp(prefix="analysis_speed_"))
+    store = arguments.store or scratch / "fifty.zarr"
+    if not store.exists():
+        make_store(store, arguments.episodes, arguments.replans)
+    size = sum(file.stat().st_size for file in store.rglob("*") if file.is_file())
+    print(f"{store}: {size / 1e9:.2f} GB in {sum(1 for _ in store.rglob('*'))} files; {os.cpu_count()} cores")
+    weights = np.random.default_rng(0).random((978, 4)).astype(np.float32)
+    np.save(scratch / "weights.npy", weights)
+    ours = [sys.executable, "-m", "analyze"]
+    rest = [str(store), "--output", str(scratch / "out")]
+    cases = {
+        "default": [*ours, *rest],
+        "default-no-plots": [*ours, *rest, "--no-plots"],
+        "span": [*ours, *rest, "--no-plots", "--grouping", "cameras"],
+        "span-tables": [sys.executable, str(Path(__file__)), "--span-tables", str(store)],
+        "words": [*ours, *rest, "--no-plots", "--group", "soup=word:soup", "--group", "v=role:image", "--ratio", "v/soup"],
+        "objects": [*ours, *rest, "--no-plots", "--grouping", "objects"],
+        "plain-zarr": [sys.executable, "-c", PYTHON_LOOP, str(store), str(scratch / "weights.npy")],
+        "xarray-dask": [sys.executable, "-c", XARRAY_DASK, str(store), str(scratch / "weights.npy")],
+    }
+    unknown = set(arguments.only or []) - set(cases)
+    if unknown:
+        raise SystemExit(f"unknown: {', '.join(sorted(unknown))}; existing: {', '.join(cases)}")
+    print(f"{'what':<20}{'seconds':>10}{'peak MB':>10}")
+    for name, command in cases.items():
+        if arguments.only is None or name in arguments.only:
+            runs = [measured(command) for _ in range(arguments.repeats)]
+            print(f"{name:<20}{min(run[0] for run in runs):>10.2f}{max(run[1] for run in runs):>10.0f}", flush=True)
+    shutil.rmtree(scratch)
+
+
+def span_tables(store: Path) -> None:
+    """The tables of a span-level grouping, from an open store to the table of tasks, timed inside one process."""
+    from analyze.pipeline import analyse
+    from analyze.question import AnalysisSettings, ask
+    from analyze.reader import open_store
+
+    began = time.perf_counter()
+    opened = [open_store(store)]
+    analyse(ask(opened, AnalysisSettings(grouping="cameras")))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"first: {time.perf_counter() - began:.2f} s, {peak:.0f} MB", file=sys.stderr)
+    began = time.perf_counter()
+    analyse(ask(opened, AnalysisSettings(grouping="instruction")))
+    print(f"second: {time.perf_counter() - began:.2f} s", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--span-tables"]:
+        span_tables(Path(sys.argv[2]))
+    else:
+        main()
