@@ -15,6 +15,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from analyze.shards import ShardedLayers
 from schemas.errors import did_you_mean, listing
 from schemas.jsonable import MalformedDocument, from_json
 from schemas.store import (
@@ -87,6 +88,10 @@ class StoredEpisode:
     def _opened(self) -> dict[str, zarr.Array]:
         return {}
 
+    @cached_property
+    def _layers(self) -> dict[str, ShardedLayers | None]:
+        return {}
+
     def array(self, name: str) -> zarr.Array:
         """One array of the episode; raises `CorruptEpisode` when it lacks a file or has another shape than promised."""
         if name not in self._opened:
@@ -119,9 +124,22 @@ class StoredEpisode:
             raise  # the caller's mistake
         except Exception as error:  # damaged bytes can make codecs raise anything
             raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {error}.") from error
-        kind = values.dtype.kind
-        lost = np.isnan(values) if kind == "f" else values == -1 if kind == "i" else np.zeros(0, dtype=bool)
-        if lost.any() or (name.endswith("/key_role") and not values.all()):
+        if _holds_missing(values) or (name.endswith("/key_role") and not values.all()):
+            raise CorruptEpisode(f"Array {name} of episode {self.name} has missing values: a chunk is lost.")
+        return values
+
+    def read_layer(self, name: str, layer: int, denoise: int) -> NDArray[np.float32]:
+        """One layer and denoise step (positions) of an array (replan, layer, denoise, ...), without those two axes."""
+        if name not in self._layers:
+            self._layers[name] = ShardedLayers.of(self.folder / name, dict(self.array(name).metadata.to_dict()))
+        layers = self._layers[name]
+        if layers is None:
+            return self.read(name, (slice(None), layer, denoise))
+        try:
+            values = layers.read(layer, denoise)
+        except CorruptEpisode as error:
+            raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {error}") from None
+        if _holds_missing(values):
             raise CorruptEpisode(f"Array {name} of episode {self.name} has missing values: a chunk is lost.")
         return values
 
@@ -206,6 +224,15 @@ def open_store(path: Path) -> Store:
     except (MalformedDocument, OSError, ValueError) as error:
         raise StoreError(f"The store {path} cannot be read: {error}") from None
     return Store(path, root, tuple(StoredEpisode(path / EPISODES_GROUP / name) for _, name in keyed))
+
+
+def _holds_missing(values: NDArray[Any]) -> bool:
+    """Whether numbers that a missing chunk reads as are among the values."""
+    if values.dtype.kind == "i":
+        return bool((values == -1).any())
+    if values.dtype.kind != "f" or not np.isnan(values.sum()):
+        return False  # one pass without a temporary array: rows are large
+    return bool(np.isnan(values).any())
 
 
 def _chunk_files(array: zarr.Array) -> Iterator[str]:

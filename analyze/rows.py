@@ -29,8 +29,10 @@ class LayerRows:
 
 def layer_rows(episode: StoredEpisode, selection: Selection, site: str) -> Iterator[LayerRows]:
     """Read the selected layers and denoise steps of an episode one after the other."""
-    heads = list(selection.heads)
+    stored = episode.array(f"{site}/rows").shape[3]
+    # A slice where it can be one: picking heads by their numbers copies every row.
+    heads = slice(None) if selection.heads == tuple(range(stored)) else list(selection.heads)
     for i, layer in enumerate(selection.layers):
         for j, step in enumerate(selection.denoise):
-            rows = episode.read(f"{site}/rows", (slice(None), layer, step))[:, heads]
+            rows = episode.read_layer(f"{site}/rows", layer, step)[:, heads]
             yield LayerRows(i, j, rows.mean(axis=2) if rows.shape[2] > 1 else rows[:, :, 0])

@@ -32,7 +32,7 @@ import sys, numpy as np, zarr
 from pathlib import Path
 weights = np.load(sys.argv[2])
 out = []
-for episode in sorted(Path(sys.argv[1], "episodes").iterdir()):
+for episode in sorted(Path(sys.argv[1], "episodes").glob("task*")):
     rows = zarr.open_array(episode / "joint/rows", mode="r")
     for layer in range(rows.shape[1]):
         for denoise in range(rows.shape[2]):
@@ -44,7 +44,7 @@ import sys, numpy as np, xarray as xr
 from pathlib import Path
 weights = xr.DataArray(np.load(sys.argv[2]), dims=("key", "group"))
 out = []
-for episode in sorted(Path(sys.argv[1], "episodes").iterdir()):
+for episode in sorted(Path(sys.argv[1], "episodes").glob("task*")):
     data = xr.open_zarr(episode / "joint", consolidated=False, zarr_format=3, chunks={})
     out.append(data["rows"].mean(("head", "query")).dot(weights, dim="key").compute())
 print(sum(part.size for part in out))
@@ -121,7 +121,10 @@ def main() -> None:
     scratch = Path(tempfile.mkdtemp(prefix="analysis_speed_"))
     store = arguments.store or scratch / "fifty.zarr"
     if not store.exists():
-        make_store(store, arguments.episodes, arguments.replans)
+        # In a process of its own: a child's peak memory counts from what its parent holds when it starts it.
+        subprocess.run(
+            [sys.executable, __file__, "--make", str(store), str(arguments.episodes), str(arguments.replans)], check=True
+        )
     size = sum(file.stat().st_size for file in store.rglob("*") if file.is_file())
     print(f"{store}: {size / 1e9:.2f} GB in {sum(1 for _ in store.rglob('*'))} files; {os.cpu_count()} cores")
     weights = np.random.default_rng(0).random((978, 4)).astype(np.float32)
@@ -166,6 +169,9 @@ def span_tables(store: Path) -> None:
 
 
 if __name__ == "__main__":
+    if sys.argv[1:2] == ["--make"]:
+        make_store(Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))
+        raise SystemExit
     if sys.argv[1:2] == ["--span-tables"]:
         span_tables(Path(sys.argv[2]))
     else:
