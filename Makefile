@@ -3,6 +3,7 @@
 #   make capture     run a policy in simulation and record its attention (installs torch and the simulators)
 #   make analyze     masses, ratios, tables and pictures from a store (installs the laptop's small set only)
 #   make test        formatting, types and all tests
+#   make test-slurm  an array job on the SLURM that sbatch reaches from here (opt-in; installs nothing)
 #   make setup       the whole environment        make setup-analyze   the laptop's part of it
 #
 # Options, as in: make capture SUITE=libero_10 TASK_ID=0 CHECKPOINT=~/pi05_libero, or make capture POLICY=cosmos
@@ -32,7 +33,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 SOURCES := schemas capture analyze tests benchmarks scripts
 
-.PHONY: capture analyze test check unit setup setup-analyze schemas clean
+.PHONY: capture analyze test test-slurm check unit setup setup-analyze schemas clean
 
 capture: .venv/capture-installed
 	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --seed $(SEED) --store $(STORE) \
@@ -50,6 +51,11 @@ check: .venv/capture-installed
 
 unit: .venv/capture-installed
 	$(BIN)/pytest $(ARGS)
+
+# Takes about ten minutes, most of it waiting: SLURM holds a requeued job back for two. Works with any environment that is active.
+test-slurm:
+	@sinfo >/dev/null 2>&1 || { echo "make test-slurm needs a running SLURM: sinfo does not answer here (is SLURM_CONF set?)." >&2; exit 2; }
+	VLA_TEST_SLURM=1 $(if $(wildcard $(BIN)/pytest),$(BIN)/)pytest tests/end_to_end/test_slurm_array.py $(ARGS)
 
 schemas: .venv/capture-installed
 	$(BIN)/python -m schemas.json_files

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -12,8 +13,14 @@ from schemas.command_line import run_command
 from schemas.errors import UnknownName, UserError, did_you_mean, listing
 
 
+#: Episodes are measured by threads of our own (`analyze.parallel`); products that each start threads too only stand in their way.
+_ONE_THREAD_EACH = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code (2: a mistake in what was given, said in one sentence)."""
+    for name in _ONE_THREAD_EACH:  # read when numpy is imported, which is later
+        os.environ.setdefault(name, "1")
     words = sys.argv[1:] if argv is None else list(argv)
     name = words[0] if words[:1] and words[0] in COMMANDS else ""
     prog = f"vla-analyze {name}".strip()

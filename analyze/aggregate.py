@@ -21,12 +21,15 @@ from analyze.statistics import (
     DEFAULT_LEVEL,
     DEFAULT_RESAMPLES,
     DEFAULT_SEED,
+    POSITIVE,
+    SHARE,
     EpisodeStatistic,
+    Resamples,
     bootstrap_intervals,
     geometric_mean_over_episodes,
     mean_over_episodes,
     ratio_of_means_over_episodes,
-    resampled_counts,
+    resample_episodes,
     summarize,
 )
 from schemas.grouping import Grouping
@@ -45,7 +48,7 @@ def per_replan(steps: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
     The number of keys and the uniform ratio do not depend on denoise step and head and are taken over. Adds
     `nonfinite_layers`, 1 where the ratio is infinite or undefined (when the grouping has a ratio).
     """
-    masses = [*_mass_columns(grouping), "row_sum", "num_valid", *(f"{name}_keys" for name in grouping.names)]
+    masses = [*_mass_columns(grouping), "row_sum", "valid_mass", "num_valid", *(f"{name}_keys" for name in grouping.names)]
     constant = ["uniform_ratio"] if grouping.ratio else []
     averaged = (
         steps.with_columns(pl.col("layer").alias("layer_number"), pl.col("layer").cast(pl.String))
@@ -65,7 +68,7 @@ def add_layers_avg(replans: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
     Masses are means over the layers; the ratio is the mean of the layers' finite ratios (null when none is finite; the published
     scripts write 0 there); fractions and lifts come from the averaged masses. `nonfinite_layers` counts the layers left out.
     """
-    means = [*_mass_columns(grouping), "row_sum", "num_valid", *(f"{name}_keys" for name in grouping.names)]
+    means = [*_mass_columns(grouping), "row_sum", "valid_mass", "num_valid", *(f"{name}_keys" for name in grouping.names)]
     ratio = (
         [
             pl.col("uniform_ratio").first(),
@@ -93,7 +96,7 @@ def episodes_table(replans: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
     """One row per (episode, layer), over the episode's replans.
 
     Columns, beside the episode's and the layer's: `num_replans`; `row_sum`, `num_valid`; per group `{g}_mass`, `{g}_mass_std`,
-    `{g}_fraction`, `{g}_fraction_std`, `{g}_keys`, `{g}_lift` (means; std with ddof 0). With a ratio also
+    `{g}_fraction`, `{g}_fraction_std`, `{g}_keys`, `{g}_density`, `{g}_lift` (means; std with ddof 0). With a ratio also
         ratio_mean, ratio_std, ratio_median, ratio_min, ratio_max   over the finite ratios
         ratio_of_means    mean numerator mass / mean denominator mass
         geometric_mean    exp(log_ratio_mean), log_ratio_mean = mean log ratio over finite positive ratios
@@ -108,7 +111,8 @@ def episodes_table(replans: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
         for kind in ("mass", "fraction"):
             column = pl.col(f"{name}_{kind}")
             columns += [column.mean(), column.std(ddof=0).alias(f"{name}_{kind}_std")]
-        columns += [pl.col(f"{name}_keys").mean(), _finite(f"{name}_lift").mean().alias(f"{name}_lift")]
+        columns += [pl.col(f"{name}_keys").mean(), pl.col(f"{name}_density").mean()]
+        columns += [_finite(f"{name}_lift").mean().alias(f"{name}_lift")]
     if grouping.ratio:
         ratio = _finite("ratio")
         columns += [
@@ -143,8 +147,8 @@ def tasks_table(
     """One row per (task, layer) and, over tasks, rows with `task_id` null. Episodes are the unit and weigh the same.
 
     `scope` is "task", "all" (every task of one suite) or "combined" (every suite; only when there are several).
-    `X_low` and `X_high` bound the percentile interval of X: over episodes inside a task, two-level over tasks; null with
-    fewer than two episodes. X is each of `{g}_fraction` and, with a ratio, `ratio_mean`, `ratio_of_means`, `geometric_mean`
+    `X_low` and `X_high` bound the interval of X (see `statistics`): over episodes inside a task, two-level over tasks; null
+    with fewer than two episodes. X is each of `{g}_fraction` and, with a ratio, `ratio_mean`, `ratio_of_means`, `geometric_mean`
     and `ratio_lift`. `ratio_std`, `ratio_median`, `ratio_min`, `ratio_max` are over the episodes' mean ratios.
     `episodes_without_ratio` counts episodes without a single finite ratio; the counts of `episodes_table` are summed.
     """
@@ -152,14 +156,14 @@ def tasks_table(
     episodes = _sorted(episodes).with_columns(pl.col(pl.Float64).fill_null(float("nan")))
     # Task ids repeat between suites; a task is a pair of both.
     episodes = episodes.with_columns(pl.struct("suite", "task_id").rank("dense").cast(pl.Int64).alias(_TASK))
-    draws: dict[bytes, NDArray[np.float64]] = {}
+    draws: dict[bytes, Resamples] = {}
     rows = []
     for part, scope in _scopes(episodes):
         tasks = part[_TASK].to_numpy()
         # Where only one task is left, all that matters is how many episodes it has.
         key = (tasks - tasks[0]).tobytes()
         if key not in draws:
-            draws[key] = resampled_counts(tasks, num_resamples, seed)
+            draws[key] = resample_episodes(tasks, num_resamples, seed)
         rows.append({**scope, **_task_row(part, grouping, draws[key], level)})
     table = pl.DataFrame(rows, schema_overrides=_task_schema(grouping), infer_schema_length=None)
     order = pl.col("scope").replace_strict({"task": 0, "all": 1, "combined": 2}, return_dtype=pl.Int64)
@@ -201,7 +205,7 @@ def _scopes(episodes: pl.DataFrame) -> Iterable[tuple[pl.DataFrame, dict[str, ob
 
 
 def _task_row(
-    part: pl.DataFrame, grouping: Grouping, counts: NDArray[np.float64], level: float
+    part: pl.DataFrame, grouping: Grouping, resamples: Resamples, level: float
 ) -> dict[str, float | int | None]:
     def values(column: str) -> NDArray[np.float64]:
         return part[column].to_numpy()
@@ -213,21 +217,21 @@ def _task_row(
         "success_rate": float(part["success"].to_numpy().mean()),
     }
     bounded: dict[str, EpisodeStatistic] = {}
-    plain = [f"{name}_{kind}" for name in grouping.names for kind in ("mass", "keys", "lift")]
+    plain = [f"{name}_{kind}" for name in grouping.names for kind in ("mass", "keys", "density", "lift")]
     for name in grouping.names:
-        bounded[f"{name}_fraction"] = mean_over_episodes(values(f"{name}_fraction"))
+        bounded[f"{name}_fraction"] = mean_over_episodes(values(f"{name}_fraction"), SHARE)
     if grouping.ratio:
         plain += ["numerator_mass", "denominator_mass", "uniform_ratio"]
         spread = summarize(values("ratio_mean"))
         row |= {f"ratio_{name}": getattr(spread, name) for name in ("std", "median", "min", "max")}
         row["episodes_without_ratio"] = spread.num_nonfinite
         row |= {name: int(part[name].sum()) for name in ("num_nonfinite", "geometric_left_out", "nonfinite_layers")}
-        bounded["ratio_mean"] = mean_over_episodes(values("ratio_mean"))
+        bounded["ratio_mean"] = mean_over_episodes(values("ratio_mean"), POSITIVE)
         bounded["ratio_of_means"] = ratio_of_means_over_episodes(values("numerator_mass"), values("denominator_mass"))
         bounded["geometric_mean"] = geometric_mean_over_episodes(values("log_ratio_mean"))
-        bounded["ratio_lift"] = mean_over_episodes(values("ratio_lift"))
+        bounded["ratio_lift"] = mean_over_episodes(values("ratio_lift"), POSITIVE)
     row |= {column: mean_over_episodes(values(column)).value for column in plain}
-    intervals = bootstrap_intervals(list(bounded.values()), counts, level)
+    intervals = bootstrap_intervals(list(bounded.values()), resamples, level)
     for (column, statistic), interval in zip(bounded.items(), intervals, strict=True):
         row[column] = statistic.value
         row[f"{column}_low"] = interval.low if interval else None
@@ -237,7 +241,7 @@ def _task_row(
 
 def _task_schema(grouping: Grouping) -> dict[str, type[pl.DataType]]:
     """Types of the columns that may hold nothing but null."""
-    floats = [f"{name}_{kind}" for name in grouping.names for kind in ("mass", "keys", "lift")]
+    floats = [f"{name}_{kind}" for name in grouping.names for kind in ("mass", "keys", "density", "lift")]
     bounded = [f"{name}_fraction" for name in grouping.names]
     if grouping.ratio:
         floats += ["ratio_std", "ratio_median", "ratio_min", "ratio_max"]
@@ -260,18 +264,19 @@ def _mass_columns(grouping: Grouping) -> list[str]:
 
 
 def _with_derived(table: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
-    """Add fractions and lifts from masses and keys; `ratio_lift` and `log2_ratio` from `ratio`.
+    """Add fractions, densities and lifts from masses and keys; `ratio_lift` and `log2_ratio` from `ratio`.
 
-    fraction = mass / sum of all groups' masses; lift = (mass / keys) / (row_sum / num_valid); null where 0 / 0, and lift
-    null without keys.
+    fraction = mass / sum of all groups' masses; density = mass / keys; lift = density / (valid_mass / num_valid); null where
+    0 / 0, and density and lift null without keys.
     """
     total = pl.sum_horizontal(f"{name}_mass" for name in grouping.names)
-    density = pl.col("row_sum") / pl.col("num_valid")
+    uniform = pl.col("valid_mass") / pl.col("num_valid")
     columns = []
     for name in grouping.names:
         mass, keys = pl.col(f"{name}_mass"), pl.col(f"{name}_keys")
         columns.append(_quotient(mass, total).alias(f"{name}_fraction"))
-        columns.append(pl.when(keys > 0).then(_quotient(mass / keys, density)).alias(f"{name}_lift"))
+        columns.append(pl.when(keys > 0).then(_quotient(mass, keys)).alias(f"{name}_density"))
+        columns.append(pl.when(keys > 0).then(_quotient(mass / keys, uniform)).alias(f"{name}_lift"))
     if grouping.ratio:
         columns.append(_quotient(pl.col("ratio"), pl.col("uniform_ratio")).alias("ratio_lift"))
         columns.append(pl.col("ratio").log(2.0).alias("log2_ratio"))

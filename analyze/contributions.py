@@ -20,7 +20,7 @@ from analyze.aggregate import LAYERS_AVG
 from analyze.masses import ratio
 from analyze.reader import Store, StoredEpisode
 from analyze.selection import Selection
-from analyze.statistics import bootstrap_interval, mean_over_episodes
+from analyze.statistics import POSITIVE, bootstrap_interval, mean_over_episodes
 from analyze.summary import WIDTH
 from analyze.text_table import format_interval, format_number, text_table
 from schemas.segments import Segment
@@ -105,14 +105,33 @@ def _episode_frame(
     )
 
 
-def summarise_contributions(table: pl.DataFrame, seed: int) -> str:
-    """The summary's section: per layer the mean norms over episodes and their ratio with a two-level interval (95 %)."""
+def contribution_rows(table: pl.DataFrame, seed: int) -> pl.DataFrame:
+    """One row per layer and over all of them ("layers_avg"): mean norms over episodes, their ratio with a two-level interval (95 %).
+
+    Columns: layer, layer_number, visual_norm, linguistic_norm, ratio (mean over episodes of the mean ratio of norms), ratio_low,
+    ratio_high.
+    """
     rows = [
-        _summary_row(table.filter(layer=layer), str(layer), seed)
+        _summary_row(table.filter(layer=layer), str(layer), layer, seed)
         for layer in table["layer"].unique(maintain_order=True)
     ]
     once = table.unique(["suite", "task_id", "episode_index", "replan", "block", "denoise_step"], maintain_order=True)
-    rows.append(_summary_row(once, LAYERS_AVG, seed))
+    rows.append(_summary_row(once, LAYERS_AVG, None, seed))
+    numbers = ("visual_norm", "linguistic_norm", "ratio", "ratio_low", "ratio_high")
+    types = {"layer": pl.String, "layer_number": pl.Int64, **dict.fromkeys(numbers, pl.Float64)}
+    return pl.DataFrame(rows, schema=types, orient="row")
+
+
+def summarise_contributions(table: pl.DataFrame, seed: int) -> str:
+    """The summary's section: `contribution_rows` as text."""
+    rows = [
+        [
+            row["layer"],
+            *(format_number(row[column]) for column in ("visual_norm", "linguistic_norm", "ratio")),
+            format_interval(row["ratio_low"], row["ratio_high"]),
+        ]
+        for row in contribution_rows(table, seed).iter_rows(named=True)
+    ]
     title = "CONTRIBUTIONS  |visual| / |linguistic|, norms of what the keys add to the residual stream"
     note = (
         "Value-weighted, through output projection and gate; root mean square over action queries, mean over replans and denoise "
@@ -122,19 +141,14 @@ def summarise_contributions(table: pl.DataFrame, seed: int) -> str:
     return "\n".join([title, "-" * WIDTH, text_table(header, rows, left=(0,)), "", textwrap.fill(note, WIDTH), ""])
 
 
-def _summary_row(part: pl.DataFrame, label: str, seed: int) -> list[str]:
+def _summary_row(part: pl.DataFrame, label: str, number: int | None, seed: int) -> tuple[object, ...]:
     finite = pl.col("contribution_ratio").filter(pl.col("contribution_ratio").is_finite())
     episodes = part.group_by("suite", "task_id", "episode_index", maintain_order=True).agg(
         pl.col("visual_norm", "linguistic_norm").mean(), finite.mean().alias("ratio")
     )
-    values = mean_over_episodes(episodes["ratio"].cast(pl.Float64).fill_null(float("nan")).to_numpy())
+    values = mean_over_episodes(episodes["ratio"].cast(pl.Float64).fill_null(float("nan")).to_numpy(), POSITIVE)
     tasks = episodes.select(pl.struct("suite", "task_id").rank("dense")).to_series().to_numpy()
     interval = bootstrap_interval(values, tasks, seed=seed)
     norms = [episodes[f"{side}_norm"].cast(pl.Float64).mean() for side in ("visual", "linguistic")]
     bounds = (None, None) if interval is None else (interval.low, interval.high)
-    return [
-        label,
-        *(format_number(norm if isinstance(norm, float) else None) for norm in norms),
-        format_number(values.value),
-        format_interval(*bounds),
-    ]
+    return (label, number, *norms, values.value, *bounds)

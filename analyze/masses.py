@@ -31,6 +31,7 @@ class GroupMeasures:
 
     mass: NDArray[np.float64]
     fraction: NDArray[np.float64]
+    density: NDArray[np.float64]
     lift: NDArray[np.float64]
 
 
@@ -40,7 +41,7 @@ def group_measures(
     num_keys: NDArray[np.float64],
     num_valid: NDArray[np.int64],
 ) -> GroupMeasures:
-    """Fractions and lifts of masses.
+    """Fractions, densities and lifts of masses.
 
     fraction = mass / sum of the masses of all groups; density = mass / number of keys;
     lift = density / (mass of all valid keys / their number), so that attention that is uniform over the valid keys gives 1. Keys of
@@ -53,15 +54,16 @@ def group_measures(
         num_valid: (replan or 1,).
 
     Returns:
-        Measures; the lift of a group without keys, and every fraction of a row without any mass, is NaN.
+        Measures; density and lift of a group without keys, and every fraction of a row without any mass, is NaN.
     """
     middle = (1,) * (mass.ndim - 2)
     keys = num_keys.reshape(num_keys.shape[0], *middle, num_keys.shape[1])
     valid = num_valid.reshape(num_valid.shape[0], *middle, 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         fraction = mass / mass.sum(axis=-1, keepdims=True)
-        lift = np.where(keys > 0, (mass / keys) / (valid_mass[..., None] / valid), np.nan)
-    return GroupMeasures(mass, fraction, lift)
+        density = np.where(keys > 0, mass / keys, np.nan)
+        lift = density / (valid_mass[..., None] / valid)
+    return GroupMeasures(mass, fraction, density, lift)
 
 
 def ratio(numerator: NDArray[np.float64], denominator: NDArray[np.float64]) -> NDArray[np.float64]:

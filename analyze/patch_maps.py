@@ -28,15 +28,22 @@ def patch_maps(item: SelectedEpisode, selection: Selection, site: str) -> dict[s
     Row 0, column 0 is the top left patch of the picture as the model sees it, which is the stored frame as it is. A block that
     was named by two layer numbers counts once.
     """
-    cameras = seen_cameras(item)
-    total, count = 0.0, 0
-    for part in layer_rows(item.episode, selection, site):
-        if selection.blocks.index(selection.blocks[part.layer]) == part.layer:
-            total, count = total + part.rows.mean(axis=1, dtype=np.float64), count + 1
-    mean = np.asarray(total) / count
+    mean = mean_rows(item, selection, site)
     maps = {}
-    for camera in cameras:
+    for camera in seen_cameras(item):
         span = item.tokens.layout.camera_span(camera)
         assert span.grid is not None
         maps[camera] = mean[:, span.start : span.stop].reshape(-1, span.grid.rows, span.grid.columns)
     return maps
+
+
+def mean_rows(item: SelectedEpisode, selection: Selection, site: str) -> NDArray[np.float64]:
+    """Probability of every key, shape (replan, key): mean over the selected layers, denoise steps and heads.
+
+    A block that was named by two layer numbers counts once.
+    """
+    total, count = 0.0, 0
+    for part in layer_rows(item.episode, selection, site):
+        if selection.blocks.index(selection.blocks[part.layer]) == part.layer:
+            total, count = total + part.rows.mean(axis=1, dtype=np.float64), count + 1
+    return np.asarray(total) / count

@@ -11,6 +11,7 @@ import polars as pl
 from analyze.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
 from analyze.atomic_file import replacing
 from analyze.contributions import contribution_table, summarise_contributions
+from analyze.frame_proxy import frame_proxy
 from analyze.question import Question
 from analyze.results_file import write_results_of_suites
 from analyze.selection import Selection
@@ -67,7 +68,7 @@ def analyse(question: Question) -> Analysis:
         policy=f"{policy.name} ({policy.checkpoint_format}: {policy.checkpoint})",
         untrained=policy.untrained,
         denoise_steps=question.selection.denoise_steps,
-        heads=_describe_heads(question.selection, root.policy.num_heads),
+        heads=describe_heads(question.selection, root.policy.num_heads),
         notes=[*_notes(root, question.selection, question.site), *question.skipped],
     )
     text = summary_text(run, grouping, episodes, tasks)
@@ -92,7 +93,9 @@ def write_tables(analysis: Analysis, folder: Path) -> WrittenFiles:
                     table.write_parquet(temporary)
                 written.files.append(path)
         if analysis.grouping.ratio is not None:
-            written.files += write_results_of_suites(folder, analysis.replans, analysis.grouping)
+            question = analysis.question
+            proxy = frame_proxy(question.stores[0].attributes, question.selected[0].tokens.layout, analysis.grouping)
+            written.files += write_results_of_suites(folder, analysis.replans, analysis.grouping, proxy)
         path = folder / "summary.txt"
         write_summary(path, analysis.summary)
         written.files.append(path)
@@ -114,6 +117,7 @@ def _notes(root: RootAttributes, selection: Selection, site: str) -> list[str]:
     return notes
 
 
-def _describe_heads(selection: Selection, num_heads: int) -> str:
+def describe_heads(selection: Selection, num_heads: int) -> str:
+    """What was done about heads, in words."""
     which = "all heads" if len(selection.heads) == num_heads else f"heads {listing(selection.head_numbers, 40)}"
     return f"mean over {which}" + (" (kept apart in the steps table)" if selection.per_head else "")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -11,79 +11,79 @@ import polars as pl
 
 from analyze.aggregate import EPISODE_KEYS, LAYERS_AVG
 from analyze.atomic_file import replacing
-from analyze.statistics import summarize
 from schemas.grouping import Grouping
-from schemas.jsonable import MalformedDocument, from_json, to_json
-from schemas.results import (
-    EpisodeResult,
-    LayerSummary,
-    MeanStd,
-    RatioSummary,
-    ResultsError,
-    ResultsNotFound,
-    StepRatio,
-    results_file_name,
-)
+from schemas.jsonable import MalformedDocument, from_json
+from schemas.results import EpisodeResult, FrameProxy, ResultsError, ResultsNotFound, results_file_name
 
 #: Fields that are absent, not null, when the grouping has no group of this name.
 _ACTION = "action"
-_ACTION_FIELDS = ("action_mass", "action_fraction")
+_SIDES = ("visual", "linguistic")
+_RATIO = "visual_linguistic_ratio"
 
 
-def episode_results(replans: pl.DataFrame, grouping: Grouping) -> list[EpisodeResult]:
-    """Episodes of one or more suites from the table of replans (`aggregate.add_layers_avg`), in its order.
+def episode_documents(
+    replans: pl.DataFrame, grouping: Grouping, proxy: FrameProxy | None = None
+) -> Iterator[dict[str, Any]]:
+    """Episodes of one or more suites from the table of replans (`aggregate.add_layers_avg`), in its order, as JSON documents.
 
     visual is the sum of the ratio's numerator groups, linguistic that of its denominator groups; the fraction of either is
-    its mass / sum of all groups' masses.
+    its mass / sum of all groups' masses. With a `proxy` the numbers are those of the published Cosmos scripts instead: masses are
+    sums over the queries (ours are means), and fractions are of visual + linguistic only.
+
+    Plain values rather than `schemas.results.EpisodeResult` objects, which describe them: a suite has a hundred thousand steps.
     """
     if grouping.ratio is None:
         raise ResultsError(
             f"Grouping '{grouping.name}' defines no ratio, so there is no visual/linguistic ratio to write into a results "
             "file; expected a [ratio] with numerator and denominator groups (or --ratio A,B/C)."
         )
-    table = _with_sides(replans, grouping)
-    keys = list(EPISODE_KEYS)
-    episodes = []
+    sides = [*_SIDES, _ACTION] if _ACTION in grouping.names and proxy is None else list(_SIDES)
+    kinds = [f"{side}_{kind}" for side in sides for kind in ("mass", "fraction")]
+    table = _with_sides(replans, grouping, proxy).select(*EPISODE_KEYS, "layer", "replan", "step", _RATIO, *kinds)
+    extra = {} if proxy is None else proxy.fields()
     for part in table.partition_by("suite", "task_id", "episode_index", maintain_order=True):
-        identity = part.select(keys).row(0, named=True)
-        layers = {
-            LAYERS_AVG if layer == LAYERS_AVG else f"layer_{layer}": rows.sort("replan")
-            for (layer,), rows in part.partition_by("layer", as_dict=True, maintain_order=True).items()
+        identity = part.select(EPISODE_KEYS).row(0, named=True)
+        summaries = {row["layer"]: row for row in _summaries(part, kinds).iter_rows(named=True)}
+        layers = part.partition_by("layer", as_dict=True, maintain_order=True)
+        steps = {
+            str(layer): rows.sort("replan").drop(*EPISODE_KEYS, "layer", "replan") for (layer,), rows in layers.items()
         }
-        episodes.append(
-            EpisodeResult(
-                task_id=identity["task_id"],
-                episode_idx=identity["episode_index"],
-                task_description=identity["instruction"],
-                success=identity["success"],
-                num_steps=identity["num_steps"],
-                summary={name: _summary(rows) for name, rows in layers.items()},
-                per_step_ratios={
-                    name: [StepRatio(**row) for row in _steps(rows).iter_rows(named=True)]
-                    for name, rows in layers.items()
-                },
-            )
-        )
-    return episodes
+        yield {
+            "task_id": identity["task_id"],
+            "episode_idx": identity["episode_index"],
+            "task_description": identity["instruction"],
+            "success": identity["success"],
+            "num_steps": identity["num_steps"],
+            "summary": {_layer_name(layer): _summary_document(summaries[layer], kinds) for layer in steps},
+            "per_step_ratios": {
+                _layer_name(layer): [step | extra for step in rows.to_dicts()] for layer, rows in steps.items()
+            },
+        }
 
 
-def write_results(path: Path, episodes: Iterable[EpisodeResult]) -> None:
+def episode_results(replans: pl.DataFrame, grouping: Grouping, proxy: FrameProxy | None = None) -> list[EpisodeResult]:
+    """`episode_documents` as objects."""
+    return from_json(list[EpisodeResult], list(episode_documents(replans, grouping, proxy)))
+
+
+def write_results(path: Path, episodes: Iterable[dict[str, Any]]) -> None:
     """Write a results file atomically, as strict JSON with one episode per line."""
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         separator = "[\n"
         for episode in episodes:
-            # One C-encoded line per episode: a suite with all layers has hundreds of thousands of steps.
-            file.write(separator + json.dumps(_without_absent(to_json(episode)), allow_nan=False, ensure_ascii=False))
+            file.write(separator + json.dumps(episode, allow_nan=False, ensure_ascii=False))
             separator = ",\n"
         file.write("\n]\n" if separator == ",\n" else "[]\n")
 
 
-def write_results_of_suites(folder: Path, replans: pl.DataFrame, grouping: Grouping) -> list[Path]:
+def write_results_of_suites(
+    folder: Path, replans: pl.DataFrame, grouping: Grouping, proxy: FrameProxy | None = None
+) -> list[Path]:
     """Write `attention_ratio_results_<suite>.json` for every suite of the table and return the paths."""
     paths = []
     for (suite,), part in replans.partition_by("suite", as_dict=True, maintain_order=True).items():
         path = folder / results_file_name(str(suite))
-        write_results(path, episode_results(part, grouping))
+        write_results(path, episode_documents(part, grouping, proxy))
         paths.append(path)
     return paths
 
@@ -108,63 +108,41 @@ def _refuse_constant(constant: str) -> NoReturn:
     )
 
 
-def _with_sides(replans: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
+def _with_sides(replans: pl.DataFrame, grouping: Grouping, proxy: FrameProxy | None) -> pl.DataFrame:
+    """Add step, ratio (null where it is not finite), and the masses and fractions of the two sides."""
     assert grouping.ratio is not None
-    total = pl.sum_horizontal(f"{name}_mass" for name in grouping.names)
     visual = pl.sum_horizontal(f"{name}_mass" for name in grouping.ratio.numerator)
     linguistic = pl.sum_horizontal(f"{name}_mass" for name in grouping.ratio.denominator)
-    sides = [
+    queries = 1 if proxy is None else proxy.num_queries
+    total = visual + linguistic if proxy else pl.sum_horizontal(f"{name}_mass" for name in grouping.names)
+    # What the table calls after a group may be the name of a side.
+    return replans.with_columns(
         pl.col("env_step").alias("step"),
-        pl.when(pl.col("ratio").is_finite()).then(pl.col("ratio")).alias("visual_linguistic_ratio"),
-        visual.alias("visual_mass"),
-        linguistic.alias("linguistic_mass"),
+        pl.when(pl.col("ratio").is_finite()).then(pl.col("ratio")).alias(_RATIO),
+        (visual * queries).alias("visual_mass"),
+        (linguistic * queries).alias("linguistic_mass"),
         (visual / total).fill_nan(None).alias("visual_fraction"),
         (linguistic / total).fill_nan(None).alias("linguistic_fraction"),
-    ]
-    action = list(_ACTION_FIELDS) if _ACTION in grouping.names else []
-    return replans.select(*EPISODE_KEYS, "layer", "replan", *sides, *action)
-
-
-def _steps(rows: pl.DataFrame) -> pl.DataFrame:
-    return rows.drop(*EPISODE_KEYS, "layer", "replan")
-
-
-def _summary(rows: pl.DataFrame) -> LayerSummary:
-    ratio = summarize(_values(rows, "visual_linguistic_ratio"))
-    return LayerSummary(
-        visual_linguistic_ratio=RatioSummary(
-            ratio.mean, ratio.std, ratio.median, ratio.min, ratio.max, ratio.num_nonfinite
-        ),
-        visual_mass=_mean_std(rows, "visual_mass"),
-        linguistic_mass=_mean_std(rows, "linguistic_mass"),
-        visual_fraction=_mean_std(rows, "visual_fraction"),
-        linguistic_fraction=_mean_std(rows, "linguistic_fraction"),
-        num_steps=rows.height,
-        **{field: _mean_std(rows, field) for field in _ACTION_FIELDS if field in rows.columns},
     )
 
 
-def _mean_std(rows: pl.DataFrame, column: str) -> MeanStd:
-    summary = summarize(_values(rows, column))
-    return MeanStd(summary.mean, summary.std)
+def _summaries(episode: pl.DataFrame, kinds: Sequence[str]) -> pl.DataFrame:
+    """One row per layer: number of steps, the finite ratios in five numbers, mean and std (ddof 0) of the others."""
+    ratio = pl.col(_RATIO)
+    spread = [ratio.mean(), ratio.std(ddof=0).alias("std"), ratio.median().alias("median")]
+    ends = [ratio.min().alias("min"), ratio.max().alias("max"), ratio.null_count().alias("num_nonfinite")]
+    others = [part for kind in kinds for part in (pl.col(kind).mean(), pl.col(kind).std(ddof=0).alias(f"{kind}_std"))]
+    return episode.group_by("layer").agg(pl.len().alias("num_steps"), *spread, *ends, *others)
 
 
-def _values(rows: pl.DataFrame, column: str) -> Any:
-    return rows[column].fill_null(float("nan")).to_numpy()
+def _summary_document(row: dict[str, Any], kinds: Sequence[str]) -> dict[str, Any]:
+    spread = {name: row[name] for name in ("std", "median", "min", "max", "num_nonfinite")}
+    return {
+        _RATIO: {"mean": row[_RATIO], **spread},
+        **{kind: {"mean": row[kind], "std": row[f"{kind}_std"]} for kind in kinds},
+        "num_steps": row["num_steps"],
+    }
 
 
-def _without_absent(episode: dict[str, Any]) -> dict[str, Any]:
-    """Drop the action fields of a grouping without such a group: the published files lack them rather than hold null."""
-    for layer in episode["summary"].values():
-        _drop_action(layer)
-    for steps in episode["per_step_ratios"].values():
-        for step in steps:
-            _drop_action(step)
-    return episode
-
-
-def _drop_action(record: dict[str, Any]) -> None:
-    # The mass decides: a fraction may be null although there is such a group (when every mass is 0).
-    if record["action_mass"] is None:
-        for field in _ACTION_FIELDS:
-            del record[field]
+def _layer_name(layer: str) -> str:
+    return layer if layer == LAYERS_AVG else f"layer_{layer}"

@@ -3,7 +3,14 @@
 Replans inside an episode follow each other within a second and are strongly correlated, so the episode is the unit of
 replication: whatever has an interval here is first reduced to one value (or one pair of sums) per episode.
 Resampling has two levels, tasks and then episodes within the drawn tasks, because episodes of one task share their
-instruction and their scene (a cluster bootstrap; Davison & Hinkley 1997, section 3.8). Intervals are percentile intervals.
+instruction and their scene (a cluster bootstrap; Davison & Hinkley 1997, section 3.8).
+
+What an interval is about: the value for tasks like these, of which these are taken to be a sample, when there are several
+tasks; the value of the task, for episodes like these, when there is one. For these very tasks it is wider than it need be.
+
+Intervals are percentile intervals, widened by a factor for few tasks or episodes (`small_samples`): plain percentile
+intervals of nominal 95 % cover 84 % with 5 episodes of a task and 90 % with 10 tasks that differ. Where tasks do not differ,
+two-level intervals cover more than their level, because the noise of episodes enters at both levels (the same section).
 
 A ratio can be infinite (nothing on the denominator) or undefined (nothing on either side). Neither takes part in a mean;
 each function here returns how many values it left out.
@@ -17,9 +24,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analyze.small_samples import widen, widening
+
 DEFAULT_RESAMPLES = 2000
 DEFAULT_LEVEL = 0.95
 DEFAULT_SEED = 0
+#: Natural limits of a quantity, for `mean_over_episodes`: an interval never leaves them.
+NO_LIMITS = (-np.inf, np.inf)
+POSITIVE = (0.0, np.inf)
+SHARE = (0.0, 1.0)
 #: Draws made at once: bounds the memory of the bootstrap at some tens of megabytes for any number of episodes.
 _DRAWS_AT_ONCE = 2_000_000
 
@@ -41,7 +54,7 @@ class SampleSummary:
 
 @dataclass(frozen=True)
 class Interval:
-    """A percentile interval. `num_undefined`: resamples in which the statistic had no finite value, and that were left out."""
+    """An interval. `num_undefined`: resamples in which the statistic had no finite value, and that were left out."""
 
     low: float
     high: float
@@ -58,12 +71,14 @@ class EpisodeStatistic:
         denominator: (episode,) float64; for a mean this is 1 for episodes that take part and 0 for those left out.
         used: (episode,) bool, which episodes take part.
         exponentiate: g is exp (geometric mean) instead of the identity.
+        limits: natural limits of the quotient before g, which its interval never leaves: `NO_LIMITS`, `POSITIVE`, `SHARE`.
     """
 
     numerator: NDArray[np.float64]
     denominator: NDArray[np.float64]
     used: NDArray[np.bool_]
     exponentiate: bool = False
+    limits: tuple[float, float] = NO_LIMITS
 
     @property
     def num_left_out(self) -> int:
@@ -75,6 +90,24 @@ class EpisodeStatistic:
         """The statistic over all episodes; +inf for a positive sum over zero, None when it is undefined."""
         value = float(_quotient(self.numerator.sum(), self.denominator.sum(), self.exponentiate))
         return None if np.isnan(value) else value
+
+
+@dataclass(frozen=True)
+class Resamples:
+    """Draws of the two-level bootstrap.
+
+    Attributes:
+        counts: (resample, episode) how often each episode was drawn.
+        task_of: (episode,) number of each episode's task, from 0.
+    """
+
+    counts: NDArray[np.float64]
+    task_of: NDArray[np.int64]
+
+    def num_units(self, used: NDArray[np.bool_]) -> int:
+        """The units that an interval rests on: tasks that take part or, where only one does, its episodes."""
+        tasks = len(np.unique(self.task_of[used]))
+        return tasks if tasks > 1 else int(used.sum())
 
 
 def summarize(values: ArrayLike) -> SampleSummary:
@@ -105,18 +138,21 @@ def geometric_mean(ratios: ArrayLike) -> tuple[float | None, int]:
     return (float(np.exp(np.log(usable).mean())) if usable.size else None), left_out
 
 
-def mean_over_episodes(values: ArrayLike) -> EpisodeStatistic:
-    """Mean of one value per episode, shape (episode,); episodes whose value is not finite are left out and counted."""
+def mean_over_episodes(values: ArrayLike, limits: tuple[float, float] = NO_LIMITS) -> EpisodeStatistic:
+    """Mean of one value per episode, shape (episode,); episodes whose value is not finite are left out and counted.
+
+    `limits`: `POSITIVE` for masses and ratios, `SHARE` for fractions, so that no interval reaches what cannot be.
+    """
     sample = np.asarray(values, dtype=np.float64)
     used = np.isfinite(sample)
-    return EpisodeStatistic(np.where(used, sample, 0.0), used.astype(np.float64), used)
+    return EpisodeStatistic(np.where(used, sample, 0.0), used.astype(np.float64), used, limits=limits)
 
 
 def ratio_of_means_over_episodes(numerator: ArrayLike, denominator: ArrayLike) -> EpisodeStatistic:
     """Mean numerator mass / mean denominator mass, both of shape (episode,). Infinite ratios take part as what they are."""
     above, below = np.asarray(numerator, dtype=np.float64), np.asarray(denominator, dtype=np.float64)
     used = np.isfinite(above) & np.isfinite(below)
-    return EpisodeStatistic(np.where(used, above, 0.0), np.where(used, below, 0.0), used)
+    return EpisodeStatistic(np.where(used, above, 0.0), np.where(used, below, 0.0), used, limits=POSITIVE)
 
 
 def geometric_mean_over_episodes(log_means: ArrayLike) -> EpisodeStatistic:
@@ -125,10 +161,8 @@ def geometric_mean_over_episodes(log_means: ArrayLike) -> EpisodeStatistic:
     return EpisodeStatistic(mean.numerator, mean.denominator, mean.used, exponentiate=True)
 
 
-def resampled_counts(
-    tasks: ArrayLike, num_resamples: int = DEFAULT_RESAMPLES, seed: int = DEFAULT_SEED
-) -> NDArray[np.float64]:
-    """How often each episode is drawn in each resample of the two-level bootstrap, shape (resample, episode).
+def resample_episodes(tasks: ArrayLike, num_resamples: int = DEFAULT_RESAMPLES, seed: int = DEFAULT_SEED) -> Resamples:
+    """How often each episode is drawn in each resample of the two-level bootstrap.
 
     Level one draws as many tasks as there are, with replacement; level two draws, for each drawn task, as many of its
     episodes as it has, with replacement. With one task only the second level is left: the usual bootstrap over episodes.
@@ -160,36 +194,40 @@ def resampled_counts(
         cell = np.arange(rows)[:, None, None] * num_episodes + episode
         used = slot < sizes
         counts[start : start + rows] = np.bincount(cell[used], minlength=rows * num_episodes).reshape(rows, -1)
-    return counts
+    return Resamples(counts, task_of.astype(np.int64))
 
 
 def bootstrap_intervals(
-    statistics: Sequence[EpisodeStatistic], counts: NDArray[np.float64], level: float = DEFAULT_LEVEL
+    statistics: Sequence[EpisodeStatistic],
+    resamples: Resamples,
+    level: float = DEFAULT_LEVEL,
+    widened: bool = True,
 ) -> list[Interval | None]:
-    """Percentile intervals of several statistics over the same episodes, from `resampled_counts`.
+    """Intervals of several statistics over the same episodes, from `resample_episodes`.
 
     None where fewer than two episodes take part: a single episode says nothing about how much episodes differ.
+    `widened=False` gives the plain percentile interval, which covers less than its level when units are few.
     """
     if not statistics:
         return []
-    above = counts @ np.stack([statistic.numerator for statistic in statistics], axis=1)
-    below = counts @ np.stack([statistic.denominator for statistic in statistics], axis=1)
+    above = resamples.counts @ np.stack([statistic.numerator for statistic in statistics], axis=1)
+    below = resamples.counts @ np.stack([statistic.denominator for statistic in statistics], axis=1)
     values = _quotient(above, below, exponentiate=False)
     finite = np.isfinite(values)
     tail = (1.0 - level) / 2.0
     # All columns at once, then again the few that hold undefined resamples. exp is monotonic: it may come after.
-    bounds = np.quantile(np.where(finite, values, 0.0), [tail, 1.0 - tail], axis=0)
+    quantiles = np.quantile(np.where(finite, values, 0.0), [tail, 1.0 - tail], axis=0)
     intervals: list[Interval | None] = []
     for column, statistic in enumerate(statistics):
-        defined = values[finite[:, column], column]
-        if statistic.used.sum() < 2 or defined.size == 0:
-            intervals.append(None)
-            continue
-        whole = defined.size == len(values)
-        low, high = bounds[:, column] if whole else np.quantile(defined, [tail, 1.0 - tail])
-        if statistic.exponentiate:
-            low, high = np.exp(low), np.exp(high)
-        intervals.append(Interval(float(low), float(high), level, len(values) - defined.size))
+        whole = bool(finite[:, column].all())
+        bounds = quantiles[:, column] if whole else None
+        estimate = float(_quotient(statistic.numerator.sum(), statistic.denominator.sum(), exponentiate=False))
+        num_units = resamples.num_units(statistic.used)
+        interval = _interval(values[:, column], estimate, num_units, level, statistic.limits, widened, bounds)
+        if interval is not None and statistic.exponentiate:
+            ends = np.exp([interval.low, interval.high])
+            interval = Interval(float(ends[0]), float(ends[1]), level, interval.num_undefined)
+        intervals.append(interval)
     return intervals
 
 
@@ -199,9 +237,44 @@ def bootstrap_interval(
     num_resamples: int = DEFAULT_RESAMPLES,
     level: float = DEFAULT_LEVEL,
     seed: int = DEFAULT_SEED,
+    widened: bool = True,
 ) -> Interval | None:
-    """Two-level percentile interval of one statistic; `tasks` are the episodes' task labels, shape (episode,)."""
-    return bootstrap_intervals([statistic], resampled_counts(tasks, num_resamples, seed), level)[0]
+    """Two-level interval of one statistic; `tasks` are the episodes' task labels, shape (episode,)."""
+    return bootstrap_intervals([statistic], resample_episodes(tasks, num_resamples, seed), level, widened)[0]
+
+
+def interval_of_values(
+    values: NDArray[np.float64],
+    estimate: float | None,
+    num_units: int,
+    level: float = DEFAULT_LEVEL,
+    limits: tuple[float, float] = NO_LIMITS,
+) -> Interval | None:
+    """The widened interval of any statistic, from its values (resample,) and its value over all episodes.
+
+    `num_units`: what the statistic rests on, see `Resamples.num_units`; with fewer than two there is no interval.
+    """
+    return None if estimate is None else _interval(values, estimate, num_units, level, limits)
+
+
+def _interval(
+    values: NDArray[np.float64],
+    estimate: float,
+    num_units: int,
+    level: float,
+    limits: tuple[float, float],
+    widened: bool = True,
+    bounds: NDArray[np.float64] | None = None,
+) -> Interval | None:
+    finite = np.isfinite(values)
+    if num_units < 2 or not finite.any() or not np.isfinite(estimate):
+        return None
+    if bounds is None:
+        tail = (1.0 - level) / 2.0
+        bounds = np.quantile(values[finite], [tail, 1.0 - tail])
+    if widened:
+        bounds = widen(estimate, bounds, widening(num_units, level), limits)
+    return Interval(float(bounds[0]), float(bounds[1]), level, int((~finite).sum()))
 
 
 def _quotient(above: ArrayLike, below: ArrayLike, exponentiate: bool) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from schemas.grouping import Grouping
 WIDTH = 100
 #: Thresholds of the published interpretation guide, on the mean ratio.
 VISUAL_ABOVE, LINGUISTIC_BELOW = 1.5, 0.67
-#: Below this, a percentile bootstrap interval spans little more than the episodes themselves.
+#: Below this, intervals of single tasks are so wide that a word on it is due.
 FEW_EPISODES = 5
 
 
@@ -147,7 +147,8 @@ def _interval_note(run: AnalysedRun, overall: dict[str, object]) -> str:
     if overall["num_episodes"] == 1:
         return "No interval: a single episode says nothing about how much episodes differ."
     units = "tasks and episodes within tasks" if overall["num_tasks"] != 1 else "episodes of the one task"
-    return f"interval: of the mean, bootstrap over {units}."
+    about = ", for tasks like these" if overall["num_tasks"] != 1 else ""
+    return f"interval: of the mean{about}; bootstrap over {units}, widened for their number."
 
 
 def _baseline_sentence(grouping: Grouping, overall: dict[str, float]) -> str:
@@ -268,8 +269,8 @@ def _across_section(run: AnalysedRun, grouping: Grouping, tasks: pl.DataFrame, s
     fewest = rows["num_episodes"].min()
     if grouping.ratio and scope == "task" and isinstance(fewest, int) and 1 < fewest < FEW_EPISODES:
         warning = (
-            f"Intervals over fewer than {FEW_EPISODES} episodes of a task are too narrow: resampling cannot show what was "
-            "not drawn."
+            f"Intervals over fewer than {FEW_EPISODES} episodes of a task are wide, because so few show little of how much episodes "
+            "differ; more episodes narrow them quickly."
         )
         table = "\n".join([table, *textwrap.wrap(warning, WIDTH)])
     return "\n".join([_title(f"PER {name.upper()}{of}  {what}, {shown}"), table])

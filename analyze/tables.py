@@ -11,6 +11,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from analyze.masses import group_measures, masses, ratio
+from analyze.parallel import map_episodes
 from analyze.reader import Store, StoredEpisode
 from analyze.rows import layer_rows
 from analyze.selection import Selection
@@ -22,11 +23,22 @@ from schemas.vocabulary import EpisodeTokens, Vocabulary, collect_vocabulary
 
 @dataclass(frozen=True)
 class SelectedEpisode:
-    """An episode together with its store and its tokens."""
+    """An episode together with its store and its tokens.
+
+    `without`: keys that are taken out of every group and of the valid keys (sinks; see `analyze.metrics.sinks`).
+    """
 
     store: Store
     episode: StoredEpisode
     tokens: EpisodeTokens
+    without: tuple[int, ...] = ()
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Keys that can hold information and were not taken out, shape (replan or 1, key)."""
+        valid = self.tokens.valid.copy()
+        valid[:, list(self.without)] = False
+        return valid
 
 
 def load_tokens(chosen: Sequence[tuple[Store, StoredEpisode]], site: str) -> list[SelectedEpisode]:
@@ -57,7 +69,19 @@ def resolve_all(grouping: Grouping, selected: Sequence[SelectedEpisode]) -> list
                 f"Group '{name}' ({selectors}) has no key in any of the {len(selected)} selected episodes; change its "
                 f'selector, or add allow_empty = ["{name}"] to the grouping.'
             )
-    return resolved
+    return [_without(weights, item) if item.without else weights for item, weights in zip(selected, resolved, strict=True)]
+
+
+def _without(resolved: ResolvedGrouping, item: SelectedEpisode) -> ResolvedGrouping:
+    """The grouping without the keys that were taken out of the episode: in no group, not valid, not counted."""
+    weights = resolved.weights.copy()
+    weights[:, list(item.without)] = 0.0
+    return ResolvedGrouping(
+        names=resolved.names,
+        weights=weights,
+        num_keys=weights.sum(axis=1, dtype=np.float64),
+        num_valid=item.valid.sum(axis=1),
+    )
 
 
 def steps_table(
@@ -69,12 +93,11 @@ def steps_table(
 ) -> pl.DataFrame:
     """Measure every selected episode; `progress` is called with 1 after each."""
     resolved = resolve_all(grouping, selected)
-    frames = []
-    for item, weights in zip(selected, resolved, strict=True):
-        frames.append(_episode_steps(item, weights, grouping, selection, site))
-        if progress is not None:
-            progress(1)
-    return pl.concat(frames)
+
+    def measure(pair: tuple[SelectedEpisode, ResolvedGrouping]) -> pl.DataFrame:
+        return _episode_steps(*pair, grouping, selection, site)
+
+    return pl.concat(map_episodes(measure, list(zip(selected, resolved, strict=True)), progress))
 
 
 def episode_masses(
@@ -87,23 +110,31 @@ def episode_masses(
     Averaged over the stored queries and, unless heads are kept apart, over the selected heads. Uses the stored segment
     masses when the grouping does not cut through a segment, and reads rows otherwise.
     """
-    episode, tokens = item.episode, item.tokens
-    row_sum = _reduce(_cells(episode.read(f"{site}/row_sum"), selection), selection).astype(np.float64)
-    segments = episode.attributes.segments[site]
-    weights = _with_valid(resolved.weights, tokens.valid)
-    on_segments = weights_on_segments(weights, segment_members(tokens.layout, tokens.static_roles, segments))
-    if on_segments is not None:
-        atoms = _cells(episode.read(f"{site}/atoms"), selection)
-        return masses(_reduce(atoms, selection, axis=-2), on_segments), row_sum
-    shape = (*row_sum.shape, weights.shape[2])
-    result = np.empty(shape)
-    for part in layer_rows(episode, selection, site):
+    row_sum = row_sums(item, selection, site)
+    weights = with_valid(resolved.weights, item.valid)
+    of_segments = segment_weights(item, weights, site)
+    if of_segments is not None:
+        atoms = _cells(item.episode.read(f"{site}/atoms"), selection)
+        return masses(_reduce(atoms, selection, axis=-2), of_segments), row_sum
+    result = np.empty((*row_sum.shape, weights.shape[2]))
+    for part in layer_rows(item.episode, selection, site):
         rows = part.rows if selection.per_head else part.rows.mean(axis=1, keepdims=True)
         result[:, part.layer, part.denoise] = masses(rows, weights)
     return result, row_sum
 
 
-def _with_valid(weights: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+def row_sums(item: SelectedEpisode, selection: Selection, site: str) -> NDArray[np.float64]:
+    """Stored sums of the rows (replan, layer, denoise, head or 1), as they were before storage rounded the rows."""
+    return _reduce(_cells(item.episode.read(f"{site}/row_sum"), selection), selection).astype(np.float64)
+
+
+def segment_weights(item: SelectedEpisode, weights: NDArray[np.float32], site: str) -> NDArray[np.float32] | None:
+    """Weights (replan or 1, key, group) on the stored segments (replan or 1, segment, group); None where a group cuts one."""
+    tokens, segments = item.tokens, item.episode.attributes.segments[site]
+    return weights_on_segments(weights, segment_members(tokens.layout, tokens.static_roles, segments))
+
+
+def with_valid(weights: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Weights (replan or 1, key, group) with one more group: the valid keys (replan or 1, key)."""
     replans = max(len(weights), len(valid))
     parts = [
@@ -126,7 +157,18 @@ def _reduce(values: NDArray[np.float32], selection: Selection, axis: int = -1) -
 def _episode_steps(
     item: SelectedEpisode, resolved: ResolvedGrouping, grouping: Grouping, selection: Selection, site: str
 ) -> pl.DataFrame:
-    mass, row_sum = episode_masses(item, resolved, selection, site)
+    return episode_steps(item, resolved, grouping, selection, *episode_masses(item, resolved, selection, site))
+
+
+def episode_steps(
+    item: SelectedEpisode,
+    resolved: ResolvedGrouping,
+    grouping: Grouping,
+    selection: Selection,
+    mass: NDArray[np.float64],
+    row_sum: NDArray[np.float64],
+) -> pl.DataFrame:
+    """One episode's part of the steps table, from what `episode_masses` gives."""
     mass, valid_mass = mass[..., :-1], mass[..., -1]
     measures = group_measures(mass, valid_mass, resolved.num_keys, resolved.num_valid)
     shape = row_sum.shape
@@ -151,12 +193,14 @@ def _episode_steps(
         "denoise_time": along(episode.read("denoise_time")[list(selection.denoise)].astype(np.float64), 2),
         "head": along(np.array(selection.head_numbers, dtype=np.int64), 3) if selection.per_head else None,
         "row_sum": row_sum.ravel(),
+        "valid_mass": valid_mass.ravel(),
         "num_valid": along(np.broadcast_to(resolved.num_valid, shape[:1]), 0),
     }
     for i, name in enumerate(grouping.names):
         columns[f"{name}_mass"] = measures.mass[..., i].ravel()
         columns[f"{name}_fraction"] = measures.fraction[..., i].ravel()
         columns[f"{name}_keys"] = along(np.broadcast_to(resolved.num_keys[:, i], shape[:1]), 0)
+        columns[f"{name}_density"] = measures.density[..., i].ravel()
         columns[f"{name}_lift"] = measures.lift[..., i].ravel()
     if grouping.ratio is not None:
         columns.update(_ratio_columns(grouping, measures.mass, resolved.num_keys, along))

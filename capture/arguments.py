@@ -7,9 +7,9 @@ from pathlib import Path
 
 from capture.environments.base import EnvironmentSettings
 from capture.environments.suites import SUITES, check_task_id, find_suite
-from capture.run import RecordingSettings, RunSettings
+from capture.settings import RecordingSettings, RunSettings
 from schemas.command_line import OneSentenceParser
-from schemas.errors import BadArgument
+from schemas.errors import BadArgument, listing
 from schemas.precision import DEFAULT_MANTISSA_BITS, parse_precision
 from schemas.store import STORE_SUFFIX
 
@@ -22,8 +22,29 @@ _EXAMPLES = """examples:
       --task-suite libero_10 --num-episodes 5 --output-dir results/attention_ratio
   vla-capture pi --checkpoint lerobot/pi05_libero_finetuned --tokenizer PATH --task-suite libero_10
   vla-capture pi --task-suite libero_10 --task-id 0 --num-episodes 1 --max-steps 40 --libero-assets PATH
+  vla-capture status runs/libero_10.zarr                     what is there, what is missing, who is writing
   vla-capture parity CASE --format orbax                     our numbers against a reference's, on your own checkpoint
 """
+
+
+#: Policy family -> (one word for a list, what the command does).
+_FAMILIES = {
+    "cosmos": (
+        "Cosmos Policy",
+        "Record a Cosmos Policy: self-attention over latent frames, cross-attention over text.",
+    ),
+    "pi": ("pi0 or pi0.5", "Record a pi0 or pi0.5 policy."),
+}
+#: What the published scripts load unless told otherwise.
+PUBLISHED_CHECKPOINTS = {
+    "pi": "~/.cache/openpi/openpi-assets/checkpoints/pi05_libero",
+    "cosmos": "nvidia/Cosmos-Policy-LIBERO-Predict2-2B",
+}
+#: The layers that they analyse unless told otherwise.
+PUBLISHED_LAYERS = (25, 26, 27)
+#: `--task-suite all`: the standard suites of LIBERO.
+ALL_SUITES = "all"
+STANDARD_SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10")
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -35,28 +56,17 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     families = parser.add_subparsers(dest="policy", required=True, metavar="POLICY", parser_class=OneSentenceParser)
-    cosmos = families.add_parser(
-        "cosmos",
-        help="Cosmos Policy",
-        description="Record a Cosmos Policy: self-attention over latent frames, cross-attention over text.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    _add_cosmos_arguments(cosmos)
-    _add_run_arguments(cosmos)
-    _add_recording_arguments(cosmos)
-    _add_store_arguments(cosmos)
-    pi = families.add_parser(
-        "pi",
-        help="pi0 or pi0.5",
-        description="Record a pi0 or pi0.5 policy.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    _add_pi_arguments(pi)
-    _add_run_arguments(pi)
-    _add_recording_arguments(pi)
-    _add_store_arguments(pi)
+    for family, (title, description) in _FAMILIES.items():
+        _add_capture_arguments(
+            families.add_parser(
+                family,
+                help=title,
+                description=description,
+                epilog=_EXAMPLES,
+                formatter_class=argparse.RawDescriptionHelpFormatter,
+            ),
+            family,
+        )
     parity = families.add_parser(
         "parity",
         help="compare a pi model with what a reference implementation computed",
@@ -64,7 +74,76 @@ def build_parser() -> argparse.ArgumentParser:
         "Exit code 0: all within the limit, 1: beyond it, 2: the case cannot be used.",
     )
     _add_parity_arguments(parity)
+    status = families.add_parser(
+        "status",
+        help="what a store holds, what is missing, and who is writing",
+        description="Episodes committed and expected per task, success, size, last writer, what is missing and what is being written. "
+        "Reads only; works while captures run, and needs neither torch nor a GPU.",
+    )
+    _add_status_arguments(status)
+    tasks = families.add_parser("tasks", help="the tasks of a suite", description="The tasks of a suite by their ids.")
+    tasks.add_argument("suite", metavar="SUITE", help="task suite")
+    tasks.add_argument("--array", action="store_true", help="only the range of ids, as sbatch --array takes it")
     return parser
+
+
+def build_evaluate_parser(program: str, family: str) -> argparse.ArgumentParser:
+    """The parser of `evaluate-attention-ratio` (family "pi") and `evaluate-attention-ratio-cosmos` ("cosmos")."""
+    parser = OneSentenceParser(
+        prog=program,
+        description=f"{_FAMILIES[family][1]} Then analyse, with the arguments of the published script. All layers are recorded, so "
+        "that other --layers need no second capture; an existing store is continued with what is missing.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    _add_capture_arguments(parser, family, evaluate=True)
+    job = parser.add_argument_group("as a job of a cluster (see docs/cluster.md)")
+    job.add_argument(
+        "--stage",
+        choices=("capture", "analyze", "both"),
+        help="what to do (default: both; in an array job capture, as all of its tasks fill one store)",
+    )
+    job.add_argument(
+        "--array-index",
+        type=int,
+        metavar="N",
+        help="index in an array job: a task, counted through the suites of 'all'",
+    )
+    job.add_argument(
+        "--max-requeues",
+        type=int,
+        default=0,
+        metavar="N",
+        help="after SIGTERM put the SLURM job back into the queue, at most N times (default: 0)",
+    )
+    job.add_argument(
+        "--from-environment",
+        action="store_true",
+        help="also read the variables of scripts/run_attention_ratio*.sh (CHECKPOINT, TASK_SUITE, LAYERS ...); see their heads",
+    )
+    parser.set_defaults(
+        policy=family, checkpoint=PUBLISHED_CHECKPOINTS[family], task_suite="libero_10", resume=True, store=None
+    )
+    return parser
+
+
+def _add_capture_arguments(parser: argparse.ArgumentParser, family: str, evaluate: bool = False) -> None:
+    """Everything that capturing with one policy family takes."""
+    (_add_pi_arguments if family == "pi" else _add_cosmos_arguments)(parser)
+    _add_run_arguments(parser, evaluate)
+    _add_recording_arguments(parser, evaluate)
+    _add_store_arguments(parser, evaluate)
+
+
+def _add_status_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("stores", nargs="+", type=Path, metavar="STORE", help="one or several NAME.zarr")
+    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+    parser.add_argument(
+        "--expected",
+        type=int,
+        metavar="N",
+        help="episodes expected per task (default: what the runs that filled the store planned)",
+    )
+    parser.add_argument("--check", action="store_true", help="exit code 1 when an expected episode is missing")
 
 
 def _add_cosmos_arguments(parser: argparse.ArgumentParser) -> None:
@@ -76,7 +155,7 @@ def _add_cosmos_arguments(parser: argparse.ArgumentParser) -> None:
         default=EMBEDDED,
         metavar="PATH",
         help="checkpoint folder, ORG/NAME on the Hugging Face hub, or a file of weights; "
-        f"'{EMBEDDED}' (default) is a small untrained policy that comes with the tool, '{DUMMY}' a smaller one",
+        f"'{EMBEDDED}' is a small untrained policy that comes with the tool, '{DUMMY}' a smaller one (default: %(default)s)",
     )
     model.add_argument("--config-name", metavar="NAME", help="the reference's name for the configuration")
     model.add_argument("--dataset-stats-path", metavar="PATH", help="statistics (default: the checkpoint's own)")
@@ -135,7 +214,8 @@ def _add_pi_arguments(parser: argparse.ArgumentParser) -> None:
         default=EMBEDDED,
         metavar="PATH",
         help="checkpoint folder of openpi (JAX or PyTorch) or LeRobot, ORG/NAME on the Hugging Face hub, or gs://...; "
-        f"'{EMBEDDED}' (default) is a small untrained policy that comes with the tool, '{DUMMY}' a smaller one for trying things out",
+        f"'{EMBEDDED}' is a small untrained policy that comes with the tool, '{DUMMY}' a smaller one for trying things out "
+        "(default: %(default)s)",
     )
     model.add_argument(
         "--checkpoint-format",
@@ -168,10 +248,13 @@ def _add_pi_arguments(parser: argparse.ArgumentParser) -> None:
     model.add_argument("--num-image-tokens", type=int, metavar="N", help="checked against the policy's layout")
 
 
-def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
+def _add_run_arguments(parser: argparse.ArgumentParser, evaluate: bool) -> None:
     run = parser.add_argument_group("evaluation")
     names = ", ".join(suite.name for suite in SUITES)
-    run.add_argument("--task-suite", default="robosuite", metavar="SUITE", help=f"one of {names} (default: robosuite)")
+    which = f"one of {names} (default: robosuite)"
+    if evaluate:
+        which = f"one of {names}, or {ALL_SUITES} for {listing(STANDARD_SUITES)} (default: libero_10)"
+    run.add_argument("--task-suite", default="robosuite", metavar="SUITE", help=which)
     run.add_argument("--task-id", type=int, metavar="N", help="a single task (default: all tasks of the suite)")
     run.add_argument("--num-episodes", type=int, default=5, metavar="N", help="episodes per task (default: 5)")
     run.add_argument("--seed", type=int, default=7, help="seed of the simulator and of all noise (default: 7)")
@@ -189,14 +272,15 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_recording_arguments(parser: argparse.ArgumentParser) -> None:
+def _add_recording_arguments(parser: argparse.ArgumentParser, evaluate: bool) -> None:
     attention = parser.add_argument_group("what is recorded")
+    which = "layers to analyse; all are recorded (default: 25 26 27)" if evaluate else "block indices (default: all)"
     attention.add_argument(
         "--layers",
         type=int,
         nargs="+",
         metavar="N",
-        help="block indices (default: all); for pi also the published scripts' numbers 18..35 (25 = block 7)",
+        help=f"{which}; for pi also the published scripts' numbers 18..35 (25 = block 7)",
     )
     attention.add_argument(
         "--denoise-steps",
@@ -227,23 +311,26 @@ def _add_recording_arguments(parser: argparse.ArgumentParser) -> None:
     attention.add_argument("--no-frames", action="store_true", help="do not store the model's input images")
 
 
-def _add_store_arguments(parser: argparse.ArgumentParser) -> None:
+def _add_store_arguments(parser: argparse.ArgumentParser, evaluate: bool) -> None:
     output = parser.add_argument_group("output")
     output.add_argument(
         "--store",
         type=Path,
         metavar="NAME.zarr",
-        help="store to write (default: runs/SUITE.zarr, for cosmos runs/cosmos_SUITE.zarr)",
+        help=f"store to write (default: {'in --output-dir' if evaluate else 'runs'}, SUITE.zarr or cosmos_SUITE.zarr)",
     )
+    where = "default: results/attention_ratio_SUITE or results/attention_ratio_cosmos_SUITE"
     output.add_argument(
         "--output-dir",
         type=Path,
         metavar="PATH",
-        help="folder for the store (unless --store is given) and for the results of an analysis that runs afterwards",
+        help="folder for the store (unless --store is given) and for the results of "
+        + (f"the analysis; {where}" if evaluate else "an analysis that runs afterwards"),
     )
     output.add_argument("--save-viz", action="store_true", help="analyse afterwards, with pictures of every episode")
     existing = output.add_mutually_exclusive_group()
-    existing.add_argument("--resume", action="store_true", help="continue an existing store with what is missing")
+    resume = "continue an existing store with what is missing" + (" (default)" if evaluate else "")
+    existing.add_argument("--resume", action="store_true", help=resume)
     existing.add_argument("--overwrite", action="store_true", help="delete an existing store first")
 
 
@@ -264,7 +351,7 @@ def run_settings(arguments: argparse.Namespace) -> RunSettings:
         replan_steps=arguments.replan_steps,
         max_steps=suite.max_steps if arguments.max_steps is None else arguments.max_steps,
         store=store_path(arguments),
-        mode="resume" if arguments.resume else "overwrite" if arguments.overwrite else "new",
+        mode="overwrite" if arguments.overwrite else "resume" if arguments.resume else "new",
         environment=EnvironmentSettings(libero_assets=arguments.libero_assets),
         recording=RecordingSettings(
             layers=None if arguments.layers is None else tuple(arguments.layers),

@@ -21,8 +21,10 @@ from schemas.layout import SiteLayout
 from schemas.segments import segment_members, segments_of
 from schemas.store import Protocol, Recording
 
-#: Called after each replan with (environment steps done, most steps of the episode).
+#: Called after each replan's actions with (environment steps done, replans done).
 StepReport = Callable[[int, int], None]
+#: Called before every environment step and policy call; raises to drop the episode.
+StopCheck = Callable[[], None]
 
 
 @dataclass(frozen=True)
@@ -61,11 +63,12 @@ def run_episode(
     episode_index: int,
     provenance: dict[str, str],
     report: StepReport | None = None,
+    check: StopCheck = lambda: None,
 ) -> EpisodeResult:
     """Run one episode from the stored initial state of the same index, and commit it.
 
     The protocol of the published evaluations: waiting steps, then a policy call every `replan_steps` executed actions until
-    the task is solved or `max_steps` actions have been executed.
+    the task is solved or `max_steps` actions have been executed. What `check` raises drops the episode without a trace.
     """
     protocol = store.attributes.protocol
     environment.reset(episode_index, protocol.seed)
@@ -81,14 +84,16 @@ def run_episode(
     )
     denoise_times = policy.denoise_times()[list(store.attributes.recording.denoise_steps)]
     with store.episode(start, denoise_times, max_replans(protocol)) as writer:
-        observation = _wait(environment, protocol.wait_steps)
+        observation = _wait(environment, protocol.wait_steps, check)
         success, step, replans = False, 0, 0
         while step < protocol.max_steps and not success:
+            check()
             actions = _replan(environment, policy, store, writer, task, episode_index, observation, step)
             replans += 1
             chunk = min(protocol.replan_steps, protocol.max_steps - step)
             for i in range(chunk):
                 # Pictures are drawn only where the policy will look: before the next replan.
+                check()
                 look = i == chunk - 1 and step + 1 < protocol.max_steps
                 result = environment.step(actions[i], observe=look)
                 step += 1
@@ -98,7 +103,7 @@ def run_episode(
                 if result.observation is not None:
                     observation = result.observation
             if report is not None:
-                report(step, protocol.max_steps)
+                report(step, replans)
         folder = writer.commit(success, step)
     return EpisodeResult(task.task_id, episode_index, success, step, replans, folder)
 
@@ -119,9 +124,10 @@ def make_recorders(
     return recorders
 
 
-def _wait(environment: Environment, steps: int) -> Observation:
+def _wait(environment: Environment, steps: int, check: StopCheck) -> Observation:
     observation = None
     for i in range(steps):
+        check()
         observation = environment.step(environment.wait_action, observe=i == steps - 1).observation
     if observation is None:
         raise ValueError("an episode needs at least one waiting step: the first picture is the one after it")

@@ -2,59 +2,28 @@
 
 from __future__ import annotations
 
-import sys
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal, cast
 
 import numpy as np
-from tqdm import tqdm
 
-from capture.disk_estimate import describe, estimate_disk, format_bytes
-from capture.environments.base import EnvironmentSettings, Task
-from capture.environments.suites import Suite, check_initial_state_index, list_tasks, make_environment
+from capture.disk_estimate import describe, estimate_disk
+from capture.environments.suites import check_initial_state_index, list_tasks
+from capture.episode_loop import EpisodeLoop, say
+from capture.job import this_worker
 from capture.machine import describe_machine
 from capture.policies.base import Policy
 from capture.policies.identity import identify
-from capture.rollout import EpisodeResult, check_protocol, max_replans, run_episode
-from capture.store_writer import RunStore, WriteMode, open_run
+from capture.rollout import EpisodeResult, check_protocol, max_replans
+from capture.run_records import PlannedTask, RecordKeeper, forget_runs, planned_tasks, read_records
+from capture.settings import RecordingSettings, RunSettings
+from capture.store_writer import RunStore, open_run
+from capture.termination import Termination
 from schemas.errors import BadArgument, listing
 from schemas.layers import select_layers
 from schemas.store import FORMAT_NAME, FORMAT_VERSION, Protocol, Recording, RootAttributes
 
 _QUERIES = {"mean": "the mean over", "steps": "the action steps' means over", "all": "each of"}
-
-
-@dataclass(frozen=True)
-class RecordingSettings:
-    """What a user asks to be recorded; None and empty mean the default."""
-
-    layers: tuple[int, ...] | None = None
-    denoise_steps: tuple[str, ...] = ("first", "last")
-    heads: tuple[int, ...] | None = None
-    queries: str = "mean"
-    mantissa_bits: int = 10
-    frames: bool = True
-    contributions: bool = True
-
-
-@dataclass(frozen=True)
-class RunSettings:
-    """What a user asks to be run."""
-
-    suite: Suite
-    task_id: int | None
-    num_episodes: int
-    seed: int
-    #: None: what the policy's own evaluation does
-    replan_steps: int | None
-    max_steps: int
-    store: Path
-    mode: WriteMode
-    environment: EnvironmentSettings
-    recording: RecordingSettings
 
 
 def plan_recording(settings: RecordingSettings, policy: Policy) -> tuple[Recording, str | None]:
@@ -99,8 +68,14 @@ def _denoise_steps(words: Sequence[str], count: int) -> tuple[int, ...]:
     return tuple(sorted(steps))
 
 
-def run_capture(settings: RunSettings, policy: Policy, device: str) -> list[EpisodeResult]:
-    """Run every missing episode of the settings into the store; returns the episodes that were added."""
+def run_capture(
+    settings: RunSettings, policy: Policy, device: str, termination: Termination | None = None
+) -> list[EpisodeResult]:
+    """Run every missing episode of the settings into the store; returns the episodes that this process added.
+
+    Raises:
+        Terminated: `termination` was told to stop; the episode in flight was dropped.
+    """
     protocol = Protocol(
         suite=settings.suite.name,
         seed=settings.seed,
@@ -128,6 +103,8 @@ def run_capture(settings: RunSettings, policy: Policy, device: str) -> list[Epis
     if note:
         say(note)
     store = open_run(settings.store, attributes, settings.mode)
+    if settings.mode == "overwrite":
+        forget_runs(store.path)
     done = store.committed()
     todo = [
         (task, episode)
@@ -137,7 +114,27 @@ def run_capture(settings: RunSettings, policy: Policy, device: str) -> list[Epis
     ]
     todo.sort(key=lambda item: item[0].task_id)
     _announce(policy, store, len(wanted) * settings.num_episodes, len(todo))
-    return _run_episodes(settings, policy, store, todo, machine) if todo else []
+    expected = {task.task_id: task for task in (*wanted, *(tasks[index] for index in settings.array_task_ids))}
+    plan = tuple(
+        PlannedTask(task.task_id, task.name, task.instruction, settings.num_episodes)
+        for _, task in sorted(expected.items())
+    )
+    known = planned_tasks(read_records(store.path))
+    if not todo and all(task.task_id in known and known[task.task_id].episodes >= task.episodes for task in plan):
+        return []
+    worker = this_worker()
+    record = RecordKeeper(store.path, worker, plan)
+    loop = EpisodeLoop(
+        suite=settings.suite,
+        environment_settings=settings.environment,
+        policy=policy,
+        store=store,
+        worker=worker,
+        record=record,
+        machine=machine,
+        termination=termination or Termination(),
+    )
+    return loop.run(todo)
 
 
 def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int) -> None:
@@ -167,52 +164,3 @@ def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int) -
     say(describe(estimate, store.path))
     if num_todo < num_wanted:
         say(f"{num_wanted - num_todo} of {num_wanted} episodes are complete already; {num_todo} to run.")
-
-
-def _run_episodes(
-    settings: RunSettings,
-    policy: Policy,
-    store: RunStore,
-    todo: Sequence[tuple[Task, int]],
-    machine: dict[str, str],
-) -> list[EpisodeResult]:
-    results: list[EpisodeResult] = []
-    terminal = sys.stderr.isatty()
-    bar = tqdm(total=len(todo) * store.attributes.protocol.max_steps, unit="step", disable=not terminal)
-    environment, current = None, None
-    try:
-        for number, (task, episode) in enumerate(todo, start=1):
-            if current != task.task_id:
-                if environment is not None:
-                    environment.close()
-                environment, current = (
-                    make_environment(settings.suite, task.task_id, settings.environment),
-                    task.task_id,
-                )
-            assert environment is not None
-            bar.set_description(f"task {task.task_id} episode {episode}")
-            begun, steps_before = time.monotonic(), bar.n
-
-            def report(step: int, _most: int, before: float = steps_before) -> None:
-                bar.update(before + step - bar.n)
-
-            result = run_episode(environment, policy, store, task, episode, machine, report)
-            bar.update(steps_before + store.attributes.protocol.max_steps - bar.n)
-            results.append(result)
-            size = sum(file.stat().st_size for file in result.folder.rglob("*") if file.is_file())
-            line = (
-                f"[{number}/{len(todo)}] task {task.task_id} episode {episode}: "
-                f"{'success' if result.success else 'no success'} after {result.num_steps} steps, {result.num_replans} replans, "
-                f"{format_bytes(size)}, {time.monotonic() - begun:.0f} s ({task.instruction})"
-            )
-            bar.write(line) if terminal else say(line)
-    finally:
-        bar.close()
-        if environment is not None:
-            environment.close()
-    return results
-
-
-def say(line: str) -> None:
-    """Print one line at once, also when the output is a file that somebody follows."""
-    print(line, flush=True)

@@ -26,7 +26,14 @@ from capture.durable_files import (
 from capture.episode_writer import EpisodeStart, EpisodeWriter
 from capture.store_root import check_same_run, create_root, delete_store, episode_folders, read_root
 from schemas.errors import BadArgument, UserError
-from schemas.store import STORE_SUFFIX, RootAttributes, StoreExists, episode_name, parse_episode_name
+from schemas.store import (
+    EPISODES_GROUP,
+    STORE_SUFFIX,
+    RootAttributes,
+    StoreExists,
+    episode_name,
+    parse_episode_name,
+)
 
 WriteMode = Literal["new", "resume", "overwrite"]
 
@@ -41,6 +48,10 @@ class RunStore:
     def committed(self) -> set[tuple[int, int]]:
         """(task id, episode index) of every complete episode."""
         return {parse_episode_name(folder.name) for folder in episode_folders(self.path)}
+
+    def has(self, task_id: int, episode_index: int) -> bool:
+        """Whether an episode is complete; asks the file system, as other processes may have added it."""
+        return (self.path / EPISODES_GROUP / episode_name(task_id, episode_index)).is_dir()
 
     @contextmanager
     def episode(

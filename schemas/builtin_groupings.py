@@ -7,6 +7,7 @@ from pathlib import Path
 
 from schemas.errors import did_you_mean, listing
 from schemas.grouping import Grouping, GroupingError, GroupingNotFound, Ratio, read_grouping_file
+from schemas.resolve import NO_COVERAGE
 from schemas.vocabulary import Vocabulary
 
 _TEXT = "role:bos | role:template | role:instruction | role:text"
@@ -70,6 +71,8 @@ def cameras(vocabulary: Vocabulary) -> Grouping:
 
 def objects(vocabulary: Vocabulary) -> Grouping:
     """One group per object of the scene, by the area of each patch that it covers."""
+    if not vocabulary.objects:
+        raise GroupingError(f"Grouping 'objects': {NO_COVERAGE}.")
     things = {name: (f"object:{name}",) for name in vocabulary.objects}
     return Grouping(
         name="objects",

@@ -8,6 +8,7 @@ intersection and difference are exact, and a key's weight is the covered area of
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,7 @@ from schemas.grouping import REST, Grouping, GroupingError
 from schemas.layout import SiteLayout, find_role
 from schemas.selectors import Atom, Everything, Selector, SelectorError, atoms_of, parse_selector
 from schemas.vocabulary import EpisodeTokens, Vocabulary
-from schemas.words import find_phrase, split_words
+from schemas.words import Word, find_phrase, has_phrase, split_words, word_class
 
 #: Axes (replan or 1, key, cell or 1).
 Membership = NDArray[np.bool_]
@@ -74,17 +75,16 @@ def _unknown(atom: Atom, known: dict[str, tuple[str, ...]], vocabulary: Vocabula
     if atom.kind == "role":
         find_role(name)
         return None
-    if atom.kind == "word":
-        words = [name[start:stop] for start, stop in split_words(name)]
-        missing = [word for word in words if word.casefold() not in vocabulary.words]
-        if not missing:
-            return None
-        near = did_you_mean(missing[0], vocabulary.words)
-        return f"no instruction has the word '{missing[0]}'.{near} Words: {listing(vocabulary.words, 40)}."
+    if atom.kind in ("word", "words"):
+        return _unknown_words(atom, vocabulary)
     if atom.kind == "object":
-        if name.startswith("@"):
-            return None if name in _SPECIAL_OBJECTS else _no_such("object class", name, _SPECIAL_OBJECTS)
-        return None if name in vocabulary.objects else _no_such("object", name, vocabulary.objects)
+        if name.startswith("@") and name not in _SPECIAL_OBJECTS:
+            return _no_such("object class", name, _SPECIAL_OBJECTS)
+        if not vocabulary.objects:
+            return f"{NO_COVERAGE}."
+        return (
+            None if name in (*vocabulary.objects, *_SPECIAL_OBJECTS) else _no_such("object", name, vocabulary.objects)
+        )
     if atom.kind in known:
         if atom.kind == "patch":
             name = name.partition("[")[0]
@@ -94,11 +94,41 @@ def _unknown(atom: Atom, known: dict[str, tuple[str, ...]], vocabulary: Vocabula
     return None
 
 
+def _unknown_words(atom: Atom, vocabulary: Vocabulary) -> str | None:
+    if atom.kind == "words" and atom.argument.casefold() not in _WORD_CLASSES:
+        return _no_such("word class", atom.argument, _WORD_CLASSES)
+    if not vocabulary.words:
+        return f"{NO_WORDS}."
+    if atom.kind == "words":
+        return None
+    words = [atom.argument[start:stop] for start, stop in split_words(atom.argument)]
+    if not words:
+        return f"'{atom.argument}' has no letter or digit, so it is no word."
+    for word in words:
+        if word.casefold() not in vocabulary.words:
+            near = did_you_mean(word, vocabulary.words)
+            return f"no instruction has the word '{word}'.{near} Words: {listing(vocabulary.words, 40)}."
+    if not any(has_phrase(sentence, atom.argument) for sentence in vocabulary.sentences):
+        nearest = max(vocabulary.sentences, key=lambda sentence: sum(word.casefold() in sentence for word in words))
+        return (
+            f"no instruction has the words '{atom.argument}' one after the other. Nearest: '{' '.join(nearest)}'; a list of "
+            "word: selectors takes single words."
+        )
+    return None
+
+
 def _no_such(kind: str, name: str, existing: tuple[str, ...]) -> str:
     return f"there is no {kind} '{name}'.{did_you_mean(name, existing)} Existing: {listing(existing, 40)}."
 
 
 _SPECIAL_OBJECTS = ("@interest", "@robot", "@background")
+_WORD_CLASSES = ("content", "stop", "all")
+#: Why there is nothing to name, and what to do about it.
+NO_WORDS = "the keys of this site spell no words; choose a site with text by --site (Cosmos: cross)"
+NO_COVERAGE = (
+    "no selected episode has object coverage at this site, which is recorded from the simulator's segmentation; choose a site "
+    "with pictures by --site (Cosmos: self), or use a store as vla-capture wrote it, not a copy without objects"
+)
 
 
 def resolve(grouping: Grouping, tokens: EpisodeTokens) -> ResolvedGrouping:
@@ -143,6 +173,25 @@ def memberships(grouping: Grouping, tokens: EpisodeTokens) -> dict[str, Membersh
         if selectors[0].strip() == REST:
             members[group] = ~taken
     return members
+
+
+def shared_keys(grouping: Grouping, tokens: EpisodeTokens) -> NDArray[np.float64]:
+    """How many keys two groups have in common, shape (replan or 1, group, group); the diagonal is each group's own number.
+
+    Exact for objects too: two halves of one patch that do not touch share nothing.
+    """
+    members = list(memberships(grouping, tokens).values())
+    cells = cell_coverage(tokens) if any(member.shape[2] > 1 for member in members) else None
+    counts = {
+        (i, j): _weights(first & second, cells).sum(axis=1, dtype=np.float64)
+        for i, first in enumerate(members)
+        for j, second in enumerate(members[: i + 1])
+    }
+    replans = max(len(count) for count in counts.values())
+    shared = np.zeros((replans, len(members), len(members)))
+    for (i, j), count in counts.items():
+        shared[:, i, j] = shared[:, j, i] = count
+    return shared
 
 
 def _raise_overlap(group: str, member: Membership, others: dict[str, Membership], tokens: EpisodeTokens) -> None:
@@ -218,9 +267,22 @@ def _frame(argument: str, tokens: EpisodeTokens) -> Membership:
 
 
 def _word(argument: str, tokens: EpisodeTokens) -> Membership:
+    return _keys_of_words(tokens, [find_phrase(words, argument) for words in tokens.words])
+
+
+def _words(argument: str, tokens: EpisodeTokens) -> Membership:
+    wanted = argument.casefold()
+    if wanted not in _WORD_CLASSES:
+        raise SelectorError("T" + _no_such("word class", argument, _WORD_CLASSES)[1:])
+    chosen = [[word for word in words if wanted in ("all", word_class(word.text))] for words in tokens.words]
+    return _keys_of_words(tokens, chosen)
+
+
+def _keys_of_words(tokens: EpisodeTokens, chosen: Sequence[Sequence[Word]]) -> Membership:
+    """The keys of the words that were chosen from each of the episode's prompts."""
     by_prompt = np.zeros((max(1, len(tokens.prompts)), tokens.layout.num_keys), dtype=bool)
-    for row, words in zip(by_prompt, tokens.words, strict=False):
-        for word in find_phrase(words, argument):
+    for row, words in zip(by_prompt, chosen, strict=False):
+        for word in words:
             row[list(word.keys)] = True
     if len(by_prompt) == 1 or tokens.prompt_index is None:
         return by_prompt[:1, :, None]
@@ -282,6 +344,7 @@ _ATOMS = {
     "span": _span,
     "frame": _frame,
     "word": _word,
+    "words": _words,
     "object": _object,
     "patch": _patch,
     "keys": _keys,

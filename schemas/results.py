@@ -23,8 +23,36 @@ class ResultsNotFound(ResultsError, FileNotFoundError):
 
 
 @dataclass(frozen=True)
+class FrameProxy:
+    """What the published Cosmos scripts measure: one latent frame's mass over another's, of one frame's queries, in self-attention.
+
+    Their masses are sums over the queries, their fractions parts of the two frames' masses only. `selected_call_s` is the
+    sequence length of the call whose rows are used, the frames are named as the user named them, and `num_queries` is the number of
+    queries in the frame.
+    """
+
+    selected_call_s: int
+    query_frame: str
+    visual_frame: str
+    text_frame: str
+    num_queries: int
+
+    def fields(self) -> dict[str, int | str]:
+        """The fields that every step of a results file has of it, under their published names."""
+        return {
+            "selected_call_S": self.selected_call_s,
+            "query_frame": self.query_frame,
+            "visual_frame": self.visual_frame,
+            "text_frame": self.text_frame,
+        }
+
+
+@dataclass(frozen=True)
 class StepRatio:
-    """One replan. `step` is the environment step index, waiting steps included; masses and fractions are without unit."""
+    """One replan. `step` is the environment step index, waiting steps included; masses and fractions are without unit.
+
+    The last four are there when a ratio of latent frames was measured (see `FrameProxy`), and absent otherwise.
+    """
 
     step: int
     visual_linguistic_ratio: float | None
@@ -34,6 +62,10 @@ class StepRatio:
     linguistic_fraction: float | None
     action_mass: float | None = None
     action_fraction: float | None = None
+    selected_call_S: int | None = None
+    query_frame: str | None = None
+    visual_frame: str | None = None
+    text_frame: str | None = None
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
     selector   = term { ("|" | "-") term }          left to right
     term       = factor { "&" factor }              binds tighter than | and -
     factor     = "(" selector ")" | "*" | kind ":" argument
-    argument   = "quoted text" | a run without spaces, &, |, ( and ) | name[r0:r1,c0:c1]
+    argument   = "quoted text" | 'quoted text' | a run without spaces, &, |, ( and ) | name[r0:r1,c0:c1]
 
 `-` is an operator only with spaces around it, so that names and ranges (`keys:3-9`) may contain it. `*` is every key.
 """
@@ -22,6 +22,7 @@ SELECTOR_KINDS: dict[str, str] = {
     "span": "every key of one span",
     "frame": "every key of one latent frame",
     "word": "every piece of a word of the instruction; a phrase in quotes",
+    "words": "the words of the instruction by class: content, stop (a shipped list of function words) or all",
     "object": "the patches that an object covers, by covered area; @interest, @robot or @background",
     "patch": "a region of a camera's patch grid: camera[r0:r1,c0:c1], rows and columns from the top left, r1 and c1 excluded",
     "keys": "keys by number, a-b with both ends",
@@ -59,7 +60,7 @@ Selector = Atom | Everything | Operation
 _TOKEN = re.compile(
     r"""\s*(?:
       (?P<open>\() | (?P<close>\)) | (?P<and>&) | (?P<or>\|) | (?P<minus>-(?=\s|$)) | (?P<star>\*)
-      | (?P<kind>[A-Za-z_]+):(?P<argument>"[^"]*" | [^\s&|()\[\]"]+(?:\[[^\]]*\])? | )
+      | (?P<kind>[A-Za-z_]+):(?P<argument>"[^"]*" | '[^']*' | [^\s&|()\[\]"']+[^\s&|()\[\]"]*(?:\[[^\]]*\])? | )
     )""",
     re.VERBOSE,
 )
@@ -75,6 +76,10 @@ def atoms_of(selector: Selector) -> tuple[Atom, ...]:
     if isinstance(selector, Operation):
         return atoms_of(selector.left) + atoms_of(selector.right)
     return (selector,) if isinstance(selector, Atom) else ()
+
+
+def _unquoted(argument: str) -> str:
+    return argument[1:-1] if argument[:1] in ('"', "'") else argument
 
 
 class _Parser:
@@ -97,7 +102,7 @@ class _Parser:
             kind = match.lastgroup or ""
             if kind == "argument":
                 self._check_atom(match, start)
-                tokens.append(("atom", match["kind"] + ":" + match["argument"].strip('"'), start))
+                tokens.append(("atom", match["kind"] + ":" + _unquoted(match["argument"]), start))
             else:
                 tokens.append((kind, match[kind], start))
             position = match.end()
@@ -110,7 +115,7 @@ class _Parser:
                 f"unknown kind '{match['kind']}:';{did_you_mean(match['kind'], SELECTOR_KINDS).lower()} "
                 f"existing kinds: {listing(SELECTOR_KINDS)}",
             )
-        if not match["argument"].strip('"').strip():
+        if not _unquoted(match["argument"]).strip():
             raise self._fail(start, f"expected a name after '{match['kind']}:'")
 
     def _peek(self) -> tuple[str, str, int]:

@@ -73,7 +73,8 @@ class EpisodeTokens:
 class Vocabulary:
     """The names that selectors may use over a selection of episodes, for validation and for "did you mean".
 
-    `layout` is the site's, which all episodes of a selection share.
+    `words` are case-folded, and `sentences` are the instructions as such words; `layout` is the site's, which all episodes of a
+    selection share.
     """
 
     cameras: tuple[str, ...]
@@ -82,6 +83,7 @@ class Vocabulary:
     words: tuple[str, ...]
     objects: tuple[str, ...]
     layout: SiteLayout | None = None
+    sentences: tuple[tuple[str, ...], ...] = ()
 
 
 def collect_vocabulary(episodes: Iterable[EpisodeTokens]) -> Vocabulary:
@@ -91,6 +93,7 @@ def collect_vocabulary(episodes: Iterable[EpisodeTokens]) -> Vocabulary:
     roles: dict[str, None] = {}
     words: dict[str, None] = {}
     objects: dict[str, None] = {}
+    sentences: dict[tuple[str, ...], None] = {}
     layout: SiteLayout | None = None
     for tokens in episodes:
         layout = tokens.layout
@@ -100,7 +103,11 @@ def collect_vocabulary(episodes: Iterable[EpisodeTokens]) -> Vocabulary:
                 cameras[span.camera] = None
         roles.update({Role(code).label: None for code in np.unique(tokens.static_roles)})
         for line in tokens.words:
-            words.update({word.text.casefold(): None for word in line})
+            sentence = tuple(word.text.casefold() for word in line)
+            sentences[sentence] = None
+            words.update(dict.fromkeys(sentence))
         if tokens.coverage:
             objects.update({thing.name: None for thing in tokens.objects})
-    return Vocabulary(tuple(cameras), tuple(spans), tuple(roles), tuple(words), tuple(objects), layout)
+    return Vocabulary(
+        tuple(cameras), tuple(spans), tuple(roles), tuple(words), tuple(objects), layout, tuple(sentences)
+    )

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
+from typing import Literal
 
 from schemas.layout import Piece, Prompt
+
+WordClass = Literal["content", "stop"]
 
 _WORD = re.compile(r"\w+(?:['\u2019-]\w+)*")
 
@@ -39,14 +44,35 @@ def words_of(prompt: Prompt) -> tuple[Word, ...]:
 def find_phrase(words: Sequence[Word], phrase: str) -> tuple[Word, ...]:
     """Every word that takes part in an occurrence of the phrase (case-insensitive, whole words, in sequence)."""
     wanted = [phrase[start:stop].casefold() for start, stop in split_words(phrase)]
-    if not wanted:
-        return ()
     given = [word.text.casefold() for word in words]
-    found: dict[int, Word] = {}
-    for first in range(len(given) - len(wanted) + 1):
-        if given[first : first + len(wanted)] == wanted:
-            found.update({i: words[i] for i in range(first, first + len(wanted))})
-    return tuple(found.values())
+    taken = {i for first in _occurrences(given, wanted) for i in range(first, first + len(wanted))}
+    return tuple(words[i] for i in sorted(taken))
+
+
+@functools.cache
+def stop_words() -> frozenset[str]:
+    """The shipped stop list (`word_lists/english_stop_words.txt`, which says what is in it and why), in lower case."""
+    text = files("schemas").joinpath("word_lists", "english_stop_words.txt").read_text(encoding="utf-8")
+    return frozenset(word for line in text.splitlines() for word in line.partition("#")[0].split())
+
+
+def word_class(word: str) -> WordClass:
+    """`stop` for a word of the stop list, else `content`. Needs no model: the same word has the same class everywhere."""
+    return "stop" if word.casefold().replace("\u2019", "'") in stop_words() else "content"
+
+
+def has_phrase(sentence: Sequence[str], phrase: str) -> bool:
+    """Whether the words of a phrase follow each other in a sentence, both case-folded."""
+    wanted = [phrase[start:stop].casefold() for start, stop in split_words(phrase)]
+    return any(True for _ in _occurrences(sentence, wanted))
+
+
+def _occurrences(given: Sequence[str], wanted: Sequence[str]) -> Iterator[int]:
+    """Where the wanted words begin, one after the other, among the given ones."""
+    if wanted:
+        for first in range(len(given) - len(wanted) + 1):
+            if list(given[first : first + len(wanted)]) == list(wanted):
+                yield first
 
 
 def _keys_between(pieces: Sequence[Piece], begin: int, end: int) -> tuple[int, ...]:

@@ -8,16 +8,25 @@ import numpy as np
 import polars as pl
 
 from analyze.aggregate import LAYERS_AVG, layer_order, overall_layer, overall_rows
-from analyze.plots.style import drawn_in_our_style, group_styles, new_figure, plural, save_figure, title, wrapped
+from analyze.plots.style import drawn_in_our_style, group_styles, named, new_figure, plural, save_figure, title, wrapped
 from schemas.grouping import Grouping
 
 STEM = "attention_fractions"
 
 
 @drawn_in_our_style
-def plot_attention_fractions(tasks: pl.DataFrame, grouping: Grouping, folder: Path) -> list[Path]:
+def plot_attention_fractions(
+    tasks: pl.DataFrame,
+    grouping: Grouping,
+    folder: Path,
+    *,
+    stem: str = STEM,
+    about: str | None = None,
+    note: str = "",
+) -> list[Path]:
     """Draw from `aggregate.tasks_table` (its rows over everything); returns the paths of png, pdf and csv.
 
+    `stem`: the files' name. `about`: what the title says the fractions are of, the grouping unless given. `note`: a further sentence.
     Fractions are means over episodes; they sum to 1 also where groups overlap, because each is a share of the summed masses.
     """
     rows = overall_rows(tasks)
@@ -31,16 +40,16 @@ def plot_attention_fractions(tasks: pl.DataFrame, grouping: Grouping, folder: Pa
         positions[-1] += 0.6  # apart from the single layers
     figure = new_figure(max(6.2, 3.4 + 0.42 * len(layers)), 4.6)
     overall = by_layer[overall_layer(rows)]
-    note = f"n = {plural(overall['num_episodes'], 'episode')} of {plural(overall['num_tasks'], 'task')}, means over episodes."
+    counts = f"n = {plural(overall['num_episodes'], 'episode')} of {plural(overall['num_tasks'], 'task')}, means over episodes."
     if grouping.overlap:
-        note += " Groups overlap: a fraction is the share in the sum of all groups' masses."
-    title(figure, f"Attention fractions, grouping '{grouping.name}'", note)
+        counts += " Groups overlap: a fraction is the share in the sum of all groups' masses."
+    title(figure, f"Attention fractions, {about or named(grouping)}", f"{counts} {note}")
     axes = figure.subplots()
     styles = group_styles(grouping.names)
     bottom = np.zeros(len(layers))
     for i, name in enumerate(grouping.names):
-        if not rows[f"{name}_keys"].sum():
-            continue  # a group without a key, like state digits where the prompt has none
+        if rows[f"{name}_keys"].sum() == 0 and rows[f"{name}_keys"].null_count() == 0:
+            continue  # a group without a key, like state digits where the prompt has none (null: nobody knows)
         style = styles[name]
         empty = not fractions[:, i].any()
         label = wrapped(name, 28, 1) + (" (0)" if empty else "")
@@ -69,7 +78,7 @@ def plot_attention_fractions(tasks: pl.DataFrame, grouping: Grouping, folder: Pa
     axes.legend(handles[::-1], labels[::-1], loc="upper left", bbox_to_anchor=(1.0, 1.0))
     columns = [f"{name}_fraction{end}" for name in grouping.names for end in ("", "_low", "_high")]
     data = rows.filter(pl.col("layer").is_in(layers)).select("layer", "block", "num_episodes", *columns)
-    return save_figure(figure, folder, STEM, data)
+    return save_figure(figure, folder, stem, data)
 
 
 def _ink(color: str) -> str:

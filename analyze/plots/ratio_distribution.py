@@ -17,6 +17,7 @@ from analyze.plots.style import (
     NOTE_COLOR,
     drawn_in_our_style,
     explain,
+    named,
     new_figure,
     plural,
     ratio_axis,
@@ -37,8 +38,19 @@ _MEDIAN_COLOR, _BOX_COLOR, _DOT_COLOR = "#D55E00", "#CFE3F1", "#333333"
 
 
 @drawn_in_our_style
-def plot_ratio_distribution(replans: pl.DataFrame, grouping: Grouping, folder: Path) -> list[Path]:
-    """Draw from the table of replans (`aggregate.add_layers_avg`); returns the paths of png, pdf and csv."""
+def plot_ratio_distribution(
+    replans: pl.DataFrame,
+    grouping: Grouping,
+    folder: Path,
+    *,
+    stem: str = STEM,
+    about: str | None = None,
+    note: str = "",
+) -> list[Path]:
+    """Draw from the table of replans (`aggregate.add_layers_avg`); returns the paths of png, pdf and csv.
+
+    `stem`: the files' name. `about`: what the title says the ratios are of, the grouping unless given. `note`: a further sentence.
+    """
     layers = layer_order(replans)
     if len(layers) == 2 and LAYERS_AVG in layers:
         layers.remove(LAYERS_AVG)  # of a single layer: the same numbers once more
@@ -48,7 +60,7 @@ def plot_ratio_distribution(replans: pl.DataFrame, grouping: Grouping, folder: P
     if grouping.ratio is None:
         figure = new_figure(8, 3)
         explain(figure.subplots(), f"Grouping '{grouping.name}' defines no ratio.")
-        return save_figure(figure, folder, STEM, rows.select(columns))
+        return save_figure(figure, folder, stem, rows.select(columns))
     data = rows.select(*columns, "ratio", "uniform_ratio")
     overall = rows.filter(pl.col("layer") == chosen)
     height = 2.9 + 0.24 * len(layers) + 0.9
@@ -56,12 +68,12 @@ def plot_ratio_distribution(replans: pl.DataFrame, grouping: Grouping, folder: P
     shown = rows.filter(_drawable())
     title(
         figure,
-        f"Ratio over replans, grouping '{grouping.name}'",
-        _counts(overall, rows, chosen) if shown.height else "",
+        f"Ratio over replans, {about or named(grouping)}",
+        f"{_counts(overall, rows, chosen)} {note}" if shown.height else "",
     )
     if shown.is_empty():
         explain(figure.subplots(), _why_empty(rows))
-        return save_figure(figure, folder, STEM, data)
+        return save_figure(figure, folder, stem, data)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[2.2, 0.5 + 0.24 * len(layers)])
     uniform = rows["uniform_ratio"].drop_nulls().to_numpy()
     uniform = uniform[np.isfinite(uniform) & (uniform > 0)]
@@ -73,7 +85,7 @@ def plot_ratio_distribution(replans: pl.DataFrame, grouping: Grouping, folder: P
         axes.grid(axis="x")
     top.legend(handles=_legend(uniform), loc="upper left", bbox_to_anchor=(1.0, 1.0))
     bottom.set_xlabel(f"ratio of masses, {ratio_name(grouping.ratio)} (logarithmic)")
-    return save_figure(figure, folder, STEM, data)
+    return save_figure(figure, folder, stem, data)
 
 
 def _drawable() -> pl.Expr:

@@ -16,6 +16,7 @@ from analyze.plots.style import (
     NOTE_COLOR,
     drawn_in_our_style,
     explain,
+    named,
     new_figure,
     plural,
     ratio_axis,
@@ -50,10 +51,15 @@ def plot_ratio_per_task(
     folder: Path,
     layer: str | None = None,
     level: float = 0.95,
+    *,
+    stem: str = STEM,
+    about: str | None = None,
+    note: str = "",
 ) -> list[Path]:
     """Draw from `aggregate.episodes_table` and `aggregate.tasks_table`; returns the paths of png, pdf and csv.
 
-    `layer`: which one, "layers_avg" unless given. `level` is that of the intervals in `tasks`.
+    `layer`: which one, "layers_avg" unless given. `level` is that of the intervals in `tasks`. `stem`: the files' name.
+    `about`: what the title says the ratios are of, the grouping unless given. `note`: a further sentence.
     """
     layer = layer or overall_layer(tasks)
     rows = tasks.filter((pl.col("layer") == layer) & (pl.col("scope") == "task"))
@@ -63,14 +69,14 @@ def plot_ratio_per_task(
     if grouping.ratio is None:
         figure = new_figure(8, 3)
         explain(figure.subplots(), f"Grouping '{grouping.name}' defines no ratio.")
-        return save_figure(figure, folder, STEM, rows.select(identity))
+        return save_figure(figure, folder, stem, rows.select(identity))
     data = pl.concat([rows, overall]).select(*identity, *_COLUMNS)
     # One task is its own total.
     shown = pl.concat([rows, overall]) if rows.height > 1 else rows
     few = rows.height <= _MANY
     figure = new_figure(9, 1.6 + (0.46 if few else 0.2) * (shown.height + 0.5))
     name = layer if layer == LAYERS_AVG else f"layer {layer}"
-    title(figure, f"Ratio per task, {name}, grouping '{grouping.name}'", _counts(rows, dots))
+    title(figure, f"Ratio per task, {name}, {about or named(grouping)}", f"{_counts(rows, dots)} {note}")
     axes = figure.subplots()
     values = [data[column].drop_nulls().to_numpy() for column in _COLUMNS[:4]] + [
         dots["ratio_mean"].drop_nulls().to_numpy()
@@ -81,7 +87,7 @@ def plot_ratio_per_task(
             axes,
             f"No episode has a finite ratio: all {left_out} ratios are infinite (no denominator mass) or undefined.",
         )
-        return save_figure(figure, folder, STEM, data)
+        return save_figure(figure, folder, stem, data)
     ratio_axis(axes.xaxis, np.concatenate(values))
     _draw_rows(axes, shown, dots, few)
     several = rows["suite"].n_unique() > 1
@@ -90,8 +96,13 @@ def plot_ratio_per_task(
     axes.tick_params(axis="y", length=0)
     axes.grid(axis="x")
     axes.set_xlabel(f"ratio of masses, {ratio_name(grouping.ratio)} (logarithmic)")
-    _legend(axes, level, with_interval=shown["ratio_mean_low"].is_not_null().any())
-    return save_figure(figure, folder, STEM, data)
+    _legend(
+        axes,
+        level,
+        with_interval=shown["ratio_mean_low"].is_not_null().any(),
+        with_baseline=shown["uniform_ratio"].is_not_null().any(),
+    )
+    return save_figure(figure, folder, stem, data)
 
 
 def _draw_rows(axes: Axes, shown: pl.DataFrame, dots: pl.DataFrame, few: bool) -> None:
@@ -149,12 +160,13 @@ def _label(row: dict, several: bool, few: bool) -> str:
     return wrapped(f"{number}: {row['instruction']}", 52 if few else 60, 2 if few else 1)
 
 
-def _legend(axes: Axes, level: float, with_interval: bool) -> None:
+def _legend(axes: Axes, level: float, with_interval: bool, with_baseline: bool) -> None:
     axes.plot([], [], "o", color=DATA_COLOR, markersize=6, label="mean over episodes")
     if with_interval:
         axes.plot([], [], color=DATA_COLOR, linewidth=2, label=f"{level:.0%} bootstrap interval")
     axes.scatter([], [], s=14, color="#56B4E9", linewidths=0, label="single episode")
-    axes.plot([], [], "--", color=BASELINE_COLOR, linewidth=1.2, label=BASELINE_LABEL)
+    if with_baseline:
+        axes.plot([], [], "--", color=BASELINE_COLOR, linewidth=1.2, label=BASELINE_LABEL)
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderaxespad=0.1, handlelength=1.5)
 
 

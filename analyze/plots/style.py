@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 
 from analyze.atomic_file import replacing
-from schemas.grouping import Ratio
+from schemas.grouping import Grouping, Ratio
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -161,6 +161,11 @@ def wrapped(text: str, width: int, lines: int) -> str:
     return "\n".join(textwrap.wrap(" ".join(text.split()), width, max_lines=lines, placeholder=" …"))
 
 
+def shortened(name: str, width: int) -> str:
+    """A name that must not be broken at spaces, in at most so many characters, with … where it was cut."""
+    return name if len(name) <= width else f"{name[: width - 1]}…"
+
+
 def whole_numbers(axis: Axis) -> None:
     """Ticks of a linear axis at whole numbers only: counts and steps have no halves."""
     from matplotlib.ticker import MaxNLocator
@@ -189,6 +194,11 @@ def title(figure: Figure, text: str, note: str = "") -> None:
 def plural(count: int, noun: str) -> str:
     """`1 task`, `2 tasks`."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def named(grouping: Grouping) -> str:
+    """What a picture is about, for its title."""
+    return f"grouping '{grouping.name}'"
 
 
 def ratio_name(ratio: Ratio) -> str:

@@ -120,12 +120,15 @@ def make_steps(
         "denoise_time": 1.0 - np.array(denoise_steps)[denoise] / 10.0,
         "head": pl.Series([None] * len(task), dtype=pl.Int64) if heads is None else np.array(heads)[head],
         "row_sum": np.ones(len(task)),
+        "valid_mass": np.ones(len(task)),
         "num_valid": np.full(len(task), round(num_valid)),
     }
     for name, i in number.items():
         columns[f"{name}_mass"] = masses[:, i]
         columns[f"{name}_fraction"] = masses[:, i] / masses.sum(axis=1)
         columns[f"{name}_keys"] = np.full(len(task), keys[name])
+        density = masses[:, i] / keys[name] if keys[name] else None
+        columns[f"{name}_density"] = pl.Series([None] * len(task), dtype=pl.Float64) if density is None else density
         lift = masses[:, i] / keys[name] * round(num_valid) if keys[name] else None
         columns[f"{name}_lift"] = pl.Series([None] * len(task), dtype=pl.Float64) if lift is None else lift
     if grouping.ratio:

@@ -7,8 +7,14 @@ import polars as pl
 import pytest
 
 from analyze.aggregate import add_layers_avg, per_replan
-from analyze.results_file import episode_results, read_results, write_results, write_results_of_suites
-from schemas.results import ResultsError, ResultsNotFound, results_file_name, suite_of_results_file
+from analyze.results_file import (
+    episode_documents,
+    episode_results,
+    read_results,
+    write_results,
+    write_results_of_suites,
+)
+from schemas.results import FrameProxy, ResultsError, ResultsNotFound, results_file_name, suite_of_results_file
 from tests.analyze.synthetic import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps
 
 GROUPING = default_grouping()
@@ -75,9 +81,10 @@ def test_infinite_ratios_are_null_in_strict_json(tmp_path):
 @pytest.mark.parametrize("with_action", [True, False])
 def test_reading_gives_back_what_was_written(tmp_path, with_action):
     grouping, keys = (GROUPING, None) if with_action else (custom_grouping(), CUSTOM_KEYS)
-    results = episode_results(replans_of(make_steps(grouping, keys, no_denominator=0.3), grouping), grouping)
+    replans = replans_of(make_steps(grouping, keys, no_denominator=0.3), grouping)
+    results = episode_results(replans, grouping)
     path = tmp_path / "results" / results_file_name("libero_10")
-    write_results(path, results)
+    write_results(path, episode_documents(replans, grouping))
     assert read_results(path) == results
     assert ("action_mass" in path.read_text(encoding="utf-8")) == with_action
     assert [file.name for file in path.parent.iterdir()] == [path.name]  # nothing temporary stays
@@ -95,6 +102,27 @@ def test_sides_of_another_grouping_are_the_sums_of_the_ratios_groups():
     assert step.action_mass is None
 
 
+def test_a_ratio_of_latent_frames_has_the_published_fields_and_sums_over_queries(tmp_path):
+    """Masses x number of queries, fractions of the two frames only, the frames' names beside every step."""
+    proxy = FrameProxy(1764, "action", "curr_last", "frame0", num_queries=196)
+    replans = replans_of(make_steps())
+    (path,) = write_results_of_suites(tmp_path, replans, GROUPING, proxy)
+    episode = json.loads(path.read_text(encoding="utf-8"))[1]
+    rows = replans.filter(task_id=0, episode_index=1, layer="25").sort("replan")
+    for step, row in zip(episode["per_step_ratios"]["layer_25"], rows.iter_rows(named=True), strict=True):
+        assert step["visual_mass"] == pytest.approx(196 * row["visual_mass"])
+        assert step["linguistic_mass"] == pytest.approx(196 * row["linguistic_mass"])
+        assert step["visual_linguistic_ratio"] == pytest.approx(row["visual_mass"] / row["linguistic_mass"])
+        both = row["visual_mass"] + row["linguistic_mass"]
+        assert step["visual_fraction"] == pytest.approx(row["visual_mass"] / both)
+        assert step["linguistic_fraction"] == pytest.approx(row["linguistic_mass"] / both)
+        names = ("selected_call_S", "query_frame", "visual_frame", "text_frame")
+        assert [step[name] for name in names] == [1764, "action", "curr_last", "frame0"]
+        assert "action_mass" not in step
+    assert "action_mass" not in episode["summary"]["layer_25"]
+    assert read_results(path)[0].per_step_ratios["layers_avg"][0].text_frame == "frame0"
+
+
 def test_every_suite_has_its_own_file(tmp_path):
     steps = pl.concat([make_steps(), make_steps(suite="libero_goal", num_tasks=1)])
     paths = write_results_of_suites(tmp_path, replans_of(steps), GROUPING)
@@ -109,11 +137,12 @@ def test_no_episodes_are_an_empty_list(tmp_path):
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "results.json"
-    results = episode_results(replans_of(make_steps()), GROUPING)
-    write_results(path, results)
+    documents = list(episode_documents(replans_of(make_steps()), GROUPING))
+    write_results(path, documents)
+    results = read_results(path)
 
     def broken():
-        yield results[0]
+        yield documents[0]
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):

@@ -7,22 +7,25 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from scipy import stats
+from scipy import special, stats
 
+from analyze.small_samples import student_quantile
 from analyze.statistics import (
+    POSITIVE,
+    SHARE,
     bootstrap_interval,
     bootstrap_intervals,
     geometric_mean,
     geometric_mean_over_episodes,
     mean_over_episodes,
     ratio_of_means_over_episodes,
-    resampled_counts,
+    resample_episodes,
     summarize,
 )
 
 ONE_TASK = np.zeros(25)
 SAMPLE = np.random.default_rng(3).lognormal(1.0, 0.6, 25)
-POSITIVE = hnp.arrays(np.float64, st.integers(2, 12), elements=st.floats(0.01, 1000.0))
+POSITIVE_SAMPLES = hnp.arrays(np.float64, st.integers(2, 12), elements=st.floats(0.01, 1000.0))
 
 
 def test_summary_is_that_of_numpy_over_finite_values_and_counts_the_others():
@@ -44,7 +47,7 @@ def test_geometric_mean_agrees_with_scipy_and_counts_what_has_no_logarithm():
     assert geometric_mean([0.0]) == (None, 1)
 
 
-@given(POSITIVE)
+@given(POSITIVE_SAMPLES)
 def test_geometric_mean_does_not_depend_on_which_side_is_the_numerator(ratios):
     forward, _ = geometric_mean(ratios)
     backward, _ = geometric_mean(1.0 / ratios)
@@ -53,7 +56,7 @@ def test_geometric_mean_does_not_depend_on_which_side_is_the_numerator(ratios):
 
 @pytest.mark.parametrize("level", [0.95, 0.8])
 def test_one_level_mean_agrees_with_scipy(level):
-    ours = bootstrap_interval(mean_over_episodes(SAMPLE), ONE_TASK, num_resamples=20000, level=level)
+    ours = bootstrap_interval(mean_over_episodes(SAMPLE), ONE_TASK, num_resamples=20000, level=level, widened=False)
     theirs = stats.bootstrap(
         (SAMPLE,), np.mean, n_resamples=20000, confidence_level=level, method="percentile", rng=np.random.default_rng(1)
     ).confidence_interval
@@ -67,7 +70,7 @@ def test_one_level_ratio_of_means_agrees_with_scipy():
     def quotient(x, y, axis=-1):
         return x.mean(axis=axis) / y.mean(axis=axis)
 
-    ours = bootstrap_interval(ratio_of_means_over_episodes(above, below), ONE_TASK, num_resamples=20000)
+    ours = bootstrap_interval(ratio_of_means_over_episodes(above, below), ONE_TASK, num_resamples=20000, widened=False)
     theirs = stats.bootstrap(
         (above, below), quotient, n_resamples=20000, method="percentile", paired=True, rng=np.random.default_rng(1)
     ).confidence_interval
@@ -75,7 +78,9 @@ def test_one_level_ratio_of_means_agrees_with_scipy():
 
 
 def test_one_level_geometric_mean_agrees_with_scipy():
-    ours = bootstrap_interval(geometric_mean_over_episodes(np.log(SAMPLE)), ONE_TASK, num_resamples=20000)
+    ours = bootstrap_interval(
+        geometric_mean_over_episodes(np.log(SAMPLE)), ONE_TASK, num_resamples=20000, widened=False
+    )
     theirs = stats.bootstrap(
         (SAMPLE,), stats.gmean, n_resamples=20000, method="percentile", rng=np.random.default_rng(1)
     ).confidence_interval
@@ -87,7 +92,7 @@ def test_two_levels_agree_with_a_plain_loop():
     sizes = [3, 5, 2, 6]
     tasks = np.repeat([7, 1, 4, 2], sizes)
     values = generator.normal(np.repeat([0.0, 3.0, -1.0, 2.0], sizes), 0.5) + 10
-    ours = bootstrap_interval(mean_over_episodes(values), tasks, num_resamples=20000)
+    ours = bootstrap_interval(mean_over_episodes(values), tasks, num_resamples=20000, widened=False)
     means = []
     for _ in range(4000):
         drawn = generator.choice([7, 1, 4, 2], 4)
@@ -96,7 +101,7 @@ def test_two_levels_agree_with_a_plain_loop():
     low, high = np.quantile(means, [0.025, 0.975])
     assert (ours.low, ours.high) == pytest.approx((low, high), rel=0.02)
     # Tasks differ far more than episodes do: ignoring the first level would claim too much.
-    one_level = bootstrap_interval(mean_over_episodes(values), np.zeros(len(values)))
+    one_level = bootstrap_interval(mean_over_episodes(values), np.zeros(len(values)), widened=False)
     assert ours.high - ours.low > 1.5 * (one_level.high - one_level.low)
 
 
@@ -104,7 +109,7 @@ def test_two_levels_agree_with_a_plain_loop():
 @settings(deadline=None)
 def test_every_resample_draws_whole_tasks(tasks, seed):
     tasks = np.array(tasks)
-    counts = resampled_counts(tasks, num_resamples=20, seed=seed)
+    counts = resample_episodes(tasks, num_resamples=20, seed=seed).counts
     labels, sizes = np.unique(tasks, return_counts=True)
     for row in counts:
         # A task that was drawn k times contributes k times as many draws as it has episodes.
@@ -115,13 +120,13 @@ def test_every_resample_draws_whole_tasks(tasks, seed):
 
 def test_draws_in_pieces_still_draw_each_episode_equally_often(monkeypatch):
     monkeypatch.setattr("analyze.statistics._DRAWS_AT_ONCE", 50)
-    counts = resampled_counts(np.array([0, 0, 0, 1, 1, 1]), num_resamples=4000, seed=1)
+    counts = resample_episodes(np.array([0, 0, 0, 1, 1, 1]), num_resamples=4000, seed=1).counts
     assert counts.shape == (4000, 6)
     assert (counts.sum(axis=1) == 6).all()
     assert counts.mean(axis=0) == pytest.approx(np.ones(6), abs=0.06)
 
 
-@given(POSITIVE, st.floats(0.1, 50.0))
+@given(POSITIVE_SAMPLES, st.floats(0.1, 50.0))
 @settings(deadline=None)
 def test_scaling_the_values_scales_the_interval(values, factor):
     tasks = np.arange(len(values)) // 3
@@ -134,15 +139,78 @@ def test_scaling_the_values_scales_the_interval(values, factor):
     assert (scaled.low, scaled.high) == pytest.approx((plain.low * factor, plain.high * factor), rel=1e-9)
 
 
-@given(POSITIVE)
+@given(POSITIVE_SAMPLES)
 @settings(deadline=None)
-def test_intervals_stay_inside_the_range_of_the_values_and_around_the_mean(values):
-    interval = bootstrap_interval(mean_over_episodes(values), np.zeros(len(values)), num_resamples=1000)
+def test_percentile_intervals_stay_inside_the_range_of_the_values_and_around_the_mean(values):
+    statistic, one_task = mean_over_episodes(values), np.zeros(len(values))
+    interval = bootstrap_interval(statistic, one_task, num_resamples=1000, widened=False)
     slack = 1e-9 * values.max()
     assert values.min() - slack <= interval.low <= interval.high <= values.max() + slack
     assert interval.low <= values.mean() + slack
     # The bootstrap distribution of very skewed samples can leave the mean at its edge, never beyond the other side.
     assert interval.high >= values.mean() - slack - 0.2 * np.ptp(values)
+
+
+@pytest.mark.parametrize("episodes", [2, 5, 25])
+def test_one_task_is_widened_by_students_t_and_the_lost_degree_of_freedom(episodes):
+    values = SAMPLE[:episodes]
+    plain, widened = (
+        bootstrap_interval(mean_over_episodes(values), np.zeros(episodes), widened=flag) for flag in (False, True)
+    )
+    factor = stats.t.ppf(0.975, episodes - 1) / stats.norm.ppf(0.975) * np.sqrt(episodes / (episodes - 1))
+    assert widened.low == pytest.approx(values.mean() + factor * (plain.low - values.mean()))
+    assert widened.high == pytest.approx(values.mean() + factor * (plain.high - values.mean()))
+
+
+def test_ratios_are_widened_on_a_logarithmic_scale_and_fractions_on_that_of_the_odds():
+    tasks = np.arange(25) // 5
+    factor = stats.t.ppf(0.975, 4) / stats.norm.ppf(0.975) * np.sqrt(5 / 4)
+    shares = SAMPLE / SAMPLE.max() * 0.99
+    for values, limits, scale in ((SAMPLE, POSITIVE, np.log), (shares, SHARE, special.logit)):
+        plain, widened = (
+            bootstrap_interval(mean_over_episodes(values, limits), tasks, widened=flag) for flag in (False, True)
+        )
+        centre = scale(values.mean())
+        assert scale(widened.low) == pytest.approx(centre + factor * (scale(plain.low) - centre))
+        assert scale(widened.high) == pytest.approx(centre + factor * (scale(plain.high) - centre))
+
+
+@given(hnp.arrays(np.float64, st.integers(2, 8), elements=st.floats(0.0, 1.0)), st.integers(1, 4))
+@settings(deadline=None)
+def test_widened_intervals_hold_the_percentile_interval_and_never_leave_the_limits(values, per_task):
+    tasks = np.arange(len(values)) // per_task
+    for limits in (SHARE, POSITIVE):
+        statistic = mean_over_episodes(values, limits)
+        plain, widened = (bootstrap_interval(statistic, tasks, 200, widened=flag) for flag in (False, True))
+        assert limits[0] <= widened.low <= widened.high <= limits[1]
+        slack = 1e-9
+        # With one-sided resamples even the percentile interval may lie beside the estimate, and then moves as a whole.
+        if plain.low <= statistic.value <= plain.high:
+            assert widened.low <= plain.low + slack
+            assert widened.high >= plain.high - slack
+
+
+@pytest.mark.parametrize("level", [0.5, 0.9, 0.95, 0.999])
+def test_quantiles_of_students_t_agree_with_scipy(level):
+    for degrees in (1, 2, 3, 4, 5, 9, 30, 49, 600, 5000):
+        assert student_quantile(level, degrees) == pytest.approx(stats.t.ppf(0.5 + level / 2, degrees), rel=1e-3)
+        if degrees < 2000:
+            assert student_quantile(level, degrees) == pytest.approx(stats.t.ppf(0.5 + level / 2, degrees), rel=1e-9)
+
+
+def test_five_episodes_are_covered_like_by_students_interval_and_far_better_than_by_percentiles():
+    """A thousand samples with a known mean. Student's interval covers 95 % of these exactly, but for the chance of the samples."""
+    generator = np.random.default_rng(11)
+    hits = {True: 0, False: 0, "student": 0}
+    for i in range(1000):
+        sample = generator.normal(3.0, 0.5, 5)
+        for widened in (True, False):
+            interval = bootstrap_interval(mean_over_episodes(sample), np.zeros(5), seed=i, widened=widened)
+            hits[widened] += interval.low <= 3.0 <= interval.high
+        low, high = stats.t.interval(0.95, 4, sample.mean(), stats.sem(sample))
+        hits["student"] += low <= 3.0 <= high
+    assert hits[True] > hits["student"] - 25
+    assert hits[False] < hits["student"] - 60
 
 
 def test_order_of_episodes_matters_no_more_than_the_seed():
@@ -169,7 +237,8 @@ def test_one_episode_or_one_usable_episode_gives_no_interval():
 
 
 def test_undefined_resamples_are_counted():
-    interval = bootstrap_interval(mean_over_episodes([1.0, 2.0, np.inf]), [0, 0, 0], num_resamples=5000)
+    statistic = mean_over_episodes([1.0, 2.0, np.inf])
+    interval = bootstrap_interval(statistic, [0, 0, 0], num_resamples=5000, widened=False)
     # All three draws hit the infinite episode with probability 1/27.
     assert interval.num_undefined / 5000 == pytest.approx(1 / 27, abs=0.01)
     assert 1.0 <= interval.low <= interval.high <= 2.0
@@ -184,7 +253,7 @@ def test_ratio_of_means_without_any_denominator_is_infinite():
 def test_several_statistics_at_once_are_the_same_as_one_by_one():
     tasks = np.arange(25) // 5
     statistics = [mean_over_episodes(SAMPLE), geometric_mean_over_episodes(np.where(SAMPLE > 6, np.nan, SAMPLE))]
-    together = bootstrap_intervals(statistics, resampled_counts(tasks, 500, 9))
+    together = bootstrap_intervals(statistics, resample_episodes(tasks, 500, 9))
     for statistic, interval in zip(statistics, together, strict=True):
         alone = bootstrap_interval(statistic, tasks, 500, seed=9)
         assert (interval.low, interval.high) == pytest.approx((alone.low, alone.high), rel=1e-12)

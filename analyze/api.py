@@ -1,0 +1,273 @@
+"""The Python API: an opened store whose methods mirror the commands of `vla-analyze` and return polars frames.
+
+The examples run as tests, with `store` and `other` being paths of small stores and `folder` that of an empty folder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal, Unpack
+
+import polars as pl
+
+from analyze.keywords import Settings, analysis_settings
+from analyze.opened import Opened, check_name
+from analyze.question import ask
+from analyze.reader import open_store
+from analyze.selection import check_combinable
+from schemas.errors import BadArgument, listing
+
+
+def open_stores(stores: str | Path | Sequence[str | Path]) -> OpenStores:
+    """See `analyze.open`."""
+    paths = [stores] if isinstance(stores, (str, Path)) else list(stores)
+    if not paths:
+        raise BadArgument("No store was given; expected the path of a NAME.zarr, or several.")
+    opened = tuple(open_store(Path(path)) for path in paths)
+    check_combinable(opened)
+    return OpenStores(opened)
+
+
+class OpenStores(Opened):
+    """One or several stores, opened for questions. Made by `analyze.open`; holds the episodes that were complete then.
+
+    Every method takes the keywords of `analyze.keywords.Settings`, reads what it needs and no more, and returns a polars frame
+    (which of several is chosen by `table`). Mistakes raise a `schemas.errors.UserError` that says what exists.
+
+    Attributes:
+        stores: the stores, as `analyze.reader` opens them.
+        attributes: the run's own description (policy, protocol, recording, sites) of the first store.
+
+    >>> run = analyze.open(store)
+    >>> run.attributes.recording.layers
+    (0, 2)
+    >>> print(run)
+    OpenStores of 1 store: 4 episodes of 2 tasks (2 solved), 12 replans, suite made_up
+    """
+
+    def groups(
+        self, table: Literal["groups", "words", "overlaps"] = "groups", **settings: Unpack[Settings]
+    ) -> pl.DataFrame:
+        """What a grouping takes, before any number: keys by span and role, words with their pieces, shared keys.
+
+        >>> found = analyze.open(store).groups(groups={"bowl": "word:bowl", "rest": "*"})
+        >>> found.filter(pl.col("span").is_null(), group="bowl")["keys_max"].to_list()
+        [1.0]
+        """
+        from analyze.group_preview import preview_groups
+
+        check_name("table", table, ("groups", "words", "overlaps"))
+        return _frame(preview_groups(self.ask(**settings)), table)
+
+    def heads(
+        self, table: Literal["heads", "dispersion", "depth", "denoise"] = "heads", **settings: Unpack[Settings]
+    ) -> pl.DataFrame:
+        """Who looks and who reads: every head, how much heads differ, the profile over depth, over denoise steps.
+
+        >>> analyze.open(store).heads()["head"].unique().sort().to_list()
+        [0, 1]
+        """
+        from analyze.metrics.head_study import study_heads
+
+        check_name("table", table, ("heads", "dispersion", "depth", "denoise"))
+        return _frame(study_heads(self.ask(**settings)), table)
+
+    def row_metrics(self, **settings: Unpack[Settings]) -> pl.DataFrame:
+        """Entropy, effective number of keys and top-k mass of every row (`analyze.metrics.row_metrics`). Reads all rows.
+
+        >>> analyze.open(store).row_metrics(layers=0, denoise="first", heads=1).height
+        12
+        """
+        from analyze.metrics.row_metrics import row_metrics_table
+
+        return row_metrics_table(self.ask(**settings))
+
+    def sinks(self, **settings: Unpack[Settings]) -> pl.DataFrame:
+        """Keys that take far more than their share in most rows (`analyze.metrics.sinks`), per task. Reads all rows.
+
+        >>> analyze.open(store).sinks().columns[:3]
+        ['suite', 'task_id', 'num_episodes']
+        """
+        from analyze.metrics.sinks import sinks_table
+
+        return sinks_table(self.ask(**settings))
+
+    def words(self, table: Literal["summary", "episodes"] = "summary", **settings: Unpack[Settings]) -> pl.DataFrame:
+        """Which words are read: over all episodes with intervals ("summary"), or per episode and layer.
+
+        >>> words = analyze.open(store).words(tasks=0)
+        >>> sorted(words.filter(kind="word")["item"].to_list())
+        ['bowl', 'on', 'plate', 'put', 'the']
+        """
+        from analyze.word_reading import site_of_words, words_summary, words_table
+
+        check_name("table", table, ("summary", "episodes"))
+        settings["site"] = site_of_words(self.attributes, settings.get("site"))
+        question = self.ask(**settings)
+        episodes = words_table(question)
+        return episodes if table == "episodes" else words_summary(episodes, seed=question.settings.seed)
+
+    def objects(
+        self, table: Literal["objects", "times", "iou"] = "objects", **settings: Unpack[Settings]
+    ) -> pl.DataFrame:
+        """Which objects are looked at: shares and lifts, shares over time, or pointing game and IoU with their masks.
+
+        >>> objects = analyze.open(store).objects()
+        >>> "akita_black_bowl_1" in objects["item"].to_list()
+        True
+
+        Raises:
+            BadArgument: the stores hold no object masks.
+        """
+        from analyze.object_attention import ObjectSettings, object_tables
+
+        check_name("table", table, ("objects", "times", "iou"))
+        return _frame(object_tables(self.ask(**settings), ObjectSettings(spatial=table == "iou")), table)
+
+    def time(
+        self,
+        table: Literal["course", "closing", "change", "outcomes", "autocorrelation"] = "course",
+        bins: int | None = None,
+        window: int | None = None,
+        **settings: Unpack[Settings],
+    ) -> pl.DataFrame:
+        """Over the course of an episode: phase-aligned means, the gripper's closing, success against failure.
+
+        `bins` and `window` are those of `analyze.time_courses.TimeSettings`.
+
+        >>> course = analyze.open(store).time(bins=3)
+        >>> course["quantity"].unique().sort().to_list()[-1]
+        'visual'
+        """
+        from analyze.time_courses import TimeSettings, time_courses
+
+        check_name("table", table, ("course", "closing", "change", "outcomes", "autocorrelation"))
+        given = {name: value for name, value in (("num_bins", bins), ("window", window)) if value is not None}
+        return _frame(time_courses(self.ask(**settings), TimeSettings(**given)), table)
+
+    def compare(
+        self,
+        other: OpenStores | str | Path | Sequence[str | Path],
+        table: Literal["differences", "estimates", "pairs", "unpaired"] = "differences",
+        allow_mismatch: Sequence[str] = (),
+        names: tuple[str, str] = ("first", "other"),
+        **settings: Unpack[Settings],
+    ) -> pl.DataFrame:
+        """This run against another: other minus this one, paired where initial states and seeds are shared.
+
+        >>> differences = analyze.open(store).compare(other)
+        >>> differences.filter(scope="all", layer="layers_avg", quantity="success")["difference"].to_list()
+        [0.0]
+
+        Raises:
+            MixedPolicies, RunsDiffer: the runs differ in what is not compared, see `allow_mismatch` and `analyze.runs`.
+        """
+        from analyze.comparison import compare
+        from analyze.runs import RunArgument, open_runs
+
+        check_name("table", table, ("differences", "estimates", "pairs", "unpaired"))
+        opened = other if isinstance(other, OpenStores) else open_stores(other)
+        arguments = [
+            RunArgument(name, tuple(store.path for store in stores))
+            for name, stores in zip(names, (self.stores, opened.stores), strict=True)
+        ]
+        runs = open_runs(arguments, analysis_settings(**settings), allow_mismatch)
+        return _frame(compare(runs, allow_mismatch), table)
+
+    def overlay(
+        self,
+        task: int | None = None,
+        episode: int | None = None,
+        replans: int | Sequence[int] | None = None,
+        cameras: str | Sequence[str] | None = None,
+        folder: str | Path | None = None,
+        measure: Literal["lift", "share"] = "lift",
+        smooth: bool = False,
+        **settings: Unpack[Settings],
+    ) -> pl.DataFrame:
+        """Attention on the pictures of one episode: one row per (replan, camera, patch); with `folder`, also drawn there as a strip.
+
+        The first episode unless `task` and `episode` say which; every replan unless `replans` names some. `groups` are outlined, as in
+        `vla-analyze overlay`, which can also make videos.
+
+        >>> patches = analyze.open(store).overlay(task=1, replans=0, folder=folder)
+        >>> patches.height, sorted(file.suffix for file in folder.iterdir())
+        (16, ['.csv', '.pdf', '.png'])
+        """
+        from analyze.group_preview import find_example
+        from analyze.overlay_data import (
+            camera_names,
+            check_outlines,
+            chosen_replans,
+            episode_overlay,
+            outline_grouping,
+            overlay_table,
+            ratios_of,
+        )
+
+        check_name("measure", measure, ("lift", "share"))
+        wanted = analysis_settings(**settings)
+        outlined = outline_grouping(wanted.groups)
+        question = ask(self.stores, replace(wanted, groups=()))
+        check_outlines(question, outlined)
+        named = [cameras] if isinstance(cameras, str) else cameras
+        item = find_example(question.selected, task, episode)
+        overlay = episode_overlay(question, item, camera_names(question, named), ratios_of(question, item), outlined)
+        asked = None if replans is None else [replans] if isinstance(replans, int) else list(replans)
+        shown = chosen_replans(overlay, asked, overlay.num_replans)
+        if folder is not None:
+            from analyze.plots.overlay_strip import plot_overlay_strip
+
+            stem = f"overlay_{item.episode.name}"
+            plot_overlay_strip(overlay, question.grouping, shown, Path(folder), stem, measure=measure, smooth=smooth)
+        return overlay_table(overlay, shown)
+
+    def report(
+        self, path: str | Path, episodes: int | None = None, replans: int | None = None, **settings: Unpack[Settings]
+    ) -> Path:
+        """Write the self-contained HTML page of `vla-analyze report`; returns its path.
+
+        `episodes` with overlays and `replans` of each are those of `analyze.report.page.report_html`.
+
+        >>> page = analyze.open(store).report(folder / "report.html", episodes=1, replans=2)
+        >>> page.read_text(encoding="utf-8")[:15].lower()
+        '<!doctype html>'
+        """
+        from analyze.atomic_file import write_text
+        from analyze.report.page import DEFAULT_EPISODES, DEFAULT_REPLANS, report_html
+
+        page = report_html(
+            self.analysis(**settings),
+            episodes=DEFAULT_EPISODES if episodes is None else episodes,
+            replans=DEFAULT_REPLANS if replans is None else replans,
+        )
+        try:
+            write_text(Path(path), page)
+        except OSError as error:
+            raise BadArgument(
+                f"Cannot write the report to {path}: {error.strerror or error}; give another path."
+            ) from None
+        return Path(path)
+
+    def __repr__(self) -> str:
+        root = self.attributes
+        policy, recording = root.policy, root.recording
+        untrained = ", UNTRAINED random weights" if policy.untrained else ""
+        lines = [
+            str(self),
+            f"  stores   {listing([store.path for store in self.stores])}",
+            f"  policy   {policy.name} ({policy.checkpoint_format}: {policy.checkpoint}){untrained}",
+            f"  layers   {listing(recording.layer_labels, 40)}; denoise steps {listing(recording.denoise_steps, 40)}; "
+            f"heads {listing(recording.heads, 40)}",
+            f"  sites    {listing(f'{site.name} ({site.num_keys} keys)' for site in root.sites)}",
+            "  ask with .ratios() .masses() .summary() .groups() .heads() .words() .objects() .time() .compare(other)",
+            "           .overlay() .report(path) .to_xarray()",
+        ]
+        return "\n".join(lines)
+
+
+def _frame(tables: object, name: str) -> pl.DataFrame:
+    frame: pl.DataFrame = getattr(tables, name)
+    return frame

@@ -1,0 +1,137 @@
+"""Depth: at which layers a group is attended to, as a centre of gravity, by masses and by contributions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import polars as pl
+from numpy.typing import ArrayLike, NDArray
+
+from analyze.aggregate import LAYERS_AVG
+from analyze.contributions import joint_norm
+from analyze.episode_intervals import means_with_intervals
+from analyze.question import Question
+from analyze.statistics import DEFAULT_SEED
+from analyze.tables import SelectedEpisode
+from schemas.grouping import Grouping
+from schemas.resolve import ResolvedGrouping
+from schemas.segments import segment_members, weights_on_segments
+
+
+def depth_centre(amounts: ArrayLike, blocks: ArrayLike) -> NDArray[np.float64]:
+    """Centre of gravity over layers: sum over l of l x a_l / sum over l of a_l, with block indices l.
+
+    As the "center of gravity" of Tenney et al. (2019), "BERT Rediscovers the NLP Pipeline", section 3, which weighs layers in
+    the same way. The same amount at every layer gives the mean block.
+
+    Args:
+        amounts: (..., layer), at least 0: masses of a group, or norms of its contributions.
+        blocks: (layer,) block indices. The centre is one over these layers, whatever lies between them.
+
+    Returns:
+        (...); NaN where all amounts are 0 or one is not finite.
+    """
+    amount, block = np.asarray(amounts, dtype=np.float64), np.asarray(blocks, dtype=np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (amount * block).sum(axis=-1) / amount.sum(axis=-1)
+
+
+def depth_table(
+    episodes: pl.DataFrame, grouping: Grouping, norms: pl.DataFrame | None = None, seed: int = DEFAULT_SEED
+) -> pl.DataFrame:
+    """One row per group that has any amount: the mean over episodes of its centre, with a two-level interval (95 %).
+
+    Columns: group; of: "mass", or "contribution" (the norm of what the group's keys add to the residual stream; norms grow with
+    depth where a network's updates do, so read this centre beside those of other groups); num_episodes, num_tasks,
+    centre_episodes (with a centre); centre, centre_low, centre_high; even: the centre of the same amount at every layer;
+    first_block, last_block, num_layers: the layers that it is a centre over.
+
+    Args:
+        episodes: `aggregate.episodes_table`. A block that was named by two layer numbers counts once.
+        grouping: the groups.
+        norms: suite, task_id, episode_index, block and per group `{g}_norm` (see `contribution_norms`), where there are any.
+        seed: of the bootstrap.
+    """
+    single = episodes.filter(pl.col("layer") != LAYERS_AVG)
+    parts = [_centres(single, {name: f"{name}_mass" for name in grouping.names}, "mass")]
+    if norms is not None:
+        parts.append(_centres(norms, {name: f"{name}_norm" for name in grouping.names if f"{name}_norm" in norms.columns}, "contribution"))
+    blocks = single["block"].unique().sort()
+    limits = (float(blocks[0]), float(blocks[-1]))
+    table = means_with_intervals(pl.concat(parts), ("group", "of"), {"centre": limits}, seed)
+    return table.filter(pl.col("centre").is_not_null()).with_columns(
+        pl.lit(float(np.mean(blocks.to_numpy()))).alias("even"),
+        pl.lit(blocks[0], dtype=pl.Int64).alias("first_block"),
+        pl.lit(blocks[-1], dtype=pl.Int64).alias("last_block"),
+        pl.lit(len(blocks), dtype=pl.Int64).alias("num_layers"),
+    )
+
+
+def _centres(table: pl.DataFrame, columns: Mapping[str, str], of: str) -> pl.DataFrame:
+    """One row per (group, episode) with its centre, from one row per (episode, block)."""
+    keys = ("suite", "task_id", "episode_index")
+    once = table.unique([*keys, "block"], keep="first", maintain_order=True).sort(*keys, "block")
+    episodes = once.select(keys).unique(maintain_order=True)
+    blocks = once["block"].unique().sort().to_numpy()
+    rows = []
+    for name, column in columns.items():
+        amounts = once[column].fill_null(0.0).to_numpy().reshape(episodes.height, len(blocks))
+        rows.append(
+            episodes.select(
+                pl.all(),
+                pl.lit(name).alias("group"),
+                pl.lit(of).alias("of"),
+                pl.Series("centre", depth_centre(amounts, blocks)).fill_nan(None),
+            )
+        )
+    return pl.concat(rows)
+
+
+def contribution_norms(question: Question, resolved: Sequence[ResolvedGrouping]) -> pl.DataFrame | None:
+    """Norm of what each group's keys add to the residual stream, one row per (episode, block): `{g}_norm`.
+
+    Mean over replans and denoise steps of `contributions.joint_norm`. Gram matrices are of whole segments, so only
+    groups that take each segment whole or not at all, the same ones at every replan, have a norm; None where no group has one, or nothing was
+    recorded.
+    """
+    selection, site = question.selection, question.site
+    if not all(store.attributes.recording.contributions for store in question.stores):
+        return None
+    chosen = [_whole_segments(item, groups, site) for item, groups in zip(question.selected, resolved, strict=True)]
+    # A group that cannot be measured in one episode would be a mean over the others only.
+    names = [name for name in question.grouping.names if all(name in parts for parts in chosen)]
+    if not names:
+        return None
+    frames = []
+    for item, parts in zip(question.selected, chosen, strict=True):
+        gram = item.episode.read(f"{site}/contribution")[:, list(selection.layers)][:, :, list(selection.denoise)]
+        norms = {f"{name}_norm": joint_norm(gram, parts[name]).mean(axis=(0, 2)) for name in names}
+        attributes = item.episode.attributes
+        frames.append(
+            pl.DataFrame({"block": np.array(selection.blocks, dtype=np.int64), **norms}).select(
+                pl.lit(item.store.suite).alias("suite"),
+                pl.lit(attributes.task_id, dtype=pl.Int64).alias("task_id"),
+                pl.lit(attributes.episode_index, dtype=pl.Int64).alias("episode_index"),
+                pl.all(),
+            )
+        )
+    return pl.concat(frames)
+
+
+def _whole_segments(item: SelectedEpisode, resolved: ResolvedGrouping, site: str) -> dict[str, NDArray[np.bool_]]:
+    """By group, which parts of the Gram matrix are its own; groups that cut a segment are left out."""
+    tokens, segments = item.tokens, item.episode.attributes.segments[site]
+    members = segment_members(tokens.layout, tokens.static_roles, segments)
+    present = members.any(axis=1)
+    parts = {}
+    for i, name in enumerate(resolved.names):
+        weights = weights_on_segments(resolved.weights[:, :, i : i + 1], members)
+        if weights is None:
+            continue
+        taken = weights[:, :, 0].max(axis=0)
+        # Whole or not at all, and at every replan that has the segment.
+        if np.isin(taken, (0.0, 1.0)).all() and (~present | (weights[:, :, 0] == taken)).all():
+            # The last part is the whole update of the block, and belongs to no group.
+            parts[name] = np.array([*(taken == 1.0), False])
+    return parts

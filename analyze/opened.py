@@ -1,0 +1,204 @@
+"""An opened store, without the studies: what is in it, masses, ratios, labelled arrays. See `analyze.api`."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal, Unpack
+
+import polars as pl
+
+from analyze.keywords import Settings, analysis_settings
+from analyze.pipeline import Analysis, analyse
+from analyze.question import AnalysisSettings, Question, ask
+from analyze.reader import Store
+from schemas.errors import BadArgument, did_you_mean, listing
+from schemas.store import RootAttributes
+
+if TYPE_CHECKING:
+    import xarray
+
+Level = Literal["tasks", "episodes", "replans", "steps"]
+_LEVELS = ("tasks", "episodes", "replans", "steps")
+#: Answers that are kept, so that asking for tasks after episodes does not read everything again.
+_KEPT = 4
+_STEP_IDENTITY = (
+    "suite", "task_id", "instruction", "episode_index", "success", "num_steps", "replan", "env_step", "layer", "block",
+    "denoise_step", "denoise_time", "head", "row_sum", "num_valid",
+)  # fmt: skip
+_GROUP_MEASURES = ("mass", "fraction", "keys", "density", "lift")
+
+
+class Opened:
+    """The part of `analyze.api.OpenStores` that is about masses and ratios; its examples run as tests like those there."""
+
+    def __init__(self, stores: Sequence[Store]) -> None:
+        self.stores = tuple(stores)
+        self._answers: OrderedDict[AnalysisSettings, Analysis] = OrderedDict()
+
+    @property
+    def attributes(self) -> RootAttributes:
+        """The run's own description; the same for all stores but for the suite."""
+        return self.stores[0].attributes
+
+    @property
+    def episodes(self) -> pl.DataFrame:
+        """One row per episode, from its attributes; reads no rows.
+
+        >>> analyze.open(store).episodes.select("task_id", "episode_index", "success", "num_replans").rows()
+        [(0, 0, False, 3), (0, 1, True, 3), (1, 0, False, 3), (1, 1, True, 3)]
+        """
+        names = [
+            "task_id",
+            "task_name",
+            "instruction",
+            "episode_index",
+            "initial_state_index",
+            "success",
+            "num_steps",
+            "num_replans",
+        ]
+        return pl.DataFrame(
+            [
+                {
+                    "store": str(store.path),
+                    "suite": store.suite,
+                    **{name: getattr(episode.attributes, name) for name in names},
+                }
+                for store in self.stores
+                for episode in store.episodes
+            ],
+            schema_overrides={"task_id": pl.Int64},
+        )
+
+    def ask(self, **settings: Unpack[Settings]) -> Question:
+        """The checked question behind the tables, for the functions of the package's modules.
+
+        >>> analyze.open(store).ask(grouping="cameras", layers=2).selection.blocks
+        (2,)
+        """
+        return ask(self.stores, analysis_settings(**settings))
+
+    def analysis(self, **settings: Unpack[Settings]) -> Analysis:
+        """All tables and the summary of one grouping, as `vla-analyze STORE` computes them; the last few are kept."""
+        wanted = analysis_settings(**settings)
+        if wanted not in self._answers:
+            self._answers[wanted] = analyse(ask(self.stores, wanted))
+        self._answers.move_to_end(wanted)
+        while len(self._answers) > _KEPT:
+            self._answers.popitem(last=False)
+        return self._answers[wanted]
+
+    def ratios(self, level: Level = "tasks", **settings: Unpack[Settings]) -> pl.DataFrame:
+        """Masses, fractions, lifts and ratios as `vla-analyze ratios` gives them.
+
+        `level`: "tasks" (per task and over all, with intervals), "episodes", "replans" or "steps" (every replan, layer, denoise step).
+        Columns: `analyze.aggregate` and `analyze.tables`.
+
+        >>> run = analyze.open(store)
+        >>> run.ratios("steps", groups={"bowl": "word:bowl", "rest": "*"}, layers=2, denoise="last").height
+        12
+        >>> run.ratios("episodes", grouping="cameras", tasks=0).select("task_id", "layer").unique().height
+        3
+        """
+        check_name("level", level, _LEVELS)
+        table: pl.DataFrame = getattr(self.analysis(**settings), level)
+        return table
+
+    def masses(self, **settings: Unpack[Settings]) -> pl.DataFrame:
+        """The steps table in long form: one row per (episode, replan, layer, denoise step[, head], group).
+
+        Columns beside the identity: group, mass, fraction, keys, density, lift.
+
+        >>> masses = analyze.open(store).masses(grouping="instruction", per_head=True)
+        >>> masses.group_by("group").agg(pl.col("keys").mean()).filter(group="linguistic")["keys"].to_list()
+        [5.0]
+        """
+        analysis = self.analysis(**settings)
+        identity = [column for column in _STEP_IDENTITY if column in analysis.steps.columns]
+        parts = [
+            analysis.steps.select(
+                *identity,
+                pl.lit(name).alias("group"),
+                *(
+                    pl.col(f"{name}_{measure}").alias(measure)
+                    for measure in _GROUP_MEASURES
+                    if f"{name}_{measure}" in analysis.steps.columns
+                ),
+            )
+            for name in analysis.grouping.names
+        ]
+        return pl.concat(parts)
+
+    def summary(self, **settings: Unpack[Settings]) -> str:
+        """The text that `vla-analyze STORE` prints.
+
+        >>> analyze.open(store).summary().splitlines()[0]
+        'ATTENTION SUMMARY'
+        """
+        return self.analysis(**settings).summary
+
+    def describe(self) -> str:
+        """What the stores hold: run, layout, words, objects, tasks; the text of `vla-analyze STORE --list`.
+
+        >>> "akita_black_bowl_1" in analyze.open(store).describe()
+        True
+        """
+        from analyze.contents import describe_store
+
+        return "\n\n".join(describe_store(store) for store in self.stores)
+
+    def contributions(self, **settings: Unpack[Settings]) -> pl.DataFrame:
+        """Norms of what seeing and reading add to the residual stream (`analyze.contributions`), where they were recorded.
+
+        >>> analyze.open(store).contributions(layers=0)["contribution_ratio"].is_finite().all()
+        True
+
+        Raises:
+            BadArgument: the stores hold no contributions.
+        """
+        from analyze.export import chosen_tables
+
+        return chosen_tables(self.analysis(**settings), ["contributions"])["contributions"]
+
+    def to_xarray(
+        self, rows: bool = False, most_gigabytes: float = 4.0, **settings: Unpack[Settings]
+    ) -> xarray.Dataset:
+        """Masses of every head as labelled arrays, or with `rows` the rows themselves; see `analyze.labelled_arrays`.
+
+        (episode, replan) is one axis `sample`. Rows that would take more memory than `most_gigabytes` are refused. Needs the extra
+        `xarray`.
+
+        >>> analyze.open(store).to_xarray(grouping="cameras")["mass"].dims
+        ('sample', 'layer', 'denoise', 'head', 'group')
+        >>> analyze.open(store).to_xarray(rows=True, layers=2)["rows"].shape
+        (12, 1, 2, 2, 39)
+
+        Raises:
+            MissingDependency: xarray is not installed.
+            BadArgument: the rows are larger than allowed.
+        """
+        from analyze.labelled_arrays import masses_array, rows_array
+
+        question = self.ask(**settings)
+        return rows_array(question, int(most_gigabytes * 1e9)) if rows else masses_array(question)
+
+    def __str__(self) -> str:
+        episodes = [episode.attributes for store in self.stores for episode in store.episodes]
+        tasks = {(store.suite, task) for store in self.stores for task in store.task_ids}
+        suites = list(dict.fromkeys(store.suite for store in self.stores))
+        return (
+            f"OpenStores of {_count(len(self.stores), 'store')}: {_count(len(episodes), 'episode')} of {_count(len(tasks), 'task')} "
+            f"({sum(episode.success for episode in episodes)} solved), {sum(episode.num_replans for episode in episodes)} replans, "
+            f"suite {listing(suites)}"
+        )
+
+
+def check_name(what: str, given: str, known: Sequence[str]) -> None:
+    """Raise `BadArgument` unless a name is one of those that exist."""
+    if given not in known:
+        raise BadArgument(f"Unknown {what} '{given}'.{did_you_mean(given, known)} Existing: {listing(known)}.")
+
+
+def _count(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -1,0 +1,178 @@
+"""Where on a picture attention lies, against object masks: centre, pointing game, IoU, and what chance gives. Pure arithmetic.
+
+A map has one value per patch; patches go row by row from the top left, on a grid of `rows` x `columns`. Masks are sets of
+patches. Axes are named in the docstrings; `...` stands for any axes in between, such as (denoise, head).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Masks = NDArray[np.bool_]
+
+
+def patch_centres(rows: int, columns: int) -> Floats:
+    """Row and column of every patch's centre in patch units from the picture's top left corner, shape (patch, 2)."""
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    return np.stack([row + 0.5, column + 0.5], axis=-1)
+
+
+def centre_of_mass(maps: NDArray[np.floating], centres: Floats) -> Floats:
+    """Mean position under a map: sum of value x position / sum of values; (..., patch) gives (..., 2) in patch units.
+
+    NaN where a map is all 0. Of a uniform map it is the picture's middle, whatever the objects are.
+    """
+    values = np.asarray(maps, dtype=np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return (values @ centres) / values.sum(axis=-1, keepdims=True)
+
+
+def distance_in_pictures(first: Floats, second: Floats, rows: int, columns: int) -> Floats:
+    """Distance of positions (..., 2) in patch units as a part of the picture's side: sqrt((dr / rows)^2 + (dc / columns)^2).
+
+    1.41 is the whole diagonal, and half of that the most that a uniform map's centre can be off.
+    """
+    step = (first - second) / np.array([rows, columns], dtype=np.float64)
+    return np.asarray(np.sqrt((step**2).sum(axis=-1)))
+
+
+def object_masks(coverage: NDArray[np.floating], least: float) -> Masks:
+    """Patches of which an object covers at least the share `least`, of the same shape as the coverage."""
+    return np.asarray(coverage >= least)
+
+
+def near_patches(rows: int, columns: int, tolerance: float) -> Masks:
+    """Which patches' centres are at most `tolerance` patch widths apart, shape (patch, patch)."""
+    centres = patch_centres(rows, columns)
+    squared = ((centres[:, None] - centres[None]) ** 2).sum(axis=-1)
+    return np.asarray(squared <= tolerance**2 + 1e-9)
+
+
+def grown(masks: Masks, near: Masks) -> Masks:
+    """Masks (replan, patch, item) with every patch that is near one of theirs; `near` is from `near_patches`."""
+    return np.asarray(np.matmul(near.astype(np.float32), masks.astype(np.float32)) > 0.5)
+
+
+def pointing_hits(maps: NDArray[np.floating], masks: Masks | NDArray[np.float32]) -> Floats:
+    """The pointing game: 1 where a map's highest patch lies in the mask, else 0.
+
+    Zhang, Lin, Brandt, Shen & Sclaroff 2018, "Top-down neural attention by excitation backprop", IJCV 126, section 5.1, who
+    accept a maximum within 15 pixels of the object: give masks that `grown` has widened by as much. Of several equally high
+    patches each counts its part, so that a uniform map scores what chance does: the mask's share of the picture.
+
+    Args:
+        maps: (replan, ..., patch).
+        masks: (replan, patch, item).
+
+    Returns:
+        (replan, ..., item); NaN where the item has no patch.
+    """
+    highest = (maps == maps.max(axis=-1, keepdims=True)).astype(np.float32)
+    hits = _over_patches(highest / highest.sum(axis=-1, keepdims=True), masks)
+    there = mask_sizes(masks) > 0
+    return np.where(_over_replans(there, hits.ndim), hits, np.nan)
+
+
+def percentile_regions(maps: NDArray[np.floating], percentile: float) -> Masks:
+    """Patches at or above a map's own percentile (linear interpolation between values): of 256 patches 26 at 90, 52 at 80.
+
+    Of a constant map that is all of them.
+    """
+    return np.asarray(maps >= np.percentile(maps, percentile, axis=-1, keepdims=True))
+
+
+def otsu_thresholds(maps: NDArray[np.floating]) -> Floats:
+    """Otsu's threshold of each map (..., patch): the value t for which {<= t} and {> t} differ most.
+
+    Maximises the between-class variance w0 w1 (mu0 - mu1)^2 (Otsu 1979, "A threshold selection method from gray-level
+    histograms", IEEE SMC 9, eq. 14) over all splits between different values, not over bins of a histogram; the lowest of equally
+    good ones. Shape (...); NaN for a constant map, which has nothing to tell apart.
+    """
+    ordered = np.sort(np.asarray(maps, dtype=np.float64), axis=-1)
+    count = ordered.shape[-1]
+    below = np.arange(1, count, dtype=np.float64)  # values in the lower class when the split is after the i-th
+    # Taken from the mean, so that the sums of nearly equal values keep their digits.
+    sums = np.cumsum(ordered - ordered.mean(axis=-1, keepdims=True), axis=-1)
+    lower, total = sums[..., :-1], sums[..., -1:]
+    between = (lower / below - (total - lower) / (count - below)) ** 2 * below * (count - below)
+    between = np.where(ordered[..., :-1] < ordered[..., 1:], between, -1.0)
+    best = between.argmax(axis=-1)[..., None]
+    threshold = np.take_along_axis(ordered, best, axis=-1)[..., 0]
+    return np.where(np.take_along_axis(between, best, axis=-1)[..., 0] < 0, np.nan, threshold)
+
+
+def otsu_regions(maps: NDArray[np.floating]) -> Masks:
+    """Patches above each map's Otsu threshold; none of a constant map."""
+    thresholds = otsu_thresholds(maps)[..., None]
+    return np.asarray(maps > np.where(np.isnan(thresholds), np.inf, thresholds))
+
+
+def mask_sizes(masks: Masks | NDArray[np.float32]) -> Floats:
+    """Number of patches of masks (replan, patch, item), shape (replan, item)."""
+    # A product with ones: numpy's own sum over a middle axis takes ten times as long.
+    ones = np.ones((1, masks.shape[1]), dtype=np.float32)
+    return np.matmul(ones, masks.astype(np.float32, copy=False))[:, 0].astype(np.float64)
+
+
+def intersection_over_union(regions: Masks, masks: Masks | NDArray[np.float32]) -> Floats:
+    """|region and mask| / |region or mask| (Jaccard 1912) of regions (replan, ..., patch) and masks (replan, patch, item).
+
+    Masks may be given as 0 and 1 in float32, which saves their conversion when many regions are held against the same ones.
+
+    Returns:
+        (replan, ..., item); NaN where the item has no patch, so that there is nothing to find.
+    """
+    common = _over_patches(regions.astype(np.float32), masks)
+    sizes = _over_replans(mask_sizes(masks), common.ndim)
+    union = regions.sum(axis=-1)[..., None] + sizes - common
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(sizes > 0, common / union, np.nan)
+
+
+def random_iou(region_sizes: NDArray[np.integer], mask_sizes: NDArray[np.integer], num_patches: int) -> Floats:
+    """Mean IoU of a mask with a region of the given size whose patches are drawn at random: what chance gives.
+
+    E[X / (k + m - X)], where X, the number of common patches of k drawn and m wanted ones, has the hypergeometric distribution
+    over `num_patches`. Sizes are broadcast; NaN where the mask is empty.
+    """
+    drawn, wanted = np.broadcast_arrays(region_sizes, mask_sizes)
+    pairs, place = np.unique(drawn.astype(np.int64) * (num_patches + 1) + wanted, return_inverse=True)
+    values = [_random_iou_of(*divmod(int(pair), num_patches + 1), num_patches) for pair in pairs]
+    return np.array(values)[place].reshape(drawn.shape)
+
+
+@functools.lru_cache(maxsize=1 << 16)
+def _random_iou_of(drawn: int, wanted: int, total: int) -> float:
+    if wanted == 0:
+        return math.nan
+    common = np.arange(max(0, drawn + wanted - total), min(drawn, wanted) + 1)
+    log = _log_binomial(wanted, common) + _log_binomial(total - wanted, drawn - common)
+    chance = np.exp(log - _log_binomial(total, np.array([drawn])))
+    return float((chance * common / (drawn + wanted - common)).sum())
+
+
+def _log_binomial(total: int, chosen: NDArray[np.integer]) -> Floats:
+    log_factorial = _log_factorials(total)
+    return np.asarray(log_factorial[total] - log_factorial[chosen] - log_factorial[total - chosen])
+
+
+@functools.lru_cache(maxsize=64)
+def _log_factorials(last: int) -> Floats:
+    return np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, last + 1)))])
+
+
+def _over_patches(values: NDArray[np.float32], masks: Masks | NDArray[np.float32]) -> Floats:
+    """Sum over patches of (replan, ..., patch) inside masks (replan, patch, item): (replan, ..., item). Exact for counts."""
+    flat = values.reshape(values.shape[0], -1, values.shape[-1])
+    product = np.matmul(flat, masks.astype(np.float32, copy=False)).astype(np.float64)
+    return product.reshape(*values.shape[:-1], masks.shape[-1])
+
+
+def _over_replans(values: NDArray, ndim: int) -> NDArray:
+    """(replan, item) as (replan, 1, ..., item) with so many axes."""
+    return values.reshape(values.shape[0], *(1,) * (ndim - 2), values.shape[-1])

@@ -1,0 +1,182 @@
+"""The Python API: its examples, and that its tables are those of the commands."""
+
+from __future__ import annotations
+
+import doctest
+from dataclasses import fields
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import polars as pl
+import pytest
+import zarr
+from polars.testing import assert_frame_equal
+
+import analyze
+import analyze.api
+import analyze.keywords
+import analyze.opened
+from analyze.__main__ import main
+from analyze.api import OpenStores
+from analyze.keywords import Settings, analysis_settings
+from analyze.question import AnalysisSettings
+from schemas.errors import BadArgument
+from schemas.precision import mass_error_bound
+from schemas.store import StoreError, StoreNotFound
+from tests.store_kit import small_layout, write_store
+
+MODULES = (analyze, analyze.api, analyze.opened, analyze.keywords)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory) -> Path:
+    return write_store(tmp_path_factory.mktemp("api") / "a.zarr", contributions=True)
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory) -> Path:
+    return write_store(tmp_path_factory.mktemp("other") / "b.zarr", contributions=True)
+
+
+@pytest.fixture(scope="module")
+def run(store) -> OpenStores:
+    return analyze.open(store)
+
+
+def examples(module: ModuleType) -> list[doctest.DocTest]:
+    return [test for test in doctest.DocTestFinder().find(module) if test.examples]
+
+
+@pytest.mark.parametrize(
+    "test",
+    [test for module in MODULES for test in examples(module)],
+    ids=lambda test: test.name,
+)
+def test_examples(test, store, other, tmp_path):
+    test.globs.update(store=store, other=other, folder=tmp_path, analyze=analyze, pl=pl)
+    result = doctest.DocTestRunner(verbose=False).run(test)
+    assert result.failed == 0
+    assert result.attempted > 0
+
+
+def test_every_method_has_an_example():
+    named = {test.name.rpartition(".")[2] for module in MODULES for test in examples(module)}
+    methods = {name for name in dir(OpenStores) if not name.startswith("_")} - {"attributes", "analysis"}
+    assert methods <= named
+
+
+@pytest.mark.parametrize("level", ["tasks", "episodes", "steps"])
+def test_ratios_are_those_of_the_command(run, store, tmp_path, level):
+    assert main(["ratios", str(store), "--no-plots", "--output", str(tmp_path), "--layers", "2", "--seed", "3"]) == 0
+    assert_frame_equal(run.ratios(level, layers=[2], seed=3), pl.read_parquet(tmp_path / f"{level}.parquet"))
+
+
+def test_masses_in_long_form_are_sums_over_the_raw_rows(run, store):
+    masses = run.masses(grouping="cameras", per_head=True, tasks=1)
+    span = small_layout().span("base_0_rgb")
+    names = [f"task001_episode00{i}" for i in range(2)]
+    group = zarr.open_group(store, mode="r")["episodes"]
+    rows = np.concatenate([group[name]["joint/rows"][:].mean(axis=4) for name in names])
+    expected = rows[..., span.start : span.stop].sum(axis=-1).ravel()
+    found = masses.filter(group="base_0_rgb")
+    np.testing.assert_allclose(found["mass"].to_numpy(), expected, rtol=mass_error_bound(10) + 1e-6)
+    assert found["keys"].unique().to_list() == [12.0]
+    total = masses.group_by("episode_index", "replan", "layer", "denoise_step", "head").agg(pl.col("fraction").sum())
+    np.testing.assert_allclose(total["fraction"].to_numpy(), 1, rtol=1e-9)
+
+
+def test_answers_are_kept_and_the_oldest_go(store, monkeypatch):
+    run = analyze.open(store)
+    asked = []
+    real = analyze.opened.analyse
+    monkeypatch.setattr(analyze.opened, "analyse", lambda question: (asked.append(question), real(question))[1])
+    run.ratios("tasks")
+    run.ratios("episodes")
+    run.summary()
+    assert len(asked) == 1
+    for layer in (0, 2):
+        for head in (0, 1):
+            run.ratios(layers=layer, heads=head)
+    run.ratios("steps")
+    assert len(asked) == 6
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({"layers": 25}, AnalysisSettings(layers=(25,))),
+        ({"layers": range(2), "heads": np.array([1, 3])}, AnalysisSettings(layers=(0, 1), heads=(1, 3))),
+        ({"denoise": "last"}, AnalysisSettings(denoise=("last",))),
+        ({"denoise": [0, "last"]}, AnalysisSettings(denoise=("0", "last"))),
+        (
+            {"groups": {"a": "word:x", "b": ["word:y", "word:z"]}},
+            AnalysisSettings(groups=("a=word:x", "b=(word:y) | (word:z)")),
+        ),
+        ({"groups": ["a=word:x"]}, AnalysisSettings(groups=("a=word:x",))),
+        ({"ratio": ("a", ["b", "c"])}, AnalysisSettings(ratio="a/b,c")),
+        ({"grouping": Path("g.toml"), "layers": None}, AnalysisSettings(grouping="g.toml")),
+    ],
+)
+def test_plain_values_are_settings(given, expected):
+    assert analysis_settings(**given) == expected
+    assert hash(analysis_settings(**given)) == hash(expected)
+
+
+def test_keywords_are_the_settings_of_the_commands():
+    assert set(Settings.__annotations__) == {field.name for field in fields(AnalysisSettings)}
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda run: run.ratios(layer=3), r"Unknown setting 'layer'\. Did you mean 'layers'"),
+        (lambda run: run.ratios("task"), r"Unknown level 'task'\. Did you mean 'tasks'"),
+        (lambda run: run.heads(table="head"), r"Unknown table 'head'\. Did you mean 'heads'"),
+        (lambda run: run.ratios(layers="two"), r"Cannot use 'two' as numbers"),
+        (lambda run: run.ratios(ratio=("a", "b", "c")), r"expected 'A,B/C' or a pair"),
+        (lambda run: run.ratios(layers=1), r"were not recorded"),
+        (lambda run: run.to_xarray(rows=True, most_gigabytes=1e-6), r"more than the 1 kB"),
+        (lambda run: analyze.open([]), r"No store was given"),
+    ],
+)
+def test_mistakes_say_what_exists(run, call, message):
+    with pytest.raises(BadArgument, match=message):
+        call(run)
+
+
+def test_stores_are_opened_by_path_text_or_several(store, other, tmp_path):
+    assert analyze.open(str(store)).episodes.height == 4
+    second = write_store(tmp_path / "second.zarr", suite="second", contributions=True)
+    both = analyze.open([store, second])
+    assert both.episodes["suite"].unique().sort().to_list() == ["made_up", "second"]
+    assert both.ratios()["scope"].unique().sort().to_list() == ["all", "combined", "task"]
+    with pytest.raises(StoreNotFound):
+        analyze.open(tmp_path / "absent.zarr")
+    with pytest.raises(StoreError, match="both hold"):
+        analyze.open([store, other])
+
+
+def test_what_it_is_can_be_seen(run, store):
+    text = repr(run)
+    assert text.splitlines()[0] == "OpenStores of 1 store: 4 episodes of 2 tasks (2 solved), 12 replans, suite made_up"
+    for part in (str(store), "UNTRAINED", "layers   0, 2", "joint (39 keys)", ".ratios()"):
+        assert part in text
+
+
+def test_an_empty_store_can_be_opened_and_says_that_it_is_empty(tmp_path):
+    run = analyze.open(write_store(tmp_path / "a.zarr", tasks=()))
+    assert run.episodes.height == 0
+    assert "0 episodes" in repr(run)
+    with pytest.raises(StoreError, match="no complete episode"):
+        run.ratios()
+
+
+def test_the_guides_examples(tmp_path, monkeypatch):
+    guide = Path(analyze.__file__).parents[1] / "docs" / "python.md"
+    (tmp_path / "runs").mkdir()
+    write_store(tmp_path / "runs" / "libero_10.zarr", suite="libero_10")
+    monkeypatch.chdir(tmp_path)
+    result = doctest.testfile(str(guide), module_relative=False, verbose=False)
+    assert result.failed == 0
+    assert result.attempted > 6

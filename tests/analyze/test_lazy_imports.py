@@ -1,0 +1,46 @@
+"""`--help` waits for no library: what it imports is looked at, no time is measured."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from analyze.commands import COMMANDS
+
+#: Each takes a tenth of a second or more to import.
+HEAVY = ("numpy", "polars", "zarr", "matplotlib", "tqdm", "xarray", "pandas", "torch")
+_CHECK = """
+import runpy, sys
+sys.argv = {argv!r}
+try:
+    runpy.run_module({module!r}, run_name="__main__")
+except SystemExit as end:
+    assert not end.code, end.code
+heavy = [name for name in {heavy!r} if name in sys.modules]
+assert not heavy, heavy
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "words"),
+    [
+        ("analyze.parse_results", ["--help"]),
+        ("analyze", ["--help"]),
+        *(("analyze", [command, "--help"]) for command in COMMANDS),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else value,
+)
+def test_help_imports_no_library(module, words):
+    code = _CHECK.format(argv=[module, *words], module=module, heavy=HEAVY)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("usage:")
+    assert "examples:" in done.stdout or words == ["verify", "--help"]
+
+
+def test_importing_the_package_imports_no_library():
+    code = f"import sys, analyze; print([name for name in {HEAVY!r} if name in sys.modules], analyze.open)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("[] <function open")

@@ -1,0 +1,169 @@
+"""Captures that are told to stop, and captures that share a store: a real process and real simulators."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from analyze.__main__ import main as analyze
+from capture.__main__ import main as capture
+from capture.claims import Claims, holders
+from capture.evaluate import main_pi
+from capture.job import Worker
+from capture.status import store_status
+from capture.termination import EXIT_TERMINATED, Terminated, Termination
+
+pytestmark = pytest.mark.simulator
+
+DUMMY = ["pi", "--checkpoint", "dummy", "--replan-steps", "4", "--task-id", "0"]
+NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2")
+
+
+def test_sigterm_drops_the_episode_in_flight_and_resuming_completes_the_store(tmp_path):
+    store = tmp_path / "a.zarr"
+    arguments = [*DUMMY, "--num-episodes", "2", "--max-steps", "32", "--store", str(store)]
+    log = tmp_path / "log"
+    with log.open("w") as out:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "capture", *arguments],
+            stdout=out,
+            stderr=subprocess.STDOUT,
+            env=os.environ | {"MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl"), "SLURM_JOB_ID": ""},
+        )
+        until = time.monotonic() + 120
+        while not list((tmp_path / "a.zarr.partial").glob("task000_episode001-*")):
+            assert process.poll() is None, log.read_text()
+            assert time.monotonic() < until, log.read_text()
+            time.sleep(0.02)
+        assert [holder.episode for holder in holders(store)] == ["task000_episode001"]
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == EXIT_TERMINATED, log.read_text()
+    said = log.read_text()
+    assert "Stopped by SIGTERM: dropped task000_episode001 at step" in said
+    assert "committed 1 episodes (task000_episode000); 1 of this process's 2 are missing" in said
+    assert "Traceback" not in said
+    assert "\r" not in said  # no progress bar in a file
+    assert not (tmp_path / "a.zarr.partial").exists()
+    assert holders(store) == []
+    (task,) = store_status(store).tasks
+    assert (task.committed, task.expected, task.missing) == (1, 2, (1,))
+    assert f"process {process.pid}" in task.last_by
+
+    assert capture([*arguments, "--resume"]) == 0
+    assert analyze(["verify", str(store)]) == 0
+    assert store_status(store).complete
+
+
+def test_an_episode_of_another_process_is_waited_for_and_left_to_it(tmp_path, monkeypatch, capsys):
+    """When it returns, everything is there: a dependent analysis is complete."""
+    store = tmp_path / "a.zarr"
+    arguments = [*DUMMY, "--max-steps", "4", "--store", str(store)]
+    assert capture([*arguments, "--num-episodes", "1"]) == 0
+    other = Claims(store, NODE)
+    assert other.acquire("task000_episode001") is None
+    monkeypatch.setattr("capture.episode_loop._LOOK_EVERY_S", 0.05)
+    seen: list[bool] = []
+
+    def release_when_the_rest_is_done() -> None:
+        until = time.monotonic() + 60
+        while not (store / "episodes/task000_episode002").is_dir() and time.monotonic() < until:
+            time.sleep(0.05)
+        time.sleep(0.3)
+        seen.append((store / "episodes/task000_episode001").is_dir())
+        other.release("task000_episode001")  # without having written it
+
+    thread = threading.Thread(target=release_when_the_rest_is_done)
+    thread.start()
+    assert capture([*arguments, "--num-episodes", "3", "--resume"]) == 0
+    thread.join()
+    assert seen == [False]
+    said = capsys.readouterr().out
+    assert said.count("Waiting for what others are writing: task000_episode001 by node7 (job 98_2)") == 1
+    assert sorted(folder.name for folder in (store / "episodes").glob("task*")) == [
+        f"task000_episode00{episode}" for episode in range(3)
+    ]
+    assert [holder.episode for holder in holders(store)] == []
+
+
+def test_array_tasks_fill_one_store_and_the_analysis_comes_last(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name, value in {"MIN": "0", "MAX": "1", "STEP": "1", "COUNT": "2"}.items():
+        monkeypatch.setenv(f"SLURM_ARRAY_TASK_{name}", value)
+    words = ["--checkpoint", "dummy", "--task-suite", "robosuite", "--num-episodes", "1"]
+    run = ["--replan-steps", "4", "--max-steps", "8"]
+    folder = tmp_path / "results/attention_ratio_robosuite"
+    store = folder / "robosuite.zarr"
+    assert main_pi([*words, *run, "--array-index", "0"]) == 0
+    assert not list(folder.glob("*.json"))
+    assert [(task.task_id, task.committed, task.expected) for task in store_status(store).tasks] == [
+        (0, 1, 1),
+        (1, 0, 1),  # of an array task that has not begun
+    ]
+    assert main_pi([*words, "--stage", "analyze"]) == 0
+    assert "task 1 lacks 1 of 1 episodes: 0" in capsys.readouterr().out
+    assert main_pi([*words, *run, "--array-index", "1"]) == 0
+    assert store_status(store).complete
+    for layers in (("0",), ("1", "5")):
+        assert main_pi([*words, "--stage", "analyze", "--layers", *layers]) == 0
+        name = "attention_ratio_results_robosuite.json"
+        results = json.loads((folder / name).read_text())
+        assert [item["task_id"] for item in results] == [0, 1]
+        assert set(results[0]["summary"]) == {f"layer_{layer}" for layer in layers} | {"layers_avg"}
+        assert results == json.loads((folder / f"layers_{'_'.join(layers)}" / name).read_text())
+    # All layers were recorded, so neither question needed another capture.
+    assert json.loads((store / "zarr.json").read_text())["attributes"]["recording"]["layers"] == [0, 1, 2]
+
+
+def test_within_an_episode_a_signal_waits_for_a_check():
+    termination = Termination()
+    steps = []
+
+    def episode() -> None:
+        with termination.only_at_checks():
+            steps.append("begun")
+            termination.on_signal(signal.SIGTERM, None)
+            steps.append("still here")
+            termination.check()
+            steps.append("never")
+
+    with pytest.raises(Terminated):
+        episode()
+    assert steps == ["begun", "still here"]
+    with pytest.raises(Terminated):  # nothing to lose outside
+        Termination().on_signal(signal.SIGTERM, None)
+    impatient = Termination()
+    with pytest.raises(Terminated), impatient.only_at_checks():  # noqa: PT012
+        impatient.on_signal(signal.SIGTERM, None)
+        impatient.on_signal(signal.SIGTERM, None)
+
+
+def test_a_job_that_slurm_still_wants_to_run_is_requeued(tmp_path, monkeypatch):
+    """With a scontrol of our own that notes what it is asked for."""
+    from capture.job import ask_for_requeue
+
+    notes, state = tmp_path / "notes", tmp_path / "state"
+    script = tmp_path / "scontrol"
+    script.write_text(
+        f'#!/bin/sh\necho "$@" >> {notes}\n[ "$1" = show ] && echo "JobId=9 JobState=$(cat {state}) X=1"\nexit 0\n'
+    )
+    script.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    state.write_text("RUNNING")
+    assert "is back in the queue" in ask_for_requeue(NODE, 1)
+    assert Path(notes).read_text().splitlines() == ["show job 98_2", "requeue 98_2"]
+    notes.unlink()
+    state.write_text("CANCELLED")
+    assert "whether it comes back is decided there" in ask_for_requeue(NODE, 1)
+    assert notes.read_text().splitlines() == ["show job 98_2"]
+    assert "has been requeued 0 times" in ask_for_requeue(NODE, 0)
+    script.write_text("#!/bin/sh\necho no such job >&2\nexit 1\n")
+    assert "no such job" in ask_for_requeue(NODE, 1)
+    assert ask_for_requeue(Worker("t", "h", 1, "1", ""), 5) == ""

@@ -1,0 +1,142 @@
+"""A real array job on a real SLURM: cancelled in mid-episode, requeued, analysed. Opt-in: `make test-slurm`, where sbatch works."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analyze.__main__ import main as analyze
+from analyze.reader import open_store
+from capture.claims import holders
+from capture.evaluate import main_pi
+from capture.status import store_status
+from schemas.store import PARTIAL_SUFFIX
+
+pytestmark = [
+    pytest.mark.simulator,
+    pytest.mark.skipif(not os.environ.get("VLA_TEST_SLURM"), reason="needs a running SLURM: make test-slurm"),
+]
+
+ROOT = Path(__file__).resolve().parents[2]
+TASKS, EPISODES = (0, 1, 2), 3
+ARGS = "--max-steps 80 --replan-steps 4"
+#: SLURM holds a requeued job back for two minutes.
+PATIENCE_S = 900
+
+
+def slurm(*command: str) -> str:
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout.strip()
+
+
+def state_of(job: str) -> str:
+    shown = slurm("scontrol", "show", "job", job)
+    return re.search(r"JobState=(\w+)", shown)[1]
+
+
+def wait_until(what: str, condition: Callable[[], object], log: Callable[[], str], every_s: float = 0.2) -> None:
+    until = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < until, f"never happened: {what}\n{slurm('squeue')}\n{log()}"
+        time.sleep(every_s)
+
+
+def test_an_array_cancelled_in_mid_episode_equals_a_single_process(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    output = tmp_path / "array"
+    store = output / "robosuite.zarr"
+    variables = {
+        "CHECKPOINT": "dummy",
+        "TASK_SUITE": "robosuite",
+        "NUM_EPISODES": str(EPISODES),
+        "ARGS": ARGS,
+        "LAYERS": "0 2",
+        "OUTPUT_DIR": str(output),
+        "SETUP": f"export PATH={Path(sys.executable).parent}:$PATH",
+    }
+    said = subprocess.run(
+        [ROOT / "scripts/submit_attention_ratio.sh", f"--array={TASKS[0]}-{TASKS[-1]}", "--ntasks=1"],
+        env=os.environ | variables,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    array, analysis = re.search(r"Job (\d+) captures .* job (\d+) analyses", said).groups()
+
+    def log_of(task: int) -> str:
+        file = tmp_path / f"slurm-{array}_{task}.out"
+        return file.read_text() if file.exists() else ""
+
+    def logs() -> str:
+        return "\n".join(file.read_text() for file in sorted(tmp_path.glob("slurm-*.out")))
+
+    def in_mid_episode(task: int) -> bool:
+        """Some replans of an episode are on their way to disk."""
+        beginnings = store.with_name(store.name + PARTIAL_SUFFIX).glob(f"task{task:03d}_episode*")
+        claimed = (
+            any(holder.episode.startswith(f"task{task:03d}") for holder in holders(store)) if store.exists() else 0
+        )
+        return bool(claimed) and any(True for _ in beginnings)
+
+    try:
+        # One task is told that its time is nearly over, as --signal does, and requeues itself ...
+        wait_until("task 0 is in mid-episode", lambda: in_mid_episode(0), logs, 0.05)
+        slurm("scancel", "--signal=TERM", "--batch", f"{array}_0")
+        wait_until("task 0 is requeued", lambda: "is back in the queue" in log_of(0), logs)
+        assert re.search(r"Stopped by SIGTERM: dropped task000_episode\d+ at step \d+; committed \d", log_of(0))
+        # ... and one is cancelled and requeued by SLURM, as preemption and `scontrol requeue` do.
+        wait_until("task 1 is in mid-episode", lambda: in_mid_episode(1), logs, 0.05)
+        slurm("scontrol", "requeue", f"{array}_1")
+        wait_until("task 1 says what it dropped", lambda: "Stopped by SIGTERM: dropped task001" in log_of(1), logs)
+        assert not any(holder.episode.startswith("task000") for holder in holders(store))
+        wait_until("the analysis is done", lambda: state_of(analysis) not in ("PENDING", "RUNNING", "COMPLETING"), logs)
+        assert state_of(analysis) == "COMPLETED", logs()
+    finally:
+        subprocess.run(["scancel", array, analysis], check=False)
+
+    status = store_status(store)
+    assert status.complete, logs()
+    assert [task.committed for task in status.tasks] == [EPISODES] * len(TASKS)
+    assert status.writing == ()
+    assert not store.with_name(store.name + PARTIAL_SUFFIX).exists()
+    assert analyze(["verify", str(store)]) == 0
+    assert "requeued 1 times" in log_of(0)
+    assert "requeued 1 times" in log_of(1)
+    assert "requeued" not in log_of(2)
+
+    single = tmp_path / "single"
+    for task in TASKS:
+        words = ["--checkpoint", "dummy", "--task-suite", "robosuite", "--task-id", str(task)]
+        words += ["--num-episodes", str(EPISODES), "--layers", "0", "2", "--output-dir", str(single), *ARGS.split()]
+        assert main_pi([*words, "--stage", "capture"]) == 0
+    words = ["--task-suite", "robosuite", "--checkpoint", "dummy", "--layers", "0", "2", "--output-dir", str(single)]
+    assert main_pi([*words, "--stage", "analyze"]) == 0
+    assert_same(store, single / "robosuite.zarr")
+    name = "attention_ratio_results_robosuite.json"
+    results = json.loads((output / name).read_text())
+    assert results == json.loads((single / name).read_text())
+    expected = [(task, episode) for task in TASKS for episode in range(EPISODES)]
+    assert sorted((item["task_id"], item["episode_idx"]) for item in results) == expected
+
+
+def assert_same(one: Path, other: Path) -> None:
+    """The same episodes, and every array the same bit for bit; only the provenance may differ."""
+    first, second = open_store(one), open_store(other)
+    assert [episode.name for episode in first.episodes] == [episode.name for episode in second.episodes]
+    for left, right in zip(first.episodes, second.episodes, strict=True):
+        assert left.attributes.arrays == right.attributes.arrays
+        assert (left.attributes.success, left.attributes.num_steps) == (
+            right.attributes.success,
+            right.attributes.num_steps,
+        )
+        for name in left.attributes.arrays:
+            assert np.array_equal(left.read(name), right.read(name)), (left.name, name)
+            assert left.read(name).tobytes() == right.read(name).tobytes(), (left.name, name)
