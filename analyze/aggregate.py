@@ -48,7 +48,13 @@ def per_replan(steps: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
     The number of keys and the uniform ratio do not depend on denoise step and head and are taken over. Adds
     `nonfinite_layers`, 1 where the ratio is infinite or undefined (when the grouping has a ratio).
     """
-    masses = [*_mass_columns(grouping), "row_sum", "valid_mass", "num_valid", *(f"{name}_keys" for name in grouping.names)]
+    masses = [
+        *_mass_columns(grouping),
+        "row_sum",
+        "valid_mass",
+        "num_valid",
+        *(f"{name}_keys" for name in grouping.names),
+    ]
     constant = ["uniform_ratio"] if grouping.ratio else []
     averaged = (
         steps.with_columns(pl.col("layer").alias("layer_number"), pl.col("layer").cast(pl.String))
@@ -68,7 +74,13 @@ def add_layers_avg(replans: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
     Masses are means over the layers; the ratio is the mean of the layers' finite ratios (null when none is finite; the published
     scripts write 0 there); fractions and lifts come from the averaged masses. `nonfinite_layers` counts the layers left out.
     """
-    means = [*_mass_columns(grouping), "row_sum", "valid_mass", "num_valid", *(f"{name}_keys" for name in grouping.names)]
+    means = [
+        *_mass_columns(grouping),
+        "row_sum",
+        "valid_mass",
+        "num_valid",
+        *(f"{name}_keys" for name in grouping.names),
+    ]
     ratio = (
         [
             pl.col("uniform_ratio").first(),

@@ -12,11 +12,12 @@ from analyze.aggregate import add_layers_avg, episodes_table, per_replan, tasks_
 from analyze.atomic_file import replacing
 from analyze.contributions import contribution_table, summarise_contributions
 from analyze.frame_proxy import frame_proxy
+from analyze.group_contributions import group_contribution_table, summarise_group_contributions
 from analyze.question import Question
 from analyze.results_file import write_results_of_suites
 from analyze.selection import Selection
 from analyze.summary import AnalysedRun, summary_text, write_summary
-from analyze.tables import steps_table
+from analyze.tables import resolve_all, steps_table
 from analyze.terminal import progress_bar
 from schemas.errors import BadArgument, listing
 from schemas.grouping import Grouping
@@ -28,7 +29,7 @@ class Analysis:
     """The tables of one grouping over one selection of episodes.
 
     `steps` is described in `analyze.tables`; `replans`, `episodes` and `tasks` in `analyze.aggregate`; `contributions` (None
-    when they were not recorded) in `analyze.contributions`.
+    when they were not recorded) in `analyze.contributions`, `group_contributions` in the module of that name.
     """
 
     question: Question
@@ -37,6 +38,7 @@ class Analysis:
     episodes: pl.DataFrame
     tasks: pl.DataFrame
     contributions: pl.DataFrame | None
+    group_contributions: pl.DataFrame | None
     summary: str
 
     @property
@@ -57,8 +59,9 @@ def analyse(question: Question) -> Analysis:
     """Compute all tables. Shows progress at a terminal when it takes longer than a moment."""
     stores, settings, grouping = question.stores, question.settings, question.grouping
     root = stores[0].attributes
+    resolved = resolve_all(grouping, question.selected)
     with progress_bar(len(question.selected), "episodes") as advance:
-        steps = steps_table(question.selected, grouping, question.selection, question.site, advance)
+        steps = steps_table(question.selected, grouping, question.selection, question.site, advance, resolved)
     replans = add_layers_avg(per_replan(steps, grouping), grouping)
     episodes = episodes_table(replans, grouping)
     tasks = tasks_table(episodes, grouping, seed=settings.seed)
@@ -75,7 +78,11 @@ def analyse(question: Question) -> Analysis:
     contributions = contribution_table(question.episodes, question.selection)
     if contributions is not None:
         text += "\n" + summarise_contributions(contributions, settings.seed)
-    return Analysis(question, steps, replans, episodes, tasks, contributions, text)
+    groups = None
+    if all(store.attributes.recording.contributions for store in stores):
+        groups = group_contribution_table(question, resolved)
+        text += "\n" + summarise_group_contributions(groups, grouping, question.site, settings.seed)
+    return Analysis(question, steps, replans, episodes, tasks, contributions, groups, text)
 
 
 def write_tables(analysis: Analysis, folder: Path) -> WrittenFiles:
@@ -85,7 +92,7 @@ def write_tables(analysis: Analysis, folder: Path) -> WrittenFiles:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK):
             raise PermissionError(13, "Permission denied")
-        for name in ("steps", "episodes", "tasks", "contributions"):
+        for name in ("steps", "episodes", "tasks", "contributions", "group_contributions"):
             table: pl.DataFrame | None = getattr(analysis, name)
             if table is not None:
                 path = folder / f"{name}.parquet"

@@ -69,7 +69,9 @@ def resolve_all(grouping: Grouping, selected: Sequence[SelectedEpisode]) -> list
                 f"Group '{name}' ({selectors}) has no key in any of the {len(selected)} selected episodes; change its "
                 f'selector, or add allow_empty = ["{name}"] to the grouping.'
             )
-    return [_without(weights, item) if item.without else weights for item, weights in zip(selected, resolved, strict=True)]
+    return [
+        _without(weights, item) if item.without else weights for item, weights in zip(selected, resolved, strict=True)
+    ]
 
 
 def _without(resolved: ResolvedGrouping, item: SelectedEpisode) -> ResolvedGrouping:
@@ -90,9 +92,13 @@ def steps_table(
     selection: Selection,
     site: str,
     progress: Callable[[int], object] | None = None,
+    resolved: Sequence[ResolvedGrouping] | None = None,
 ) -> pl.DataFrame:
-    """Measure every selected episode; `progress` is called with 1 after each."""
-    resolved = resolve_all(grouping, selected)
+    """Measure every selected episode; `progress` is called with 1 after each.
+
+    `resolved` is the grouping on every episode where it is known already; else it is resolved here.
+    """
+    resolved = resolve_all(grouping, selected) if resolved is None else resolved
 
     def measure(pair: tuple[SelectedEpisode, ResolvedGrouping]) -> pl.DataFrame:
         return _episode_steps(*pair, grouping, selection, site)

@@ -1,4 +1,4 @@
-"""How long does an analysis of fifty episodes take on a laptop, and how much memory? Side by side with plain zarr-python and xarray + dask.
+"""How long does an analysis of fifty episodes take on a laptop, and how much memory? Beside plain zarr-python and xarray + dask.
 
 Usage: python benchmarks/analysis_speed.py [--store PATH] [--episodes 50] [--replans 52] [--only NAME ...]
 
@@ -25,7 +25,7 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
-WORDS = "put both the alphabet soup and the tomato sauce in the basket".split()
+WORDS = ["put", "both", "the", "alphabet", "soup", "and", "the", "tomato", "sauce", "in", "the", "basket"]
 NAMES = ("alphabet_soup_1", "tomato_sauce_1", "basket_1", "cream_cheese_1", "milk_1", "robot", "background")
 PYTHON_LOOP = """
 import sys, numpy as np, zarr
@@ -112,7 +112,9 @@ def measured(command: list[str]) -> tuple[float, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--store", type=Path, help="made when it is not there (default: a temporary one, deleted afterwards)")
+    parser.add_argument(
+        "--store", type=Path, help="made when it is not there (default: a temporary one, deleted afterwards)"
+    )
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--replans", type=int, default=52)
     parser.add_argument("--only", nargs="+", metavar="NAME", help="measure only these")
@@ -123,7 +125,8 @@ def main() -> None:
     if not store.exists():
         # In a process of its own: a child's peak memory counts from what its parent holds when it starts it.
         subprocess.run(
-            [sys.executable, __file__, "--make", str(store), str(arguments.episodes), str(arguments.replans)], check=True
+            [sys.executable, __file__, "--make", str(store), str(arguments.episodes), str(arguments.replans)],
+            check=True,
         )
     size = sum(file.stat().st_size for file in store.rglob("*") if file.is_file())
     print(f"{store}: {size / 1e9:.2f} GB in {sum(1 for _ in store.rglob('*'))} files; {os.cpu_count()} cores")
@@ -136,7 +139,17 @@ def main() -> None:
         "default-no-plots": [*ours, *rest, "--no-plots"],
         "span": [*ours, *rest, "--no-plots", "--grouping", "cameras"],
         "span-tables": [sys.executable, str(Path(__file__)), "--span-tables", str(store)],
-        "words": [*ours, *rest, "--no-plots", "--group", "soup=word:soup", "--group", "v=role:image", "--ratio", "v/soup"],
+        "words": [
+            *ours,
+            *rest,
+            "--no-plots",
+            "--group",
+            "soup=word:soup",
+            "--group",
+            "v=role:image",
+            "--ratio",
+            "v/soup",
+        ],
         "objects": [*ours, *rest, "--no-plots", "--grouping", "objects"],
         "plain-zarr": [sys.executable, "-c", PYTHON_LOOP, str(store), str(scratch / "weights.npy")],
         "xarray-dask": [sys.executable, "-c", XARRAY_DASK, str(store), str(scratch / "weights.npy")],

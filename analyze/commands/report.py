@@ -50,6 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from analyze.atomic_file import write_text
     from analyze.pipeline import analyse
+    from analyze.plots.style import plural
     from analyze.question import ask
     from analyze.reader import open_store
     from analyze.report.page import report_html
@@ -74,6 +75,6 @@ def run(arguments: argparse.Namespace) -> int:
         ) from None
     for line in analysis.question.skipped:
         print(line)
-    print(f"{path}: {len(page.encode()) / 1e6:.1f} MB, {analysis.episodes['layer'].n_unique()} layers or averages, "
-          f"{len(analysis.question.selected)} episodes. Open it in a browser.")  # fmt: skip
+    size = len(page.encode()) / 1e6
+    print(f"{path}: {size:.1f} MB on {plural(len(analysis.question.selected), 'episode')}. Open it in a browser.")
     return 0

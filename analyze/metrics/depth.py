@@ -9,14 +9,12 @@ import polars as pl
 from numpy.typing import ArrayLike, NDArray
 
 from analyze.aggregate import LAYERS_AVG
-from analyze.contributions import joint_norm
 from analyze.episode_intervals import means_with_intervals
+from analyze.group_contributions import group_contribution_table
 from analyze.question import Question
 from analyze.statistics import DEFAULT_SEED
-from analyze.tables import SelectedEpisode
 from schemas.grouping import Grouping
 from schemas.resolve import ResolvedGrouping
-from schemas.segments import segment_members, weights_on_segments
 
 
 def depth_centre(amounts: ArrayLike, blocks: ArrayLike) -> NDArray[np.float64]:
@@ -56,7 +54,13 @@ def depth_table(
     single = episodes.filter(pl.col("layer") != LAYERS_AVG)
     parts = [_centres(single, {name: f"{name}_mass" for name in grouping.names}, "mass")]
     if norms is not None:
-        parts.append(_centres(norms, {name: f"{name}_norm" for name in grouping.names if f"{name}_norm" in norms.columns}, "contribution"))
+        parts.append(
+            _centres(
+                norms,
+                {name: f"{name}_norm" for name in grouping.names if f"{name}_norm" in norms.columns},
+                "contribution",
+            )
+        )
     blocks = single["block"].unique().sort()
     limits = (float(blocks[0]), float(blocks[-1]))
     table = means_with_intervals(pl.concat(parts), ("group", "of"), {"centre": limits}, seed)
@@ -89,49 +93,9 @@ def _centres(table: pl.DataFrame, columns: Mapping[str, str], of: str) -> pl.Dat
 
 
 def contribution_norms(question: Question, resolved: Sequence[ResolvedGrouping]) -> pl.DataFrame | None:
-    """Norm of what each group's keys add to the residual stream, one row per (episode, block): `{g}_norm`.
-
-    Mean over replans and denoise steps of `contributions.joint_norm`. Gram matrices are of whole segments, so only
-    groups that take each segment whole or not at all, the same ones at every replan, have a norm; None where no group has one, or nothing was
-    recorded.
-    """
-    selection, site = question.selection, question.site
-    if not all(store.attributes.recording.contributions for store in question.stores):
+    """`group_contributions.group_contribution_table`, mean over replans and denoise steps: one row per (episode, block)."""
+    table = group_contribution_table(question, resolved)
+    if table is None:
         return None
-    chosen = [_whole_segments(item, groups, site) for item, groups in zip(question.selected, resolved, strict=True)]
-    # A group that cannot be measured in one episode would be a mean over the others only.
-    names = [name for name in question.grouping.names if all(name in parts for parts in chosen)]
-    if not names:
-        return None
-    frames = []
-    for item, parts in zip(question.selected, chosen, strict=True):
-        gram = item.episode.read(f"{site}/contribution")[:, list(selection.layers)][:, :, list(selection.denoise)]
-        norms = {f"{name}_norm": joint_norm(gram, parts[name]).mean(axis=(0, 2)) for name in names}
-        attributes = item.episode.attributes
-        frames.append(
-            pl.DataFrame({"block": np.array(selection.blocks, dtype=np.int64), **norms}).select(
-                pl.lit(item.store.suite).alias("suite"),
-                pl.lit(attributes.task_id, dtype=pl.Int64).alias("task_id"),
-                pl.lit(attributes.episode_index, dtype=pl.Int64).alias("episode_index"),
-                pl.all(),
-            )
-        )
-    return pl.concat(frames)
-
-
-def _whole_segments(item: SelectedEpisode, resolved: ResolvedGrouping, site: str) -> dict[str, NDArray[np.bool_]]:
-    """By group, which parts of the Gram matrix are its own; groups that cut a segment are left out."""
-    tokens, segments = item.tokens, item.episode.attributes.segments[site]
-    members = segment_members(tokens.layout, tokens.static_roles, segments)
-    present = members.any(axis=1)
-    parts = {}
-    for i, name in enumerate(resolved.names):
-        weights = weights_on_segments(resolved.weights[:, :, i : i + 1], members)
-        if weights is None:
-            continue
-        taken = weights[:, :, 0].max(axis=0)
-        # Whole or not at all, and at every replan that has the segment.
-        if np.isin(taken, (0.0, 1.0)).all() and (~present | (weights[:, :, 0] == taken)).all():
-            # The last part is the whole update of the block, and belongs to no group.
-            parts[name] = np.array([*(taken == 1.0), False])
-    return parts
+    norms = [f"{name}_norm" for name in question.grouping.names if f"{name}_norm" in table.columns]
+    return table.group_by("suite", "task_id", "episode_index", "block", maintain_order=True).agg(pl.col(norms).mean())

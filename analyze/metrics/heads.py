@@ -103,8 +103,8 @@ def heads_table(episodes: pl.DataFrame, grouping: Grouping, seed: int = DEFAULT_
     """One row per (layer, head), from `head_frame` of all episodes: means over episodes with two-level intervals (95 %).
 
     Columns: layer, block, head, num_episodes, num_tasks; bounded by X_low and X_high, with X_episodes saying how many episodes have
-    a finite value: `{g}_fraction`, `{g}_lift`, and with a ratio `numerator_fraction`, `log2_ratio` (two to its power is the geometric mean
-    that `tasks_table` has) and `log2_lift`; without bounds, with a ratio, `denominator_fraction`, `ratio_of_means`
+    a finite value: `{g}_fraction`, `{g}_lift`, and with a ratio `numerator_fraction`, `log2_ratio` (two to its power is
+    the geometric mean that `tasks_table` has) and `log2_lift`; without bounds, with a ratio, `denominator_fraction`, `ratio_of_means`
     (mean numerator mass / mean denominator mass) and `num_nonfinite`, the number of (episode, replan) left out of the logarithms.
     """
     bounded = {f"{name}_fraction": SHARE for name in grouping.names}

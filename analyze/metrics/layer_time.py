@@ -40,7 +40,7 @@ def layer_time_table(
         quantities = [f"{name}_fraction" for name in having[:_MOST_GROUPS]]
     layers = [layer for layer in layer_order(single) if layer != LAYERS_AVG]
     blocks = dict(single.select("layer", "block").unique().iter_rows())
-    bins = num_bins or min(MOST_BINS, int(single["replan"].max() or 0) + 1)  # type: ignore[call-overload]
+    bins = num_bins or min(MOST_BINS, int(single["replan"].to_numpy().max()) + 1)
     place = {layer: i for i, layer in enumerate(layers)}
     values, tasks = [], []
     for key, part in single.sort(*_EPISODE, "replan").group_by(_EPISODE, maintain_order=True):

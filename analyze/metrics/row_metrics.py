@@ -38,7 +38,9 @@ class RowOptions:
     def __post_init__(self) -> None:
         """Check the numbers of keys."""
         if not self.top or min(self.top) < 1 or len(set(self.top)) != len(self.top):
-            raise BadArgument(f"Cannot take the top {listing(self.top)} keys; expected different whole numbers from 1 on.")
+            raise BadArgument(
+                f"Cannot take the top {listing(self.top)} keys; expected different whole numbers from 1 on."
+            )
 
 
 @dataclass(frozen=True)
@@ -171,9 +173,7 @@ def row_table(
     )
 
 
-def groups_with_valid_keys(
-    items: Sequence[SelectedEpisode], resolved: Sequence[ResolvedGrouping]
-) -> tuple[str, ...]:
+def groups_with_valid_keys(items: Sequence[SelectedEpisode], resolved: Sequence[ResolvedGrouping]) -> tuple[str, ...]:
     """The groups that have a valid key anywhere: only inside these is there an entropy."""
     having: set[int] = set()
     for item, groups in zip(items, resolved, strict=True):

@@ -49,7 +49,9 @@ class SinkRule:
     def __post_init__(self) -> None:
         """Check that the rule can single anything out."""
         if not 1.0 <= self.factor < np.inf:
-            raise BadArgument(f"The sink factor {self.factor:g} must be at least 1: at 1 a key takes its uniform share.")
+            raise BadArgument(
+                f"The sink factor {self.factor:g} must be at least 1: at 1 a key takes its uniform share."
+            )
         if not 0.0 < self.share <= 1.0:
             raise BadArgument(f"The sink share {self.share:g} is no share of rows; expected more than 0 and at most 1.")
 
@@ -113,8 +115,8 @@ def key_shares_table(question: Question, shares: Sequence[KeyShares]) -> pl.Data
     """One row per (task, key that is valid in one of its episodes), episodes weighing the same.
 
     Columns: suite, task_id, num_episodes; key, span, role (the commonest over replans), patch_row, patch_column (null unless
-    the key is a patch), description (in words); share_of_rows, mean_mass (share of the valid keys' mass), times_uniform (mean_mass x mean
-    number of valid keys).
+    the key is a patch), description (in words); share_of_rows, mean_mass (share of the valid keys' mass), times_uniform
+    (mean_mass x mean number of valid keys).
     """
     frames = []
     for (suite, task), positions in _tasks(question).items():
@@ -178,7 +180,8 @@ def merged_sinks(sinks: pl.DataFrame) -> pl.DataFrame:
     """Sinks over tasks, one row per (key, description): num_tasks, and means over those tasks of the three numbers."""
     numbers = ("share_of_rows", "mean_mass", "times_uniform")
     merged = sinks.group_by("key", "span", "role", "description", maintain_order=True).agg(
-        pl.struct("suite", "task_id").n_unique().cast(pl.Int64).alias("num_tasks"), *(pl.col(name).mean() for name in numbers)
+        pl.struct("suite", "task_id").n_unique().cast(pl.Int64).alias("num_tasks"),
+        *(pl.col(name).mean() for name in numbers),
     )
     return merged.sort("num_tasks", "mean_mass", "key", descending=[True, True, False])
 
@@ -193,7 +196,9 @@ def describe_sinks(sinks: pl.DataFrame, num_tasks: int, rule: SinkRule) -> list[
         f"{row['description']} ({row['role']}; in {row['num_tasks']} {of}, {row['mean_mass']:.1%} of the mass)"
         for row in merged.iter_rows(named=True)
     ]
-    return [f"Without sinks, keys that take {rule}: {listing(named, 6)} were taken out of every group and of the valid keys."]
+    return [
+        f"Without sinks, keys that take {rule}: {listing(named, 6)} were taken out of every group and of the valid keys."
+    ]
 
 
 _TOLD = {

@@ -26,7 +26,9 @@ def plot_head_grid(heads: pl.DataFrame, grouping: Grouping, folder: Path) -> lis
     quantity = _quantity(heads, grouping)
     layers = heads["layer"].unique(maintain_order=True).to_list()
     numbers = heads["head"].unique(maintain_order=True).to_list()
-    log2, low, high = (_grid(heads, column, len(layers)) for column in (quantity, f"{quantity}_low", f"{quantity}_high"))
+    log2, low, high = (
+        _grid(heads, column, len(layers)) for column in (quantity, f"{quantity}_low", f"{quantity}_high")
+    )
     label = f"{_name(grouping, heads)}, relative to uniform attention"
     if quantity == "log2_ratio":
         label = f"{_name(grouping, heads)} (no uniform baseline)"
@@ -52,7 +54,9 @@ def plot_head_grid(heads: pl.DataFrame, grouping: Grouping, folder: Path) -> lis
 def _quantity(heads: pl.DataFrame, grouping: Grouping) -> str:
     if grouping.ratio is None:
         return f"{main_group(heads, grouping)}_lift"
-    return "log2_ratio" if heads["log2_lift"].is_null().all() and heads["log2_ratio"].is_not_null().any() else "log2_lift"
+    return (
+        "log2_ratio" if heads["log2_lift"].is_null().all() and heads["log2_ratio"].is_not_null().any() else "log2_lift"
+    )
 
 
 def _name(grouping: Grouping, heads: pl.DataFrame) -> str:

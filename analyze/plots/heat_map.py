@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
-#: Towards the numerator as the visual group is drawn, towards the denominator as the linguistic one; they stay apart for colour-blind eyes.
+#: Towards the numerator as the visual group is drawn, towards the denominator as the linguistic one: apart for colour-blind eyes.
 _LESS, _EVEN, _MORE = "#A63C00", "#F7F7F7", "#00507D"
 _NOTHING = "#D9D9D9"
 #: Half of what the colours span at least, in powers of two: tiny differences must not look large.
@@ -48,7 +48,7 @@ def draw_log2_map(
     ticks = _factor_ticks(span)
     bar.set_ticks(ticks, labels=[_factor(tick) for tick in ticks])
     bar.set_label(label)
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.outline.set_visible(False)
 
 
 def draw_dots(axes: Axes, where: NDArray[np.bool_]) -> None:
@@ -85,5 +85,5 @@ def _factor_ticks(span: float) -> list[float]:
 def _factor(log2: float) -> str:
     """2 to the power as a short factor: ×4, ×1.4, ×1/4."""
     if log2 < 0 and log2 == round(log2):
-        return f"×1/{2 ** int(-log2)}"
-    return f"×{2.0**log2:.3g}"
+        return f"\u00d71/{2 ** int(-log2)}"
+    return f"\u00d7{2.0**log2:.3g}"

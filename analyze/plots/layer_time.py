@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -18,11 +19,13 @@ from analyze.plots.style import (
     ratio_name,
     save_figure,
     title,
-    whole_numbers,
     wrapped,
 )
 from analyze.statistics import DEFAULT_SEED
 from schemas.grouping import Grouping
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 STEM = "layer_time"
 
@@ -73,7 +76,7 @@ def plot_layer_time(replans: pl.DataFrame, grouping: Grouping, folder: Path, see
     return save_figure(figure, folder, STEM, table)
 
 
-def _time_axis(axes, bins: int) -> None:  # type: ignore[no-untyped-def]
+def _time_axis(axes: Axes, bins: int) -> None:
     positions = np.linspace(-0.5, bins - 0.5, 6)
     axes.set_xticks(positions, [f"{share:.1f}" for share in np.linspace(0, 1, 6)])
     axes.set_xlabel("episode time (0: first replan, 1: end)")

@@ -29,9 +29,7 @@ _MOST_GROUPS = 6
 _MOST_LABELS = 20
 
 
-def draw_profile(
-    figure: Figure, rows: pl.DataFrame, grouping: Grouping, labels: Sequence[str], along: str
-) -> None:
+def draw_profile(figure: Figure, rows: pl.DataFrame, grouping: Grouping, labels: Sequence[str], along: str) -> None:
     """Draw rows of `aggregate.tasks_table`, one per position: ratio (if there is one) above, fractions below."""
     panels = 1 if grouping.ratio is None else 2
     every = figure.subplots(panels, 1, squeeze=False, sharex=False)[:, 0]

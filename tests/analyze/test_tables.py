@@ -15,7 +15,7 @@ from polars.testing import assert_frame_equal
 
 from analyze.pipeline import analyse
 from analyze.question import AnalysisSettings, ask
-from analyze.reader import open_store
+from analyze.reader import StoredEpisode, open_store
 from analyze.selection import parse_denoise_steps, select
 from analyze.tables import load_tokens, steps_table, vocabulary_of
 from schemas.builtin_groupings import default
@@ -101,14 +101,20 @@ def test_fractions_lifts_and_ratios_follow_from_masses_and_counts(data):
 def test_rows_are_only_read_when_the_grouping_cuts_through_a_segment(tmp_path, monkeypatch):
     path = write_store(tmp_path / "a.zarr")
     read: list[str] = []
-    original = zarr.Array.__getitem__
-    monkeypatch.setattr(
-        zarr.Array, "__getitem__", lambda array, key: (read.append(array.basename), original(array, key))[1]
-    )
+
+    def spy_on(method: str) -> None:
+        original = getattr(StoredEpisode, method)
+        monkeypatch.setattr(
+            StoredEpisode, method, lambda episode, name, *more: (read.append(name), original(episode, name, *more))[1]
+        )
+
+    spy_on("read")
+    spy_on("read_layer")
     table_of(path, Grouping("spans", {"a": ("span:prompt & role:instruction",), "rest": ("*",)}))
-    assert "rows" not in read
+    assert "joint/atoms" in read
+    assert "joint/rows" not in read
     table_of(path, Grouping("words", {"a": ("word:the",), "rest": ("*",)}))
-    assert "rows" in read
+    assert "joint/rows" in read
 
 
 def test_a_selection_of_layers_steps_and_heads_takes_exactly_those(tmp_path):
