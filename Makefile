@@ -31,7 +31,7 @@ endif
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
-SOURCES := schemas capture analyze tests benchmarks scripts
+SOURCES := schemas capture analyze tests benchmarks scripts docs
 
 .PHONY: capture analyze test test-slurm check unit setup setup-analyze schemas clean
 

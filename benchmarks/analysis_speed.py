@@ -25,8 +25,6 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
-WORDS = ["put", "both", "the", "alphabet", "soup", "and", "the", "tomato", "sauce", "in", "the", "basket"]
-NAMES = ("alphabet_soup_1", "tomato_sauce_1", "basket_1", "cream_cheese_1", "milk_1", "robot", "background")
 PYTHON_LOOP = """
 import sys, numpy as np, zarr
 from pathlib import Path
@@ -53,36 +51,9 @@ print(sum(part.size for part in out))
 
 def make_store(path: Path, episodes: int, replans: int) -> None:
     """Write the store; fifty episodes take a minute or two."""
-    from schemas.layout import PatchGrid, Piece, Prompt, Role, SiteLayout, Span
-    from schemas.vocabulary import EpisodeTokens, SceneObject
+    from tests.libero_tokens import libero_tokens
     from tests.store_kit import StoreSpec, write_store
 
-    spans = []
-    for i, camera in enumerate(("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")):
-        grid = PatchGrid(16, 16, 224, 224)
-        spans.append(Span(camera, "image", 256 * i, 256 * (i + 1), camera=camera, grid=grid))
-    spans += [Span("prompt", "text", 768, 968), Span("actions", "action", 968, 978)]
-    layout = SiteLayout("joint", tuple(spans))
-    generator = np.random.default_rng(0)
-    prompts, roles = [], np.zeros((replans, 978), dtype=np.uint8)
-    for replan in range(replans):  # the state is written into the prompt: another prompt at every replan
-        roles[replan, :512], roles[replan, 512:768], roles[replan, 968:] = Role.IMAGE, Role.MASKED_IMAGE, Role.ACTION
-        roles[replan, 768:968], roles[replan, 768] = Role.PADDING, Role.BOS
-        pieces, position = [], 0
-        digits = [str(generator.integers(256)) for _ in range(8)]
-        for i, text in enumerate([*WORDS, *digits]):
-            length = len(text) + (i > 0)
-            pieces.append(Piece(769 + i, (" " if i else "") + text, position, position + length))
-            roles[replan, 769 + i] = Role.INSTRUCTION if i < len(WORDS) else Role.STATE
-            position += length
-        prompts.append(Prompt(" ".join([*WORDS, *digits]), tuple(pieces), (0, len(" ".join(WORDS)))))
-    kinds = {"robot": "robot", "background": "background"}
-    objects = tuple(SceneObject(name, kinds.get(name, "object"), i < 3) for i, name in enumerate(NAMES))  # type: ignore[arg-type]
-    coverage = {
-        camera: generator.dirichlet(np.full(len(objects), 0.2), (replans, 256)).astype(np.float32)
-        for camera in layout.cameras[:2]
-    }
-    tokens = EpisodeTokens(layout, roles, tuple(prompts), np.arange(replans), objects, coverage)
     spec = StoreSpec(
         suite="libero_10",
         tasks=tuple(range(10)),
@@ -93,7 +64,7 @@ def make_store(path: Path, episodes: int, replans: int) -> None:
         frames=False,
         contributions=True,
         num_action_queries=10,
-        tokens=tokens,
+        tokens=libero_tokens(replans),
     )
     began = time.perf_counter()
     write_store(path, spec=spec)

@@ -1,0 +1,103 @@
+"""Draw the pictures of `docs/interpreting.md` from made-up rows with a known truth, with the tool's own commands.
+
+Usage: python docs/make_pictures.py [--folder docs/pictures]
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from analyze.__main__ import main as analyze
+from schemas.layout import Role
+from schemas.vocabulary import EpisodeTokens
+from tests.libero_tokens import libero_tokens
+from tests.store_kit import StoreSpec, write_store
+
+#: Task 0 ignores content, task 1 looks (patches get four times as much as words), task 2 reads (the reverse).
+FAVOURS = {0: 1.0, 1: 4.0, 2: 0.25}
+SINK_PATCH = (2, 13)
+SINK_SHARE = 1 / 3
+SPECIALIST = (9, 3)
+
+
+def nearly_uniform(tokens: EpisodeTokens, shape: tuple[int, ...], seed: list[int], spread: float = 0.4) -> np.ndarray:
+    """Weights (replan, *shape, key) of log-normal noise around equal attention to every valid key, not normalised."""
+    generator = np.random.default_rng(seed)
+    noise = np.exp(spread * generator.normal(size=(tokens.num_replans, *shape, tokens.layout.num_keys)))
+    level = np.exp(0.25 * generator.normal())  # episodes differ
+    text = is_text(tokens)[:, None, None, None, None]
+    return noise * np.where(text, level, 1.0) * tokens.valid[:, None, None, None, None]
+
+
+def is_text(tokens: EpisodeTokens) -> np.ndarray:
+    """Keys of bos and instruction, shape (replan or 1, key)."""
+    return np.isin(tokens.static_roles, [Role.BOS, Role.INSTRUCTION])
+
+
+def normalised(weights: np.ndarray) -> np.ndarray:
+    return weights / weights.sum(axis=-1, keepdims=True)
+
+
+def favour(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
+    weights = nearly_uniform(tokens, rows.shape[1:-1], [1, task, episode])
+    image = (tokens.static_roles == Role.IMAGE)[:, None, None, None, None]
+    return normalised(weights * np.where(image, FAVOURS[task], 1.0))
+
+
+def sink(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
+    made = normalised(nearly_uniform(tokens, rows.shape[1:-1], [2, task, episode]))
+    key = SINK_PATCH[0] * 16 + SINK_PATCH[1]
+    made[..., key] = 0.0
+    made *= (1.0 - SINK_SHARE) / made.sum(axis=-1, keepdims=True)
+    made[..., key] = SINK_SHARE
+    return made
+
+
+def specialist(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
+    weights = nearly_uniform(tokens, rows.shape[1:-1], [3, task, episode])
+    layer, head = SPECIALIST
+    text = np.broadcast_to(is_text(tokens)[:, None, None], weights[:, layer, :, head].shape)
+    weights[:, layer, :, head] *= np.where(text, 40.0, 1.0)
+    return normalised(weights)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--folder", type=Path, default=Path(__file__).parent / "pictures")
+    folder = parser.parse_args().folder
+    folder.mkdir(parents=True, exist_ok=True)
+    scratch = Path(tempfile.mkdtemp(prefix="pictures_"))
+    shape = StoreSpec(
+        tokens=libero_tokens(6),
+        num_layers=18,
+        layers=tuple(range(18)),
+        heads=tuple(range(8)),
+        frames=False,
+        coverage=False,
+    )
+    cases = {
+        "baseline": (favour, {"layers": (0, 9, 17), "tasks": (0, 1, 2), "episodes": 6}, ["ratios"], "ratio_per_task"),
+        "sink": (sink, {"layers": (9,), "tasks": (0,), "episodes": 2}, ["overlay", "--camera", "base_0_rgb"], None),
+        "specialist_head": (specialist, {"tasks": (0, 1), "episodes": 3}, ["heads"], "head_grid"),
+    }
+    for name, (plant, changes, command, picture) in cases.items():
+        store = write_store(scratch / f"{name}.zarr", spec=shape, plant_rows=plant, suite="made_up", **changes)
+        output = scratch / name
+        if analyze([command[0], str(store), *command[1:], "--output", str(output)]):
+            raise SystemExit(f"{name}: the analysis failed")
+        drawn = output / f"{picture}.png" if picture else next(output.rglob("*.png"))
+        shutil.copyfile(drawn, folder / f"{name}.png")
+        print(folder / f"{name}.png")
+    shutil.rmtree(scratch)
+
+
+if __name__ == "__main__":
+    main()
