@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from analyze.metrics.sinks import SinkRule
     from analyze.question import AnalysisSettings
 
 
@@ -58,6 +59,24 @@ def add_output(parser: argparse.ArgumentParser, default: str = "results/STORE/GR
     output.add_argument("--no-plots", action="store_true", help="numbers only")
     output.add_argument("--seed", type=int, default=0, help="seed of the bootstrap (default: 0)")
     return output
+
+
+def add_sink_rule(parser: argparse._ArgumentGroup) -> None:
+    """--sink-factor and --sink-share; their defaults are those of `metrics.sinks.SinkRule`."""
+    parser.add_argument(
+        "--sink-factor", type=float, metavar="X", help="a sink takes more than X times its uniform share (default: 10)"
+    )
+    parser.add_argument(
+        "--sink-share", type=float, metavar="F", help="in at least this share of the rows (default: 0.5)"
+    )
+
+
+def sink_rule(arguments: argparse.Namespace) -> SinkRule:
+    """The rule that --sink-factor and --sink-share give."""
+    from analyze.metrics.sinks import SinkRule
+
+    given = {"factor": arguments.sink_factor, "share": arguments.sink_share}
+    return SinkRule(**{name: value for name, value in given.items() if value is not None})
 
 
 def settings_of(arguments: argparse.Namespace) -> AnalysisSettings:

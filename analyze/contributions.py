@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from analyze.aggregate import LAYERS_AVG
 from analyze.masses import ratio
+from analyze.parallel import map_episodes
 from analyze.reader import Store, StoredEpisode
 from analyze.selection import Selection
 from analyze.statistics import POSITIVE, bootstrap_interval, mean_over_episodes
@@ -36,8 +37,8 @@ def joint_norm(gram: NDArray[np.floating], chosen: NDArray[np.bool_]) -> NDArray
 
     gram: (..., part, part); chosen: (part,) bool. Returns (...). Rounding may leave tiny negative squares: they are 0.
     """
-    weights = chosen.astype(np.float64)
-    squared = np.einsum("...ab,a,b->...", gram.astype(np.float64), weights, weights)
+    part = np.flatnonzero(chosen)
+    squared = gram[..., part[:, None], part].sum(axis=(-2, -1), dtype=np.float64)
     return np.sqrt(np.clip(squared, 0.0, None))
 
 
@@ -48,30 +49,36 @@ def contribution_table(chosen: Sequence[tuple[Store, StoredEpisode]], selection:
     contribution_ratio (visual / linguistic; infinite or null where the denominator is 0). A side is read at the site that has
     such keys: both at `joint` for pi, `self` and `cross` for Cosmos. None also when a run has no such keys at all.
     """
-    frames = []
-    for store, episode in chosen:
-        root = store.attributes
-        if not root.recording.contributions:
-            return None
-        visual = _side_norm(root, episode, selection, VISUAL_ROLES)
-        linguistic = _side_norm(root, episode, selection, LINGUISTIC_ROLES)
-        if visual is None or linguistic is None:
-            return None
-        frames.append(_episode_frame(store, episode, selection, visual, linguistic))
-    return pl.concat(frames)
+    if not all(store.attributes.recording.contributions for store, _ in chosen):
+        return None
+
+    def measure(pair: tuple[Store, StoredEpisode]) -> pl.DataFrame | None:
+        store, episode = pair
+        sides = [_parts_of_side(store.attributes, episode, roles) for roles in (VISUAL_ROLES, LINGUISTIC_ROLES)]
+        grams = {site: selected_gram(episode, site, selection) for site in {side[0] for side in sides if side}}
+        norms = [joint_norm(grams[side[0]], side[1]) for side in sides if side is not None]
+        return _episode_frame(store, episode, selection, norms[0], norms[1]) if len(norms) == len(sides) else None
+
+    frames = [frame for frame in map_episodes(measure, chosen) if frame is not None]
+    return pl.concat(frames) if len(frames) == len(chosen) else None
 
 
-def _side_norm(
-    root: RootAttributes, episode: StoredEpisode, selection: Selection, roles: Sequence[str]
-) -> NDArray[np.float64] | None:
-    """Norm (replan, layer, denoise) of all segments with these roles, at the first site that has any."""
+def selected_gram(episode: StoredEpisode, site: str, selection: Selection) -> NDArray[np.float32]:
+    """The Gram matrices (replan, layer, denoise, part, part) of the selected layers and denoise steps."""
+    gram: NDArray[np.float32] = episode.read(f"{site}/contribution")
+    return gram[:, list(selection.layers)][:, :, list(selection.denoise)]
+
+
+def _parts_of_side(
+    root: RootAttributes, episode: StoredEpisode, roles: Sequence[str]
+) -> tuple[str, NDArray[np.bool_]] | None:
+    """The first site that has segments with these roles, and which parts they are, (part,)."""
     for site in root.sites:
         segments: tuple[Segment, ...] = episode.attributes.segments[site.name]
         # The last part is the whole update of the block, and belongs to no side.
         parts = np.array([*(segment.role in roles for segment in segments), False])
         if parts.any():
-            gram = episode.read(f"{site.name}/contribution")
-            return joint_norm(gram[:, list(selection.layers)][:, :, list(selection.denoise)], parts)
+            return site.name, parts
     return None
 
 

@@ -14,7 +14,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from analyze.aggregate import LAYERS_AVG
-from analyze.contributions import joint_norm
+from analyze.contributions import joint_norm, selected_gram
 from analyze.episode_intervals import means_with_intervals
 from analyze.masses import ratio
 from analyze.parallel import map_episodes
@@ -78,8 +78,7 @@ def group_contribution_table(question: Question, resolved: Sequence[ResolvedGrou
 
 def _episode_frame(item: SelectedEpisode, parts: Mapping[str, NDArray[np.bool_]], question: Question) -> pl.DataFrame:
     selection, grouping = question.selection, question.grouping
-    gram = item.episode.read(f"{question.site}/contribution")
-    gram = gram[:, list(selection.layers)][:, :, list(selection.denoise)]
+    gram = selected_gram(item.episode, question.site, selection)
     norms = {f"{name}_norm": joint_norm(gram, taken) for name, taken in parts.items()}
     if grouping.ratio is not None and {*grouping.ratio.numerator, *grouping.ratio.denominator} <= parts.keys():
         above, below = (

@@ -72,7 +72,7 @@ def analyse(question: Question) -> Analysis:
         untrained=policy.untrained,
         denoise_steps=question.selection.denoise_steps,
         heads=describe_heads(question.selection, root.policy.num_heads),
-        notes=[*_notes(root, question.selection, question.site), *question.skipped],
+        notes=[*_notes(root, question.selection, question.site), *question.skipped, *question.notes],
     )
     text = summary_text(run, grouping, episodes, tasks)
     contributions = contribution_table(question.episodes, question.selection)

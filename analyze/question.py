@@ -51,6 +51,7 @@ class Question:
         selected: the episodes, each with its store and its tokens.
         grouping: the groups of keys.
         skipped: one line for every episode that was left out because it is damaged or empty (`skip_corrupt`).
+        notes: further lines that belong beside every number, for instance which keys were taken out.
     """
 
     stores: tuple[Store, ...]
@@ -60,6 +61,7 @@ class Question:
     selected: tuple[SelectedEpisode, ...]
     grouping: Grouping
     skipped: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def episodes(self) -> list[tuple[Store, StoredEpisode]]:

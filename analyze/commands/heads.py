@@ -8,10 +8,12 @@ from analyze.arguments import (
     add_grouping,
     add_output,
     add_selection,
+    add_sink_rule,
     add_stores,
     output_folder,
     report_files,
     settings_of,
+    sink_rule,
 )
 from schemas.command_line import OneSentenceParser
 
@@ -30,9 +32,9 @@ def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-analyze heads STORE ...`."""
     parser = OneSentenceParser(
         prog="vla-analyze heads",
-        description="Who looks and who reads: the most visual and most linguistic heads, how much heads differ, layers, depth and denoise "
-        "steps, with intervals over tasks and episodes; and of single rows entropy, effective number of keys, mass of the largest keys "
-        "and sinks.",
+        description="Who looks and who reads: the most visual and most linguistic heads, how much heads differ, layers, depth and "
+        "denoise steps, with intervals over tasks and episodes; and of single rows entropy, effective number of keys, mass of the "
+        "largest keys and sinks.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -42,7 +44,12 @@ def build_parser() -> argparse.ArgumentParser:
     rows = parser.add_argument_group("rows and heads")
     rows.add_argument("--top", type=int, default=5, metavar="N", help="heads listed on either end (default: 5)")
     rows.add_argument(
-        "--top-k", type=int, nargs="+", default=[1, 5, 10], metavar="K", help="numbers of largest keys (default: 1 5 10)"
+        "--top-k",
+        type=int,
+        nargs="+",
+        default=[1, 5, 10],
+        metavar="K",
+        help="numbers of largest keys (default: 1 5 10)",
     )
     rows.add_argument(
         "--no-rows", action="store_true", help="do not read the rows: no entropy, no largest keys, no sinks"
@@ -50,22 +57,6 @@ def build_parser() -> argparse.ArgumentParser:
     add_sink_rule(rows)
     add_output(parser, "results/STORE/heads")
     return parser
-
-
-def add_sink_rule(parser: argparse._ArgumentGroup) -> None:
-    """--sink-factor and --sink-share; their defaults are `metrics.sinks.SinkRule`'s."""
-    parser.add_argument(
-        "--sink-factor", type=float, metavar="X", help="a sink takes more than X times its uniform share (default: 10)"
-    )
-    parser.add_argument("--sink-share", type=float, metavar="F", help="in at least this share of the rows (default: 0.5)")
-
-
-def sink_rule(arguments: argparse.Namespace):  # type: ignore[no-untyped-def]
-    """The `SinkRule` that the arguments give."""
-    from analyze.metrics.sinks import SinkRule
-
-    given = {"factor": arguments.sink_factor, "share": arguments.sink_share}
-    return SinkRule(**{name: value for name, value in given.items() if value is not None})
 
 
 def run(arguments: argparse.Namespace) -> int:

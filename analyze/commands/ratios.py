@@ -8,10 +8,12 @@ from analyze.arguments import (
     add_grouping,
     add_output,
     add_selection,
+    add_sink_rule,
     add_stores,
     output_folder,
     report_files,
     settings_of,
+    sink_rule,
 )
 from analyze.commands import list_of_commands
 from schemas.command_line import OneSentenceParser
@@ -21,6 +23,7 @@ _EXAMPLES = """examples:
   vla-analyze runs/libero_10.zarr --list
   vla-analyze runs/libero_10.zarr --grouping cameras --layers 25 26 27
   vla-analyze runs/libero_10.zarr --group bowl='object:akita_black_bowl_1' --group noun=word:bowl --ratio bowl/noun
+  vla-analyze runs/libero_10.zarr --without-sinks
   vla-analyze heads runs/libero_10.zarr
   vla-analyze compare runs/base.zarr runs/finetuned.zarr
 
@@ -44,6 +47,13 @@ def build_parser(prog: str = "vla-analyze") -> argparse.ArgumentParser:
     add_grouping(parser)
     selection = add_selection(parser)
     selection.add_argument("--per-head", action="store_true", help="keep heads apart in the steps table")
+    sinks = parser.add_argument_group("sinks")
+    sinks.add_argument(
+        "--without-sinks",
+        action="store_true",
+        help="take keys that are sinks out of every group and of the valid keys, and say which (reads all selected rows)",
+    )
+    add_sink_rule(sinks)
     output = add_output(parser)
     output.add_argument("--save-viz", action="store_true", help="also a picture per episode and layer")
     return parser
@@ -55,6 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     from analyze.pipeline import analyse, write_tables
     from analyze.question import ask
     from analyze.reader import open_store
+    from schemas.errors import BadArgument
 
     stores = [open_store(path) for path in arguments.stores]
     if arguments.list:
@@ -63,9 +74,22 @@ def run(arguments: argparse.Namespace) -> int:
         print("\n\n".join(describe_store(store, arguments.tasks) for store in stores))
         return 0
     question = ask(stores, settings_of(arguments))
+    sinks = None
+    if arguments.without_sinks:
+        from analyze.metrics.sinks import sinks_table, without_sinks
+
+        rule = sink_rule(arguments)
+        sinks = sinks_table(question, rule)
+        question = without_sinks(question, sinks, rule)
+    elif arguments.sink_factor is not None or arguments.sink_share is not None:
+        raise BadArgument("--sink-factor and --sink-share say what a sink is for --without-sinks; give that too.")
     analysis = analyse(question)
     folder = output_folder(arguments, question.grouping.name)
     written = write_tables(analysis, folder)
+    if sinks is not None:
+        from analyze.table_files import write_parquet
+
+        written.files += write_parquet(folder, sinks=sinks)
     print(analysis.summary)
     if not arguments.no_plots:
         from analyze.plots.write import write_plots

@@ -12,9 +12,10 @@ from analyze.aggregate import LAYERS_AVG, overall_rows
 from analyze.episode_intervals import means_with_intervals
 from analyze.metrics.head_study import HeadStudy
 from analyze.metrics.heads import main_group, ranked_heads
+from analyze.metrics.row_metrics import episode_layer_means
 from analyze.metrics.sinks import SinkRule, merged_sinks
 from analyze.statistics import POSITIVE
-from analyze.summary import WIDTH
+from analyze.text_header import WIDTH, header
 from analyze.text_table import format_interval, format_number, text_table
 from schemas.errors import listing
 from schemas.grouping import Grouping
@@ -34,38 +35,31 @@ def heads_text(study: HeadStudy, top: int) -> str:
 def row_summary(study: HeadStudy) -> pl.DataFrame:
     """Per layer the means over episodes, with two-level intervals, of what `rows` holds; one row per layer."""
     assert study.rows is not None
-    keys = ("suite", "task_id", "episode_index", "layer", "block")
     measured = [name for name, kind in study.rows.schema.items() if kind == pl.Float32]
-    episodes = study.rows.group_by(keys).agg(pl.col(measured).cast(pl.Float64).mean()).sort(keys)
+    episodes = episode_layer_means(study.rows, study.question.selected)
     limits = dict.fromkeys(measured, POSITIVE)
     # Fractions of a key may be fewer than one, and their entropy below 0.
     limits |= {name: (float("-inf"), float("inf")) for name in measured if name.endswith("entropy")}
     order = study.tasks.filter(pl.col("layer") != LAYERS_AVG)["layer_number"].unique().sort().to_list()
     table = means_with_intervals(episodes, ("layer", "block"), limits, study.question.settings.seed)
-    return table.sort(pl.col("layer").replace_strict({layer: i for i, layer in enumerate(order)}, return_dtype=pl.Int64))
+    return table.sort(
+        pl.col("layer").replace_strict({layer: i for i, layer in enumerate(order)}, return_dtype=pl.Int64)
+    )
 
 
 def _header(study: HeadStudy) -> str:
-    question = study.question
-    policy = question.stores[0].attributes.policy
-    tasks = {(item.store.suite, item.episode.attributes.task_id) for item in question.selected}
-    lines = ["HEADS, LAYERS, DENOISE STEPS", "=" * WIDTH]
-    if policy.untrained:
-        lines += ["UNTRAINED WEIGHTS: these numbers say nothing about any policy.", "-" * WIDTH]
-    lines += _labelled("store", ", ".join(str(store.path) for store in question.stores))
-    lines += _labelled("policy", f"{policy.name}; site '{question.site}'")
-    lines += _labelled("episodes", f"{len(question.selected)} of {len(tasks)} task{'' if len(tasks) == 1 else 's'}")
-    chosen = question.selection
-    lines += _labelled(
-        "selection",
-        f"layers {listing(chosen.layer_labels, 40)}; denoise steps {listing(chosen.denoise_steps, 40)}; heads "
+    question, chosen = study.question, study.question.selection
+    layer = LAYERS_AVG if len(chosen.layer_labels) > 1 else str(chosen.layer_labels[0])
+    lines = header(question, "HEADS, LAYERS, DENOISE STEPS", layer)
+    told = [
+        f"Layers {listing(chosen.layer_labels, 40)}; denoise steps {listing(chosen.denoise_steps, 40)}; heads "
         f"{listing(chosen.head_numbers, 40)}",
-    )
-    lines += _labelled("grouping", f"{question.grouping.name}; {_measure_name(study.heads, question.grouping)}")
-    for note in (*([chosen.note] if chosen.note else []), *question.skipped):
-        lines += _labelled("note", note)
-    lines += _labelled("intervals", "95 %, two-level bootstrap over tasks and episodes; - with fewer than two episodes")
-    return "\n".join(lines)
+        f"Grouping '{question.grouping.name}'; {_measure_name(study.heads, question.grouping)}",
+        *([chosen.note] if chosen.note else []),
+        *question.notes,
+        "Intervals: 95 %, two-level bootstrap over tasks and episodes; - with fewer than two episodes",
+    ]
+    return "\n".join([*lines, *(part for line in told for part in textwrap.wrap(line, WIDTH))])
 
 
 def _measure_name(heads: pl.DataFrame, grouping: Grouping) -> str:
@@ -90,9 +84,15 @@ def _ranking(study: HeadStudy, top: int) -> str:
     lines = [_title(most), _head_rows(first, study)]
     if last.height:
         lines += ["", _title(least), _head_rows(last, study)]
-    note = f"{ranked.height} heads. The ends of so many are extreme partly by chance: their intervals are those of heads chosen beforehand."
+    note = (
+        f"{ranked.height} heads. The ends of so many are extreme partly by chance: their intervals are those of heads chosen "
+        "beforehand."
+    )
     if grouping.ratio is not None:
-        note = "ratio: geometric mean over replans and episodes. lift: ratio / uniform ratio, 1 = uniform attention. " + note
+        note = (
+            "ratio: geometric mean over replans and episodes. lift: ratio / uniform ratio, 1 = uniform attention. "
+            + note
+        )
         left_out = int(study.heads.unique(["block", "head"])["num_nonfinite"].sum())
         if left_out:
             note += f" {left_out} (head, replan) ratios are infinite, undefined or 0 and in no geometric mean."
@@ -147,13 +147,17 @@ def _dispersion(study: HeadStudy) -> str:
         for name in ("fraction_std", "fraction_cv", *(["log2_ratio_std"] if grouping.ratio else [])):
             cells += [format_number(row[name]), _interval(row, name)]
         rows.append(cells)
-    return "\n".join([_title(f"HOW MUCH HEADS DIFFER  spread of {what} over the heads of a layer"), text_table(header, rows)])
+    return "\n".join(
+        [_title(f"HOW MUCH HEADS DIFFER  spread of {what} over the heads of a layer"), text_table(header, rows)]
+    )
 
 
 def _layers(study: HeadStudy) -> str:
     grouping = study.question.grouping
     rows = overall_rows(study.tasks).filter(pl.col("layer") != LAYERS_AVG).sort("layer_number")
-    return "\n".join([_title("LAYERS  mean over heads"), _profile(rows, "layer", [str(n) for n in rows["layer"]], grouping)])
+    return "\n".join(
+        [_title("LAYERS  mean over heads"), _profile(rows, "layer", [str(n) for n in rows["layer"]], grouping)]
+    )
 
 
 def _profile(rows: pl.DataFrame, label: str, labels: Sequence[str], grouping: Grouping) -> str:
@@ -163,9 +167,17 @@ def _profile(rows: pl.DataFrame, label: str, labels: Sequence[str], grouping: Gr
     for name, row in zip(labels, rows.iter_rows(named=True), strict=True):
         if grouping.ratio is not None:
             cells = [format_number(row["ratio_mean"]), _interval(row, "ratio_mean")]
-            cells += [format_number(row["uniform_ratio"]), format_number(row["ratio_lift"]), _interval(row, "ratio_lift")]
+            cells += [
+                format_number(row["uniform_ratio"]),
+                format_number(row["ratio_lift"]),
+                _interval(row, "ratio_lift"),
+            ]
         else:
-            cells = [cell for group in groups for cell in (_percent(row[f"{group}_fraction"]), _percent_interval(row, f"{group}_fraction"))]
+            cells = [
+                cell
+                for group in groups
+                for cell in (_percent(row[f"{group}_fraction"]), _percent_interval(row, f"{group}_fraction"))
+            ]
         table.append([name, *cells])
     if grouping.ratio is not None:
         return text_table([label, "ratio", "interval", "uniform", "lift", "interval"], table)
@@ -178,20 +190,31 @@ def _depth(study: HeadStudy) -> str:
         return ""
     first, last, count = (table[name][0] for name in ("first_block", "last_block", "num_layers"))
     if count < 2:
-        return _title("DEPTH") + f"\nA centre of gravity over layers needs two of them; this is about block {first} alone."
+        return (
+            _title("DEPTH") + f"\nA centre of gravity over layers needs two of them; this is about block {first} alone."
+        )
     rows = [
-        [row["group"][:30], "mass" if row["of"] == "mass" else "contribution", format_number(row["centre"]), _interval(row, "centre")]
+        [
+            row["group"][:30],
+            "mass" if row["of"] == "mass" else "contribution",
+            format_number(row["centre"]),
+            _interval(row, "centre"),
+        ]
         for row in table.iter_rows(named=True)
     ]
     every = count == last - first + 1
     whole = every and first == 0 and last + 1 == study.question.stores[0].attributes.policy.num_layers
     over = "all" if whole else f"only {count} of {study.question.stores[0].attributes.policy.num_layers}"
     note = (
-        f"Mean block, weighted by a group's mass (or the norm of its contribution) at each, over {over} blocks, {first} to {last}; the "
-        f"same amount everywhere gives {format_number(table['even'][0])}."
+        f"Mean block, weighted by a group's mass (or the norm of its contribution) at each, over {over} blocks, {first} to "
+        f"{last}; the same amount everywhere gives {format_number(table['even'][0])}."
     )
     return "\n".join(
-        [_title("DEPTH  centre of gravity over blocks"), text_table(["group", "of", "centre", "interval"], rows, left=(0, 1)), *textwrap.wrap(note, WIDTH)]
+        [
+            _title("DEPTH  centre of gravity over blocks"),
+            text_table(["group", "of", "centre", "interval"], rows, left=(0, 1)),
+            *textwrap.wrap(note, WIDTH),
+        ]
     )
 
 
@@ -200,7 +223,12 @@ def _denoise(study: HeadStudy) -> str:
     if rows.height < 2:
         return ""
     labels = [f"{step} ({time:.3g})" for step, time in rows.select("denoise_step", "denoise_time").iter_rows()]
-    return "\n".join([_title("DENOISE STEPS  (and their times), mean over layers and heads"), _profile(rows, "step", labels, study.question.grouping)])
+    return "\n".join(
+        [
+            _title("DENOISE STEPS  (and their times), mean over layers and heads"),
+            _profile(rows, "step", labels, study.question.grouping),
+        ]
+    )
 
 
 def _rows_by_layer(study: HeadStudy) -> str:
@@ -211,17 +239,24 @@ def _rows_by_layer(study: HeadStudy) -> str:
     header += [f"in {name[:14]}" for name in groups]
     rows = []
     for row in summary.iter_rows(named=True):
-        cells = [str(row["layer"]), format_number(row["entropy"]), format_number(row["effective_keys"]), _interval(row, "effective_keys")]
+        cells = [
+            str(row["layer"]),
+            format_number(row["entropy"]),
+            format_number(row["effective_keys"]),
+            _interval(row, "effective_keys"),
+        ]
         cells += [_percent(row[f"top{k}_mass"]) for k in study.options.top]
         cells += [format_number(row[f"{name}_effective_keys"]) for name in groups]
         rows.append(cells)
     keys = [item.valid.sum(axis=1).mean() for item in study.question.selected]
     note = (
-        "Of single rows, renormalised over valid keys (masked and padded ones excluded), then averaged. entropy: nats. eff. keys: exp(entropy), the number "
-        f"of keys that sharing evenly would have it, of {format_number(sum(keys) / len(keys))}. top k: share of the k largest keys. in GROUP: "
-        "effective keys of the row cut down to the group."
+        "Of single rows, renormalised over valid keys (masked and padded ones excluded), then averaged. entropy: nats. eff. keys: "
+        f"exp(entropy), the number of keys that sharing evenly would have it, of {format_number(sum(keys) / len(keys))}. top k: "
+        "share of the k largest keys. in GROUP: effective keys of the row cut down to the group."
     )
-    return "\n".join([_title("ROWS  how spread out attention is"), text_table(header, rows), *textwrap.wrap(note, WIDTH)])
+    return "\n".join(
+        [_title("ROWS  how spread out attention is"), text_table(header, rows), *textwrap.wrap(note, WIDTH)]
+    )
 
 
 def _sinks(study: HeadStudy) -> str:
@@ -261,8 +296,9 @@ def sinks_text(sinks: pl.DataFrame, key_shares: pl.DataFrame, rule: SinkRule) ->
     if merged.height > _MOST_SINKS:
         lines.append(f"{merged.height - _MOST_SINKS} more in sinks.parquet.")
     note = (
-        "Searched task by task. rows: share of the (replan, layer, denoise step, head) rows in which the key takes that much; mass: mean share of the "
-        "valid keys' mass. Numbers without these keys: vla-analyze ratios --without-sinks, with the same --sink-factor and --sink-share."
+        "Searched task by task. rows: share of the (replan, layer, denoise step, head) rows in which the key takes that much; mass: "
+        "mean share of the valid keys' mass. Numbers without these keys: vla-analyze ratios --without-sinks, with the same "
+        "--sink-factor and --sink-share."
     )
     return "\n".join([*lines, *textwrap.wrap(note, WIDTH)])
 
@@ -283,10 +319,6 @@ def _percent(value: float | None) -> str:
 def _percent_interval(row: dict[str, Any], name: str) -> str:
     low, high = row[f"{name}_low"], row[f"{name}_high"]
     return "-" if low is None or high is None else f"[{100 * low:.1f}, {100 * high:.1f}]%"
-
-
-def _labelled(label: str, text: str) -> list[str]:
-    return textwrap.wrap(f"{label + ':':<12}{text}", WIDTH, subsequent_indent=" " * 12, break_on_hyphens=False)
 
 
 def _title(text: str) -> str:

@@ -173,6 +173,19 @@ def row_table(
     )
 
 
+def episode_layer_means(rows: pl.DataFrame, items: Sequence[SelectedEpisode]) -> pl.DataFrame:
+    """Means of `row_table` (of these episodes) over replans, denoise steps and heads: one row per (episode, layer), float64."""
+    keys = ("suite", "task_id", "episode_index", "layer", "block")
+    measured = [name for name, kind in rows.schema.items() if kind == pl.Float32]
+    per_replan, start, parts = rows.height // sum(item.tokens.num_replans for item in items), 0, []
+    # A million rows grouped at once would take as much memory as all that came before.
+    for item in items:
+        part = rows.slice(start, item.tokens.num_replans * per_replan)
+        parts.append(part.group_by(keys, maintain_order=True).agg(pl.col(measured).mean().cast(pl.Float64)))
+        start += part.height
+    return pl.concat(parts).sort("suite", "task_id", "episode_index", maintain_order=True)
+
+
 def groups_with_valid_keys(items: Sequence[SelectedEpisode], resolved: Sequence[ResolvedGrouping]) -> tuple[str, ...]:
     """The groups that have a valid key anywhere: only inside these is there an entropy."""
     having: set[int] = set()

@@ -159,11 +159,12 @@ def sinks_table(question: Question, rule: SinkRule | None = None) -> pl.DataFram
     return sinks_of(key_shares_table(question, shares), rule)
 
 
-def without_sinks(question: Question, sinks: pl.DataFrame) -> Question:
+def without_sinks(question: Question, sinks: pl.DataFrame, rule: SinkRule) -> Question:
     """The same question with every task's sinks taken out of all groups and of the valid keys.
 
     Masses, fractions, lifts, ratios and uniform baselines then all are those of the remaining keys. The grouping is called
-    NAME-without-sinks, so that its results are not taken for those with all keys.
+    NAME-without-sinks, so that its results are not taken for those with all keys, and a note says what was taken out.
+    Norms of contributions cannot be corrected: their Gram matrices are of whole segments.
     """
     keys: dict[tuple[str, int], tuple[int, ...]] = {}
     for suite, task, key in sinks.select("suite", "task_id", "key").iter_rows():
@@ -173,7 +174,8 @@ def without_sinks(question: Question, sinks: pl.DataFrame) -> Question:
         for item in question.selected
     )
     grouping = replace(question.grouping, name=f"{question.grouping.name}-without-sinks")
-    return replace(question, selected=selected, grouping=grouping)
+    notes = (*question.notes, describe_sinks(sinks, len(_tasks(question)), rule))
+    return replace(question, selected=selected, grouping=grouping, notes=notes)
 
 
 def merged_sinks(sinks: pl.DataFrame) -> pl.DataFrame:
@@ -186,19 +188,19 @@ def merged_sinks(sinks: pl.DataFrame) -> pl.DataFrame:
     return merged.sort("num_tasks", "mean_mass", "key", descending=[True, True, False])
 
 
-def describe_sinks(sinks: pl.DataFrame, num_tasks: int, rule: SinkRule) -> list[str]:
-    """What was taken out, in sentences for a summary."""
+def describe_sinks(sinks: pl.DataFrame, num_tasks: int, rule: SinkRule) -> str:
+    """What was taken out, in a sentence for a summary."""
     if sinks.is_empty():
-        return [f"Without sinks: no key takes {rule}, so nothing was taken out."]
-    merged = merged_sinks(sinks)
+        return f"Without sinks: no key takes {rule}, so nothing was taken out."
     of = f"of {num_tasks} tasks" if num_tasks > 1 else "of the one task"
     named = [
         f"{row['description']} ({row['role']}; in {row['num_tasks']} {of}, {row['mean_mass']:.1%} of the mass)"
-        for row in merged.iter_rows(named=True)
+        for row in merged_sinks(sinks).iter_rows(named=True)
     ]
-    return [
-        f"Without sinks, keys that take {rule}: {listing(named, 6)} were taken out of every group and of the valid keys."
-    ]
+    return (
+        f"Without sinks, keys that take {rule}: {listing(named, 6)} {'is' if len(named) == 1 else 'are'} out of every group and "
+        "of the valid keys (but not of norms of contributions)."
+    )
 
 
 _TOLD = {

@@ -29,16 +29,16 @@ def plot_head_grid(heads: pl.DataFrame, grouping: Grouping, folder: Path) -> lis
     log2, low, high = (
         _grid(heads, column, len(layers)) for column in (quantity, f"{quantity}_low", f"{quantity}_high")
     )
-    label = f"{_name(grouping, heads)}, relative to uniform attention"
+    label, about = "times uniform attention", f"{_name(grouping, heads)} relative to uniform attention"
     if quantity == "log2_ratio":
-        label = f"{_name(grouping, heads)} (no uniform baseline)"
+        label, about = "ratio", f"{_name(grouping, heads)} (no uniform baseline)"
     if quantity.endswith("_lift") and quantity != "log2_lift":
         with np.errstate(divide="ignore"):
             log2, low, high = np.log2(log2), np.log2(low), np.log2(high)
     if grouping.ratio is not None:
         log2 = _with_limits(heads, log2)
     figure = new_figure(max(5.6, 2.4 + 0.34 * len(numbers)), max(2.6, 1.5 + 0.2 * len(layers)))
-    title(figure, f"Heads, {named(grouping)}", _note(heads, log2))
+    title(figure, f"Heads, {named(grouping)}: {about}", _note(heads, log2))
     axes = figure.subplots()
     if np.isnan(log2).all():
         explain(axes, f"No head has any attention on {_name(grouping, heads)}.")
@@ -78,7 +78,7 @@ def _note(heads: pl.DataFrame, log2: NDArray[np.float64]) -> str:
     episodes, tasks = int(heads["num_episodes"][0]), int(heads["num_tasks"][0])
     text = f"Means over {plural(episodes, 'episode')} of {plural(tasks, 'task')}."
     if episodes > 1:
-        text += " Dot: the head's 95 % bootstrap interval holds the uniform value; one head in twenty lacks a dot by chance."
+        text += " Dot: the head's 95 % bootstrap interval holds the uniform value. By chance alone one head in twenty lacks its dot."
     infinite = int(np.isinf(log2).sum())
     if infinite:
         text += f" ∞ or 0: {plural(infinite, 'head')} with no mass on one side at any replan."

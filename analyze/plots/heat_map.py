@@ -20,6 +20,8 @@ _LESS, _EVEN, _MORE = "#A63C00", "#F7F7F7", "#00507D"
 _NOTHING = "#D9D9D9"
 #: Half of what the colours span at least, in powers of two: tiny differences must not look large.
 _LEAST_SPAN = 0.5
+#: Marks of the colour bar, on either side of 1.
+_FACTORS = (1.1, 1.2, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)
 #: More labels than this along an axis would touch.
 _MOST_LABELS = 32
 
@@ -77,13 +79,16 @@ def label_axis(axes: Axes, which: str, labels: Sequence[str]) -> None:
 
 
 def _factor_ticks(span: float) -> list[float]:
-    step = next((step for step in (0.25, 0.5, 1.0, 2.0, 4.0) if span / step <= 4), 2.0 ** np.ceil(np.log2(span / 4)))
-    count = int(span / step)
-    return [float(i * step) for i in range(-count, count + 1)]
+    """Positions of plain factors on either side of 1: at most four that lie within the span and are not crowded."""
+    chosen: list[float] = []
+    for factor in (*_FACTORS, *(2.0**power for power in range(5, 64))):
+        log2 = float(np.log2(factor))
+        if log2 <= span and log2 - (chosen[-1] if chosen else 0.0) >= span / 5:
+            chosen.append(log2)
+    return [*(-log2 for log2 in reversed(chosen)), 0.0, *chosen]
 
 
 def _factor(log2: float) -> str:
-    """2 to the power as a short factor: ×4, ×1.4, ×1/4."""
-    if log2 < 0 and log2 == round(log2):
-        return f"\u00d71/{2 ** int(-log2)}"
-    return f"\u00d7{2.0**log2:.3g}"
+    """2 to the power, as 4 or 1/4."""
+    text = f"{2.0 ** abs(log2):.3g}"
+    return f"1/{text}" if log2 < 0 else text

@@ -56,8 +56,8 @@ def plot_layer_time(replans: pl.DataFrame, grouping: Grouping, folder: Path, see
             explain(axes, "No ratio is finite and above 0." if grouping.ratio else "No group has any mass.")
             continue
         if grouping.ratio is not None:
-            base = "relative to uniform attention" if quantity == "log2_lift" else "(no uniform baseline)"
-            draw_log2_map(figure, axes, mean, (low <= 0) & (high >= 0), f"{ratio_name(grouping.ratio)}, {base}")
+            label = "times uniform attention" if quantity == "log2_lift" else "ratio"
+            draw_log2_map(figure, axes, mean, (low <= 0) & (high >= 0), label)
         else:
             image = axes.imshow(mean, origin="lower", aspect="auto", interpolation="none", cmap="cividis", vmin=0.0)
             bar = figure.colorbar(image, ax=axes, shrink=0.9, aspect=24, pad=0.02)
@@ -72,7 +72,11 @@ def plot_layer_time(replans: pl.DataFrame, grouping: Grouping, folder: Path, see
         note += " Dot: the cell's 95 % bootstrap interval holds the uniform value."
     if undefined and grouping.ratio is not None:
         note += " Grey: no finite logarithm (infinite, undefined or zero ratios take no part)."
-    title(figure, f"Layers over the episodes' time, {named(grouping)}", note)
+    about = ""
+    if grouping.ratio is not None:
+        base = "relative to uniform attention" if quantities == ["log2_lift"] else "(no uniform baseline)"
+        about = f": {ratio_name(grouping.ratio)} {base}"
+    title(figure, f"Layers over the episodes' time, {named(grouping)}{about}", note)
     return save_figure(figure, folder, STEM, table)
 
 

@@ -107,6 +107,7 @@ def save_figure(
         metadata = {"CreationDate": None} if kind == "pdf" else None
         with replacing(path) as temporary:
             figure.savefig(temporary, format=kind, dpi=DPI, metadata=metadata)
+        figure.set_layout_engine("none")  # the places are found: they are the same in every format
         paths.append(path)
     path = folder / f"{stem}.csv"
     with replacing(path) as temporary:
