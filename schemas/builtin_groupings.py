@@ -7,18 +7,24 @@ from pathlib import Path
 
 from schemas.errors import did_you_mean, listing
 from schemas.grouping import Grouping, GroupingError, GroupingNotFound, Ratio, read_grouping_file
-from schemas.resolve import NO_COVERAGE
+from schemas.resolve import NO_COVERAGE, NO_WORDS
 from schemas.vocabulary import Vocabulary
 
 _TEXT = "role:bos | role:template | role:instruction | role:text"
-#: Groups that stand beside the visual and the linguistic ones so that the masses of a grouping sum to the row sum.
-_OTHERS = {
-    "state": ("role:state | role:proprio",),
-    "action": ("role:action",),
-    "padding": ("role:padding | role:null",),
-    "masked": ("role:masked_image",),
-    "other": ("*",),
-}
+
+
+def _others(vocabulary: Vocabulary) -> dict[str, tuple[str, ...]]:
+    """Groups that stand beside the visual and the linguistic ones so that the masses of a grouping sum to the row sum."""
+    # Cosmos's padded text: attended to, and without effect.
+    null = {"null": ("role:null",)} if "null" in vocabulary.roles else {}
+    return {
+        "state": ("role:state | role:proprio",),
+        "action": ("role:action",),
+        **null,
+        "padding": ("role:padding",),
+        "masked": ("role:masked_image",),
+        "other": ("*",),
+    }
 
 
 _TEXT_ROLES = {"bos", "template", "instruction", "text"}
@@ -32,53 +38,59 @@ def _over_linguistic(vocabulary: Vocabulary, *numerator: str) -> Ratio | None:
 
 def default(vocabulary: Vocabulary) -> Grouping:
     """Visual: every valid image key; linguistic: every valid text key that is not a state digit."""
+    others = _others(vocabulary)
     return Grouping(
         name="default",
-        groups={"visual": ("role:image",), "linguistic": (_TEXT,), **_OTHERS},
+        groups={"visual": ("role:image",), "linguistic": (_TEXT,), **others},
         ratio=_over_linguistic(vocabulary, "visual"),
-        allow_empty=("visual", "linguistic", *_OTHERS),
+        allow_empty=("visual", "linguistic", *others),
         description="visual = every valid image key; linguistic = every valid text key that is not a state digit",
     )
 
 
 def instruction(vocabulary: Vocabulary) -> Grouping:
     """Linguistic is the words of the instruction only; bos and template text are a group of their own."""
+    if "text" in vocabulary.roles and "instruction" not in vocabulary.roles:
+        raise GroupingError(f"Grouping 'instruction': {NO_WORDS}.")
+    others = _others(vocabulary)
     return Grouping(
         name="instruction",
         groups={
             "visual": ("role:image",),
             "linguistic": ("role:instruction",),
             "template": ("role:bos | role:template | role:text",),
-            **_OTHERS,
+            **others,
         },
         ratio=_over_linguistic(vocabulary, "visual"),
-        allow_empty=("visual", "linguistic", "template", *_OTHERS),
+        allow_empty=("visual", "linguistic", "template", *others),
         description="visual = every valid image key; linguistic = the words of the instruction only",
     )
 
 
 def cameras(vocabulary: Vocabulary) -> Grouping:
     """One group per camera that the policy really sees."""
+    others = _others(vocabulary)
     views = {camera: (f"camera:{camera} & role:image",) for camera in vocabulary.cameras}
     return Grouping(
         name="cameras",
-        groups={**views, "linguistic": (_TEXT,), **_OTHERS},
+        groups={**views, "linguistic": (_TEXT,), **others},
         ratio=_over_linguistic(vocabulary, *views),
-        allow_empty=(*views, "linguistic", *_OTHERS),
+        allow_empty=(*views, "linguistic", *others),
         description="one group per camera; linguistic as in 'default'",
     )
 
 
 def objects(vocabulary: Vocabulary) -> Grouping:
     """One group per object of the scene, by the area of each patch that it covers."""
+    others = _others(vocabulary)
     if not vocabulary.objects:
         raise GroupingError(f"Grouping 'objects': {NO_COVERAGE}.")
     things = {name: (f"object:{name}",) for name in vocabulary.objects}
     return Grouping(
         name="objects",
-        groups={**things, "linguistic": (_TEXT,), **_OTHERS},
+        groups={**things, "linguistic": (_TEXT,), **others},
         ratio=_over_linguistic(vocabulary, *things),
-        allow_empty=(*things, "linguistic", *_OTHERS),
+        allow_empty=(*things, "linguistic", *others),
         description="one group per scene object, weighted by the area of each patch that it covers; linguistic as in 'default'",
     )
 
@@ -98,6 +110,7 @@ def reference(vocabulary: Vocabulary) -> Grouping:
             groups=groups,
             ratio=Ratio(("visual",), ("linguistic",)),
             description="the published Cosmos scripts' frames: 'linguistic' is a blank picture, and holds no language",
+            proxy=True,
         )
     images = [span.num_keys for span in spans if span.kind == "image"]
     texts = [span.num_keys for span in spans if span.kind == "text"]
@@ -112,6 +125,7 @@ def reference(vocabulary: Vocabulary) -> Grouping:
         ratio=Ratio(("visual",), ("linguistic",)),
         allow_empty=("action",),
         description=f"the published pi scripts' key ranges: 'linguistic' is keys {first} to {last}, wherever the prompt really is",
+        proxy=True,
     )
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from schemas.errors import UserError, did_you_mean, listing
 from schemas.jsonable import MalformedDocument, from_json
-from schemas.selectors import SelectorError, parse_selector
+from schemas.selectors import SelectorError, atoms_of, parse_selector
 
 #: The selector that, alone, means: whatever no other group of the grouping takes.
 REST = "*"
@@ -54,7 +54,8 @@ class Grouping:
     """A named set of groups. Order matters only for display and for the rest group.
 
     `groups`: group name to selectors (their union). `overlap`: a key may belong to more than one group. `allow_empty`:
-    groups that may have no keys at all in what is analysed; for any other group that is an error.
+    groups that may have no keys at all in what is analysed; for any other group that is an error. `proxy`: its groups are called
+    visual and linguistic as in published scripts, and are not.
     """
 
     name: str
@@ -63,6 +64,7 @@ class Grouping:
     overlap: bool = False
     allow_empty: tuple[str, ...] = ()
     description: str = ""
+    proxy: bool = False
 
     def __post_init__(self) -> None:
         """Check everything that can be checked without a layout."""
@@ -97,8 +99,15 @@ class Grouping:
 
     @property
     def compares_modalities(self) -> bool:
-        """Whether the ratio is one of seeing over reading, so that the published thresholds can be applied to it."""
-        return self.ratio is not None and self.ratio.denominator == ("linguistic",)
+        """Whether the ratio is one of seeing over reading, so that the published thresholds can be applied to it.
+
+        It is not, whatever the groups are called, for a proxy and when the denominator is made of latent frames: those are
+        pictures, numbers and noise.
+        """
+        if self.proxy or self.ratio is None or self.ratio.denominator != ("linguistic",):
+            return False
+        atoms = [atom for text in self.groups["linguistic"] for atom in atoms_of(parse_selector(text))]
+        return not any(atom.kind == "frame" for atom in atoms)
 
     @property
     def names(self) -> tuple[str, ...]:

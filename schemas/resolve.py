@@ -124,7 +124,10 @@ def _no_such(kind: str, name: str, existing: tuple[str, ...]) -> str:
 _SPECIAL_OBJECTS = ("@interest", "@robot", "@background")
 _WORD_CLASSES = ("content", "stop", "all")
 #: Why there is nothing to name, and what to do about it.
-NO_WORDS = "the keys of this site spell no words; choose a site with text by --site (Cosmos: cross)"
+NO_WORDS = (
+    "the keys of this site spell no words; choose a site with text by --site (Cosmos: cross); a text that was captured without "
+    "its tokenizer needs a capture with --t5-tokenizer"
+)
 NO_COVERAGE = (
     "no selected episode has object coverage at this site, which is recorded from the simulator's segmentation; choose a site "
     "with pictures by --site (Cosmos: self), or use a store as vla-capture wrote it, not a copy without objects"

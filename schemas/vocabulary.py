@@ -103,6 +103,8 @@ def collect_vocabulary(episodes: Iterable[EpisodeTokens]) -> Vocabulary:
                 cameras[span.camera] = None
         roles.update({Role(code).label: None for code in np.unique(tokens.static_roles)})
         for line in tokens.words:
+            if not any(word.keys for word in line):
+                continue  # a text whose positions are known, and not which word each of them is
             sentence = tuple(word.text.casefold() for word in line)
             sentences[sentence] = None
             words.update(dict.fromkeys(sentence))

@@ -12,7 +12,7 @@ from analyze.aggregate import LAYERS_AVG
 from analyze.episode_intervals import means_with_intervals
 from analyze.group_contributions import group_contribution_table
 from analyze.question import Question
-from analyze.statistics import DEFAULT_SEED
+from analyze.statistics import DEFAULT_SEED, NO_LIMITS
 from schemas.grouping import Grouping
 from schemas.resolve import ResolvedGrouping
 
@@ -62,7 +62,8 @@ def depth_table(
             )
         )
     blocks = single["block"].unique().sort()
-    limits = (float(blocks[0]), float(blocks[-1]))
+    # A single layer leaves a centre no room, and no interval could be widened inside of that.
+    limits = (float(blocks[0]), float(blocks[-1])) if len(blocks) > 1 else NO_LIMITS
     table = means_with_intervals(pl.concat(parts), ("group", "of"), {"centre": limits}, seed)
     return table.filter(pl.col("centre").is_not_null()).with_columns(
         pl.lit(float(np.mean(blocks.to_numpy()))).alias("even"),

@@ -34,6 +34,8 @@ from schemas.resolve import describe_key
 
 DEFAULT_FACTOR = 10.0
 DEFAULT_SHARE = 0.5
+#: What is above a limit by less than this, relative to it, is above it by rounding only.
+_ROUNDING = 5e-6
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,9 @@ def key_sums(
     total = seen.sum(axis=2, dtype=np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.where(total > 0, 1.0 / total, 0.0).astype(np.float32)
-        limit = np.where(total > 0, factor * total / valid.sum(axis=1)[:, None], np.inf).astype(np.float32)
+        limit = np.where(total > 0, factor * total / valid.sum(axis=1)[:, None], np.inf)
+    # Sums in float32 err by some 1e-6: with a factor of 1, keys that share evenly must not be above their share.
+    limit = (limit * (1.0 + _ROUNDING)).astype(np.float32)
     above = (seen > limit[:, :, None]).sum(axis=(0, 1))
     held = inverse.reshape(1, -1) @ seen.reshape(-1, seen.shape[2])
     return above, held[0].astype(np.float64)
@@ -114,18 +118,19 @@ def is_first(selection: Selection, layer: int) -> bool:
 def key_shares_table(question: Question, shares: Sequence[KeyShares]) -> pl.DataFrame:
     """One row per (task, key that is valid in one of its episodes), episodes weighing the same.
 
-    Columns: suite, task_id, num_episodes; key, span, role (the commonest over replans), patch_row, patch_column (null unless
-    the key is a patch), description (in words); share_of_rows, mean_mass (share of the valid keys' mass), times_uniform
-    (mean_mass x mean number of valid keys).
+    Columns: suite, task_id, num_episodes; key, span, role (the commonest over the replans at which the key is valid), patch_row,
+    patch_column (null unless the key is a patch), description (in words); share_of_rows, mean_mass (share of the valid keys'
+    mass), times_uniform (mean_mass x mean number of valid keys).
     """
     frames = []
     for (suite, task), positions in _tasks(question).items():
         items = [question.selected[i] for i in positions]
         above = np.mean([shares[i].above for i in positions], axis=0)
         held = np.mean([shares[i].held for i in positions], axis=0)
-        num_valid = np.mean([item.valid.sum(axis=1).mean() for item in items])
-        keys = np.flatnonzero(np.any([item.valid.any(axis=0) for item in items], axis=0))
-        told = pl.DataFrame([_told(int(key), items[0]) for key in keys], schema=_TOLD, orient="row")
+        valid = [item.valid for item in items]
+        num_valid = np.mean([part.sum(axis=1).mean() for part in valid])
+        keys = np.flatnonzero(np.any([part.any(axis=0) for part in valid], axis=0))
+        told = pl.DataFrame([_told(int(key), items, valid) for key in keys], schema=_TOLD, orient="row")
         frames.append(
             told.select(
                 pl.lit(suite).alias("suite"),
@@ -213,11 +218,17 @@ _TOLD = {
 }
 
 
-def _told(key: int, item: SelectedEpisode) -> tuple[int, str, str, int | None, int | None, str]:
-    """What a key is, in the columns of `_TOLD`."""
-    tokens = item.tokens
+def _told(
+    key: int, items: Sequence[SelectedEpisode], valid: Sequence[NDArray[np.bool_]]
+) -> tuple[int, str, str, int | None, int | None, str]:
+    """What a key is in a task's episodes, in the columns of `_TOLD`; `valid`: each episode's valid keys (replan or 1, key).
+
+    Prompts differ in length: what is a state digit here is padding there. The key is what it is where it can hold information.
+    """
+    roles = [item.tokens.static_roles[part[:, key], key] for item, part in zip(items, valid, strict=True)]
+    role = Role(int(np.bincount(np.concatenate(roles)).argmax())).label
+    tokens = next(item.tokens for item, own in zip(items, roles, strict=True) if own.size)
     span = next(span for span in tokens.layout.spans if span.start <= key < span.stop)
-    role = Role(int(np.bincount(tokens.static_roles[:, key]).argmax())).label
     if span.grid is None:
         return key, span.name, role, None, None, describe_key(key, tokens)
     row, column = divmod(key - span.start, span.grid.columns)

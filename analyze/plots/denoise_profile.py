@@ -24,7 +24,7 @@ def plot_denoise_profile(table: pl.DataFrame, grouping: Grouping, folder: Path) 
         note += f" {table['nonfinite_layers'].sum()} ratios of single layers are not finite and in no mean."
     title(figure, f"Denoise steps, {named(grouping)}", note)
     labels = [f"{step}\n({time:.3g})" for step, time in table.select("denoise_step", "denoise_time").iter_rows()]
-    draw_profile(figure, table, grouping, labels, "denoise step (and its time; 0 is the finished action)")
+    draw_profile(figure, table, grouping, labels, "denoise step (in brackets its time, which ends at 0)")
     columns = [f"{name}_fraction{end}" for name in shown_groups(table, grouping) for end in ("", "_low", "_high")]
     if grouping.ratio is not None:
         columns = ["ratio_mean", "ratio_mean_low", "ratio_mean_high", "uniform_ratio", "num_nonfinite", *columns]

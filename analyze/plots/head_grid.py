@@ -9,7 +9,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from analyze.metrics.heads import main_group
-from analyze.plots.heat_map import draw_log2_map, label_axis
+from analyze.plots.heat_map import draw_log2_map, label_axis, map_height
 from analyze.plots.style import drawn_in_our_style, explain, named, new_figure, plural, ratio_name, save_figure, title
 from schemas.grouping import Grouping
 
@@ -37,13 +37,14 @@ def plot_head_grid(heads: pl.DataFrame, grouping: Grouping, folder: Path) -> lis
             log2, low, high = np.log2(log2), np.log2(low), np.log2(high)
     if grouping.ratio is not None:
         log2 = _with_limits(heads, log2)
-    figure = new_figure(max(5.6, 2.4 + 0.34 * len(numbers)), max(2.6, 1.5 + 0.2 * len(layers)))
-    title(figure, f"Heads, {named(grouping)}: {about}", _note(heads, log2))
+    uncertain = (low <= 0) & (high >= 0)
+    figure = new_figure(max(5.6, 2.4 + 0.34 * len(numbers)), max(2.6, 1.7 + map_height(len(layers), len(numbers))))
+    title(figure, f"Heads, {named(grouping)}: {about}", _note(heads, log2, bool((uncertain & np.isfinite(log2)).any())))
     axes = figure.subplots()
     if np.isnan(log2).all():
         explain(axes, f"No head has any attention on {_name(grouping, heads)}.")
     else:
-        draw_log2_map(figure, axes, log2, (low <= 0) & (high >= 0), label)
+        draw_log2_map(figure, axes, log2, uncertain, label)
         label_axis(axes, "x", [str(number) for number in numbers])
         label_axis(axes, "y", [str(layer) for layer in layers])
         axes.set_xlabel("head")
@@ -74,10 +75,10 @@ def _with_limits(heads: pl.DataFrame, log2: NDArray[np.float64]) -> NDArray[np.f
     return np.where(missing & above & ~below, np.inf, np.where(missing & below & ~above, -np.inf, log2))
 
 
-def _note(heads: pl.DataFrame, log2: NDArray[np.float64]) -> str:
+def _note(heads: pl.DataFrame, log2: NDArray[np.float64], dots: bool) -> str:
     episodes, tasks = int(heads["num_episodes"][0]), int(heads["num_tasks"][0])
     text = f"Means over {plural(episodes, 'episode')} of {plural(tasks, 'task')}."
-    if episodes > 1:
+    if dots:
         text += " Dot: the head's 95 % bootstrap interval holds the uniform value. By chance alone one head in twenty lacks its dot."
     infinite = int(np.isinf(log2).sum())
     if infinite:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-
-from analyze.plots.style import NOTE_COLOR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,7 +20,9 @@ _NOTHING = "#D9D9D9"
 #: Half of what the colours span at least, in powers of two: tiny differences must not look large.
 _LEAST_SPAN = 0.5
 #: Marks of the colour bar, on either side of 1.
-_FACTORS = (1.1, 1.2, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)
+_FACTORS = ((1.1, 1.2, 1.3, 1.4), (1.2, 1.5, 2.0), (1.5, 2.0, 3.0))
+#: With more cells than this, numbers in them could not be read.
+_MOST_NUMBERS = 64
 #: More labels than this along an axis would touch.
 _MOST_LABELS = 32
 
@@ -35,17 +36,23 @@ def draw_log2_map(
 ) -> None:
     """Draw values (row, column) as colours around 0, row 0 at the bottom, with a colour bar in plain factors.
 
-    Infinite values have the colour's end and their sign, undefined ones (NaN) are grey; `uncertain` cells carry a small dot.
+    Infinite values have the colour's end and are marked ∞ or 0, undefined ones (NaN) are grey; `uncertain` cells carry a small
+    dot. Few cells carry their number, because a colour among few others says little.
     """
     finite = log2[np.isfinite(log2)]
     span = max(_LEAST_SPAN, float(np.abs(finite).max()) if finite.size else 0.0)
     image = axes.imshow(
         np.clip(log2, -span, span), origin="lower", aspect="auto", interpolation="none", cmap=diverging_colors(), vmin=-span, vmax=span
     )  # fmt: skip
-    for row, column in np.argwhere(np.isinf(log2)):
-        sign = "∞" if log2[row, column] > 0 else "0"
-        axes.text(column, row, sign, ha="center", va="center", color="white", size=7)
-    draw_dots(axes, uncertain & np.isfinite(log2))
+    for row, column in np.argwhere(~np.isnan(log2)):
+        value = log2[row, column]
+        if np.isinf(value):
+            axes.text(column, row, "∞" if value > 0 else "0", ha="center", va="center", color="white", size=7)
+        elif log2.size <= _MOST_NUMBERS:
+            axes.text(column, row + 0.08, _factor(value), ha="center", va="center", color=_ink(value, span), size=7)
+    rows, columns = np.nonzero(uncertain & np.isfinite(log2))
+    inks = [_ink(value, span) for value in log2[rows, columns]]
+    axes.scatter(columns, rows - (0.32 if log2.size <= _MOST_NUMBERS else 0.0), s=3, color=inks, linewidths=0)
     bar = figure.colorbar(image, ax=axes, shrink=0.9, aspect=24, pad=0.02)
     ticks = _factor_ticks(span)
     bar.set_ticks(ticks, labels=[_factor(tick) for tick in ticks])
@@ -53,10 +60,9 @@ def draw_log2_map(
     bar.outline.set_visible(False)
 
 
-def draw_dots(axes: Axes, where: NDArray[np.bool_]) -> None:
-    """Small dots in the middle of cells (row, column)."""
-    rows, columns = np.nonzero(where)
-    axes.scatter(columns, rows, s=3, color=NOTE_COLOR, linewidths=0)
+def map_height(num_rows: int, num_columns: int) -> float:
+    """Inches that the cells of a map need: more where there are numbers in them."""
+    return num_rows * (0.36 if num_rows * num_columns <= _MOST_NUMBERS else 0.2)
 
 
 def diverging_colors() -> Colormap:
@@ -78,14 +84,20 @@ def label_axis(axes: Axes, which: str, labels: Sequence[str]) -> None:
         spine.set_visible(False)
 
 
+def _ink(log2: float, span: float) -> str:
+    """What can be read on a cell's colour."""
+    return "white" if abs(log2) > 0.6 * span else "black"
+
+
 def _factor_ticks(span: float) -> list[float]:
-    """Positions of plain factors on either side of 1: at most four that lie within the span and are not crowded."""
-    chosen: list[float] = []
-    for factor in (*_FACTORS, *(2.0**power for power in range(5, 64))):
-        log2 = float(np.log2(factor))
-        if log2 <= span and log2 - (chosen[-1] if chosen else 0.0) >= span / 5:
-            chosen.append(log2)
-    return [*(-log2 for log2 in reversed(chosen)), 0.0, *chosen]
+    """Positions of plain factors on either side of 1, spread over the span."""
+    plain = (tuple(float(np.log2(factor)) for factor in factors) for factors in _FACTORS)
+    powers = ((step, 2.0 * step, 3.0 * step) for step in range(1, 1000))
+    for marks in itertools.chain(plain, powers):
+        chosen = [mark for mark in marks if mark <= span]
+        if chosen and chosen[-1] >= 0.6 * span:
+            return [*(-mark for mark in reversed(chosen)), 0.0, *chosen]
+    return [0.0]
 
 
 def _factor(log2: float) -> str:

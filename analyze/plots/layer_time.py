@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from analyze.metrics.layer_time import layer_time_table
-from analyze.plots.heat_map import draw_log2_map, label_axis
+from analyze.plots.heat_map import draw_log2_map, label_axis, map_height
 from analyze.plots.style import (
     drawn_in_our_style,
     explain,
@@ -40,11 +40,11 @@ def plot_layer_time(replans: pl.DataFrame, grouping: Grouping, folder: Path, see
     table = layer_time_table(replans, grouping, seed=seed)
     quantities = table["quantity"].unique(maintain_order=True).to_list()
     layers, bins = table["layer"].unique(maintain_order=True).to_list(), table["bin"].n_unique()
-    figure = new_figure(max(6.4, 3.6 * len(quantities) + 1.0), max(2.7, 1.6 + 0.2 * len(layers)))
+    figure = new_figure(max(6.4, 3.6 * len(quantities) + 1.0), max(2.7, 1.6 + map_height(len(layers), bins)))
     episodes = replans.select("suite", "task_id", "episode_index").unique()
     note = f"Means over {plural(episodes.height, 'episode')} of {plural(episodes.select('suite', 'task_id').n_unique(), 'task')}."
     shared = figure.subplots(1, len(quantities), squeeze=False, sharey=True)[0]
-    undefined = False
+    undefined, dots = False, False
     for axes, quantity in zip(shared, quantities, strict=True):
         part = table.filter(pl.col("quantity") == quantity)
         mean, low, high = (
@@ -57,7 +57,9 @@ def plot_layer_time(replans: pl.DataFrame, grouping: Grouping, folder: Path, see
             continue
         if grouping.ratio is not None:
             label = "times uniform attention" if quantity == "log2_lift" else "ratio"
-            draw_log2_map(figure, axes, mean, (low <= 0) & (high >= 0), label)
+            uncertain = (low <= 0) & (high >= 0)
+            dots = dots or bool(uncertain.any())
+            draw_log2_map(figure, axes, mean, uncertain, label)
         else:
             image = axes.imshow(mean, origin="lower", aspect="auto", interpolation="none", cmap="cividis", vmin=0.0)
             bar = figure.colorbar(image, ax=axes, shrink=0.9, aspect=24, pad=0.02)
@@ -68,7 +70,7 @@ def plot_layer_time(replans: pl.DataFrame, grouping: Grouping, folder: Path, see
         _time_axis(axes, bins)
         if axes is shared[0]:
             axes.set_ylabel("layer")
-    if grouping.ratio is not None and episodes.height > 1:
+    if dots:
         note += " Dot: the cell's 95 % bootstrap interval holds the uniform value."
     if undefined and grouping.ratio is not None:
         note += " Grey: no finite logarithm (infinite, undefined or zero ratios take no part)."

@@ -60,7 +60,9 @@ def _ratio_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping) -> None:
     drawn = np.isfinite(mean) & (mean > 0)
     if not drawn.any():
         left_out = int(rows["num_nonfinite"].sum())
-        explain(axes, f"No ratio to draw: {left_out} are infinite or undefined, the others are 0.")
+        total = int(rows["num_replans"].sum())
+        rest = "" if left_out == total else f", the other {total - left_out} are 0"
+        explain(axes, f"No ratio to draw: {left_out} of {total} are infinite (no denominator mass) or undefined{rest}.")
         return
     ratio_axis(axes.yaxis, np.concatenate([mean, low, high, uniform]))
     at = np.arange(len(mean))
@@ -97,7 +99,9 @@ def _fraction_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping) -> None:
     axes.set_ylim(0, None)
     axes.set_ylabel("fraction of the groups'\nsummed mass")
     axes.grid(axis="y")
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    having = sum((rows[f"{name}_fraction"].fill_null(0.0) > 0).any() for name in grouping.names)
+    heading = f"{len(groups)} of {having} groups" if having > len(groups) else None
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), title=heading, title_fontsize=8, alignment="left")
 
 
 def _positions(axes: Axes, labels: Sequence[str]) -> None:

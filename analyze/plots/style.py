@@ -33,6 +33,7 @@ FIXED_COLORS = {
     "action": "#009E73",
     "state": "#CC79A7",
     "padding": "#C8C8C8",
+    "null": "#BDB7A8",
     "masked": "#8F8F8F",
     "other": "#4D4D4D",
     "rest": "#4D4D4D",

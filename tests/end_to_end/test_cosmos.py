@@ -67,7 +67,7 @@ def test_each_site_is_analysed_by_itself(cosmos_store, tmp_path, capsys):
     assert analyze([str(cosmos_store), *words]) == 0
     assert (pl.read_parquet(tmp_path / "cross" / "steps.parquet")["red_mass"] > 0).all()
     assert analyze([str(cosmos_store), "--group", "red=word:red", "--output", str(tmp_path / "none")]) == 2
-    assert "no instruction has the word 'red'" in capsys.readouterr().err
+    assert "choose a site with text by --site" in capsys.readouterr().err
 
 
 def test_the_published_frame_proxy_is_named_by_its_frames(tmp_path):

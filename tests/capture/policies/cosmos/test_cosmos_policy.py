@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 
@@ -213,3 +214,18 @@ def test_options_that_cannot_be_are_one_sentence(options, message):
     pytest.importorskip("diffusers")
     with pytest.raises((BadArgument, UnknownName), match=message):
         build_cosmos_policy("dummy", device="cpu", **options)
+
+
+def test_swapping_only_the_embedding_under_the_same_noise_changes_the_actions(dummy, prepared):
+    """Same pictures, proprioception and noise: whatever differs comes through cross-attention."""
+    other = dummy.prepare(make_observation(0), OTHER_INSTRUCTION).tensors["text"]
+    assert not torch.equal(other, prepared.tensors["text"])
+    swapped = dataclasses.replace(prepared, tensors=dict(prepared.tensors, text=other))
+    before, after = KeepAll(), KeepAll()
+    actions = dummy.act(prepared, 195, {"self": before})
+    changed = dummy.act(swapped, 195, {"self": after})
+    assert np.abs(changed - actions).max() > 1e-4
+    assert np.array_equal(dummy.act(prepared, 195), actions)
+    # The first block's self-attention comes before any text: at the first call it cannot know of the swap.
+    assert torch.equal(before.rows[0, 0], after.rows[0, 0])
+    assert not torch.equal(before.rows[1, 0], after.rows[1, 0])

@@ -1,0 +1,65 @@
+"""Rows of a made store as plain arrays, read by zarr alone: what the tests of metrics compute from, with code of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import zarr
+from hypothesis import HealthCheck, Phase, settings
+
+from analyze.question import AnalysisSettings, Question, ask
+from analyze.reader import open_store
+from schemas.grouping import Grouping
+from schemas.resolve import resolve
+from schemas.vocabulary import EpisodeTokens
+from tests.store_kit import StoreSpec, valid_keys
+
+#: Every example writes a store: shrinking one would take minutes.
+FEW = settings(
+    max_examples=8, phases=[Phase.explicit, Phase.generate], deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+
+
+@dataclass(frozen=True)
+class RawEpisode:
+    """An episode's rows (replan, layer, denoise, head, key) float64, mean over queries, one layer for each label.
+
+    `valid`: (replan, key) bool. `order`: (task, episode).
+    """
+
+    order: tuple[int, int]
+    rows: np.ndarray
+    valid: np.ndarray
+
+    def held(self, without: Sequence[int] = ()) -> tuple[np.ndarray, np.ndarray]:
+        """Rows with 0 on keys that are not valid or left out, and which keys remain (replan, key)."""
+        keys = self.valid.copy()
+        keys[:, list(without)] = False
+        return self.rows * keys[:, None, None, None, :], keys
+
+
+def raw_episodes(path: Path, spec: StoreSpec) -> list[RawEpisode]:
+    """The rows of every episode, in the order of (task, episode)."""
+    labels = spec.layer_labels or spec.layers
+    layers = [spec.layers.index(label % spec.num_layers) for label in labels]
+    found = []
+    for task, episode in spec.names:
+        site = zarr.open_group(path / f"episodes/task{task:03d}_episode{episode:03d}", mode="r")["joint"]
+        rows = site["rows"][:].astype(np.float64).mean(axis=4)[:, layers]
+        found.append(RawEpisode((task, episode), rows, valid_keys(site["key_role"][:])))
+    return found
+
+
+def question_about(path: Path, grouping: Grouping | None = None, **settings_) -> Question:
+    """The question about all of a store, with a grouping that no file or name stands for."""
+    question = ask([open_store(path)], AnalysisSettings(**settings_))
+    return question if grouping is None else replace(question, grouping=grouping)
+
+
+def weights_of(grouping: Grouping, tokens: EpisodeTokens) -> np.ndarray:
+    """Weights (replan, key, group) of a grouping; that they are right is shown elsewhere."""
+    weights = resolve(grouping, tokens).weights
+    return np.broadcast_to(weights, (tokens.num_replans, *weights.shape[1:])).astype(np.float64)

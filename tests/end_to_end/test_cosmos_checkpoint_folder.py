@@ -1,0 +1,272 @@
+"""A checkpoint folder as it is published, with small random weights: the published command, and what can be wrong with its files."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+import torch
+import zarr
+
+from analyze.__main__ import main as analyze
+from capture.__main__ import main as capture
+from capture.environments.base import EnvironmentSettings
+from capture.environments.suites import find_suite, list_tasks
+from capture.policies.cosmos.config import CosmosConfig, DitConfig, VaeConfig
+from capture.policies.cosmos.dummy_folder import WEIGHTS_NAME, write_dummy_folder
+from capture.policies.cosmos.embedded import DUMMY_CONFIG
+from capture.policies.cosmos.locate import EMBEDDINGS_NAME, STATISTICS_NAME
+
+#: The published policy's 28 blocks, nine latent frames of 14 x 14 tokens, 512 text positions and five calls; narrow inside.
+PUBLISHED_SHAPE = replace(
+    CosmosConfig(),
+    dit=DitConfig(width=24, num_blocks=28, num_heads=2, mlp_dim=48, text_dim=24, adaln_dim=8),
+    vae=VaeConfig(base_dim=4),
+)
+#: The options of the issue's command, as typed.
+PUBLISHED_OPTIONS = "--layers 25 26 27 --query-frame action --visual-frame curr_last --text-frame frame0".split()
+NUM_QUERIES, NUM_KEYS = 196, 1764
+#: One built-in task, one replan.
+SHORT = "--task-id 1 --num-episodes 1 --max-steps 4 --device cpu --layers 1".split()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def alone() -> Iterator[None]:
+    """One thread (small models wait longer for each other than they compute), and no hub whose files could decide."""
+    pytest.importorskip("diffusers")
+    before, cache = torch.get_num_threads(), os.environ.get("HF_HUB_CACHE")
+    torch.set_num_threads(1)
+    os.environ["HF_HUB_CACHE"] = os.devnull
+    yield
+    torch.set_num_threads(before)
+    if cache is None:
+        del os.environ["HF_HUB_CACHE"]
+    else:
+        os.environ["HF_HUB_CACHE"] = cache
+
+
+# The published command in the real LIBERO
+
+
+@pytest.fixture(scope="module")
+def libero_run(libero_assets: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that `--output-dir` named: the store, and the results of the proxy that was asked for."""
+    folder = tmp_path_factory.mktemp("published")
+    task = list_tasks(find_suite("libero_10"), EnvironmentSettings())[0]
+    checkpoint = write_dummy_folder(
+        folder / "checkpoint", PUBLISHED_SHAPE, [task.instruction], dtype=torch.float32, with_tokenizer=True
+    )
+    command = ["cosmos", "--ckpt-path", str(checkpoint), "--task-suite", "libero_10", "--num-episodes", "1"]
+    few = ["--task-id", "0", "--max-steps", "20", "--libero-assets", str(libero_assets), "--device", "cpu"]
+    assert capture([*command, *PUBLISHED_OPTIONS, *few, "--output-dir", str(folder / "results")]) == 0
+    return folder / "results"
+
+
+@pytest.fixture(scope="module")
+def libero_store(libero_run: Path) -> Path:
+    (store,) = libero_run.glob("*.zarr")
+    return store
+
+
+def rows_of(store: Path, site: str) -> np.ndarray:
+    """(replan, layer, denoise, head, query, key) float64."""
+    return zarr.open_group(store / "episodes/task000_episode000", mode="r")[f"{site}/rows"][:].astype(np.float64)
+
+
+@pytest.mark.libero
+def test_the_store_has_the_published_sizes_and_both_sites(libero_store, capsys):
+    assert analyze(["verify", str(libero_store)]) == 0
+    # 20 steps, 16 actions a call: two replans; layers 25 to 27; the first and the last of five calls.
+    assert rows_of(libero_store, "self").shape == (2, 3, 2, 2, 1, NUM_KEYS)
+    assert rows_of(libero_store, "cross").shape == (2, 3, 2, 2, 1, 512)
+    capsys.readouterr()
+    assert analyze([str(libero_store), "--list"]) == 0
+    printed = capsys.readouterr().out
+    for said in (
+        "Site 'self': 1764 keys",
+        "Site 'cross': 512 keys",
+        "layers     25, 26, 27 of 28",
+        "words      put, both, the, alphabet, soup",
+        "primary             588..783  image 196  14 x 14 patches",
+    ):
+        assert said in printed
+
+
+@pytest.mark.libero
+def test_the_results_of_the_command_have_the_published_fields_and_sums(libero_run, libero_store):
+    (episode,) = json.loads((libero_run / "attention_ratio_results_libero_10.json").read_text())
+    assert list(episode["per_step_ratios"]) == ["layer_25", "layer_26", "layer_27", "layers_avg"]
+    rows = rows_of(libero_store, "self")[:, :, -1, :, 0].mean(axis=2)  # the last call, mean over heads
+    visual, blank = NUM_QUERIES * rows[..., 588:784].sum(-1), NUM_QUERIES * rows[..., :196].sum(-1)
+    for i, layer in enumerate((25, 26, 27)):
+        steps = episode["per_step_ratios"][f"layer_{layer}"]
+        assert [step["step"] for step in steps] == [10, 26]
+        for replan, step in enumerate(steps):
+            assert step["visual_mass"] == pytest.approx(visual[replan, i], rel=1e-3)
+            assert step["linguistic_mass"] == pytest.approx(blank[replan, i], rel=1e-3)
+            assert step["visual_linguistic_ratio"] == pytest.approx(visual[replan, i] / blank[replan, i], rel=2e-3)
+            share = visual[replan, i] / (visual[replan, i] + blank[replan, i])
+            assert step["visual_fraction"] == pytest.approx(share, rel=2e-3)
+            assert step["selected_call_S"] == NUM_KEYS
+            assert (step["query_frame"], step["visual_frame"], step["text_frame"]) == ("action", "curr_last", "frame0")
+
+
+@pytest.mark.libero
+def test_default_and_reference_with_pictures(libero_store, tmp_path, capsys):
+    for grouping, site in (("default", "self"), ("default", "cross"), ("reference", "self")):
+        folder = tmp_path / f"{grouping}_{site}"
+        assert analyze([str(libero_store), "--grouping", grouping, "--site", site, "--output", str(folder)]) == 0
+        assert {"summary.txt", "steps.parquet", "attention_fractions.png"} <= {file.name for file in folder.iterdir()}
+    said = (tmp_path / "reference_self/summary.txt").read_text()
+    assert "holds no language" in " ".join(said.split())
+    assert "verdict" not in said
+    assert "-dominant" not in said
+    assert (tmp_path / "reference_self/ratio_distribution.png").is_file()
+    steps = pl.read_parquet(tmp_path / "reference_self/steps.parquet")
+    proxy = pl.read_parquet(libero_store.parent / "steps.parquet")
+    last = steps.filter(denoise_step=4).sort("replan", "layer")["ratio"]
+    np.testing.assert_allclose(last, proxy.sort("replan", "layer")["ratio"], rtol=1e-6)
+    cross = pl.read_parquet(tmp_path / "default_cross/steps.parquet")
+    # Padded positions take attention, and are no language.
+    assert (cross["null_mass"] > 0).all()
+    np.testing.assert_allclose(cross["linguistic_mass"] + cross["null_mass"], cross["row_sum"], rtol=1e-3)
+    capsys.readouterr()
+    assert analyze([str(libero_store), "--grouping", "reference", "--site", "cross", "--output", str(tmp_path)]) == 2
+    assert "choose with --site" in capsys.readouterr().err
+
+
+# What can be wrong with the files: one sentence, exit code 2, and no store
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A checkpoint of test size; what is wrong with it is found before anything of its size matters."""
+    return write_dummy_folder(tmp_path / "checkpoint", DUMMY_CONFIG, ["stack the red cube"], dtype=torch.float32)
+
+
+def refused(folder: Path, capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """The sentence that the command ends with, after checking the form of it."""
+    store = folder.parent / "a.zarr"
+    given = ["cosmos", "--ckpt-path", folder, "--task-id", 0, "--device", "cpu", "--store", store, *arguments]
+    capsys.readouterr()
+    assert capture([str(argument) for argument in given]) == 2
+    said = capsys.readouterr().err.strip()
+    # Loading may note on a line of its own that T5's tokenizer is absent; the mistake itself is one line.
+    *notes, sentence = said.splitlines()
+    assert all(note.startswith("T5's tokenizer") for note in notes)
+    assert sentence.startswith("vla-capture: ")
+    assert not store.exists()
+    return sentence
+
+
+@pytest.mark.parametrize(
+    ("missing", "expected"),
+    [
+        (STATISTICS_NAME, "--dataset-stats-path"),
+        (EMBEDDINGS_NAME, "--t5-text-embeddings-path"),
+        (WEIGHTS_NAME, "has no .pt file"),
+    ],
+)
+def test_a_missing_file_is_named_with_what_to_do(folder, missing, expected, capsys):
+    (folder / missing).unlink()
+    said = refused(folder, capsys)
+    assert expected in said
+    assert str(folder) in said
+    if missing != WEIGHTS_NAME:
+        assert missing in said
+        assert "elsewhere" in refused(folder, capsys, expected, "elsewhere")
+
+
+class Malicious:
+    """Makes a file when it is unpickled by something careless."""
+
+    def __init__(self, trace: Path):
+        self.trace = trace
+
+    def __reduce__(self):
+        return os.system, (f"touch {self.trace}",)
+
+
+@pytest.mark.parametrize("name", [EMBEDDINGS_NAME, WEIGHTS_NAME, "tokenizer/tokenizer.pth"])
+def test_a_malicious_pickle_is_refused_and_nothing_of_it_is_executed(folder, name, tmp_path, capsys):
+    trace, path = tmp_path / "executed", folder / name
+    if name == EMBEDDINGS_NAME:
+        content = {**pickle.loads(path.read_bytes()), "another": Malicious(trace)}
+        path.write_bytes(pickle.dumps(content))
+    else:
+        content = {**torch.load(path, weights_only=False), "net.another": Malicious(trace)}
+        torch.save(content, path)
+    said = refused(folder, capsys)
+    assert "was refused" in said
+    assert "system" in said
+    assert "nothing of it was executed" in said
+    assert not trace.exists()
+    # The file really is malicious.
+    pickle.loads(path.read_bytes()) if name == EMBEDDINGS_NAME else torch.load(path, weights_only=False)
+    assert trace.exists()
+
+
+def test_frames_and_calls_that_do_not_exist_name_those_that_do(folder, capsys):
+    said = refused(folder, capsys, "--query-frame", "actoin")
+    assert "Unknown latent frame 'actoin'. Did you mean 'action'?" in said
+    assert "blank, proprio, wrist, primary, action, future_proprio, future_wrist, future_primary, value" in said
+    assert "frame0 to frame8" in said
+    assert "Unknown latent frame 'frame9'" in refused(folder, capsys, "--text-frame", "frame9")
+    said = refused(folder, capsys, "--prefer-S", "1000")
+    assert "No call has --prefer-S 1000: all 5 calls of this policy have S = 1764" in said
+
+
+@pytest.mark.simulator
+def test_an_instruction_without_embedding_names_the_near_ones(folder, capsys):
+    """Found out at the first replan: the store exists by then, and has no episode."""
+    store = folder.parent / "a.zarr"
+    assert capture(["cosmos", "--ckpt-path", str(folder), *SHORT, "--store", str(store)]) == 2
+    assert not list((store / "episodes").glob("task*"))
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "There is no text embedding of 'stack the red cube on top of the green cube'" in said
+    assert "nearest: 'stack the red cube'" in said
+
+
+@pytest.mark.simulator
+def test_without_t5s_tokenizer_words_cannot_be_selected_and_the_text_as_a_whole_can(tmp_path, capsys):
+    task = list_tasks(find_suite("robosuite"), EnvironmentSettings())[1]
+    folder = write_dummy_folder(tmp_path / "checkpoint", DUMMY_CONFIG, [task.instruction], dtype=torch.float32)
+    store = str(tmp_path / "a.zarr")
+    assert capture(["cosmos", "--ckpt-path", str(folder), *SHORT, "--store", store]) == 0
+    assert "give --t5-tokenizer to have words" in capsys.readouterr().err
+    asked = [store, "--site", "cross", "--no-plots", "--output", str(tmp_path / "out")]
+    for words in (
+        ["--group", "cube=word:cube"],
+        ["--group", "cube=word:cube | role:null"],
+        ["--grouping", "instruction"],
+    ):
+        assert analyze([*asked, *words]) == 2
+        said = capsys.readouterr().err.strip()
+        assert "needs a capture with --t5-tokenizer" in said
+        assert "\n" not in said
+    assert not (tmp_path / "out").exists()
+    assert analyze([*asked, "--group", "text=role:text"]) == 0
+    assert (pl.read_parquet(tmp_path / "out/steps.parquet")["text_mass"] > 0).all()
+
+
+def test_latents_that_are_no_whole_number_of_patches(tmp_path, capsys):
+    """A case of the reference with one column of latents cut off."""
+    golden = Path(__file__).parents[1] / "golden" / "cosmos" / "dit_batch2_T5_rect"
+    case = shutil.copytree(golden, tmp_path / "case")
+    with np.load(case / "inputs.npz") as stored:
+        arrays = dict(stored)
+    cut = {name: arrays[name][..., :-1] for name in ("latents", "condition_mask")}
+    np.savez(case / "inputs.npz", **{**arrays, **cut})
+    assert capture(["parity", str(case)]) == 2
+    said = capsys.readouterr().err.strip()
+    height, width = cut["latents"].shape[-2:]
+    assert f"A latent frame of {height} x {width} cannot be cut into patches of 2 x 2" in said
+    assert said.count("\n") == 0
