@@ -118,6 +118,9 @@ def summarise_group_contributions(table: pl.DataFrame | None, grouping: Grouping
     if table is None:
         return "\n".join([title, "-" * WIDTH, *textwrap.wrap(note, WIDTH), ""])
     shown = [name for name in measured if (table[f"{name}_norm"] > 0).any()]
+    nothing = [name for name in measured if name not in shown]
+    if nothing:
+        note = f"Exactly nothing is added by {listing(nothing)}. {note}".strip()
     has_ratio = "contribution_ratio" in table.columns
     rows = []
     for row in _means_by_layer(table, shown, has_ratio, seed):

@@ -51,10 +51,10 @@ def plot_layer_time(replans: pl.DataFrame, grouping: Grouping, folder: Path, see
             part[column].fill_null(float("nan")).to_numpy().reshape(len(layers), bins)
             for column in ("mean", "low", "high")
         )
-        undefined = undefined or bool(np.isnan(mean).any())
         if np.isnan(mean).all():
             explain(axes, "No ratio is finite and above 0." if grouping.ratio else "No group has any mass.")
             continue
+        undefined = undefined or bool(np.isnan(mean).any())
         if grouping.ratio is not None:
             label = "times uniform attention" if quantity == "log2_lift" else "ratio"
             uncertain = (low <= 0) & (high >= 0)

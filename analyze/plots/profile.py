@@ -68,7 +68,9 @@ def _ratio_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping) -> None:
     at = np.arange(len(mean))
     # An interval may reach 0, which a logarithmic axis does not have: there it runs to the edge.
     low = np.where(low > 0, low, np.where(np.isnan(low), np.nan, axes.get_ylim()[0]))
-    axes.plot(at[drawn], mean[drawn], "o-", color=DATA_COLOR, markersize=4.5, label="mean over episodes", zorder=3)
+    # The line breaks where there is no ratio: nothing is known there.
+    shown = np.where(drawn, mean, np.nan)
+    axes.plot(at, shown, "o-", color=DATA_COLOR, markersize=4.5, label="mean over episodes", zorder=3)
     axes.vlines(at, low, high, color=DATA_COLOR, linewidth=2.2, alpha=0.55, zorder=2, label=_interval(low))
     axes.plot(at, uniform, "--", color=BASELINE_COLOR, linewidth=1.2, label=BASELINE_LABEL)
     if len(at) == 1 and np.isfinite(uniform[0]):
@@ -82,21 +84,25 @@ def _fraction_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping) -> None:
     styles = group_styles(grouping.names)
     groups = shown_groups(rows, grouping)
     at = np.arange(rows.height, dtype=float)
+    highest = 0.0
+    # Side by side, so that intervals of different groups do not cover each other; near their label where there are few positions.
+    apart = min(0.08, 0.012 * (rows.height + 0.2))
     for i, name in enumerate(groups):
         mean, low, high = (
             rows[f"{name}_fraction{end}"].cast(pl.Float64).fill_null(float("nan")).to_numpy()
             for end in ("", "_low", "_high")
         )
-        # Side by side, so that intervals of different groups do not cover each other.
-        where = at + (i - (len(groups) - 1) / 2) * 0.08
+        where = at + (i - (len(groups) - 1) / 2) * apart
         color = styles[name]["color"]
         line = "--" if styles[name]["hatch"] else "-"
         axes.plot(where, mean, f"o{line}", color=color, markersize=4, label=wrapped(name, 24, 1), zorder=3)
         axes.vlines(where, low, high, color=color, linewidth=2.2, alpha=0.55, zorder=2)
+        highest = max(highest, float(np.nanmax(np.fmax(mean, high))))
     if not groups:
         explain(axes, "No group has any mass.")
         return
-    axes.set_ylim(0, None)
+    # Room for the whole of the highest and of the lowest marker.
+    axes.set_ylim(-0.03 * highest, 1.06 * highest)
     axes.set_ylabel("fraction of the groups'\nsummed mass")
     axes.grid(axis="y")
     having = sum((rows[f"{name}_fraction"].fill_null(0.0) > 0).any() for name in grouping.names)

@@ -13,6 +13,7 @@ from analyze.group_contributions import group_contribution_table, summarise_grou
 from analyze.question import Question
 from analyze.tables import resolve_all
 from schemas.grouping import Grouping, Ratio
+from schemas.resolve import ResolvedGrouping
 from schemas.segments import Segment, segments_of
 from tests.analyze.raw_rows import question_about
 from tests.store_kit import StoreSpec, contribution_vectors, make_tokens, write_store
@@ -119,6 +120,20 @@ def test_a_group_that_takes_a_segment_at_some_replans_only_is_cut(store):
     assert set(parts) == {"all"}
     assert not parts["all"][-1]
     assert parts["all"].sum() == 1
+
+
+@pytest.mark.parametrize(("weight", "replans", "kept"), [(1.0, 3, True), (0.5, 3, False), (1.0, 1, False)])
+def test_a_segment_is_taken_whole_always_or_not_at_all(store, weight, replans, kept):
+    """A half of every key is no whole segment, and neither are all keys at some replans only."""
+    item = question_about(store).selected[0]
+    weights = np.zeros((item.tokens.num_replans, item.tokens.layout.num_keys, 1), dtype=np.float32)
+    span = item.tokens.layout.camera_span("base_0_rgb")
+    weights[:replans, span.start : span.stop, 0] = weight
+    resolved = ResolvedGrouping(("g",), weights, weights.sum(axis=1, dtype=np.float64), item.valid.sum(axis=1))
+    parts = whole_segments(item, resolved, "joint")
+    assert set(parts) == ({"g"} if kept else set())
+    if kept:
+        assert np.flatnonzero(parts["g"]).tolist() == [0]
 
 
 def test_only_groups_that_are_whole_in_every_episode_are_measured(tmp_path):

@@ -116,7 +116,14 @@ def test_all_mass_in_the_last_layer_has_its_centre_there(tmp_path):
 def test_no_mass_at_all_gives_an_empty_table():
     grouping = Grouping("g", {"a": ("*",)})
     episodes = pl.DataFrame(
-        {"suite": ["s"] * 2, "task_id": [0] * 2, "episode_index": [0] * 2, "layer": ["0", "1"], "block": [0, 1], "a_mass": [0.0, 0.0]}
+        {
+            "suite": ["s"] * 2,
+            "task_id": [0] * 2,
+            "episode_index": [0] * 2,
+            "layer": ["0", "1"],
+            "block": [0, 1],
+            "a_mass": [0.0, 0.0],
+        }
     )
     assert depth_table(episodes, grouping).is_empty()
 
@@ -125,8 +132,12 @@ def test_no_mass_at_all_gives_an_empty_table():
 def test_a_part_of_the_time_holds_what_lies_in_it_by_share(num_bins):
     """Replans of uneven length in episodes of odd lengths, cut so fine that each crumb lies in one replan and one part."""
     grouping = default_grouping()
-    steps = make_steps(layers=(3, 4), num_replans=5, num_tasks=2, num_episodes=2, no_denominator=0.3, denoise_steps=(0,))
-    steps = steps.with_columns(env_step=10 + pl.col("replan") * (pl.col("replan") + 3), num_steps=31 + pl.col("episode_index"))
+    steps = make_steps(
+        layers=(3, 4), num_replans=5, num_tasks=2, num_episodes=2, no_denominator=0.3, denoise_steps=(0,)
+    )
+    steps = steps.with_columns(
+        env_step=10 + pl.col("replan") * (pl.col("replan") + 3), num_steps=31 + pl.col("episode_index")
+    )
     replans = add_layers_avg(per_replan(steps, grouping), grouping)
     table = layer_time_table(replans, grouping, num_bins)
     bins = num_bins or 5
@@ -153,7 +164,11 @@ def test_time_has_no_more_parts_than_replans_and_groups_stand_in_where_there_is_
     steps = make_steps(grouping, CUSTOM_KEYS, num_replans=3)
     short = layer_time_table(per_replan(steps, grouping), grouping)
     assert short["bin"].n_unique() == 3
-    assert short["quantity"].unique(maintain_order=True).to_list() == ["base_fraction", "wrist_fraction", "nouns_fraction"]
+    assert short["quantity"].unique(maintain_order=True).to_list() == [
+        "base_fraction",
+        "wrist_fraction",
+        "nouns_fraction",
+    ]
     long = make_steps(grouping, CUSTOM_KEYS, num_replans=40)
     assert layer_time_table(per_replan(long, grouping), grouping)["bin"].n_unique() == MOST_BINS
 

@@ -15,7 +15,7 @@ from scipy.stats import entropy as entropy_of_scipy
 from analyze.metrics.entropy import effective_keys, entropies, top_mass
 from analyze.metrics.row_metrics import RowOptions, groups_with_valid_keys, row_metrics_table
 from analyze.tables import resolve_all
-from tests.analyze.raw_rows import FEW, question_about, raw_episodes, weights_of
+from tests.analyze.raw_rows import FEW, leaky, question_about, raw_episodes, weights_of
 from tests.store_kit import StoreSpec, write_store
 from tests.strategies import episode_tokens, groupings
 
@@ -30,7 +30,9 @@ def by_hand(row: np.ndarray, weights: np.ndarray) -> float:
 
 
 def test_known_rows_have_known_entropies():
-    rows = np.array([[[0.25, 0.25, 0.25, 0.25, 0.0]], [[1.0, 0.0, 0.0, 0.0, 0.0]], [[0.5, 0.5, 0.0, 0.0, 0.0]]], np.float32)
+    rows = np.array(
+        [[[0.25, 0.25, 0.25, 0.25, 0.0]], [[1.0, 0.0, 0.0, 0.0, 0.0]], [[0.5, 0.5, 0.0, 0.0, 0.0]]], np.float32
+    )
     every = np.ones((1, 5, 1), np.float32)
     found = entropies(rows, every)[:, 0, 0]
     np.testing.assert_allclose(found, np.log([4, 1, 2]), atol=1e-6)
@@ -65,7 +67,12 @@ def test_the_table_of_rows_holds_what_scipy_and_sorting_say_of_the_raw_rows(data
     tokens = data.draw(episode_tokens())
     grouping = data.draw(groupings(tokens))
     spec = StoreSpec(
-        tokens=tokens, tasks=(0,), episodes=1, queries=data.draw(st.sampled_from(["mean", "all"])), layer_labels=(0, 2, 4)
+        tokens=tokens,
+        plant_rows=leaky,
+        tasks=(0,),
+        episodes=1,
+        queries=data.draw(st.sampled_from(["mean", "all"])),
+        layer_labels=(0, 2, 4),
     )
     options = RowOptions(top=(2, 1, 7))
     with tempfile.TemporaryDirectory() as folder:
@@ -81,7 +88,9 @@ def test_the_table_of_rows_holds_what_scipy_and_sorting_say_of_the_raw_rows(data
     assert set(table.filter(pl.col("layer") == 4)["block"]) == {0}
     having = {name for i, name in enumerate(grouping.names) if weights[:, :, i].any()}
     assert set(shown) == having
-    for row, (replan, layer, denoise, head) in zip(table.iter_rows(named=True), np.ndindex(rows.shape[:4]), strict=True):
+    for row, (replan, layer, denoise, head) in zip(
+        table.iter_rows(named=True), np.ndindex(rows.shape[:4]), strict=True
+    ):
         where = (row["replan"], row["layer"], row["denoise_step"], row["head"])
         assert where == (replan, (0, 2, 4)[layer], spec.denoise_steps[denoise], spec.heads[head])
         seen = rows[replan, layer, denoise, head]

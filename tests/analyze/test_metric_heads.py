@@ -17,14 +17,17 @@ from analyze.metrics.heads import ranked_heads
 from analyze.metrics.row_metrics import RowOptions
 from analyze.pipeline import analyse
 from schemas.grouping import Grouping, Ratio
-from tests.analyze.raw_rows import FEW, question_about, raw_episodes, weights_of
+from tests.analyze.raw_rows import FEW, leaky, question_about, raw_episodes, weights_of
 from tests.store_kit import StoreSpec, small_layout, write_store
 from tests.strategies import episode_tokens, groupings
 
 LAYOUT = small_layout()
 BOS = LAYOUT.span("prompt").start
 SIDES = Grouping(
-    "sides", {"seen": ("role:image",), "read": ("span:prompt",), "rest": ("*",)}, Ratio(("seen",), ("read",)), allow_empty=("rest",)
+    "sides",
+    {"seen": ("role:image",), "read": ("span:prompt",), "rest": ("*",)},
+    Ratio(("seen",), ("read",)),
+    allow_empty=("rest",),
 )
 
 
@@ -49,6 +52,7 @@ def test_every_number_of_a_head_is_that_of_loops_over_raw_rows(data):
     grouping = Grouping("random", grouping.groups, ratio, allow_empty=grouping.allow_empty)
     spec = StoreSpec(
         tokens=tokens,
+        plant_rows=leaky,
         tasks=(0, 1),
         episodes=1,
         layer_labels=(0, 2, 4),
@@ -74,7 +78,10 @@ def test_every_number_of_a_head_is_that_of_loops_over_raw_rows(data):
         for raw in raws:
             mass = np.stack(
                 [
-                    [(raw.rows[replan, layer, :, head] * weights[replan, :, i]).sum(axis=-1).mean() for i in range(len(names))]
+                    [
+                        (raw.rows[replan, layer, :, head] * weights[replan, :, i]).sum(axis=-1).mean()
+                        for i in range(len(names))
+                    ]
                     for replan in range(tokens.num_replans)
                 ]
             )
@@ -95,7 +102,9 @@ def test_every_number_of_a_head_is_that_of_loops_over_raw_rows(data):
                     log2 = np.log2(up / down) if up > 0 and down > 0 else np.nan
                     left_out += not np.isfinite(log2)
                     of.setdefault("log2_ratio", []).append(log2)
-                    of.setdefault("log2_lift", []).append(log2 - np.log2(more / fewer) if more > 0 and fewer > 0 else np.nan)
+                    of.setdefault("log2_lift", []).append(
+                        log2 - np.log2(more / fewer) if more > 0 and fewer > 0 else np.nan
+                    )
                     above.append(up)
                     below.append(down)
             for column, values in of.items():
@@ -192,7 +201,9 @@ def test_heads_without_a_finite_ratio_stand_at_the_ends_and_those_without_mass_n
 
 def test_all_ratios_infinite_is_said_and_nothing_breaks(tmp_path):
     grouping = Grouping(
-        "blind", {"seen": ("role:image",), "masked": ("role:masked_image",), "rest": ("*",)}, Ratio(("seen",), ("masked",))
+        "blind",
+        {"seen": ("role:image",), "masked": ("role:masked_image",), "rest": ("*",)},
+        Ratio(("seen",), ("masked",)),
     )
     study = study_of(tmp_path, grouping)
     assert study.heads["log2_ratio"].is_null().all()

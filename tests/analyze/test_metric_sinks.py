@@ -17,7 +17,7 @@ from analyze.metrics.row_metrics import RowOptions, row_metrics_table
 from analyze.metrics.sinks import SinkRule, describe_sinks, key_sums, sinks_table, without_sinks
 from analyze.tables import resolve_all, steps_table
 from schemas.layout import Role
-from tests.analyze.raw_rows import FEW, RawEpisode, question_about, raw_episodes, weights_of
+from tests.analyze.raw_rows import FEW, RawEpisode, leaky, question_about, raw_episodes, weights_of
 from tests.store_kit import StoreSpec, make_tokens, small_layout, write_store
 from tests.strategies import episode_tokens, groupings
 
@@ -41,7 +41,9 @@ def shares_of(raw: RawEpisode, factor: float) -> tuple[np.ndarray, np.ndarray]:
 def test_sinks_are_the_keys_that_a_loop_over_raw_rows_finds(data):
     tokens = data.draw(episode_tokens())
     rule = SinkRule(data.draw(st.sampled_from([1.37, 2.11, 4.03])), data.draw(st.sampled_from([0.2, 0.5])))
-    spec = StoreSpec(tokens=tokens, tasks=(0, 1), episodes=1, queries=data.draw(st.sampled_from(["mean", "all"])))
+    spec = StoreSpec(
+        tokens=tokens, plant_rows=leaky, tasks=(0, 1), episodes=1, queries=data.draw(st.sampled_from(["mean", "all"]))
+    )
     with tempfile.TemporaryDirectory() as folder:
         path = write_store(Path(folder) / "a.zarr", spec=spec)
         # A block that is named twice has its rows counted once: the shares below are over the recorded layers.
@@ -111,7 +113,9 @@ def test_a_sink_has_the_role_that_it_has_where_it_is_one(tmp_path):
     seen = roles != Role.PADDING
     key = BOS + 10
     assert 0 < seen.sum() < seen.size
-    (row,) = [row for row in sinks_table(question_about(path), SinkRule(3.0, 0.05)).iter_rows(named=True) if row["key"] == key]
+    (row,) = [
+        row for row in sinks_table(question_about(path), SinkRule(3.0, 0.05)).iter_rows(named=True) if row["key"] == key
+    ]
     assert row["share_of_rows"] == pytest.approx(seen.mean(axis=1).mean())
     assert row["role"] == "state"
 
@@ -121,7 +125,9 @@ def test_a_sink_has_the_role_that_it_has_where_it_is_one(tmp_path):
 def test_without_sinks_every_measure_is_that_of_the_other_keys(data):
     tokens = data.draw(episode_tokens())
     grouping = data.draw(groupings(tokens))
-    spec = StoreSpec(tokens=tokens, tasks=(0, 1), episodes=1, layer_labels=(0, 2, 4), mantissa_bits=23)
+    spec = StoreSpec(
+        tokens=tokens, plant_rows=leaky, tasks=(0, 1), episodes=1, layer_labels=(0, 2, 4), mantissa_bits=23
+    )
     rule = SinkRule(1.9, 0.2)
     with tempfile.TemporaryDirectory() as folder:
         path = write_store(Path(folder) / "a.zarr", spec=spec)
@@ -153,7 +159,9 @@ def test_without_sinks_every_measure_is_that_of_the_other_keys(data):
             found = part[f"{name}_lift"].fill_null(float("nan")).to_numpy().reshape(mass.shape[:3])
             has_keys = np.broadcast_to(keys[:, None, None, i] > 1e-6, found.shape)
             np.testing.assert_allclose(found[has_keys], lifts[..., i][has_keys], rtol=1e-4, atol=1e-6)
-            np.testing.assert_allclose(part[f"{name}_keys"].to_numpy()[:: rows[0, ..., 0, 0].size], keys[:, i], rtol=1e-5)
+            np.testing.assert_allclose(
+                part[f"{name}_keys"].to_numpy()[:: rows[0, ..., 0, 0].size], keys[:, i], rtol=1e-5
+            )
         entropies = entropy_of_scipy(rows, axis=-1)
         found = study.rows.filter(task_id=raw.order[0])["entropy"].to_numpy().reshape(rows.shape[:4])
         np.testing.assert_allclose(found, entropies, atol=1e-4)

@@ -32,10 +32,13 @@ PUBLISHED_SHAPE = replace(
     vae=VaeConfig(base_dim=4),
 )
 #: The options of the issue's command, as typed.
-PUBLISHED_OPTIONS = "--layers 25 26 27 --query-frame action --visual-frame curr_last --text-frame frame0".split()
+PUBLISHED_OPTIONS = [
+    *("--layers", "25", "26", "27", "--query-frame", "action"),
+    *("--visual-frame", "curr_last", "--text-frame", "frame0"),
+]
 NUM_QUERIES, NUM_KEYS = 196, 1764
 #: One built-in task, one replan.
-SHORT = "--task-id 1 --num-episodes 1 --max-steps 4 --device cpu --layers 1".split()
+SHORT = ["--task-id", "1", "--num-episodes", "1", "--max-steps", "4", "--device", "cpu", "--layers", "1"]
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -9,6 +9,8 @@ import json
 import pytest
 import torch
 from cosmos_helpers import GOLDEN
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from capture.policies.cosmos.config import DitConfig, VaeConfig
 from capture.policies.cosmos.dit import Dit, rotate
@@ -183,3 +185,61 @@ def test_latents_must_be_whole_patches_within_the_positions():
         DitConfig().grid(7, 8)
     with pytest.raises(ValueError, match="larger than the 128 positions"):
         DitConfig().grid(258, 2)
+
+
+@st.composite
+def networks_and_batches(draw):
+    """Any sizes: odd numbers of frames, rectangles, batches whose entries differ in masks, times and lengths of text."""
+    heads, head_dim = draw(st.integers(1, 4)), draw(st.sampled_from([12, 14, 16, 18, 20, 32]))
+    channels = draw(st.sampled_from([4, 16]))
+    config = DitConfig(
+        width=heads * head_dim,
+        num_blocks=draw(st.integers(1, 3)),
+        num_heads=heads,
+        mlp_dim=16,
+        text_dim=draw(st.sampled_from([8, 20])),
+        adaln_dim=draw(st.sampled_from([4, 8])),
+        in_channels=channels,
+        out_channels=channels,
+    )
+    batch, frames, positions = draw(st.integers(1, 3)), draw(st.integers(1, 11)), draw(st.integers(1, 12))
+    height, width = 2 * draw(st.integers(1, 4)), 2 * draw(st.integers(1, 6))
+    lengths = [draw(st.integers(0, positions)) for _ in range(batch)]
+    random = torch.Generator().manual_seed(draw(st.integers(0, 2**16)))
+    given_frames = (torch.rand(batch, 1, frames, 1, 1, generator=random) < 0.5).float()
+    text = torch.randn(batch, positions, config.text_dim, generator=random)
+    for entry, length in enumerate(lengths):
+        text[entry, length:] = 0
+    inputs = {
+        "latents": torch.randn(batch, channels, frames, height, width, generator=random),
+        "times": torch.rand(batch, frames, generator=random) * (1 - given_frames[:, 0, :, 0, 0]),
+        "condition_mask": given_frames.expand(batch, 1, frames, height, width).contiguous(),
+        "padding_mask": (torch.rand(batch, 1, 8 * height, 8 * width, generator=random) < 0.3).float(),
+        "text": text,
+    }
+    return config, inputs, lengths
+
+
+@settings(max_examples=20, deadline=None)
+@given(case=networks_and_batches())
+def test_any_network_on_any_batch(case):
+    config, inputs, lengths = case
+    dit, observer = build_dit(config, random_dit_weights(config, seed=0)), EverythingObserver()
+    with torch.no_grad():
+        output = dit(**inputs)
+        assert output.shape == inputs["latents"].shape
+        assert torch.equal(dit(**inputs, observer=observer), output)
+        for entry in range(len(lengths)):
+            alone = dit(**{name: tensor[entry : entry + 1] for name, tensor in inputs.items()})
+            torch.testing.assert_close(output[entry : entry + 1], alone, rtol=1e-4, atol=2e-5)
+    keys = {"self": output.shape[2] * output.shape[3] * output.shape[4] // 4, "cross": inputs["text"].shape[1]}
+    for layer in range(config.num_blocks):
+        for site, count in keys.items():
+            rows = observer.probabilities(site, layer)
+            assert rows.shape == (len(lengths), config.num_heads, keys["self"], count)
+            torch.testing.assert_close(rows.sum(-1), torch.ones(rows.shape[:-1]), rtol=0, atol=1e-5)
+        cross = observer.probabilities("cross", layer)
+        for entry, length in enumerate(lengths):
+            # Padded positions are alike to every query, and a text of nothing else adds exactly nothing.
+            assert (cross[entry, ..., length:] == cross[entry, ..., length : length + 1]).all()
+            assert bool((observer.residual_norms[layer][entry, :, 1] == 0).all()) == (length == 0)
