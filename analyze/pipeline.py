@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import polars as pl
 
 from analyze.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
-from analyze.atomic_file import replacing
 from analyze.contributions import contribution_table, summarise_contributions
 from analyze.frame_proxy import frame_proxy
 from analyze.group_contributions import group_contribution_table, summarise_group_contributions
@@ -17,6 +15,7 @@ from analyze.question import Question
 from analyze.results_file import write_results_of_suites
 from analyze.selection import Selection
 from analyze.summary import AnalysedRun, summary_text, write_summary
+from analyze.table_files import write_parquet
 from analyze.tables import resolve_all, steps_table
 from analyze.terminal import progress_bar
 from schemas.errors import BadArgument, listing
@@ -87,29 +86,20 @@ def analyse(question: Question) -> Analysis:
 
 def write_tables(analysis: Analysis, folder: Path) -> WrittenFiles:
     """Write the results JSON (when the grouping has a ratio), the tables and the summary; each file appears whole."""
-    written = WrittenFiles(folder)
+    names = ("steps", "episodes", "tasks", "contributions", "group_contributions")
+    tables = {name: table for name in names if (table := getattr(analysis, name)) is not None}
+    written = WrittenFiles(folder, write_parquet(folder, **tables))
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if not os.access(folder, os.W_OK):
-            raise PermissionError(13, "Permission denied")
-        for name in ("steps", "episodes", "tasks", "contributions", "group_contributions"):
-            table: pl.DataFrame | None = getattr(analysis, name)
-            if table is not None:
-                path = folder / f"{name}.parquet"
-                with replacing(path) as temporary:
-                    table.write_parquet(temporary)
-                written.files.append(path)
         if analysis.grouping.ratio is not None:
             question = analysis.question
             proxy = frame_proxy(question.stores[0].attributes, question.selected[0].tokens.layout, analysis.grouping)
             written.files += write_results_of_suites(folder, analysis.replans, analysis.grouping, proxy)
-        path = folder / "summary.txt"
-        write_summary(path, analysis.summary)
-        written.files.append(path)
+        write_summary(folder / "summary.txt", analysis.summary)
     except OSError as error:
         raise BadArgument(
             f"Cannot write results to {folder}: {error.strerror or error}; give another --output."
         ) from None
+    written.files.append(folder / "summary.txt")
     return written
 
 

@@ -21,8 +21,8 @@ _NOTHING = "#D9D9D9"
 _LEAST_SPAN = 0.5
 #: Marks of the colour bar, on either side of 1.
 _FACTORS = ((1.1, 1.2, 1.3, 1.4), (1.2, 1.5, 2.0), (1.5, 2.0, 3.0))
-#: With more cells than this, numbers in them could not be read.
-_MOST_NUMBERS = 64
+#: With more cells than this, numbers in them could not be read; with more in a row, they would touch.
+_MOST_NUMBERS, _MOST_NUMBERED_COLUMNS = 64, 12
 #: More labels than this along an axis would touch.
 _MOST_LABELS = 32
 
@@ -40,6 +40,7 @@ def draw_log2_map(
     dot. Few cells carry their number, because a colour among few others says little.
     """
     finite = log2[np.isfinite(log2)]
+    numbered = _has_numbers(*log2.shape)
     span = max(_LEAST_SPAN, float(np.abs(finite).max()) if finite.size else 0.0)
     image = axes.imshow(
         np.clip(log2, -span, span), origin="lower", aspect="auto", interpolation="none", cmap=diverging_colors(), vmin=-span, vmax=span
@@ -48,11 +49,11 @@ def draw_log2_map(
         value = log2[row, column]
         if np.isinf(value):
             axes.text(column, row, "∞" if value > 0 else "0", ha="center", va="center", color="white", size=7)
-        elif log2.size <= _MOST_NUMBERS:
+        elif numbered:
             axes.text(column, row + 0.08, _factor(value), ha="center", va="center", color=_ink(value, span), size=7)
     rows, columns = np.nonzero(uncertain & np.isfinite(log2))
     inks = [_ink(value, span) for value in log2[rows, columns]]
-    axes.scatter(columns, rows - (0.32 if log2.size <= _MOST_NUMBERS else 0.0), s=3, color=inks, linewidths=0)
+    axes.scatter(columns, rows - (0.32 if numbered else 0.0), s=3, color=inks, linewidths=0)
     bar = figure.colorbar(image, ax=axes, shrink=0.9, aspect=24, pad=0.02)
     ticks = _factor_ticks(span)
     bar.set_ticks(ticks, labels=[_factor(tick) for tick in ticks])
@@ -62,7 +63,11 @@ def draw_log2_map(
 
 def map_height(num_rows: int, num_columns: int) -> float:
     """Inches that the cells of a map need: more where there are numbers in them."""
-    return num_rows * (0.36 if num_rows * num_columns <= _MOST_NUMBERS else 0.2)
+    return num_rows * (0.36 if _has_numbers(num_rows, num_columns) else 0.2)
+
+
+def _has_numbers(num_rows: int, num_columns: int) -> bool:
+    return num_rows * num_columns <= _MOST_NUMBERS and num_columns <= _MOST_NUMBERED_COLUMNS
 
 
 def diverging_colors() -> Colormap:
@@ -103,4 +108,4 @@ def _factor_ticks(span: float) -> list[float]:
 def _factor(log2: float) -> str:
     """2 to the power, as 4 or 1/4."""
     text = f"{2.0 ** abs(log2):.3g}"
-    return f"1/{text}" if log2 < 0 else text
+    return f"1/{text}" if log2 < 0 and text != "1" else text

@@ -10,6 +10,7 @@ import pytest
 
 from analyze.aggregate import LAYERS_AVG, add_layers_avg, episodes_table, overall_rows, per_replan, tasks_table
 from analyze.plots import layer_time
+from analyze.plots.heat_map import draw_log2_map, map_height
 from analyze.plots.profile import draw_profile
 from analyze.plots.style import new_figure
 from schemas.grouping import Grouping
@@ -77,3 +78,31 @@ def test_a_note_on_grey_cells_only_where_there_are_some(tmp_path, monkeypatch):
     for steps in (make_steps(), make_steps(no_denominator=1.0), some):
         layer_time.plot_layer_time(add_layers_avg(per_replan(steps, grouping), grouping), grouping, tmp_path)
     assert ["Grey" in title for title in titles] == [False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "width"), [(1, 1, 5.6), (5, 10, 6.4), (5, 12, 6.4), (3, 20, 6.4), (4, 16, 7.84)]
+)
+def test_numbers_in_cells_never_touch(rows, columns, width):
+    figure = new_figure(width, max(2.7, 1.6 + map_height(rows, columns)))
+    axes = figure.subplots()
+    values = np.full((rows, columns), -np.log2(1.51))
+    draw_log2_map(figure, axes, values, np.ones((rows, columns), dtype=bool), "times uniform attention")
+    figure.canvas.draw()
+    boxes = [text.get_window_extent() for text in axes.texts]
+    cell = np.abs(axes.transData.transform((1, 1)) - axes.transData.transform((0, 0)))
+    assert all(box.width < 0.98 * cell[0] and box.height < 0.7 * cell[1] for box in boxes)
+    assert {text.get_text() for text in axes.texts} <= {"1/1.51"}
+    assert (len(boxes) > 0) == (columns <= 12)
+    # The colour bar's label stays in the picture, however low the map is.
+    label = figure.axes[-1].yaxis.label.get_window_extent()
+    assert label.y0 >= 0
+    assert label.y1 <= figure.bbox.height
+    assert label.x1 <= figure.bbox.width
+
+
+def test_what_is_one_but_for_rounding_is_written_as_one():
+    figure = new_figure(5, 3)
+    axes = figure.subplots()
+    draw_log2_map(figure, axes, np.array([[-1e-4, 1e-4, -1.0]]), np.zeros((1, 3), dtype=bool), "times")
+    assert [text.get_text() for text in axes.texts] == ["1", "1", "1/2"]

@@ -15,6 +15,7 @@ from scipy.stats import entropy as entropy_of_scipy
 from analyze.metrics.entropy import effective_keys, entropies, top_mass
 from analyze.metrics.row_metrics import RowOptions, groups_with_valid_keys, row_metrics_table
 from analyze.tables import resolve_all
+from schemas.grouping import Grouping
 from tests.analyze.raw_rows import FEW, leaky, question_about, raw_episodes, weights_of
 from tests.store_kit import StoreSpec, write_store
 from tests.strategies import episode_tokens, groupings
@@ -108,3 +109,19 @@ def test_the_table_of_rows_holds_what_scipy_and_sorting_say_of_the_raw_rows(data
             else:
                 assert row[f"{name}_entropy"] == pytest.approx(expected, abs=5e-5)
                 assert row[f"{name}_effective_keys"] == pytest.approx(np.exp(expected), rel=2e-4)
+
+
+def test_keys_that_are_padding_at_some_replans_are_in_no_entropy_of_a_group_there(tmp_path):
+    """A third state digit is there at some replans; at the others its key is padding, and takes mass nonetheless."""
+    spec = StoreSpec(tasks=(0,), episodes=2, replans=4, plant_rows=leaky, mantissa_bits=23)
+    path = write_store(tmp_path / "a.zarr", spec=spec)
+    grouping = Grouping("g", {"text": ("span:prompt",), "rest": ("*",)})
+    table = row_metrics_table(question_about(path, grouping))
+    text = np.zeros(spec.layout.num_keys)
+    text[spec.layout.span("prompt").start : spec.layout.span("prompt").stop] = 1.0
+    for raw in raw_episodes(path, spec):
+        assert (raw.valid != raw.valid[0]).any()
+        found = table.filter(episode_index=raw.order[1])["text_entropy"].to_numpy()
+        cells = np.ndindex(raw.rows.shape[:4])
+        expected = [by_hand(raw.rows[cell], text * raw.valid[cell[0]]) for cell in cells]
+        np.testing.assert_allclose(found, expected, atol=5e-5)
