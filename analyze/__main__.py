@@ -12,7 +12,7 @@ from analyze.commands import COMMANDS, WHOLE
 from schemas.command_line import run_command
 from schemas.errors import UnknownName, UserError, did_you_mean, listing
 
-#: Episodes are measured by threads of our own (`analyze.parallel`); products that each start threads too only stand in their way.
+#: Episodes are measured by threads of our own (`analyze.stores.parallel`); products that each start threads only stand in their way.
 _ONE_THREAD_EACH = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
 
 

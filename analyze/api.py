@@ -15,8 +15,8 @@ import polars as pl
 from analyze.keywords import Settings, analysis_settings
 from analyze.opened import Opened, check_name
 from analyze.question import ask
-from analyze.reader import open_store
-from analyze.selection import check_combinable
+from analyze.stores.reader import open_store
+from analyze.stores.selection import check_combinable
 from schemas.errors import BadArgument, listing
 
 
@@ -37,7 +37,7 @@ class OpenStores(Opened):
     (which of several is chosen by `table`). Mistakes raise a `schemas.errors.UserError` that says what exists.
 
     Attributes:
-        stores: the stores, as `analyze.reader` opens them.
+        stores: the stores, as `analyze.stores.reader` opens them.
         attributes: the run's own description (policy, protocol, recording, sites) of the first store.
 
     >>> run = analyze.open(store)
@@ -56,7 +56,7 @@ class OpenStores(Opened):
         >>> found.filter(pl.col("span").is_null(), group="bowl")["keys_max"].to_list()
         [1.0]
         """
-        from analyze.group_preview import preview_groups
+        from analyze.answers.group_preview import preview_groups
 
         check_name("table", table, ("groups", "words", "overlaps"))
         return _frame(preview_groups(self.ask(**settings)), table)
@@ -101,7 +101,7 @@ class OpenStores(Opened):
         >>> sorted(words.filter(kind="word")["item"].to_list())
         ['bowl', 'on', 'plate', 'put', 'the']
         """
-        from analyze.word_reading import site_of_words, words_summary, words_table
+        from analyze.answers.word_reading import site_of_words, words_summary, words_table
 
         check_name("table", table, ("summary", "episodes"))
         settings["site"] = site_of_words(self.attributes, settings.get("site"))
@@ -121,7 +121,7 @@ class OpenStores(Opened):
         Raises:
             BadArgument: the stores hold no object masks.
         """
-        from analyze.object_attention import ObjectSettings, object_tables
+        from analyze.answers.object_attention import ObjectSettings, object_tables
 
         check_name("table", table, ("objects", "times", "iou"))
         return _frame(object_tables(self.ask(**settings), ObjectSettings(spatial=table == "iou")), table)
@@ -135,13 +135,13 @@ class OpenStores(Opened):
     ) -> pl.DataFrame:
         """Over the course of an episode: phase-aligned means, the gripper's closing, success against failure.
 
-        `bins` and `window` are those of `analyze.time_courses.TimeSettings`.
+        `bins` and `window` are those of `analyze.answers.time_courses.TimeSettings`.
 
         >>> course = analyze.open(store).time(bins=3)
         >>> course["quantity"].unique().sort().to_list()[-1]
         'visual'
         """
-        from analyze.time_courses import TimeSettings, time_courses
+        from analyze.answers.time_courses import TimeSettings, time_courses
 
         check_name("table", table, ("course", "closing", "change", "outcomes", "autocorrelation"))
         given = {name: value for name, value in (("num_bins", bins), ("window", window)) if value is not None}
@@ -162,10 +162,10 @@ class OpenStores(Opened):
         [0.0]
 
         Raises:
-            MixedPolicies, RunsDiffer: the runs differ in what is not compared, see `allow_mismatch` and `analyze.runs`.
+            MixedPolicies, RunsDiffer: the runs differ in what is not compared, see `allow_mismatch` and `analyze.answers.runs`.
         """
-        from analyze.comparison import compare
-        from analyze.runs import RunArgument, open_runs
+        from analyze.answers.comparison import compare
+        from analyze.answers.runs import RunArgument, open_runs
 
         check_name("table", table, ("differences", "estimates", "pairs", "unpaired"))
         opened = other if isinstance(other, OpenStores) else open_stores(other)
@@ -196,8 +196,8 @@ class OpenStores(Opened):
         >>> patches.height, sorted(file.suffix for file in folder.iterdir())
         (16, ['.csv', '.pdf', '.png'])
         """
-        from analyze.group_preview import find_example
-        from analyze.overlay_data import (
+        from analyze.answers.group_preview import find_example
+        from analyze.answers.overlay_data import (
             camera_names,
             check_outlines,
             chosen_replans,
@@ -235,7 +235,7 @@ class OpenStores(Opened):
         >>> page.read_text(encoding="utf-8")[:15].lower()
         '<!doctype html>'
         """
-        from analyze.atomic_file import write_text
+        from analyze.output.atomic_file import write_text
         from analyze.report.page import DEFAULT_EPISODES, DEFAULT_REPLANS, report_html
 
         page = report_html(

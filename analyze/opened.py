@@ -11,7 +11,7 @@ import polars as pl
 from analyze.keywords import Settings, analysis_settings
 from analyze.pipeline import Analysis, analyse
 from analyze.question import AnalysisSettings, Question, ask
-from analyze.reader import Store
+from analyze.stores.reader import Store
 from schemas.errors import BadArgument, did_you_mean, listing
 from schemas.store import RootAttributes
 
@@ -93,7 +93,7 @@ class Opened:
         """Masses, fractions, lifts and ratios as `vla-analyze ratios` gives them.
 
         `level`: "tasks" (per task and over all, with intervals), "episodes", "replans" or "steps" (every replan, layer, denoise step).
-        Columns: `analyze.aggregate` and `analyze.tables`.
+        Columns: `analyze.measures.aggregate` and `analyze.measures.tables`.
 
         >>> run = analyze.open(store)
         >>> run.ratios("steps", groups={"bowl": "word:bowl", "rest": "*"}, layers=2, denoise="last").height
@@ -144,12 +144,12 @@ class Opened:
         >>> "akita_black_bowl_1" in analyze.open(store).describe()
         True
         """
-        from analyze.contents import describe_store
+        from analyze.stores.contents import describe_store
 
         return "\n\n".join(describe_store(store) for store in self.stores)
 
     def contributions(self, **settings: Unpack[Settings]) -> pl.DataFrame:
-        """Norms of what seeing and reading add to the residual stream (`analyze.contributions`), where they were recorded.
+        """Norms of what seeing and reading add to the residual stream (`analyze.measures.contributions`), where they were recorded.
 
         >>> analyze.open(store).contributions(layers=0)["contribution_ratio"].is_finite().all()
         True
@@ -157,14 +157,14 @@ class Opened:
         Raises:
             BadArgument: the stores hold no contributions.
         """
-        from analyze.export import chosen_tables
+        from analyze.answers.export import chosen_tables
 
         return chosen_tables(self.analysis(**settings), ["contributions"])["contributions"]
 
     def to_xarray(
         self, rows: bool = False, most_gigabytes: float = 4.0, **settings: Unpack[Settings]
     ) -> xarray.Dataset:
-        """Masses of every head as labelled arrays, or with `rows` the rows themselves; see `analyze.labelled_arrays`.
+        """Masses of every head as labelled arrays, or with `rows` the rows themselves; see `analyze.answers.labelled_arrays`.
 
         (episode, replan) is one axis `sample`. Rows that would take more memory than `most_gigabytes` are refused. Needs the extra
         `xarray`.
@@ -178,7 +178,7 @@ class Opened:
             MissingDependency: xarray is not installed.
             BadArgument: the rows are larger than allowed.
         """
-        from analyze.labelled_arrays import masses_array, rows_array
+        from analyze.answers.labelled_arrays import masses_array, rows_array
 
         question = self.ask(**settings)
         return rows_array(question, int(most_gigabytes * 1e9)) if rows else masses_array(question)

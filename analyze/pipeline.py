@@ -7,17 +7,17 @@ from pathlib import Path
 
 import polars as pl
 
-from analyze.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
-from analyze.contributions import contribution_table, summarise_contributions
-from analyze.frame_proxy import frame_proxy
-from analyze.group_contributions import group_contribution_table, summarise_group_contributions
+from analyze.measures.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
+from analyze.measures.contributions import contribution_table, summarise_contributions
+from analyze.measures.frame_proxy import frame_proxy
+from analyze.measures.group_contributions import group_contribution_table, summarise_group_contributions
+from analyze.measures.tables import resolve_all, steps_table
+from analyze.output.summary import AnalysedRun, summary_text, write_summary
+from analyze.output.table_files import write_parquet
+from analyze.output.terminal import progress_bar
 from analyze.question import Question
-from analyze.results_file import write_results_of_suites
-from analyze.selection import Selection
-from analyze.summary import AnalysedRun, summary_text, write_summary
-from analyze.table_files import write_parquet
-from analyze.tables import resolve_all, steps_table
-from analyze.terminal import progress_bar
+from analyze.results.results_file import write_results_of_suites
+from analyze.stores.selection import Selection
 from schemas.errors import BadArgument, listing
 from schemas.grouping import Grouping
 from schemas.store import RootAttributes
@@ -27,8 +27,8 @@ from schemas.store import RootAttributes
 class Analysis:
     """The tables of one grouping over one selection of episodes.
 
-    `steps` is described in `analyze.tables`; `replans`, `episodes` and `tasks` in `analyze.aggregate`; `contributions` (None
-    when they were not recorded) in `analyze.contributions`, `group_contributions` in the module of that name.
+    In `analyze.measures` it is described what they hold: `steps` in `tables`; `replans`, `episodes` and `tasks` in `aggregate`;
+    `contributions` (None when they were not recorded) and `group_contributions` in the modules of these names.
     """
 
     question: Question

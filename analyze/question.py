@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from analyze.reader import Store, StoredEpisode
-from analyze.selection import Selection, check_combinable, choose_site, select, select_episodes
-from analyze.tables import SelectedEpisode, load_tokens, vocabulary_of
-from analyze.terminal import progress_bar
-from analyze.verify import episode_faults
+from analyze.measures.tables import SelectedEpisode, load_tokens, vocabulary_of
+from analyze.output.terminal import progress_bar
+from analyze.stores.reader import Store, StoredEpisode
+from analyze.stores.selection import Selection, check_combinable, choose_site, select, select_episodes
+from analyze.stores.verify import episode_faults
 from schemas.builtin_groupings import find_grouping
 from schemas.errors import listing
 from schemas.grouping import Grouping, parse_group_argument, parse_ratio_argument, with_groups
@@ -73,7 +73,7 @@ def ask(stores: Sequence[Store], settings: AnalysisSettings) -> Question:
     """Check what is wanted against what the stores hold. Reads the episodes' attributes and roles, no rows.
 
     Raises:
-        UserError: a subclass that says what does not fit; see the functions of `analyze.selection` and `schemas.resolve`.
+        UserError: a subclass that says what does not fit; see the functions of `analyze.stores.selection` and `schemas.resolve`.
     """
     check_combinable(stores)
     root = stores[0].attributes

@@ -140,7 +140,7 @@ def span_tables(store: Path) -> None:
     """The tables of a span-level grouping, from an open store to the table of tasks, timed inside one process."""
     from analyze.pipeline import analyse
     from analyze.question import AnalysisSettings, ask
-    from analyze.reader import open_store
+    from analyze.stores.reader import open_store
 
     began = time.perf_counter()
     opened = [open_store(store)]

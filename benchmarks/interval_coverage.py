@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from analyze import aggregate
-from analyze.statistics import bootstrap_intervals
+from analyze.measures import aggregate
+from analyze.statistics.bootstrap import bootstrap_intervals
 from schemas.grouping import Grouping, Ratio
 
 GROUPING = Grouping(
@@ -147,7 +147,7 @@ def through_files(case: Case, num_stores: int, seed: int) -> dict[tuple[str, str
     """The same with stores that are written by the capture side's writer, read back, and analysed whole."""
     from analyze.pipeline import analyse
     from analyze.question import AnalysisSettings, ask
-    from analyze.reader import open_store
+    from analyze.stores.reader import open_store
     from schemas.layout import Role
     from tests.store_kit import StoreSpec, write_store
 
@@ -199,7 +199,7 @@ def main() -> None:
         f"Coverage in % of intervals of nominal 95 %, {arguments.stores} stores of each size (standard error {error:.1f} overall)."
     )
     print(
-        "p: plain percentile interval, w: widened as in analyze.small_samples; width: mean of log(high / low), widened.\n"
+        "p: plain percentile interval, w: widened as in analyze.statistics.small_samples; width: mean of log(high / low), widened.\n"
     )
     print("                  differences of     one task       population     these tasks")
     print("tasks x episodes tasks episodes      p       w       p       w       p       w    width")

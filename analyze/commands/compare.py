@@ -50,10 +50,10 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the comparison; write tables and pictures."""
-    from analyze.comparison import compare
-    from analyze.comparison_text import comparison_text
-    from analyze.runs import open_runs, parse_runs
-    from analyze.table_files import write_parquet
+    from analyze.answers.comparison import compare
+    from analyze.answers.comparison_text import comparison_text
+    from analyze.answers.runs import open_runs, parse_runs
+    from analyze.output.table_files import write_parquet
 
     runs = open_runs(parse_runs(arguments.runs), settings_of(arguments), arguments.allow_mismatch)
     comparison = compare(runs, arguments.allow_mismatch)

@@ -37,9 +37,9 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Copy the store, or say how large its parts are."""
-    from analyze.copying import PARTS, REST, check_parts, copy_store, part_sizes
-    from analyze.reader import open_store
-    from analyze.terminal import progress_bar
+    from analyze.output.terminal import progress_bar
+    from analyze.stores.copying import PARTS, REST, check_parts, copy_store, part_sizes
+    from analyze.stores.reader import open_store
 
     store = open_store(arguments.store)
     without = check_parts(arguments.without)

@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise BadArgument("--table goes with --csv or --parquet; --netcdf always holds masses.")
     # Imported after the arguments were read: `--help` must not wait for polars and zarr.
     from analyze.question import ask
-    from analyze.reader import open_store
+    from analyze.stores.reader import open_store
 
     question = ask([open_store(path) for path in arguments.stores], settings_of(arguments))
     for line in question.skipped:
@@ -74,14 +74,14 @@ def run(arguments: argparse.Namespace) -> int:
     folder = output_folder(arguments, "export")
     written: list[Path] = []
     if tables_wanted:
-        from analyze.export import DEFAULT_TABLES, chosen_tables, write_tables
+        from analyze.answers.export import DEFAULT_TABLES, chosen_tables, write_tables
         from analyze.pipeline import analyse
 
         names = list(dict.fromkeys(arguments.table or DEFAULT_TABLES))
         written += write_tables(folder, chosen_tables(analyse(question), names), kinds)
     if arguments.netcdf:
-        from analyze.labelled_arrays import rows_size, write_netcdf
-        from analyze.terminal import progress_bar
+        from analyze.answers.labelled_arrays import rows_size, write_netcdf
+        from analyze.output.terminal import progress_bar
 
         if arguments.rows:
             print(f"rows: {rows_size(question)}, before compression")

@@ -47,10 +47,10 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print what the groups take; write tables and the picture."""
-    from analyze.group_preview import check_replan, find_example, preview_groups, preview_text
+    from analyze.answers.group_preview import check_replan, find_example, preview_groups, preview_text
+    from analyze.output.table_files import write_parquet
     from analyze.question import ask
-    from analyze.reader import open_store
-    from analyze.table_files import write_parquet
+    from analyze.stores.reader import open_store
 
     question = ask([open_store(path) for path in arguments.stores], settings_of(arguments))
     example = find_example(question.selected, arguments.task, arguments.episode)

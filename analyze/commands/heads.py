@@ -64,9 +64,9 @@ def run(arguments: argparse.Namespace) -> int:
     from analyze.metrics.head_study import study_heads
     from analyze.metrics.head_text import heads_text
     from analyze.metrics.row_metrics import RowOptions
+    from analyze.output.table_files import write_parquet
     from analyze.question import ask
-    from analyze.reader import open_store
-    from analyze.table_files import write_parquet
+    from analyze.stores.reader import open_store
     from schemas.errors import BadArgument
 
     if arguments.top < 1:

@@ -62,20 +62,20 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure the objects; print them, write tables and pictures."""
-    from analyze.aggregate import overall_layer
-    from analyze.group_preview import find_example
-    from analyze.object_attention import object_tables
-    from analyze.object_summary import (
+    from analyze.answers.group_preview import find_example
+    from analyze.answers.object_attention import object_tables
+    from analyze.answers.object_summary import (
         best_finders,
         iou_summary,
         objects_summary,
         objects_text,
         strongest_followers,
     )
-    from analyze.objects_in_view import ObjectSettings, site_of_pictures
+    from analyze.answers.objects_in_view import ObjectSettings, site_of_pictures
+    from analyze.measures.aggregate import overall_layer
+    from analyze.output.table_files import write_parquet
     from analyze.question import ask
-    from analyze.reader import open_store
-    from analyze.table_files import write_parquet
+    from analyze.stores.reader import open_store
 
     settings = ObjectSettings(
         percentiles=ObjectSettings.percentiles if arguments.percentiles is None else tuple(arguments.percentiles),

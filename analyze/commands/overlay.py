@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from analyze.overlay_data import EpisodeOverlay
+    from analyze.answers.overlay_data import EpisodeOverlay
     from schemas.grouping import Grouping
 
 _EXAMPLES = """examples:
@@ -78,8 +78,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Draw one episode."""
     from dataclasses import replace
 
-    from analyze.group_preview import find_example
-    from analyze.overlay_data import (
+    from analyze.answers.group_preview import find_example
+    from analyze.answers.overlay_data import (
         camera_names,
         check_outlines,
         chosen_replans,
@@ -89,10 +89,10 @@ def run(arguments: argparse.Namespace) -> int:
         overlay_table,
         ratios_of,
     )
+    from analyze.answers.video import check_video
     from analyze.pipeline import describe_heads
     from analyze.question import ask
-    from analyze.reader import open_store
-    from analyze.video import check_video
+    from analyze.stores.reader import open_store
     from schemas.errors import BadArgument, listing
 
     if arguments.video:
@@ -138,7 +138,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.video:
         files.append(_write_video(arguments, overlay, question.grouping, folder / f"{stem}.{arguments.video}"))
     if arguments.no_plots or arguments.video:
-        from analyze.atomic_file import replacing
+        from analyze.output.atomic_file import replacing
 
         path = folder / f"{stem}_all.csv"
         with replacing(path) as temporary:
@@ -150,9 +150,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _write_video(arguments: argparse.Namespace, overlay: EpisodeOverlay, grouping: Grouping, path: Path) -> Path:
     """The whole episode, with progress at a terminal."""
+    from analyze.answers.video import write_video
+    from analyze.output.terminal import progress_bar
     from analyze.plots.overlay_video import video_frames
-    from analyze.terminal import progress_bar
-    from analyze.video import write_video
 
     with progress_bar(overlay.num_replans, "pictures") as advance:
 
@@ -166,8 +166,8 @@ def _write_video(arguments: argparse.Namespace, overlay: EpisodeOverlay, groupin
 
 def _text(overlay: EpisodeOverlay, replans: tuple[int, ...]) -> str:
     """A line per replan of the strip: ratio, each camera's share of image attention, its brightest patch."""
-    from analyze.overlays import upright
-    from analyze.text_table import format_number, text_table
+    from analyze.answers.overlays import upright
+    from analyze.output.text_table import format_number, text_table
 
     attributes = overlay.item.episode.attributes
     header = ["replan", "step", *(["ratio"] if overlay.ratio is not None else [])]

@@ -64,12 +64,12 @@ def run(arguments: argparse.Namespace) -> int:
     # Imported after the arguments were read: `--help` must not wait for polars and zarr.
     from analyze.pipeline import analyse, write_tables
     from analyze.question import ask
-    from analyze.reader import open_store
+    from analyze.stores.reader import open_store
     from schemas.errors import BadArgument
 
     stores = [open_store(path) for path in arguments.stores]
     if arguments.list:
-        from analyze.contents import describe_store
+        from analyze.stores.contents import describe_store
 
         print("\n\n".join(describe_store(store, arguments.tasks) for store in stores))
         return 0
@@ -87,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
     folder = output_folder(arguments, question.grouping.name)
     written = write_tables(analysis, folder)
     if sinks is not None:
-        from analyze.table_files import write_parquet
+        from analyze.output.table_files import write_parquet
 
         written.files += write_parquet(folder, sinks=sinks)
     print(analysis.summary)

@@ -48,12 +48,12 @@ def run(arguments: argparse.Namespace) -> int:
     """Analyse and write the page."""
     from pathlib import Path
 
-    from analyze.atomic_file import write_text
+    from analyze.output.atomic_file import write_text
     from analyze.pipeline import analyse
     from analyze.plots.style import plural
     from analyze.question import ask
-    from analyze.reader import open_store
     from analyze.report.page import report_html
+    from analyze.stores.reader import open_store
     from schemas.errors import BadArgument
 
     if arguments.episodes < 0 or arguments.replans < 1:

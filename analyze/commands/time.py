@@ -54,11 +54,11 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the findings; write tables and pictures."""
+    from analyze.answers.time_courses import TimeSettings, time_courses
+    from analyze.answers.time_text import time_text
+    from analyze.output.table_files import write_parquet
     from analyze.question import ask
-    from analyze.reader import open_store
-    from analyze.table_files import write_parquet
-    from analyze.time_courses import TimeSettings, time_courses
-    from analyze.time_text import time_text
+    from analyze.stores.reader import open_store
 
     settings = TimeSettings(arguments.bins, arguments.window)
     question = ask([open_store(path) for path in arguments.stores], settings_of(arguments))

@@ -20,9 +20,9 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Verify every store; 1 if anything is wrong."""
-    from analyze.reader import open_store
-    from analyze.terminal import progress_bar
-    from analyze.verify import verify_store
+    from analyze.output.terminal import progress_bar
+    from analyze.stores.reader import open_store
+    from analyze.stores.verify import verify_store
 
     faulty = False
     for path in arguments.stores:

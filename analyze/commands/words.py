@@ -38,12 +38,12 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure the words; print them, write the table and the picture."""
-    from analyze.aggregate import overall_layer
+    from analyze.answers.word_reading import site_of_words, strongest_readers, words_summary, words_table
+    from analyze.answers.word_text import words_text
+    from analyze.measures.aggregate import overall_layer
+    from analyze.output.table_files import write_parquet
     from analyze.question import ask
-    from analyze.reader import open_store
-    from analyze.table_files import write_parquet
-    from analyze.word_reading import site_of_words, strongest_readers, words_summary, words_table
-    from analyze.word_text import words_text
+    from analyze.stores.reader import open_store
     from schemas.errors import BadArgument
 
     stores = [open_store(path) for path in arguments.stores]

@@ -4,8 +4,15 @@ from __future__ import annotations
 
 import polars as pl
 
-from analyze.aggregate import add_layers_avg, episodes_table, overall_layer, overall_rows, per_replan, tasks_table
-from analyze.statistics import DEFAULT_SEED
+from analyze.measures.aggregate import (
+    add_layers_avg,
+    episodes_table,
+    overall_layer,
+    overall_rows,
+    per_replan,
+    tasks_table,
+)
+from analyze.statistics.bootstrap import DEFAULT_SEED
 from schemas.grouping import Grouping
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import polars as pl
 from numpy.typing import ArrayLike, NDArray
 
-from analyze.aggregate import LAYERS_AVG
-from analyze.episode_intervals import means_with_intervals
-from analyze.group_contributions import group_contribution_table
+from analyze.measures.aggregate import LAYERS_AVG
+from analyze.measures.group_contributions import group_contribution_table
 from analyze.question import Question
-from analyze.statistics import DEFAULT_SEED, NO_LIMITS
+from analyze.statistics.bootstrap import DEFAULT_SEED, NO_LIMITS
+from analyze.statistics.episode_intervals import means_with_intervals
 from schemas.grouping import Grouping
 from schemas.resolve import ResolvedGrouping
 

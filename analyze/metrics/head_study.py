@@ -9,15 +9,8 @@ import polars as pl
 import polars.selectors as cs
 from numpy.typing import NDArray
 
-from analyze.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
-from analyze.metrics.denoise import denoise_table
-from analyze.metrics.depth import contribution_norms, depth_table
-from analyze.metrics.heads import dispersion_table, head_frame, head_values, heads_table
-from analyze.metrics.row_metrics import RowOptions, groups_with_valid_keys, measure_all_rows, row_table
-from analyze.metrics.sinks import key_shares_table, sinks_of
-from analyze.parallel import map_episodes
-from analyze.question import Question
-from analyze.tables import (
+from analyze.measures.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
+from analyze.measures.tables import (
     SelectedEpisode,
     episode_masses,
     episode_steps,
@@ -26,7 +19,14 @@ from analyze.tables import (
     segment_weights,
     with_valid,
 )
-from analyze.terminal import progress_bar
+from analyze.metrics.denoise import denoise_table
+from analyze.metrics.depth import contribution_norms, depth_table
+from analyze.metrics.heads import dispersion_table, head_frame, head_values, heads_table
+from analyze.metrics.row_metrics import RowOptions, groups_with_valid_keys, measure_all_rows, row_table
+from analyze.metrics.sinks import key_shares_table, sinks_of
+from analyze.output.terminal import progress_bar
+from analyze.question import Question
+from analyze.stores.parallel import map_episodes
 from schemas.resolve import ResolvedGrouping
 
 #: Columns of the steps table that follow from the masses: all that comes after begins with masses again.

@@ -8,15 +8,15 @@ from typing import Any
 
 import polars as pl
 
-from analyze.aggregate import LAYERS_AVG, overall_rows
-from analyze.episode_intervals import means_with_intervals
+from analyze.measures.aggregate import LAYERS_AVG, overall_rows
 from analyze.metrics.head_study import HeadStudy
 from analyze.metrics.heads import main_group, ranked_heads
 from analyze.metrics.row_metrics import episode_layer_means
 from analyze.metrics.sinks import SinkRule, merged_sinks
-from analyze.statistics import POSITIVE
-from analyze.text_header import WIDTH, header
-from analyze.text_table import format_interval, format_number, text_table
+from analyze.output.text_header import WIDTH, header
+from analyze.output.text_table import format_interval, format_number, text_table
+from analyze.statistics.bootstrap import POSITIVE
+from analyze.statistics.episode_intervals import means_with_intervals
 from schemas.errors import listing
 from schemas.grouping import Grouping
 

@@ -8,18 +8,18 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from analyze.episode_intervals import means_with_intervals
-from analyze.masses import ratio
-from analyze.selection import Selection
-from analyze.statistics import DEFAULT_SEED, NO_LIMITS, POSITIVE, SHARE
-from analyze.tables import SelectedEpisode
+from analyze.measures.masses import ratio
+from analyze.measures.tables import SelectedEpisode
+from analyze.statistics.bootstrap import DEFAULT_SEED, NO_LIMITS, POSITIVE, SHARE
+from analyze.statistics.episode_intervals import means_with_intervals
+from analyze.stores.selection import Selection
 from schemas.grouping import Grouping
 
 
 def head_values(
     mass: NDArray[np.float64], num_keys: NDArray[np.float64], num_valid: NDArray[np.int64], grouping: Grouping
 ) -> dict[str, NDArray[Any]]:
-    """Reduce one episode's masses over replans; the formulas are those of `analyze.aggregate`, for each head alone.
+    """Reduce one episode's masses over replans; the formulas are those of `analyze.measures.aggregate`, for each head alone.
 
     Args:
         mass: (replan, layer, head, group + 1), the last that of all valid keys; mean over denoise steps.

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from analyze.aggregate import LAYERS_AVG, layer_order
-from analyze.phases import on_episode_time
-from analyze.statistics import DEFAULT_SEED, bootstrap_intervals, mean_over_episodes, resample_episodes
+from analyze.answers.phases import on_episode_time
+from analyze.measures.aggregate import LAYERS_AVG, layer_order
+from analyze.statistics.bootstrap import DEFAULT_SEED, bootstrap_intervals, mean_over_episodes, resample_episodes
 from schemas.grouping import Grouping
 
 MOST_BINS = 20

@@ -10,15 +10,15 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from analyze.masses import masses
+from analyze.measures.masses import masses
+from analyze.measures.tables import SelectedEpisode, resolve_all, with_valid
 from analyze.metrics.entropy import effective_keys, entropies, top_mass
 from analyze.metrics.sinks import KeyShares, SinkRule, is_first, key_sums
-from analyze.parallel import map_episodes
+from analyze.output.terminal import progress_bar
 from analyze.question import Question
-from analyze.rows import layer_rows
-from analyze.selection import Selection
-from analyze.tables import SelectedEpisode, resolve_all, with_valid
-from analyze.terminal import progress_bar
+from analyze.stores.parallel import map_episodes
+from analyze.stores.rows import layer_rows
+from analyze.stores.selection import Selection
 from schemas.errors import BadArgument, listing
 from schemas.resolve import ResolvedGrouping
 

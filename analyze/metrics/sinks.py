@@ -22,12 +22,12 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from analyze.parallel import map_episodes
+from analyze.measures.tables import SelectedEpisode
+from analyze.output.terminal import progress_bar
 from analyze.question import Question
-from analyze.rows import layer_rows
-from analyze.selection import Selection
-from analyze.tables import SelectedEpisode
-from analyze.terminal import progress_bar
+from analyze.stores.parallel import map_episodes
+from analyze.stores.rows import layer_rows
+from analyze.stores.selection import Selection
 from schemas.errors import BadArgument, listing
 from schemas.layout import Role
 from schemas.resolve import describe_key

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from analyze.aggregate import LAYERS_AVG, layer_order, overall_layer, overall_rows
+from analyze.measures.aggregate import LAYERS_AVG, layer_order, overall_layer, overall_rows
 from analyze.plots.style import drawn_in_our_style, group_styles, named, new_figure, plural, save_figure, title, wrapped
 from schemas.grouping import Grouping
 

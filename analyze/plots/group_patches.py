@@ -10,8 +10,9 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from analyze.overlays import NO_PICTURE, upright
-from analyze.patch_maps import seen_cameras
+from analyze.answers.overlays import NO_PICTURE, upright
+from analyze.measures.patch_maps import seen_cameras
+from analyze.measures.tables import SelectedEpisode
 from analyze.plots.style import (
     NOTE_COLOR,
     drawn_in_our_style,
@@ -22,7 +23,6 @@ from analyze.plots.style import (
     shortened,
     title,
 )
-from analyze.tables import SelectedEpisode
 from schemas.grouping import Grouping
 from schemas.layout import PatchGrid, Piece
 from schemas.resolve import resolve

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import polars as pl
 
-from analyze.aggregate import LAYERS_AVG, layer_order, overall_rows
+from analyze.measures.aggregate import LAYERS_AVG, layer_order, overall_rows
 from analyze.plots.profile import draw_profile, shown_groups
 from analyze.plots.style import drawn_in_our_style, named, new_figure, plural, save_figure, title
 from schemas.grouping import Grouping

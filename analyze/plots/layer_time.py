@@ -21,7 +21,7 @@ from analyze.plots.style import (
     title,
     wrapped,
 )
-from analyze.statistics import DEFAULT_SEED
+from analyze.statistics.bootstrap import DEFAULT_SEED
 from schemas.grouping import Grouping
 
 if TYPE_CHECKING:

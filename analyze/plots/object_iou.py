@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import polars as pl
 
-from analyze.objects_in_view import ObjectSettings
+from analyze.answers.objects_in_view import ObjectSettings
 from analyze.plots.object_shares import CLASS_COLORS
 from analyze.plots.style import (
     DATA_COLOR,

@@ -9,7 +9,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from analyze.objects_in_view import ALL_CAMERAS, CLASSES
+from analyze.answers.objects_in_view import ALL_CAMERAS, CLASSES
+from analyze.measures.tables import SelectedEpisode
 from analyze.plots.style import (
     BASELINE_COLOR,
     FURTHER_COLORS,
@@ -22,7 +23,7 @@ from analyze.plots.style import (
     title,
     whole_numbers,
 )
-from analyze.statistics import (
+from analyze.statistics.bootstrap import (
     DEFAULT_SEED,
     SHARE,
     EpisodeStatistic,
@@ -32,7 +33,6 @@ from analyze.statistics import (
     ratio_of_means_over_episodes,
     resample_episodes,
 )
-from analyze.tables import SelectedEpisode
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

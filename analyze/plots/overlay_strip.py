@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from analyze.overlay_data import OUTLINE_COLORS, EpisodeOverlay, draw, orientation_note, overlay_table
-from analyze.overlays import Measure, Scale, color_bar
+from analyze.answers.overlay_data import OUTLINE_COLORS, EpisodeOverlay, draw, orientation_note, overlay_table
+from analyze.answers.overlays import Measure, Scale, color_bar
+from analyze.output.text_table import format_number
 from analyze.plots.style import NOTE_COLOR, drawn_in_our_style, new_figure, ratio_name, save_figure, title, wrapped
-from analyze.text_table import format_number
 from schemas.grouping import Grouping
 
 if TYPE_CHECKING:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from analyze.overlay_data import EpisodeOverlay, draw, orientation_note
-from analyze.overlays import Measure
+from analyze.answers.overlay_data import EpisodeOverlay, draw, orientation_note
+from analyze.answers.overlays import Measure
+from analyze.output.text_table import format_number
 from analyze.plots.overlay_strip import draw_scale, shown_ratio
 from analyze.plots.style import (
     BASELINE_COLOR,
@@ -23,7 +24,6 @@ from analyze.plots.style import (
     whole_numbers,
     wrapped,
 )
-from analyze.text_table import format_number
 from schemas.grouping import Grouping
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import polars as pl
 
-from analyze.aggregate import LAYERS_AVG
-from analyze.comparison import LOG2_RATIO, Comparison
-from analyze.comparison_text import overall_layer_of
+from analyze.answers.comparison import LOG2_RATIO, Comparison
+from analyze.answers.comparison_text import overall_layer_of
+from analyze.measures.aggregate import LAYERS_AVG
 from analyze.plots.forest import factor_axis
 from analyze.plots.style import (
     DATA_COLOR,

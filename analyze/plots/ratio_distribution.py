@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from analyze.aggregate import LAYERS_AVG, layer_order, overall_layer
+from analyze.measures.aggregate import LAYERS_AVG, layer_order, overall_layer
 from analyze.plots.style import (
     BASELINE_COLOR,
     BASELINE_LABEL,

@@ -11,7 +11,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from analyze.aggregate import LAYERS_AVG
+from analyze.measures.aggregate import LAYERS_AVG
+from analyze.output.text_table import format_number
 from analyze.plots.style import (
     BASELINE_COLOR,
     BASELINE_LABEL,
@@ -29,8 +30,7 @@ from analyze.plots.style import (
     whole_numbers,
     wrapped,
 )
-from analyze.statistics import geometric_mean, ratio_of_means_over_episodes, summarize
-from analyze.text_table import format_number
+from analyze.statistics.bootstrap import geometric_mean, ratio_of_means_over_episodes, summarize
 from schemas.grouping import Grouping
 
 if TYPE_CHECKING:

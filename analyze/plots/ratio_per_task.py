@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from analyze.aggregate import LAYERS_AVG, overall_layer
+from analyze.measures.aggregate import LAYERS_AVG, overall_layer
 from analyze.plots.style import (
     BASELINE_COLOR,
     BASELINE_LABEL,

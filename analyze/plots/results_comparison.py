@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from analyze.aggregate import LAYERS_AVG, overall_layer, overall_rows
+from analyze.measures.aggregate import LAYERS_AVG, overall_layer, overall_rows
 from analyze.plots.style import (
     FIXED_COLORS,
     NOTE_COLOR,
@@ -21,8 +21,8 @@ from analyze.plots.style import (
     title,
     wrapped,
 )
-from analyze.results_tables import ResultsTables
-from analyze.statistics import DEFAULT_LEVEL
+from analyze.results.results_tables import ResultsTables
+from analyze.statistics.bootstrap import DEFAULT_LEVEL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 import numpy as np
 import polars as pl
 
-from analyze.atomic_file import replacing
+from analyze.output.atomic_file import replacing
 from schemas.grouping import Grouping, Ratio
 
 if TYPE_CHECKING:

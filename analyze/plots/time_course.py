@@ -13,7 +13,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from analyze.aggregate import LAYERS_AVG
+from analyze.answers.time_courses import ALL, EPISODE_TIME, FAILURE, GRIPPER_CLOSING, RATIO, SUCCESS, TimeCourses
+from analyze.measures.aggregate import LAYERS_AVG
 from analyze.plots.style import (
     BASELINE_COLOR,
     BASELINE_LABEL,
@@ -31,7 +32,6 @@ from analyze.plots.style import (
     title,
     whole_numbers,
 )
-from analyze.time_courses import ALL, EPISODE_TIME, FAILURE, GRIPPER_CLOSING, RATIO, SUCCESS, TimeCourses
 from schemas.grouping import Grouping
 
 if TYPE_CHECKING:

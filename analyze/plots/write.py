@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from analyze.output.terminal import progress_bar
 from analyze.pipeline import Analysis
 from analyze.plots.attention_fractions import plot_attention_fractions
 from analyze.plots.layer_profile import plot_layer_profile
@@ -11,7 +12,6 @@ from analyze.plots.layer_time import plot_layer_time
 from analyze.plots.ratio_distribution import plot_ratio_distribution
 from analyze.plots.ratio_evolution import plot_all_evolutions
 from analyze.plots.ratio_per_task import plot_ratio_per_task
-from analyze.terminal import progress_bar
 
 #: Folder for the pictures of single episodes: there can be hundreds.
 EPISODES_FOLDER = "episodes"

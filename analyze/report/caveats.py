@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from analyze.aggregate import overall_layer, overall_rows
+from analyze.measures.aggregate import overall_layer, overall_rows
+from analyze.output.summary import FEW_EPISODES, LINGUISTIC_BELOW, VISUAL_ABOVE, verdict
+from analyze.output.text_table import format_number
 from analyze.pipeline import Analysis
 from analyze.plots.style import plural
 from analyze.question import Question
-from analyze.summary import FEW_EPISODES, LINGUISTIC_BELOW, VISUAL_ABOVE, verdict
-from analyze.text_table import format_number
 from schemas.errors import listing
 from schemas.grouping import Grouping
 from schemas.layout import Role

@@ -7,12 +7,15 @@ from pathlib import Path
 
 import polars as pl
 
-from analyze.aggregate import overall_layer
+from analyze.answers.object_attention import object_tables
+from analyze.answers.object_summary import objects_summary
+from analyze.answers.objects_in_view import ALL_CAMERAS, ObjectSettings
+from analyze.answers.time_courses import time_courses
+from analyze.answers.word_reading import site_of_words, words_summary, words_table
+from analyze.measures.aggregate import overall_layer
 from analyze.metrics.layer_time import layer_time_table
 from analyze.metrics.sinks import SinkRule
-from analyze.object_attention import object_tables
-from analyze.object_summary import objects_summary
-from analyze.objects_in_view import ALL_CAMERAS, ObjectSettings
+from analyze.output.text_table import format_number
 from analyze.pipeline import Analysis
 from analyze.plots.layer_profile import plot_layer_profile
 from analyze.plots.layer_time import plot_layer_time
@@ -31,9 +34,6 @@ from analyze.report.markup import (
 )
 from analyze.report.pictures import drawn, figure, take
 from analyze.report.sections import Section
-from analyze.text_table import format_number
-from analyze.time_courses import time_courses
-from analyze.word_reading import site_of_words, words_summary, words_table
 from schemas.errors import UserError
 
 #: Rows of the tables of sinks and objects: what follows is weak, and the commands have it.

@@ -10,8 +10,9 @@ from string import Template
 
 import polars as pl
 
-from analyze.aggregate import overall_layer, overall_rows
+from analyze.measures.aggregate import overall_layer, overall_rows
 from analyze.metrics.sinks import merged_sinks, sinks_table
+from analyze.output.terminal import progress_bar
 from analyze.pipeline import Analysis
 from analyze.plots.style import plural
 from analyze.report.caveats import Caveat, caveats, role_shares
@@ -28,7 +29,6 @@ from analyze.report.sections import (
     run_section,
     task_section,
 )
-from analyze.terminal import progress_bar
 
 DEFAULT_EPISODES, DEFAULT_REPLANS = 4, 24
 

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import polars as pl
 
-from analyze.aggregate import LAYERS_AVG, layer_order, overall_layer, overall_rows
-from analyze.contributions import contribution_rows
+from analyze.measures.aggregate import LAYERS_AVG, layer_order, overall_layer, overall_rows
+from analyze.measures.contributions import contribution_rows
+from analyze.output.text_table import format_interval, format_number
 from analyze.pipeline import Analysis, describe_heads
 from analyze.plots.attention_fractions import plot_attention_fractions
 from analyze.plots.ratio_distribution import plot_ratio_distribution
@@ -29,8 +30,7 @@ from analyze.report.markup import (
     text_cell,
 )
 from analyze.report.pictures import drawn
-from analyze.statistics import DEFAULT_RESAMPLES
-from analyze.text_table import format_interval, format_number
+from analyze.statistics.bootstrap import DEFAULT_RESAMPLES
 from schemas.errors import listing
 from schemas.jsonable import to_json
 from schemas.precision import FLOAT32_MANTISSA_BITS

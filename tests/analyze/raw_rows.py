@@ -11,7 +11,7 @@ import zarr
 from hypothesis import HealthCheck, Phase, settings
 
 from analyze.question import AnalysisSettings, Question, ask
-from analyze.reader import open_store
+from analyze.stores.reader import open_store
 from schemas.grouping import Grouping
 from schemas.resolve import resolve
 from schemas.vocabulary import EpisodeTokens

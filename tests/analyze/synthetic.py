@@ -1,4 +1,4 @@
-"""A made-up table of steps in the form that `analyze.tables` gives, with its metrics computed in numpy, not with our code."""
+"""A made-up table of steps in the form that `analyze.measures.tables` gives, with its metrics computed in numpy, not with our code."""
 
 from __future__ import annotations
 

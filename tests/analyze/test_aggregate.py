@@ -4,7 +4,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from analyze.aggregate import (
+from analyze.measures.aggregate import (
     LAYERS_AVG,
     add_layers_avg,
     episodes_table,

@@ -7,12 +7,12 @@ import polars as pl
 import pytest
 from scipy import stats
 
-from analyze import runs as runs_module
 from analyze.__main__ import main
-from analyze.comparison import compare
-from analyze.comparison_text import comparison_text
+from analyze.answers import runs as runs_module
+from analyze.answers.comparison import compare
+from analyze.answers.comparison_text import comparison_text
+from analyze.answers.runs import FIELDS, MixedPolicies, RunsDiffer, check_comparable, open_runs, parse_runs
 from analyze.question import AnalysisSettings
-from analyze.runs import FIELDS, MixedPolicies, RunsDiffer, check_comparable, open_runs, parse_runs
 from schemas.errors import BadArgument, UnknownName
 from schemas.layout import Role
 from tests.store_kit import StoreSpec, write_store

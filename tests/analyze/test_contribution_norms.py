@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analyze.contributions import (
+from analyze.measures.contributions import (
     LINGUISTIC_ROLES,
     VISUAL_ROLES,
     contribution_table,
@@ -16,9 +16,9 @@ from analyze.contributions import (
 )
 from analyze.pipeline import analyse
 from analyze.question import AnalysisSettings, ask
-from analyze.reader import open_store
-from analyze.selection import select
-from analyze.verify import verify_store
+from analyze.stores.reader import open_store
+from analyze.stores.selection import select
+from analyze.stores.verify import verify_store
 from schemas.segments import segments_of
 from tests.store_kit import StoreSpec, contribution_vectors, make_tokens, write_store
 

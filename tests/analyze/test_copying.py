@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from analyze.__main__ import main as analyze
-from analyze.copying import PARTS, check_parts, copy_store, part_sizes
-from analyze.reader import open_store
-from analyze.verify import verify_store
+from analyze.stores.copying import PARTS, check_parts, copy_store, part_sizes
+from analyze.stores.reader import open_store
+from analyze.stores.verify import verify_store
 from schemas.errors import UnknownName
 from schemas.store import CorruptEpisode, RunMismatch
 from tests.store_kit import StoreSpec, write_store

@@ -7,8 +7,8 @@ import polars as pl
 import pytest
 import scipy.stats
 
-from analyze.episode_intervals import means_with_intervals
-from analyze.statistics import POSITIVE, bootstrap_interval, mean_over_episodes
+from analyze.statistics.bootstrap import POSITIVE, bootstrap_interval, mean_over_episodes
+from analyze.statistics.episode_intervals import means_with_intervals
 
 
 def table_of(values: dict[tuple[str, int], list[float | None]]) -> pl.DataFrame:

@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
 from analyze.__main__ import main
-from analyze.labelled_arrays import masses_array, rows_array, rows_size, write_netcdf
+from analyze.answers.labelled_arrays import masses_array, rows_array, rows_size, write_netcdf
 from analyze.pipeline import analyse
 from analyze.question import AnalysisSettings, ask
-from analyze.reader import open_store
+from analyze.stores.reader import open_store
 from schemas.errors import BadArgument, MissingDependency
 from schemas.layout import Role
 from schemas.precision import mass_error_bound

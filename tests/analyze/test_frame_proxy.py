@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from analyze.frame_proxy import frame_proxy
+from analyze.measures.frame_proxy import frame_proxy
 from schemas.builtin_groupings import BUILTIN_GROUPINGS
 from schemas.grouping import Grouping, Ratio
 from schemas.layout import SiteLayout, Span

@@ -9,9 +9,9 @@ import numpy as np
 import polars as pl
 import pytest
 
-from analyze.group_contributions import group_contribution_table, summarise_group_contributions, whole_segments
+from analyze.measures.group_contributions import group_contribution_table, summarise_group_contributions, whole_segments
+from analyze.measures.tables import resolve_all
 from analyze.question import Question
-from analyze.tables import resolve_all
 from schemas.grouping import Grouping, Ratio
 from schemas.resolve import ResolvedGrouping
 from schemas.segments import Segment, segments_of

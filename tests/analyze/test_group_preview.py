@@ -7,9 +7,9 @@ import polars as pl
 import pytest
 
 from analyze.__main__ import main
-from analyze.group_preview import UNTAKEN, GroupPreview, groups_table, preview_groups
+from analyze.answers.group_preview import UNTAKEN, GroupPreview, groups_table, preview_groups
 from analyze.question import AnalysisSettings, Question, ask
-from analyze.reader import open_store
+from analyze.stores.reader import open_store
 from schemas.grouping import GroupingError
 from tests.analyze.group_stores import coverage_of, write
 from tests.store_kit import write_store

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from analyze.aggregate import LAYERS_AVG, add_layers_avg, episodes_table, overall_rows, per_replan, tasks_table
+from analyze.measures.aggregate import LAYERS_AVG, add_layers_avg, episodes_table, overall_rows, per_replan, tasks_table
 from analyze.plots import layer_time
 from analyze.plots.heat_map import draw_log2_map, map_height
 from analyze.plots.profile import draw_profile

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from analyze.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
+from analyze.measures.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
 from analyze.metrics.denoise import denoise_table
 from analyze.metrics.heads import heads_table
 from analyze.metrics.layer_time import layer_time_table

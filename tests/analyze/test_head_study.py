@@ -24,7 +24,7 @@ from analyze.metrics.row_metrics import RowOptions, row_metrics_table
 from analyze.metrics.sinks import SinkRule, sinks_table, without_sinks
 from analyze.pipeline import analyse
 from analyze.question import AnalysisSettings, Question, ask
-from analyze.reader import open_store
+from analyze.stores.reader import open_store
 from schemas.precision import mass_error_bound
 from schemas.resolve import resolve
 from tests.store_kit import StoreSpec, valid_keys, write_store

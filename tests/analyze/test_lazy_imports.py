@@ -26,7 +26,7 @@ assert not heavy, heavy
 @pytest.mark.parametrize(
     ("module", "words"),
     [
-        ("analyze.parse_results", ["--help"]),
+        ("analyze.results.parse_results", ["--help"]),
         ("analyze", ["--help"]),
         *(("analyze", [command, "--help"]) for command in COMMANDS),
     ],

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analyze.aggregate import add_layers_avg, per_replan
+from analyze.measures.aggregate import add_layers_avg, per_replan
 from analyze.metrics.denoise import denoise_table
 from analyze.metrics.depth import depth_table
 from analyze.metrics.head_study import study_heads

@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import entropy as entropy_of_scipy
 
+from analyze.measures.tables import resolve_all
 from analyze.metrics.entropy import effective_keys, entropies, top_mass
 from analyze.metrics.row_metrics import RowOptions, groups_with_valid_keys, row_metrics_table
-from analyze.tables import resolve_all
 from schemas.grouping import Grouping
 from tests.analyze.raw_rows import FEW, leaky, question_about, raw_episodes, weights_of
 from tests.store_kit import StoreSpec, write_store

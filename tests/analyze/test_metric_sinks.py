@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import entropy as entropy_of_scipy
 
+from analyze.measures.tables import resolve_all, steps_table
 from analyze.metrics.head_study import study_heads
 from analyze.metrics.row_metrics import RowOptions, row_metrics_table
 from analyze.metrics.sinks import SinkRule, describe_sinks, key_sums, sinks_table, without_sinks
-from analyze.tables import resolve_all, steps_table
 from schemas.layout import Role
 from tests.analyze.raw_rows import FEW, RawEpisode, leaky, question_about, raw_episodes, weights_of
 from tests.store_kit import StoreSpec, make_tokens, small_layout, write_store

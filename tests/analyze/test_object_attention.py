@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
 from analyze.__main__ import main
-from analyze.object_attention import ObjectTables, object_tables
-from analyze.object_summary import best_finders, iou_summary, objects_summary, strongest_followers
-from analyze.objects_in_view import ObjectSettings, site_of_pictures
+from analyze.answers.object_attention import ObjectTables, object_tables
+from analyze.answers.object_summary import best_finders, iou_summary, objects_summary, strongest_followers
+from analyze.answers.objects_in_view import ObjectSettings, site_of_pictures
+from analyze.answers.word_reading import site_of_words, words_table
 from analyze.question import AnalysisSettings, ask
-from analyze.reader import open_store
-from analyze.word_reading import site_of_words, words_table
+from analyze.stores.reader import open_store
 from schemas.errors import BadArgument
 from schemas.layout import SiteLayout, Span
 from schemas.vocabulary import EpisodeTokens

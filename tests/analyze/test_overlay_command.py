@@ -12,9 +12,9 @@ import zarr
 
 import tests.store_kit as kit
 from analyze.__main__ import main
-from analyze.overlay_data import camera_names, draw, episode_overlay, ratios_of
+from analyze.answers.overlay_data import camera_names, draw, episode_overlay, ratios_of
 from analyze.question import AnalysisSettings, ask
-from analyze.reader import open_store
+from analyze.stores.reader import open_store
 from capture.store_writer import open_run
 from schemas.errors import BadArgument
 from schemas.layout import Role, SiteLayout, Span

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from analyze.overlays import (
+from analyze.answers.overlays import (
     COLOR_KEPT,
     NO_PICTURE,
     OPACITY,

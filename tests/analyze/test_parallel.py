@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from analyze.parallel import map_episodes
+from analyze.stores.parallel import map_episodes
 
 
 def test_results_come_in_order_and_progress_counts_each():

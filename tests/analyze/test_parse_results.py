@@ -13,8 +13,8 @@ import polars as pl
 import pytest
 
 import analyze
-from analyze.parse_results import main
 from analyze.plots.results_comparison import row_names
+from analyze.results.parse_results import main
 from tests.analyze.published_results import cosmos_episodes, pi_episodes, write_published
 from tests.analyze.test_results_reader import ours
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from analyze.aggregate import LAYERS_AVG, add_layers_avg, episodes_table, per_replan, tasks_table
+from analyze.measures.aggregate import LAYERS_AVG, add_layers_avg, episodes_table, per_replan, tasks_table
 from analyze.plots.attention_fractions import plot_attention_fractions
 from analyze.plots.ratio_distribution import plot_ratio_distribution
 from analyze.plots.ratio_evolution import evolution_stem, plot_all_evolutions, plot_ratio_evolution
@@ -134,7 +134,7 @@ def test_axis_of_nearly_equal_ratios_is_not_blown_up():
 
 
 def test_importing_analyze_and_its_plots_does_not_import_matplotlib():
-    modules = ["aggregate", "summary", "results_file", "statistics"]
+    modules = ["measures.aggregate", "output.summary", "results.results_file", "statistics.bootstrap"]
     modules += ["plots", *(f"plots.{name}" for name in ("style", "ratio_distribution", "ratio_per_task"))]
     modules += ["plots.attention_fractions", "plots.ratio_evolution"]
     code = f"import sys, {', '.join(f'analyze.{name}' for name in modules)}; print('matplotlib' in sys.modules)"

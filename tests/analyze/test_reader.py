@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analyze.reader import open_store
+from analyze.stores.reader import open_store
 from schemas.store import CorruptEpisode, FormatTooNew, StoreError, StoreNotFound
 from tests.store_kit import StoreSpec, episode_records, root_attributes, write_store
 

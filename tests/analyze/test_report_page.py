@@ -13,14 +13,14 @@ import pytest
 
 import tests.store_kit as kit
 from analyze.__main__ import main
+from analyze.output.text_table import format_number
 from analyze.pipeline import Analysis, analyse
 from analyze.question import AnalysisSettings, ask
-from analyze.reader import open_store
 from analyze.report.caveats import caveats, role_shares, verdict_sentence
 from analyze.report.markup import Cell, interval_cell, number_cell, table
 from analyze.report.overlay_section import choose_episodes
 from analyze.report.page import report_html
-from analyze.text_table import format_number
+from analyze.stores.reader import open_store
 from schemas.layout import Role
 from schemas.vocabulary import EpisodeTokens
 

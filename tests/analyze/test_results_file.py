@@ -6,8 +6,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from analyze.aggregate import add_layers_avg, per_replan
-from analyze.results_file import (
+from analyze.measures.aggregate import add_layers_avg, per_replan
+from analyze.results.results_file import (
     episode_documents,
     episode_results,
     read_results,

@@ -13,10 +13,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from analyze.aggregate import add_layers_avg, per_replan
-from analyze.results_file import write_results_of_suites
-from analyze.results_reader import find_results, read_results_file
-from analyze.results_tables import NO_FINITE_AS_ZERO, ZEROS_COUNTED, disagreements, labels_of, results_tables, spread_of
+from analyze.measures.aggregate import add_layers_avg, per_replan
+from analyze.results.results_file import write_results_of_suites
+from analyze.results.results_reader import find_results, read_results_file
+from analyze.results.results_tables import (
+    NO_FINITE_AS_ZERO,
+    ZEROS_COUNTED,
+    disagreements,
+    labels_of,
+    results_tables,
+    spread_of,
+)
 from schemas.results import ResultsError, ResultsNotFound
 from tests.analyze.published_results import (
     cosmos_episodes,

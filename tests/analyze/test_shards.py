@@ -10,8 +10,8 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from analyze.reader import open_store
-from analyze.shards import ShardedLayers
+from analyze.stores.reader import open_store
+from analyze.stores.shards import ShardedLayers
 from schemas.store import CorruptEpisode
 from tests.store_kit import write_store
 

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
 
-from analyze.autocorrelation import autocorrelation_table, autocovariances, effective_count
-from analyze.effect_sizes import cliffs_delta, contrast, contrast_row, hedges_g
-from analyze.statistics import resample_episodes
+from analyze.statistics.autocorrelation import autocorrelation_table, autocovariances, effective_count
+from analyze.statistics.bootstrap import resample_episodes
+from analyze.statistics.effect_sizes import cliffs_delta, contrast, contrast_row, hedges_g
 from tests.analyze.synthetic import default_grouping, make_steps
 
 GENERATOR = np.random.default_rng(8)
@@ -191,7 +191,7 @@ def test_what_cannot_be_estimated_is_none(series):
 
 
 def test_the_table_of_counts_is_per_episode_and_layer():
-    from analyze.aggregate import per_replan
+    from analyze.measures.aggregate import per_replan
 
     replans = per_replan(make_steps(num_replans=20), default_grouping())
     table = autocorrelation_table(replans, default_grouping())

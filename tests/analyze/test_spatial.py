@@ -11,7 +11,7 @@ import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from analyze.spatial import (
+from analyze.metrics.spatial import (
     centre_of_mass,
     distance_in_pictures,
     grown,

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import special, stats
 
-from analyze.small_samples import student_quantile
-from analyze.statistics import (
+from analyze.statistics.bootstrap import (
     POSITIVE,
     SHARE,
     bootstrap_interval,
@@ -22,6 +21,7 @@ from analyze.statistics import (
     resample_episodes,
     summarize,
 )
+from analyze.statistics.small_samples import student_quantile
 
 ONE_TASK = np.zeros(25)
 SAMPLE = np.random.default_rng(3).lognormal(1.0, 0.6, 25)
@@ -119,7 +119,7 @@ def test_every_resample_draws_whole_tasks(tasks, seed):
 
 
 def test_draws_in_pieces_still_draw_each_episode_equally_often(monkeypatch):
-    monkeypatch.setattr("analyze.statistics._DRAWS_AT_ONCE", 50)
+    monkeypatch.setattr("analyze.statistics.bootstrap._DRAWS_AT_ONCE", 50)
     counts = resample_episodes(np.array([0, 0, 0, 1, 1, 1]), num_resamples=4000, seed=1).counts
     assert counts.shape == (4000, 6)
     assert (counts.sum(axis=1) == 6).all()

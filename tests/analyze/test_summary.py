@@ -3,9 +3,9 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from analyze.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
-from analyze.summary import AnalysedRun, summary_text, verdict, write_summary
-from analyze.text_table import format_interval, format_number, text_table
+from analyze.measures.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
+from analyze.output.summary import AnalysedRun, summary_text, verdict, write_summary
+from analyze.output.text_table import format_interval, format_number, text_table
 from tests.analyze.synthetic import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups
 
 RUN = AnalysedRun(

@@ -13,11 +13,11 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
+from analyze.measures.tables import load_tokens, steps_table, vocabulary_of
 from analyze.pipeline import analyse
 from analyze.question import AnalysisSettings, ask
-from analyze.reader import StoredEpisode, open_store
-from analyze.selection import parse_denoise_steps, select
-from analyze.tables import load_tokens, steps_table, vocabulary_of
+from analyze.stores.reader import StoredEpisode, open_store
+from analyze.stores.selection import parse_denoise_steps, select
 from schemas.builtin_groupings import default
 from schemas.errors import BadArgument
 from schemas.grouping import Grouping, Ratio

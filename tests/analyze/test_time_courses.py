@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from analyze.__main__ import main
-from analyze.phases import around_event, change_at_event, closing_replan, on_episode_time, replan_starts
+from analyze.answers.phases import around_event, change_at_event, closing_replan, on_episode_time, replan_starts
+from analyze.answers.time_courses import ALL, FAILURE, GRIPPER_CLOSING, SUCCESS, TimeSettings, time_courses
+from analyze.answers.time_text import time_text
 from analyze.question import AnalysisSettings, ask
-from analyze.reader import open_store
-from analyze.time_courses import ALL, FAILURE, GRIPPER_CLOSING, SUCCESS, TimeSettings, time_courses
-from analyze.time_text import time_text
+from analyze.stores.reader import open_store
 from schemas.errors import BadArgument
 from schemas.layout import Role
 from schemas.store import StoreError
@@ -255,7 +255,7 @@ def test_settings_out_of_range_are_one_sentence(store, arguments, said, capsys):
 
 
 def test_replans_beyond_the_end_of_an_episode_are_refused(store, tmp_path, capsys, monkeypatch):
-    from analyze.reader import StoredEpisode
+    from analyze.stores.reader import StoredEpisode
 
     plain = StoredEpisode.attributes.func  # type: ignore[attr-defined]
 

@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from analyze.__main__ import main
-from analyze.reader import StoredEpisode, open_store
-from analyze.verify import Fault, verify_store
+from analyze.stores.reader import StoredEpisode, open_store
+from analyze.stores.verify import Fault, verify_store
 from capture.store_writer import open_run
 from schemas.store import CorruptEpisode
 from tests.store_kit import StoreSpec, denoise_times, episode_records, root_attributes, write_store

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analyze.video import check_video, write_video
+from analyze.answers.video import check_video, write_video
 from schemas.errors import BadArgument, MissingDependency
 
 COLORS = ((200, 30, 40), (20, 160, 60), (30, 40, 220))

@@ -10,9 +10,9 @@ import pytest
 import zarr
 
 from analyze.__main__ import main
+from analyze.answers.word_reading import strongest_readers, words_summary, words_table
 from analyze.question import AnalysisSettings, Question, ask
-from analyze.reader import open_store
-from analyze.word_reading import strongest_readers, words_summary, words_table
+from analyze.stores.reader import open_store
 from schemas.layout import Role
 from schemas.vocabulary import EpisodeTokens
 from tests.analyze.group_stores import episode_tokens, random_rows, write

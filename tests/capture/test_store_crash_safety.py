@@ -25,8 +25,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 from zarr.storage import LocalStore
 
-from analyze.reader import open_store
-from analyze.verify import verify_store
+from analyze.stores.reader import open_store
+from analyze.stores.verify import verify_store
 from capture.durable_files import StoreWriteFailed
 from capture.store_writer import open_run
 from schemas.errors import BadArgument, UserError

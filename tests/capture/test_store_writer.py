@@ -17,8 +17,8 @@ import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from analyze.reader import open_store
-from analyze.verify import verify_store
+from analyze.stores.reader import open_store
+from analyze.stores.verify import verify_store
 from capture import store_arrays
 from capture.attention import RecordedRows
 from capture.store_arrays import replans_per_block, write_whole

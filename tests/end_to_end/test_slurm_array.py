@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from analyze.__main__ import main as analyze
-from analyze.reader import open_store
+from analyze.stores.reader import open_store
 from capture.claims import holders
 from capture.evaluate import main_pi
 from capture.status import store_status

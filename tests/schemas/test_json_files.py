@@ -6,8 +6,8 @@ import tomllib
 import jsonschema
 import pytest
 
-from analyze.aggregate import add_layers_avg, per_replan
-from analyze.results_file import write_results_of_suites
+from analyze.measures.aggregate import add_layers_avg, per_replan
+from analyze.results.results_file import write_results_of_suites
 from schemas.json_files import FOLDER, schema_documents, schema_text, write_schema_files
 from schemas.jsonable import to_json
 from schemas.layout import PatchGrid, Piece, Prompt, SiteLayout, Span

@@ -1,0 +1,1 @@
+"""What single commands compute and say: groups, words, objects, time, comparisons, overlays, export."""

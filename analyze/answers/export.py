@@ -1,0 +1,71 @@
+"""Tables as files for other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import polars as pl
+
+from analyze.output.atomic_file import replacing
+from analyze.output.table_files import write_parquet
+from analyze.pipeline import Analysis
+from schemas.errors import BadArgument
+
+#: Tables that can be exported, and what a row of each is.
+TABLES = {
+    "steps": "one row per episode, replan, layer, denoise step (and head, with --per-head)",
+    "replans": "one row per episode, replan, layer",
+    "episodes": "one row per episode, layer",
+    "tasks": "one row per task or all tasks, layer; with intervals",
+    "contributions": "norms of contributions, where they were recorded",
+}
+DEFAULT_TABLES = ("episodes", "tasks", "steps")
+
+
+def chosen_tables(analysis: Analysis, names: Sequence[str]) -> dict[str, pl.DataFrame]:
+    """Tables of an analysis by name.
+
+    Raises:
+        BadArgument: contributions are wanted and were not recorded.
+    """
+    tables: dict[str, pl.DataFrame] = {}
+    for name in names:
+        table: pl.DataFrame | None = getattr(analysis, name)
+        if table is None:
+            raise BadArgument(
+                "These stores hold no contributions, so that there is no such table; record them with vla-capture "
+                "--contributions, or choose other tables."
+            )
+        tables[name] = table
+    return tables
+
+
+def write_csv(folder: Path, tables: dict[str, pl.DataFrame]) -> list[Path]:
+    """Write each table as `NAME.csv` into a folder: UTF-8, a header, nothing for null, `inf` for infinite; returns the paths.
+
+    Raises:
+        BadArgument: the folder cannot be made or written to.
+    """
+    written = []
+    try:
+        for name, table in tables.items():
+            path = folder / f"{name}.csv"
+            with replacing(path) as temporary:
+                table.write_csv(temporary)
+            written.append(path)
+    except OSError as error:
+        raise BadArgument(
+            f"Cannot write tables to {folder}: {error.strerror or error}; give another --output."
+        ) from None
+    return written
+
+
+def write_tables(folder: Path, tables: dict[str, pl.DataFrame], kinds: Sequence[str]) -> list[Path]:
+    """Write tables in each of the kinds `csv` and `parquet`; returns the paths."""
+    written = []
+    if "csv" in kinds:
+        written += write_csv(folder, tables)
+    if "parquet" in kinds:
+        written += write_parquet(folder, **tables)
+    return written

@@ -1,0 +1,161 @@
+"""What seeing and reading really add to the residual stream: norms of value-weighted contributions, from stored Gram matrices.
+
+A mass says how much attention keys get, not what they do with it. The contribution of a set of keys is a vector (probabilities x
+values, through the output projection and gate; Kobayashi et al. 2020), and its norm follows from the Gram matrix of the
+parts: |sum of the chosen parts| = sqrt(wᵀ G w). Unlike masses, norms of different sites are lengths in the same space, so one of
+self-attention may be divided by one of cross-attention.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from analyze.measures.aggregate import LAYERS_AVG
+from analyze.measures.masses import ratio
+from analyze.output.summary import WIDTH
+from analyze.output.text_table import format_interval, format_number, text_table
+from analyze.statistics.bootstrap import POSITIVE, bootstrap_interval, mean_over_episodes
+from analyze.stores.parallel import map_episodes
+from analyze.stores.reader import Store, StoredEpisode
+from analyze.stores.selection import Selection
+from schemas.segments import Segment
+from schemas.store import RootAttributes
+
+#: Roles on each side of the headline: what is seen now, and what is read.
+VISUAL_ROLES = ("image",)
+LINGUISTIC_ROLES = ("bos", "template", "instruction", "text")
+
+
+def joint_norm(gram: NDArray[np.floating], chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Norm of the chosen parts' summed contribution (root mean square over the queries): sqrt(wᵀ G w).
+
+    gram: (..., part, part); chosen: (part,) bool. Returns (...). Rounding may leave tiny negative squares: they are 0.
+    """
+    part = np.flatnonzero(chosen)
+    squared = gram[..., part[:, None], part].sum(axis=(-2, -1), dtype=np.float64)
+    return np.sqrt(np.clip(squared, 0.0, None))
+
+
+def contribution_table(chosen: Sequence[tuple[Store, StoredEpisode]], selection: Selection) -> pl.DataFrame | None:
+    """Norms of both sides for every (episode, replan, layer, denoise step), or None when no contributions were recorded.
+
+    Columns: suite, task_id, episode_index, replan, env_step, layer, block, denoise_step, visual_norm, linguistic_norm,
+    contribution_ratio (visual / linguistic; infinite or null where the denominator is 0). A side is read at the site that has
+    such keys: both at `joint` for pi, `self` and `cross` for Cosmos. None also when a run has no such keys at all.
+    """
+    if not all(store.attributes.recording.contributions for store, _ in chosen):
+        return None
+
+    def measure(pair: tuple[Store, StoredEpisode]) -> pl.DataFrame | None:
+        store, episode = pair
+        sides = [_parts_of_side(store.attributes, episode, roles) for roles in (VISUAL_ROLES, LINGUISTIC_ROLES)]
+        grams = {site: selected_gram(episode, site, selection) for site in {side[0] for side in sides if side}}
+        norms = [joint_norm(grams[side[0]], side[1]) for side in sides if side is not None]
+        return _episode_frame(store, episode, selection, norms[0], norms[1]) if len(norms) == len(sides) else None
+
+    frames = [frame for frame in map_episodes(measure, chosen) if frame is not None]
+    return pl.concat(frames) if len(frames) == len(chosen) else None
+
+
+def selected_gram(episode: StoredEpisode, site: str, selection: Selection) -> NDArray[np.float32]:
+    """The Gram matrices (replan, layer, denoise, part, part) of the selected layers and denoise steps."""
+    gram: NDArray[np.float32] = episode.read(f"{site}/contribution")
+    return gram[:, list(selection.layers)][:, :, list(selection.denoise)]
+
+
+def _parts_of_side(
+    root: RootAttributes, episode: StoredEpisode, roles: Sequence[str]
+) -> tuple[str, NDArray[np.bool_]] | None:
+    """The first site that has segments with these roles, and which parts they are, (part,)."""
+    for site in root.sites:
+        segments: tuple[Segment, ...] = episode.attributes.segments[site.name]
+        # The last part is the whole update of the block, and belongs to no side.
+        parts = np.array([*(segment.role in roles for segment in segments), False])
+        if parts.any():
+            return site.name, parts
+    return None
+
+
+def _episode_frame(
+    store: Store,
+    episode: StoredEpisode,
+    selection: Selection,
+    visual: NDArray[np.float64],
+    linguistic: NDArray[np.float64],
+) -> pl.DataFrame:
+    def along(values: Any, axis: int) -> NDArray[Any]:
+        expanded = np.asarray(values).reshape([-1 if i == axis else 1 for i in range(3)])
+        return np.broadcast_to(expanded, visual.shape).ravel()
+
+    columns = {
+        "replan": along(np.arange(visual.shape[0]), 0),
+        "env_step": along(episode.read("env_step").astype(np.int64), 0),
+        "layer": along(np.array(selection.layer_labels, dtype=np.int64), 1),
+        "block": along(np.array(selection.blocks, dtype=np.int64), 1),
+        "denoise_step": along(np.array(selection.denoise_steps, dtype=np.int64), 2),
+        "visual_norm": visual.ravel(),
+        "linguistic_norm": linguistic.ravel(),
+        "contribution_ratio": ratio(visual, linguistic).ravel(),
+    }
+    attributes = episode.attributes
+    return pl.DataFrame(columns).select(
+        pl.lit(store.suite).alias("suite"),
+        pl.lit(attributes.task_id).cast(pl.Int64).alias("task_id"),
+        pl.lit(attributes.episode_index).cast(pl.Int64).alias("episode_index"),
+        pl.all().exclude("suite", "task_id", "episode_index").fill_nan(None),
+    )
+
+
+def contribution_rows(table: pl.DataFrame, seed: int) -> pl.DataFrame:
+    """One row per layer and over all of them ("layers_avg"): mean norms over episodes, their ratio with a two-level interval (95 %).
+
+    Columns: layer, layer_number, visual_norm, linguistic_norm, ratio (mean over episodes of the mean ratio of norms), ratio_low,
+    ratio_high.
+    """
+    rows = [
+        _summary_row(table.filter(layer=layer), str(layer), layer, seed)
+        for layer in table["layer"].unique(maintain_order=True)
+    ]
+    once = table.unique(["suite", "task_id", "episode_index", "replan", "block", "denoise_step"], maintain_order=True)
+    rows.append(_summary_row(once, LAYERS_AVG, None, seed))
+    numbers = ("visual_norm", "linguistic_norm", "ratio", "ratio_low", "ratio_high")
+    types = {"layer": pl.String, "layer_number": pl.Int64, **dict.fromkeys(numbers, pl.Float64)}
+    return pl.DataFrame(rows, schema=types, orient="row")
+
+
+def summarise_contributions(table: pl.DataFrame, seed: int) -> str:
+    """The summary's section: `contribution_rows` as text."""
+    rows = [
+        [
+            row["layer"],
+            *(format_number(row[column]) for column in ("visual_norm", "linguistic_norm", "ratio")),
+            format_interval(row["ratio_low"], row["ratio_high"]),
+        ]
+        for row in contribution_rows(table, seed).iter_rows(named=True)
+    ]
+    title = "CONTRIBUTIONS  |visual| / |linguistic|, norms of what the keys add to the residual stream"
+    note = (
+        "Value-weighted, through output projection and gate; root mean square over action queries, mean over replans and denoise "
+        "steps. ratio: mean over episodes of the mean ratio of norms. Norms of different sites may be divided; masses may not."
+    )
+    header = ["layer", "|visual|", "|linguistic|", "ratio", "95% interval"]
+    return "\n".join([title, "-" * WIDTH, text_table(header, rows, left=(0,)), "", textwrap.fill(note, WIDTH), ""])
+
+
+def _summary_row(part: pl.DataFrame, label: str, number: int | None, seed: int) -> tuple[object, ...]:
+    finite = pl.col("contribution_ratio").filter(pl.col("contribution_ratio").is_finite())
+    episodes = part.group_by("suite", "task_id", "episode_index", maintain_order=True).agg(
+        pl.col("visual_norm", "linguistic_norm").mean(), finite.mean().alias("ratio")
+    )
+    values = mean_over_episodes(episodes["ratio"].cast(pl.Float64).fill_null(float("nan")).to_numpy(), POSITIVE)
+    tasks = episodes.select(pl.struct("suite", "task_id").rank("dense")).to_series().to_numpy()
+    interval = bootstrap_interval(values, tasks, seed=seed)
+    norms = [episodes[f"{side}_norm"].cast(pl.Float64).mean() for side in ("visual", "linguistic")]
+    bounds = (None, None) if interval is None else (interval.low, interval.high)
+    return (label, number, *norms, values.value, *bounds)

@@ -1,0 +1,49 @@
+"""Where on the cameras' pictures the attention lies: mean mass of every patch over a selection, as grids."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analyze.measures.tables import SelectedEpisode
+from analyze.stores.rows import layer_rows
+from analyze.stores.selection import Selection
+from schemas.layout import Role
+
+
+def seen_cameras(item: SelectedEpisode) -> tuple[str, ...]:
+    """Cameras of the site that show the policy something (their patches are not masked), in key order."""
+    layout, roles = item.tokens.layout, item.tokens.static_roles
+    spans = [(camera, layout.camera_span(camera)) for camera in layout.cameras]
+    return tuple(
+        camera
+        for camera, span in spans
+        if span.grid is not None and (roles[:, span.start : span.stop] == Role.IMAGE).any()
+    )
+
+
+def patch_maps(item: SelectedEpisode, selection: Selection, site: str) -> dict[str, NDArray[np.float64]]:
+    """Mass of every patch by camera, shape (replan, row, column): mean over the selected layers, denoise steps and heads.
+
+    Row 0, column 0 is the top left patch of the picture as the model sees it, which is the stored frame as it is. A block that
+    was named by two layer numbers counts once.
+    """
+    mean = mean_rows(item, selection, site)
+    maps = {}
+    for camera in seen_cameras(item):
+        span = item.tokens.layout.camera_span(camera)
+        assert span.grid is not None
+        maps[camera] = mean[:, span.start : span.stop].reshape(-1, span.grid.rows, span.grid.columns)
+    return maps
+
+
+def mean_rows(item: SelectedEpisode, selection: Selection, site: str) -> NDArray[np.float64]:
+    """Probability of every key, shape (replan, key): mean over the selected layers, denoise steps and heads.
+
+    A block that was named by two layer numbers counts once.
+    """
+    total, count = 0.0, 0
+    for part in layer_rows(item.episode, selection, site):
+        if selection.blocks.index(selection.blocks[part.layer]) == part.layer:
+            total, count = total + part.rows.mean(axis=1, dtype=np.float64), count + 1
+    return np.asarray(total) / count

@@ -1,0 +1,1 @@
+"""Statistics over episodes: intervals, effect sizes, autocorrelation. Pure functions on arrays."""

@@ -1,0 +1,1 @@
+"""Stores on disk: reading, selecting, verifying, copying, describing. Zarr is touched nowhere else."""

@@ -1,0 +1,75 @@
+"""`--list`: what stores hold, before any number is computed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from analyze.stores.reader import Store, StoredEpisode
+from analyze.stores.selection import select_episodes
+from schemas.errors import listing
+from schemas.layers import block_of_labels
+from schemas.layout import Role, Span
+from schemas.precision import FLOAT32_MANTISSA_BITS, mass_error_bound
+from schemas.selectors import SELECTOR_KINDS
+from schemas.vocabulary import EpisodeTokens, collect_vocabulary
+
+
+def describe_store(store: Store, tasks: Sequence[int] | None = None) -> str:
+    """Describe a store: run, recorded axes, spans and roles of every site, tasks with their words, objects."""
+    episodes = select_episodes(store, tasks)
+    return "\n".join(_lines(store, episodes))
+
+
+def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
+    root = store.attributes
+    policy, recording = root.policy, root.recording
+    yield f"Store {store.path}"
+    yield f"  policy     {policy.name} ({policy.family}), {policy.checkpoint_format}: {policy.checkpoint}"
+    yield f"  weights    {policy.digest[:16]}{'  UNTRAINED random weights' if policy.untrained else ''}"
+    protocol = root.protocol
+    yield (
+        f"  run        suite {protocol.suite}, seed {protocol.seed}, replan every {protocol.replan_steps} steps, "
+        f"at most {protocol.max_steps} steps after {protocol.wait_steps} waiting steps"
+    )
+    solved = sum(episode.attributes.success for episode in episodes)
+    yield f"  episodes   {len(episodes)} ({solved} solved), tasks {listing(store.task_ids, 100)}"
+    labels = [
+        f"{label} (block {block})" if label != block else str(block)
+        for label, block in zip(
+            recording.layer_labels, block_of_labels(recording.layer_labels, policy.num_layers), strict=True
+        )
+    ]
+    yield f"  layers     {listing(labels, 40)} of {policy.num_layers}"
+    yield f"  denoise    steps {listing(recording.denoise_steps, 40)} of {policy.num_denoise_steps}"
+    yield f"  heads      {listing(recording.heads, 40)}"
+    yield f"  queries    {recording.queries} over {recording.num_action_queries} action queries"
+    exact = recording.mantissa_bits == FLOAT32_MANTISSA_BITS
+    error = "exact" if exact else f"masses within {mass_error_bound(recording.mantissa_bits):.1e} (relative)"
+    yield f"  precision  {recording.mantissa_bits} mantissa bits: {error}"
+    for site in root.sites:
+        tokens = [episode.tokens(root, site.name) for episode in episodes]
+        yield f"Site '{site.name}': {site.num_keys} keys; span, keys, roles (number of keys, of the first replan)"
+        for span in site.spans:
+            yield f"  {_describe_span(span, tokens[0])}"
+        vocabulary = collect_vocabulary(tokens)
+        yield f"  words      {listing(vocabulary.words, 200)}"
+        yield f"  objects    {listing(vocabulary.objects, 200)}"
+    yield "Tasks"
+    seen: set[int] = set()
+    for episode in episodes:
+        attributes = episode.attributes
+        if attributes.task_id not in seen:
+            seen.add(attributes.task_id)
+            count = sum(other.attributes.task_id == attributes.task_id for other in episodes)
+            interest = listing([thing.name for thing in attributes.objects if thing.of_interest])
+            yield f"  {attributes.task_id:>3}  {attributes.instruction}  ({count} episodes; objects of interest: {interest})"
+    yield "Selectors"
+    for kind, meaning in SELECTOR_KINDS.items():
+        yield f"  {kind + ':':<9} {meaning}"
+
+
+def _describe_span(span: Span, tokens: EpisodeTokens) -> str:
+    codes = tokens.key_role[0, span.start : span.stop]
+    roles = ", ".join(f"{Role(code).label} {int((codes == code).sum())}" for code in sorted(set(codes.tolist())))
+    grid = f"  {span.grid.rows} x {span.grid.columns} patches" if span.grid else ""
+    return f"{span.name:<18} {span.start:>4}..{span.stop - 1:<4} {roles}{grid}"

@@ -1,0 +1,137 @@
+"""What part of the stores an analysis looks at: tasks, layers, denoise steps, heads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from analyze.stores.reader import Store, StoredEpisode
+from schemas.errors import BadArgument, listing, unknown_name
+from schemas.layers import LayerSelection, block_of_labels, select_layers
+from schemas.store import RootAttributes, StoreError, parse_episode_name
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Positions along the stored axes, and the numbers they stand for.
+
+    `layers`, `denoise` and `heads` are positions in the stored arrays; `layer_labels` and `blocks` are the number that the
+    user typed and the block index of each layer; `head_numbers` and `denoise_steps` likewise. `per_head`: keep heads apart
+    instead of averaging over the selected ones.
+    """
+
+    layers: tuple[int, ...]
+    layer_labels: tuple[int, ...]
+    blocks: tuple[int, ...]
+    denoise: tuple[int, ...]
+    denoise_steps: tuple[int, ...]
+    heads: tuple[int, ...]
+    head_numbers: tuple[int, ...]
+    per_head: bool
+    note: str | None = None
+
+
+def select(
+    root: RootAttributes,
+    layers: Sequence[int] | None = None,
+    denoise: Sequence[str] | None = None,
+    heads: Sequence[int] | None = None,
+    per_head: bool = False,
+) -> Selection:
+    """Check the wanted layers, denoise steps and heads against what was recorded; None means all of it."""
+    recording = root.recording
+    if layers is None:
+        blocks = block_of_labels(recording.layer_labels, root.policy.num_layers)
+        wanted = LayerSelection(blocks, recording.layer_labels)
+    else:
+        wanted = select_layers(layers, root.policy.num_layers, root.policy.family)
+    missing = [
+        label for block, label in zip(wanted.blocks, wanted.labels, strict=True) if block not in recording.layers
+    ]
+    if missing:
+        raise BadArgument(
+            f"Layers {listing(missing)} were not recorded; recorded blocks: {listing(recording.layers, 40)}."
+        )
+    steps = parse_denoise_steps(denoise, recording.denoise_steps)
+    head_numbers = recording.heads if heads is None else tuple(heads)
+    for head in head_numbers:
+        if head not in recording.heads:
+            raise BadArgument(f"Head {head} was not recorded; recorded heads: {listing(recording.heads, 40)}.")
+    for what, numbers in (("Denoise steps", steps), ("Heads", head_numbers)):
+        if len(set(numbers)) != len(numbers):
+            raise BadArgument(f"{what} {listing(numbers)} name one of them twice.")
+    return Selection(
+        layers=tuple(recording.layers.index(block) for block in wanted.blocks),
+        layer_labels=wanted.labels,
+        blocks=wanted.blocks,
+        denoise=tuple(recording.denoise_steps.index(step) for step in steps),
+        denoise_steps=steps,
+        heads=tuple(recording.heads.index(head) for head in head_numbers),
+        head_numbers=head_numbers,
+        per_head=per_head,
+        note=wanted.note,
+    )
+
+
+def choose_site(root: RootAttributes, name: str | None) -> str:
+    """The wanted site, or the first one. Sites are normalised separately: one analysis never mixes them."""
+    names = [site.name for site in root.sites]
+    if name is None:
+        return names[0]
+    if name not in names:
+        raise unknown_name("site", name, names)
+    return name
+
+
+def parse_denoise_steps(words: Sequence[str] | None, recorded: Sequence[int]) -> tuple[int, ...]:
+    """Read `--denoise`: numbers of recorded denoise steps, `first`, `last` or `all`."""
+    if words is None or list(words) == ["all"]:
+        return tuple(recorded)
+    named = {"first": min(recorded), "last": max(recorded)}
+    steps = []
+    for word in words:
+        if word in named:
+            steps.append(named[word])
+        elif word.isdigit() and int(word) in recorded:
+            steps.append(int(word))
+        else:
+            raise BadArgument(
+                f"Denoise step '{word}' was not recorded; recorded: {listing(recorded, 40)}; 'first', 'last' and 'all' also work."
+            )
+    return tuple(steps)
+
+
+def select_episodes(store: Store, tasks: Sequence[int] | None) -> tuple[StoredEpisode, ...]:
+    """The store's episodes of the wanted tasks, in order; an empty selection is an error."""
+    if not store.episodes:
+        raise StoreError(f"The store {store.path} holds no complete episode yet; let vla-capture finish one.")
+    if tasks is None:
+        return store.episodes
+    for task in tasks:
+        if task not in store.task_ids:
+            raise BadArgument(
+                f"Store {store.path} has no episode of task {task}; it has tasks {listing(store.task_ids, 40)}."
+            )
+    return tuple(episode for episode in store.episodes if parse_episode_name(episode.name)[0] in tasks)
+
+
+def check_combinable(stores: Sequence[Store]) -> None:
+    """Raise unless several stores can be analysed as one: same policy and recording, and no episode twice."""
+    first = stores[0]
+    seen: dict[tuple[str, str], Store] = {}
+    for store in stores:
+        for field, mine, theirs in (
+            ("policy digest", store.attributes.policy.digest, first.attributes.policy.digest),
+            ("recording", store.attributes.recording, first.attributes.recording),
+            ("sites", store.attributes.sites, first.attributes.sites),
+        ):
+            if mine != theirs:
+                raise StoreError(
+                    f"Stores {first.path} and {store.path} differ in their {field}; analyse them one at a time."
+                )
+        for episode in store.episodes:
+            other = seen.setdefault((store.suite, episode.name), store)
+            if other is not store:
+                raise StoreError(
+                    f"Stores {other.path} and {store.path} both hold {episode.name} of {store.suite}; analyse them one at a time."
+                )
