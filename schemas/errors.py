@@ -46,6 +46,7 @@ def did_you_mean(given: str, existing: Iterable[str]) -> str:
     # Half a name is the commonest slip ('base' for 'base_0_rgb'), and too short for the similarity measure.
     near = [name for name in by_folded if len(folded) > 2 and name.startswith(folded)]
     near = near or difflib.get_close_matches(folded, list(by_folded), n=1, cutoff=0.6)
+    near = near or [name for name in by_folded if len(folded) > 2 and folded in name]
     return f" Did you mean '{by_folded[near[0]]}'?" if near else ""
 
 

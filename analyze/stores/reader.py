@@ -121,7 +121,8 @@ class StoredEpisode:
         except IndexError:
             raise  # the caller's mistake
         except Exception as error:  # damaged bytes can make codecs raise anything
-            raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {error}.") from error
+            problem = str(error).rstrip(".")
+            raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {problem}.") from error
         if _holds_missing(values) or (name.endswith("/key_role") and not values.all()):
             raise CorruptEpisode(f"Array {name} of episode {self.name} has missing values: a chunk is lost.")
         return values
