@@ -210,16 +210,17 @@ def episode_steps(
         columns[f"{name}_lift"] = measures.lift[..., i].ravel()
     if grouping.ratio is not None:
         columns.update(_ratio_columns(grouping, measures.mass, resolved.num_keys, along))
-    height = int(np.prod(shape))
-    series = [
-        pl.Series(name, np.asarray(values))
-        if isinstance(values, np.ndarray)
-        else pl.repeat(values, height, eager=True).alias(name)
-        for name, values in columns.items()
-    ]
-    frame = pl.DataFrame(series).with_columns(pl.col("head").cast(pl.Int64), pl.col(pl.Int32).cast(pl.Int64))
+    frame = pl.DataFrame({name: values for name, values in columns.items() if isinstance(values, np.ndarray)})
+    return frame.select(_expression(name, values) for name, values in columns.items())
+
+
+def _expression(name: str, values: NDArray[Any] | str | bool | int | None) -> pl.Expr:
+    """A column of the steps table, from its numbers or the one value that all of its rows have."""
+    if not isinstance(values, np.ndarray):
+        dtype = pl.String if isinstance(values, str) else pl.Boolean if isinstance(values, bool) else pl.Int64
+        return pl.lit(values, dtype=dtype).alias(name)
     # NaN stands for "undefined" in numpy; in tables that is null. Infinite ratios stay what they are.
-    return frame.with_columns(pl.col(pl.Float64).fill_nan(None))
+    return pl.col(name).fill_nan(None) if values.dtype == np.float64 else pl.col(name)
 
 
 def _ratio_columns(

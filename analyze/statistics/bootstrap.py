@@ -210,20 +210,20 @@ def bootstrap_intervals(
     """
     if not statistics:
         return []
-    above = resamples.counts @ np.stack([statistic.numerator for statistic in statistics], axis=1)
-    below = resamples.counts @ np.stack([statistic.denominator for statistic in statistics], axis=1)
-    values = _quotient(above, below, exponentiate=False)
+    above = np.stack([statistic.numerator for statistic in statistics]) @ resamples.counts.T
+    below = np.stack([statistic.denominator for statistic in statistics]) @ resamples.counts.T
+    values = _quotient(above, below, exponentiate=False)  # (statistic, resample): quantiles are of contiguous numbers
     finite = np.isfinite(values)
     tail = (1.0 - level) / 2.0
-    # All columns at once, then again the few that hold undefined resamples. exp is monotonic: it may come after.
-    quantiles = np.quantile(np.where(finite, values, 0.0), [tail, 1.0 - tail], axis=0)
+    # All statistics at once, then again the few that hold undefined resamples. exp is monotonic: it may come after.
+    quantiles = np.quantile(np.where(finite, values, 0.0), [tail, 1.0 - tail], axis=1)
     intervals: list[Interval | None] = []
-    for column, statistic in enumerate(statistics):
-        whole = bool(finite[:, column].all())
-        bounds = quantiles[:, column] if whole else None
+    for i, statistic in enumerate(statistics):
+        whole = bool(finite[i].all())
+        bounds = quantiles[:, i] if whole else None
         estimate = float(_quotient(statistic.numerator.sum(), statistic.denominator.sum(), exponentiate=False))
         num_units = resamples.num_units(statistic.used)
-        interval = _interval(values[:, column], estimate, num_units, level, statistic.limits, widened, bounds)
+        interval = _interval(values[i], estimate, num_units, level, statistic.limits, widened, bounds)
         if interval is not None and statistic.exponentiate:
             ends = np.exp([interval.low, interval.high])
             interval = Interval(float(ends[0]), float(ends[1]), level, interval.num_undefined)
