@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import polars as pl
@@ -20,6 +22,7 @@ from analyze.results.results_file import write_results_of_suites
 from analyze.stores.selection import Selection
 from schemas.errors import BadArgument, listing
 from schemas.grouping import Grouping
+from schemas.resolve import ResolvedGrouping
 from schemas.store import RootAttributes
 
 
@@ -27,23 +30,42 @@ from schemas.store import RootAttributes
 class Analysis:
     """The tables of one grouping over one selection of episodes.
 
-    In `analyze.measures` it is described what they hold: `steps` in `tables`; `replans`, `episodes` and `tasks` in `aggregate`;
-    `contributions` (None when they were not recorded) and `group_contributions` in the modules of these names.
+    In `analyze.measures` it is described what they hold: `steps` in `tables`; `replans`, `episodes` and `tasks` in `aggregate`.
+    Contributions and the summary are computed when they are first asked for: who wants ratios need not wait for them.
     """
 
     question: Question
+    resolved: Sequence[ResolvedGrouping]
     steps: pl.DataFrame
     replans: pl.DataFrame
     episodes: pl.DataFrame
     tasks: pl.DataFrame
-    contributions: pl.DataFrame | None
-    group_contributions: pl.DataFrame | None
-    summary: str
 
     @property
     def grouping(self) -> Grouping:
         """The groups of keys that everything is about."""
         return self.question.grouping
+
+    @cached_property
+    def contributions(self) -> pl.DataFrame | None:
+        """See `measures.contributions.contribution_table`; None when they were not recorded."""
+        return contribution_table(self.question.episodes, self.question.selection)
+
+    @cached_property
+    def group_contributions(self) -> pl.DataFrame | None:
+        """See `measures.group_contributions.group_contribution_table`; None also when every group cuts a segment."""
+        return group_contribution_table(self.question, self.resolved)
+
+    @cached_property
+    def summary(self) -> str:
+        """Everything as text."""
+        question, grouping, seed = self.question, self.grouping, self.question.settings.seed
+        parts = [summary_text(_described(question), grouping, self.episodes, self.tasks)]
+        if self.contributions is not None:
+            parts.append(summarise_contributions(self.contributions, seed))
+        if all(store.attributes.recording.contributions for store in question.stores):
+            parts.append(summarise_group_contributions(self.group_contributions, grouping, question.site, seed))
+        return "\n".join(parts)
 
 
 @dataclass
@@ -55,33 +77,29 @@ class WrittenFiles:
 
 
 def analyse(question: Question) -> Analysis:
-    """Compute all tables. Shows progress at a terminal when it takes longer than a moment."""
-    stores, settings, grouping = question.stores, question.settings, question.grouping
-    root = stores[0].attributes
-    resolved = resolve_all(grouping, question.selected)
+    """Compute the tables. Shows progress at a terminal when it takes longer than a moment."""
+    grouping = question.grouping
+    resolved = resolve_all(grouping, question.selected, question.vocabulary)
     with progress_bar(len(question.selected), "episodes") as advance:
         steps = steps_table(question.selected, grouping, question.selection, question.site, advance, resolved)
     replans = add_layers_avg(per_replan(steps, grouping), grouping)
     episodes = episodes_table(replans, grouping)
-    tasks = tasks_table(episodes, grouping, seed=settings.seed)
+    tasks = tasks_table(episodes, grouping, seed=question.settings.seed)
+    return Analysis(question, resolved, steps, replans, episodes, tasks)
+
+
+def _described(question: Question) -> AnalysedRun:
+    """What the summary says about where the numbers come from."""
+    root = question.stores[0].attributes
     policy = root.policy
-    run = AnalysedRun(
-        stores=[str(store.path) for store in stores],
+    return AnalysedRun(
+        stores=[str(store.path) for store in question.stores],
         policy=f"{policy.name} ({policy.checkpoint_format}: {policy.checkpoint})",
         untrained=policy.untrained,
         denoise_steps=question.selection.denoise_steps,
-        heads=describe_heads(question.selection, root.policy.num_heads),
+        heads=describe_heads(question.selection, policy.num_heads),
         notes=[*_notes(root, question.selection, question.site), *question.skipped, *question.notes],
     )
-    text = summary_text(run, grouping, episodes, tasks)
-    contributions = contribution_table(question.episodes, question.selection)
-    if contributions is not None:
-        text += "\n" + summarise_contributions(contributions, settings.seed)
-    groups = None
-    if all(store.attributes.recording.contributions for store in stores):
-        groups = group_contribution_table(question, resolved)
-        text += "\n" + summarise_group_contributions(groups, grouping, question.site, settings.seed)
-    return Analysis(question, steps, replans, episodes, tasks, contributions, groups, text)
 
 
 def write_tables(analysis: Analysis, folder: Path) -> WrittenFiles:

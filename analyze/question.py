@@ -50,6 +50,7 @@ class Question:
         site: the softmax family that is looked at.
         selected: the episodes, each with its store and its tokens.
         grouping: the groups of keys.
+        vocabulary: the names that selectors may use over the episodes.
         skipped: one line for every episode that was left out because it is damaged or empty (`skip_corrupt`).
         notes: further lines that belong beside every number, for instance which keys were taken out.
     """
@@ -60,6 +61,7 @@ class Question:
     site: str
     selected: tuple[SelectedEpisode, ...]
     grouping: Grouping
+    vocabulary: Vocabulary
     skipped: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -85,8 +87,9 @@ def ask(stores: Sequence[Store], settings: AnalysisSettings) -> Question:
         chosen, skipped = _without_faulty(chosen)
     _refuse_empty(chosen)
     selected = tuple(load_tokens(chosen, site))
-    grouping = choose_grouping(settings, vocabulary_of(selected))
-    return Question(tuple(stores), settings, selection, site, selected, grouping, tuple(skipped))
+    vocabulary = vocabulary_of(selected)
+    grouping = choose_grouping(settings, vocabulary)
+    return Question(tuple(stores), settings, selection, site, selected, grouping, vocabulary, tuple(skipped))
 
 
 def choose_grouping(settings: AnalysisSettings, vocabulary: Vocabulary) -> Grouping:

@@ -242,13 +242,20 @@ def _task_row(
         bounded["ratio_of_means"] = ratio_of_means_over_episodes(values("numerator_mass"), values("denominator_mass"))
         bounded["geometric_mean"] = geometric_mean_over_episodes(values("log_ratio_mean"))
         bounded["ratio_lift"] = mean_over_episodes(values("ratio_lift"), POSITIVE)
-    row |= {column: mean_over_episodes(values(column)).value for column in plain}
+    row |= dict(zip(plain, _finite_means(part.select(plain).to_numpy()), strict=True))
     intervals = bootstrap_intervals(list(bounded.values()), resamples, level)
     for (column, statistic), interval in zip(bounded.items(), intervals, strict=True):
         row[column] = statistic.value
         row[f"{column}_low"] = interval.low if interval else None
         row[f"{column}_high"] = interval.high if interval else None
     return row
+
+
+def _finite_means(columns: NDArray[np.float64]) -> list[float | None]:
+    """Mean over the finite values of each column of (episode, column); None without any."""
+    finite = np.isfinite(columns)
+    sums, counts = np.where(finite, columns, 0.0).sum(axis=0), finite.sum(axis=0)
+    return [float(total / count) if count else None for total, count in zip(sums, counts, strict=True)]
 
 
 def _task_schema(grouping: Grouping) -> dict[str, type[pl.DataType]]:

@@ -51,16 +51,19 @@ def vocabulary_of(selected: Sequence[SelectedEpisode]) -> Vocabulary:
     return collect_vocabulary(item.tokens for item in selected)
 
 
-def resolve_all(grouping: Grouping, selected: Sequence[SelectedEpisode]) -> list[ResolvedGrouping]:
+def resolve_all(
+    grouping: Grouping, selected: Sequence[SelectedEpisode], vocabulary: Vocabulary | None = None
+) -> list[ResolvedGrouping]:
     """Resolve a grouping on every episode, with the checks that need all of them.
+
+    `vocabulary` is what `vocabulary_of` says of the episodes, where that is known already.
 
     Raises:
         SelectorError: a name exists in no selected episode.
         OverlappingGroups: groups share keys and the grouping does not allow it.
         EmptyGroup: a group has no key in any selected episode.
     """
-    vocabulary = vocabulary_of(selected)
-    check_names(grouping, vocabulary, selected[0].tokens.layout)
+    check_names(grouping, vocabulary or vocabulary_of(selected), selected[0].tokens.layout)
     resolved = [resolve(grouping, item.tokens) for item in selected]
     for i, name in enumerate(grouping.names):
         if name not in grouping.allow_empty and not any(item.num_keys[:, i].any() for item in resolved):

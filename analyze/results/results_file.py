@@ -44,10 +44,9 @@ def episode_documents(
     for part in table.partition_by("suite", "task_id", "episode_index", maintain_order=True):
         identity = part.select(EPISODE_KEYS).row(0, named=True)
         summaries = {row["layer"]: row for row in _summaries(part, kinds).iter_rows(named=True)}
-        layers = part.partition_by("layer", as_dict=True, maintain_order=True)
-        steps = {
-            str(layer): rows.sort("replan").drop(*EPISODE_KEYS, "layer", "replan") for (layer,), rows in layers.items()
-        }
+        in_time = part.sort("replan", maintain_order=True).drop(*EPISODE_KEYS, "replan")
+        layers = in_time.partition_by("layer", as_dict=True, maintain_order=True, include_key=False)
+        steps = {str(layer): rows for (layer,), rows in layers.items()}
         yield {
             "task_id": identity["task_id"],
             "episode_idx": identity["episode_index"],
@@ -56,7 +55,8 @@ def episode_documents(
             "num_steps": identity["num_steps"],
             "summary": {_layer_name(layer): _summary_document(summaries[layer], kinds) for layer in steps},
             "per_step_ratios": {
-                _layer_name(layer): [step | extra for step in rows.to_dicts()] for layer, rows in steps.items()
+                _layer_name(layer): [step | extra for step in rows.to_dicts()] if extra else rows.to_dicts()
+                for layer, rows in steps.items()
             },
         }
 
