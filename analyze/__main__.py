@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -14,12 +15,15 @@ from schemas.errors import UnknownName, UserError, did_you_mean, listing
 
 #: Episodes are measured by threads of our own (`analyze.stores.parallel`); products that each start threads only stand in their way.
 _ONE_THREAD_EACH = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
+#: The collector need not look for cycles after every 700 of the ten thousands of token pieces and steps, which have none.
+_OBJECTS_BETWEEN_COLLECTIONS = 5_000_000
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code (2: a mistake in what was given, said in one sentence)."""
     for name in _ONE_THREAD_EACH:  # read when numpy is imported, which is later
         os.environ.setdefault(name, "1")
+    gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
     words = sys.argv[1:] if argv is None else list(argv)
     name = words[0] if words[:1] and words[0] in COMMANDS else ""
     prog = f"vla-analyze {name}".strip()

@@ -110,7 +110,7 @@ def main() -> None:
         "default": [*ours, *rest],
         "default-no-plots": [*ours, *rest, "--no-plots"],
         "span": [*ours, *rest, "--no-plots", "--grouping", "cameras"],
-        "span-tables": [sys.executable, str(Path(__file__)), "--span-tables", str(store)],
+        "span-tables": ["env", "OPENBLAS_NUM_THREADS=1", sys.executable, __file__, "--span-tables", str(store)],
         "words": [
             *ours,
             *rest,
@@ -141,7 +141,10 @@ def main() -> None:
 
 
 def span_tables(store: Path) -> None:
-    """The tables of a span-level grouping, from an open store to the table of tasks, timed inside one process."""
+    """All tables with intervals of a span-level grouping, timed inside one process: of a new store, then of one that is open.
+
+    One BLAS thread, as `vla-analyze` has it: episodes are measured by threads of its own.
+    """
     from analyze.pipeline import analyse
     from analyze.question import AnalysisSettings, ask
     from analyze.stores.reader import open_store

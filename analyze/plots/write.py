@@ -8,7 +8,6 @@ from analyze.output.terminal import progress_bar
 from analyze.pipeline import Analysis
 from analyze.plots.attention_fractions import plot_attention_fractions
 from analyze.plots.layer_profile import plot_layer_profile
-from analyze.plots.layer_time import plot_layer_time
 from analyze.plots.ratio_distribution import plot_ratio_distribution
 from analyze.plots.ratio_evolution import plot_all_evolutions
 from analyze.plots.ratio_per_task import plot_ratio_per_task
@@ -28,7 +27,6 @@ def write_plots(analysis: Analysis, folder: Path, every_episode: bool) -> list[P
         written += plot_ratio_distribution(analysis.replans, grouping, folder)
         written += plot_ratio_per_task(analysis.episodes, analysis.tasks, grouping, folder)
     written += plot_layer_profile(analysis.tasks, grouping, folder)
-    written += plot_layer_time(analysis.replans, grouping, folder, analysis.question.settings.seed)
     if every_episode:
         pictures = analysis.episodes.height
         with progress_bar(pictures, "pictures") as advance:

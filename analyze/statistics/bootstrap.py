@@ -18,6 +18,7 @@ each function here returns how many values it left out.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -173,13 +174,19 @@ def resample_episodes(tasks: ArrayLike, num_resamples: int = DEFAULT_RESAMPLES, 
         num_resamples: number of resamples.
         seed: seed of numpy's default generator; equal arguments give equal counts.
     """
-    labels = np.asarray(tasks)
-    _, task_of = np.unique(labels, return_inverse=True)
+    _, task_of = np.unique(np.asarray(tasks), return_inverse=True)
+    return _drawn(task_of.astype(np.int64).tobytes(), num_resamples, seed)
+
+
+@functools.lru_cache(maxsize=4)
+def _drawn(tasks: bytes, num_resamples: int, seed: int) -> Resamples:
+    """The draws for episodes of tasks numbered from 0 (int64 as bytes). Kept: many statistics are of the same episodes."""
+    task_of = np.frombuffer(tasks, dtype=np.int64)
     by_task = np.argsort(task_of, kind="stable")
     size = np.bincount(task_of)
     first = np.cumsum(size) - size
     generator = np.random.default_rng(seed)
-    num_tasks, num_episodes = len(size), len(labels)
+    num_tasks, num_episodes = len(size), len(task_of)
     slot = np.arange(size.max())
     at_once = max(1, _DRAWS_AT_ONCE // (num_tasks * len(slot)))
     counts = np.empty((num_resamples, num_episodes))
@@ -194,7 +201,8 @@ def resample_episodes(tasks: ArrayLike, num_resamples: int = DEFAULT_RESAMPLES, 
         cell = np.arange(rows)[:, None, None] * num_episodes + episode
         used = slot < sizes
         counts[start : start + rows] = np.bincount(cell[used], minlength=rows * num_episodes).reshape(rows, -1)
-    return Resamples(counts, task_of.astype(np.int64))
+    counts.setflags(write=False)
+    return Resamples(counts, task_of)
 
 
 def bootstrap_intervals(
