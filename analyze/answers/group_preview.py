@@ -57,7 +57,7 @@ def preview_groups(question: Question) -> GroupPreview:
         UserError: a subclass that says what is wrong with the grouping; see `analyze.measures.tables.resolve_all`.
     """
     grouping = question.grouping
-    resolve_all(grouping, question.selected)  # all checks, with the user's own groups
+    resolve_all(grouping, question.selected, question.vocabulary)  # all checks, with the user's own groups
     whole = _with_untaken(grouping)
     resolved = [resolve(whole, item.tokens) for item in question.selected]
     names = [UNTAKEN if name == _UNTAKEN_GROUP else name for name in whole.names]

@@ -78,7 +78,7 @@ def masses_array(question: Question, progress: Callable[[int], object] | None = 
     """
     xr = _needed("xarray")
     selection = replace(question.selection, per_head=True)
-    resolved = resolve_all(question.grouping, question.selected)
+    resolved = resolve_all(question.grouping, question.selected, question.vocabulary)
 
     def measure(pair: tuple[SelectedEpisode, ResolvedGrouping]) -> tuple[NDArray[Any], ...]:
         mass, row_sum = episode_masses(*pair, selection, question.site)

@@ -192,9 +192,7 @@ def _outlines(
 def check_outlines(question: Question, groups: Grouping | None) -> None:
     """Raise `SelectorError` for a group that names what exists nowhere in the selection."""
     if groups is not None:
-        from analyze.measures.tables import vocabulary_of
-
-        check_names(groups, vocabulary_of(question.selected), question.selected[0].tokens.layout)
+        check_names(groups, question.vocabulary, question.selected[0].tokens.layout)
 
 
 def draw(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from analyze.measures.aggregate import EPISODE_KEYS, LAYERS_AVG, overall_layer
 from analyze.measures.masses import group_measures, masses
-from analyze.measures.tables import SelectedEpisode, vocabulary_of
+from analyze.measures.tables import SelectedEpisode
 from analyze.output.terminal import progress_bar
 from analyze.question import Question
 from analyze.statistics.bootstrap import DEFAULT_SEED, POSITIVE, SHARE
@@ -73,7 +73,7 @@ def words_table(question: Question) -> pl.DataFrame:
     Raises:
         BadArgument: the keys of the site spell no words.
     """
-    if not vocabulary_of(question.selected).words:
+    if not question.vocabulary.words:
         raise BadArgument(f"Site '{question.site}': {NO_WORDS}.")
     with progress_bar(len(question.selected), "episodes") as advance:
 

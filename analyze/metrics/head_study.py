@@ -70,7 +70,7 @@ def study_heads(question: Question, options: RowOptions | None = None) -> HeadSt
     Without `options` they are only read when a group cuts through a stored segment (a word, an object).
     """
     grouping, seed, selection = question.grouping, question.settings.seed, question.selection
-    resolved = resolve_all(grouping, question.selected)
+    resolved = resolve_all(grouping, question.selected, question.vocabulary)
     shown = groups_with_valid_keys(question.selected, resolved)
     measures = None
     if options is not None:

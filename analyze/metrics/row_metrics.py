@@ -216,7 +216,7 @@ def measure_all_rows(
 def row_metrics_table(question: Question, options: RowOptions | None = None) -> pl.DataFrame:
     """Entropy, effective keys and top-k mass of every stored row, in the columns of `row_frame`."""
     chosen = options or RowOptions()
-    resolved = resolve_all(question.grouping, question.selected)
+    resolved = resolve_all(question.grouping, question.selected, question.vocabulary)
     shown = groups_with_valid_keys(question.selected, resolved)
     measures = measure_all_rows(question, resolved, chosen, shown)
     return row_table(question.selected, measures, shown, question.selection, chosen)

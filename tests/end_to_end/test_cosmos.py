@@ -14,6 +14,21 @@ from capture.__main__ import main as capture
 
 pytestmark = pytest.mark.simulator
 
+#: One replan of one task, and one layer of it.
+ONE_LAYER = (
+    "cosmos",
+    "--ckpt-path",
+    "dummy",
+    "--task-id",
+    "0",
+    "--num-episodes",
+    "1",
+    "--max-steps",
+    "8",
+    "--layers",
+    "1",
+)
+
 
 @pytest.fixture(scope="module")
 def cosmos_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -71,21 +86,8 @@ def test_each_site_is_analysed_by_itself(cosmos_store, tmp_path, capsys):
 
 
 def test_the_published_frame_proxy_is_named_by_its_frames(tmp_path):
-    arguments = [
-        "cosmos",
-        "--ckpt-path",
-        "dummy",
-        "--task-id",
-        "0",
-        "--num-episodes",
-        "1",
-        "--max-steps",
-        "8",
-        "--layers",
-        "1",
-    ]
     assert (
-        capture([*arguments, "--output-dir", str(tmp_path), "--visual-frame", "curr_last", "--text-frame", "frame0"])
+        capture([*ONE_LAYER, "--output-dir", str(tmp_path), "--visual-frame", "curr_last", "--text-frame", "frame0"])
         == 0
     )
     steps = pl.read_parquet(tmp_path / "steps.parquet")
@@ -95,20 +97,7 @@ def test_the_published_frame_proxy_is_named_by_its_frames(tmp_path):
 
 def test_queries_can_be_pooled_by_action_step(tmp_path):
     store = tmp_path / "a.zarr"
-    arguments = [
-        "cosmos",
-        "--ckpt-path",
-        "dummy",
-        "--task-id",
-        "0",
-        "--num-episodes",
-        "1",
-        "--max-steps",
-        "8",
-        "--layers",
-        "1",
-    ]
-    assert capture([*arguments, "--queries", "steps", "--store", str(store)]) == 0
+    assert capture([*ONE_LAYER, "--queries", "steps", "--store", str(store)]) == 0
     rows = zarr.open_group(store / "episodes/task000_episode000", mode="r")["self/rows"]
     assert rows.shape[4] == 16 * 7
     assert analyze(["verify", str(store)]) == 0
