@@ -7,8 +7,7 @@ from pathlib import Path
 
 import polars as pl
 
-from analyze.output.atomic_file import replacing
-from analyze.output.table_files import write_parquet
+from analyze.output.table_files import write_csv, write_parquet
 from analyze.pipeline import Analysis
 from schemas.errors import BadArgument
 
@@ -41,31 +40,11 @@ def chosen_tables(analysis: Analysis, names: Sequence[str]) -> dict[str, pl.Data
     return tables
 
 
-def write_csv(folder: Path, tables: dict[str, pl.DataFrame]) -> list[Path]:
-    """Write each table as `NAME.csv` into a folder: UTF-8, a header, nothing for null, `inf` for infinite; returns the paths.
-
-    Raises:
-        BadArgument: the folder cannot be made or written to.
-    """
-    written = []
-    try:
-        for name, table in tables.items():
-            path = folder / f"{name}.csv"
-            with replacing(path) as temporary:
-                table.write_csv(temporary)
-            written.append(path)
-    except OSError as error:
-        raise BadArgument(
-            f"Cannot write tables to {folder}: {error.strerror or error}; give another --output."
-        ) from None
-    return written
-
-
 def write_tables(folder: Path, tables: dict[str, pl.DataFrame], kinds: Sequence[str]) -> list[Path]:
     """Write tables in each of the kinds `csv` and `parquet`; returns the paths."""
     written = []
     if "csv" in kinds:
-        written += write_csv(folder, tables)
+        written += write_csv(folder, **tables)
     if "parquet" in kinds:
         written += write_parquet(folder, **tables)
     return written

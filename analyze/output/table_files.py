@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import polars as pl
@@ -17,15 +18,26 @@ def write_parquet(folder: Path, **tables: pl.DataFrame) -> list[Path]:
     Raises:
         BadArgument: the folder cannot be made or written to.
     """
+    return _write(folder, "parquet", pl.DataFrame.write_parquet, tables)
+
+
+def write_csv(folder: Path, **tables: pl.DataFrame) -> list[Path]:
+    """Write each table as `NAME.csv`, otherwise like `write_parquet`: UTF-8, a header, nothing for null, `inf` for infinite."""
+    return _write(folder, "csv", pl.DataFrame.write_csv, tables)
+
+
+def _write(
+    folder: Path, ending: str, write: Callable[[pl.DataFrame, Path], object], tables: Mapping[str, pl.DataFrame]
+) -> list[Path]:
     written = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK):
             raise PermissionError(13, "Permission denied")
         for name, table in tables.items():
-            path = folder / f"{name}.parquet"
+            path = folder / f"{name}.{ending}"
             with replacing(path) as temporary:
-                table.write_parquet(temporary)
+                write(table, temporary)
             written.append(path)
     except OSError as error:
         raise BadArgument(
