@@ -31,7 +31,7 @@ endif
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
-SOURCES := schemas capture analyze tests benchmarks scripts docs
+SOURCES := vla_attention schemas capture analyze tests benchmarks scripts docs
 
 .PHONY: capture analyze test test-slurm check unit setup setup-analyze schemas clean
 
@@ -58,7 +58,7 @@ test-slurm:
 	VLA_TEST_SLURM=1 $(if $(wildcard $(BIN)/pytest),$(BIN)/)pytest tests/end_to_end/test_slurm_array.py $(ARGS)
 
 schemas: .venv/capture-installed
-	$(BIN)/python -m schemas.json_files
+	$(BIN)/python -m vla_attention.schemas.json_files
 
 setup: .venv/capture-installed
 

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 
-from analyze.commands import COMMANDS, WHOLE
-from schemas.command_line import run_command
-from schemas.errors import UnknownName, UserError, did_you_mean, listing
+from vla_attention.analyze.commands import COMMANDS, DEFAULT_COMMAND
+from vla_attention.schemas.command_line import run_command
+from vla_attention.schemas.errors import UnknownName, UserError, did_you_mean, listing
 
-#: Episodes are measured by threads of our own (`analyze.stores.parallel`); products that each start threads only stand in their way.
+#: Episodes are measured by threads of our own (`vla_attention.analyze.stores.parallel`); products that each start threads only stand in their way.
 _ONE_THREAD_EACH = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
 #: The collector need not look for cycles after every 700 of the ten thousands of token pieces and steps, which have none.
 _OBJECTS_BETWEEN_COLLECTIONS = 5_000_000
@@ -33,8 +33,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(name: str, words: Sequence[str]) -> int:
     if not name:
         _refuse_misspelt_command(words)
-    command = import_module(f"analyze.commands.{COMMANDS[name or WHOLE][0]}")
-    parser = command.build_parser(prog=f"vla-analyze {name}") if name == WHOLE else command.build_parser()
+    command = import_module(f"vla_attention.analyze.{name or DEFAULT_COMMAND}.command")
+    parser = command.build_parser(prog=f"vla-analyze {name}") if name == DEFAULT_COMMAND else command.build_parser()
     try:
         return command.run(parser.parse_args(words))
     except UserError as error:
@@ -43,7 +43,7 @@ def _run(name: str, words: Sequence[str]) -> int:
 
 def _with_way_out(error: UserError) -> UserError:
     """Add to the error of a damaged episode what can be done about it."""
-    from schemas.store import CorruptEpisode
+    from vla_attention.schemas.stores.store_format import CorruptEpisode
 
     if not isinstance(error, CorruptEpisode):
         return error

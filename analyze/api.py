@@ -12,16 +12,16 @@ from typing import Literal, Unpack
 
 import polars as pl
 
-from analyze.keywords import Settings, analysis_settings
-from analyze.opened import Opened, check_name
-from analyze.question import ask
-from analyze.stores.reader import open_store
-from analyze.stores.selection import check_combinable
-from schemas.errors import BadArgument, listing
+from vla_attention.analyze.measures.question import ask
+from vla_attention.analyze.measures.settings import Settings, analysis_settings
+from vla_attention.analyze.opened import Opened, check_name
+from vla_attention.analyze.stores.selection import check_combinable
+from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.stores.reader import open_store
 
 
 def open_stores(stores: str | Path | Sequence[str | Path]) -> OpenStores:
-    """See `analyze.open`."""
+    """See `va.open`."""
     paths = [stores] if isinstance(stores, (str, Path)) else list(stores)
     if not paths:
         raise BadArgument("No store was given; expected the path of a NAME.zarr, or several.")
@@ -31,16 +31,16 @@ def open_stores(stores: str | Path | Sequence[str | Path]) -> OpenStores:
 
 
 class OpenStores(Opened):
-    """One or several stores, opened for questions. Made by `analyze.open`; holds the episodes that were complete then.
+    """One or several stores, opened for questions. Made by `va.open`; holds the episodes that were complete then.
 
-    Every method takes the keywords of `analyze.keywords.Settings`, reads what it needs and no more, and returns a polars frame
-    (which of several is chosen by `table`). Mistakes raise a `schemas.errors.UserError` that says what exists.
+    Every method takes the keywords of `vla_attention.analyze.measures.settings.Settings`, reads what it needs and no more, and returns a polars frame
+    (which of several is chosen by `table`). Mistakes raise a `vla_attention.schemas.errors.UserError` that says what exists.
 
     Attributes:
-        stores: the stores, as `analyze.stores.reader` opens them.
+        stores: the stores, as `vla_attention.schemas.stores.reader` opens them.
         attributes: the run's own description (policy, protocol, recording, sites) of the first store.
 
-    >>> run = analyze.open(store)
+    >>> run = va.open(store)
     >>> run.attributes.recording.layers
     (0, 2)
     >>> print(run)
@@ -52,11 +52,11 @@ class OpenStores(Opened):
     ) -> pl.DataFrame:
         """What a grouping takes, before any number: keys by span and role, words with their pieces, shared keys.
 
-        >>> found = analyze.open(store).groups(groups={"bowl": "word:bowl", "rest": "*"})
+        >>> found = va.open(store).groups(groups={"bowl": "word:bowl", "rest": "*"})
         >>> found.filter(pl.col("span").is_null(), group="bowl")["keys_max"].to_list()
         [1.0]
         """
-        from analyze.answers.group_preview import preview_groups
+        from vla_attention.analyze.groups.group_preview import preview_groups
 
         check_name("table", table, ("groups", "words", "overlaps"))
         return _frame(preview_groups(self.ask(**settings)), table)
@@ -66,42 +66,42 @@ class OpenStores(Opened):
     ) -> pl.DataFrame:
         """Who looks and who reads: every head, how much heads differ, the profile over depth, over denoise steps.
 
-        >>> analyze.open(store).heads()["head"].unique().sort().to_list()
+        >>> va.open(store).heads()["head"].unique().sort().to_list()
         [0, 1]
         """
-        from analyze.metrics.head_study import study_heads
+        from vla_attention.analyze.heads.head_study import study_heads
 
         check_name("table", table, ("heads", "dispersion", "depth", "denoise"))
         return _frame(study_heads(self.ask(**settings)), table)
 
     def row_metrics(self, **settings: Unpack[Settings]) -> pl.DataFrame:
-        """Entropy, effective number of keys and top-k mass of every row (`analyze.metrics.row_metrics`). Reads all rows.
+        """Entropy, effective number of keys and top-k mass of every row (`vla_attention.analyze.heads.row_metrics`). Reads all rows.
 
-        >>> analyze.open(store).row_metrics(layers=0, denoise="first", heads=1).height
+        >>> va.open(store).row_metrics(layers=0, denoise="first", heads=1).height
         12
         """
-        from analyze.metrics.row_metrics import row_metrics_table
+        from vla_attention.analyze.heads.row_metrics import row_metrics_table
 
         return row_metrics_table(self.ask(**settings))
 
     def sinks(self, **settings: Unpack[Settings]) -> pl.DataFrame:
-        """Keys that take far more than their share in most rows (`analyze.metrics.sinks`), per task. Reads all rows.
+        """Keys that take far more than their share in most rows (`vla_attention.analyze.measures.sinks`), per task. Reads all rows.
 
-        >>> analyze.open(store).sinks().columns[:3]
+        >>> va.open(store).sinks().columns[:3]
         ['suite', 'task_id', 'num_episodes']
         """
-        from analyze.metrics.sinks import sinks_table
+        from vla_attention.analyze.measures.sinks import sinks_table
 
         return sinks_table(self.ask(**settings))
 
     def words(self, table: Literal["summary", "episodes"] = "summary", **settings: Unpack[Settings]) -> pl.DataFrame:
         """Which words are read: over all episodes with intervals ("summary"), or per episode and layer.
 
-        >>> words = analyze.open(store).words(tasks=0)
+        >>> words = va.open(store).words(tasks=0)
         >>> sorted(words.filter(kind="word")["item"].to_list())
         ['bowl', 'on', 'plate', 'put', 'the']
         """
-        from analyze.answers.word_reading import site_of_words, words_summary, words_table
+        from vla_attention.analyze.words.word_reading import site_of_words, words_summary, words_table
 
         check_name("table", table, ("summary", "episodes"))
         settings["site"] = site_of_words(self.attributes, settings.get("site"))
@@ -114,14 +114,14 @@ class OpenStores(Opened):
     ) -> pl.DataFrame:
         """Which objects are looked at: shares and lifts, shares over time, or pointing game and IoU with their masks.
 
-        >>> objects = analyze.open(store).objects()
+        >>> objects = va.open(store).objects()
         >>> "akita_black_bowl_1" in objects["item"].to_list()
         True
 
         Raises:
             BadArgument: the stores hold no object masks.
         """
-        from analyze.answers.object_attention import ObjectSettings, object_tables
+        from vla_attention.analyze.objects.object_attention import ObjectSettings, object_tables
 
         check_name("table", table, ("objects", "times", "iou"))
         return _frame(object_tables(self.ask(**settings), ObjectSettings(spatial=table == "iou")), table)
@@ -135,13 +135,13 @@ class OpenStores(Opened):
     ) -> pl.DataFrame:
         """Over the course of an episode: phase-aligned means, the gripper's closing, success against failure.
 
-        `bins` and `window` are those of `analyze.answers.time_courses.TimeSettings`.
+        `bins` and `window` are those of `vla_attention.analyze.time.time_courses.TimeSettings`.
 
-        >>> course = analyze.open(store).time(bins=3)
+        >>> course = va.open(store).time(bins=3)
         >>> course["quantity"].unique().sort().to_list()[-1]
         'visual'
         """
-        from analyze.answers.time_courses import TimeSettings, time_courses
+        from vla_attention.analyze.time.time_courses import TimeSettings, time_courses
 
         check_name("table", table, ("course", "closing", "change", "outcomes", "autocorrelation"))
         given = {name: value for name, value in (("num_bins", bins), ("window", window)) if value is not None}
@@ -157,15 +157,15 @@ class OpenStores(Opened):
     ) -> pl.DataFrame:
         """This run against another: other minus this one, paired where initial states and seeds are shared.
 
-        >>> differences = analyze.open(store).compare(other)
+        >>> differences = va.open(store).compare(other)
         >>> differences.filter(scope="all", layer="layers_avg", quantity="success")["difference"].to_list()
         [0.0]
 
         Raises:
-            MixedPolicies, RunsDiffer: the runs differ in what is not compared, see `allow_mismatch` and `analyze.answers.runs`.
+            MixedPolicies, RunsDiffer: the runs differ in what is not compared, see `allow_mismatch` and `vla_attention.analyze.compare.runs`.
         """
-        from analyze.answers.comparison import compare
-        from analyze.answers.runs import RunArgument, open_runs
+        from vla_attention.analyze.compare.comparison import compare
+        from vla_attention.analyze.compare.runs import RunArgument, open_runs
 
         check_name("table", table, ("differences", "estimates", "pairs", "unpaired"))
         opened = other if isinstance(other, OpenStores) else open_stores(other)
@@ -192,12 +192,12 @@ class OpenStores(Opened):
         The first episode unless `task` and `episode` say which; every replan unless `replans` names some. `groups` are outlined, as in
         `vla-analyze overlay`, which can also make videos.
 
-        >>> patches = analyze.open(store).overlay(task=1, replans=0, folder=folder)
+        >>> patches = va.open(store).overlay(task=1, replans=0, folder=folder)
         >>> patches.height, sorted(file.suffix for file in folder.iterdir())
         (16, ['.csv', '.pdf', '.png'])
         """
-        from analyze.answers.group_preview import find_example
-        from analyze.answers.overlay_data import (
+        from vla_attention.analyze.groups.group_preview import find_example
+        from vla_attention.analyze.overlay.overlay_data import (
             camera_names,
             check_outlines,
             chosen_replans,
@@ -218,7 +218,7 @@ class OpenStores(Opened):
         asked = None if replans is None else [replans] if isinstance(replans, int) else list(replans)
         shown = chosen_replans(overlay, asked, overlay.num_replans)
         if folder is not None:
-            from analyze.plots.overlay_strip import plot_overlay_strip
+            from vla_attention.analyze.overlay.plot_strip import plot_overlay_strip
 
             stem = f"overlay_{item.episode.name}"
             plot_overlay_strip(overlay, question.grouping, shown, Path(folder), stem, measure=measure, smooth=smooth)
@@ -229,14 +229,14 @@ class OpenStores(Opened):
     ) -> Path:
         """Write the self-contained HTML page of `vla-analyze report`; returns its path.
 
-        `episodes` with overlays and `replans` of each are those of `analyze.report.page.report_html`.
+        `episodes` with overlays and `replans` of each are those of `vla_attention.analyze.report.page.report_html`.
 
-        >>> page = analyze.open(store).report(folder / "report.html", episodes=1, replans=2)
+        >>> page = va.open(store).report(folder / "report.html", episodes=1, replans=2)
         >>> page.read_text(encoding="utf-8")[:15].lower()
         '<!doctype html>'
         """
-        from analyze.output.atomic_file import write_text
-        from analyze.report.page import DEFAULT_EPISODES, DEFAULT_REPLANS, report_html
+        from vla_attention.analyze.report.page import DEFAULT_EPISODES, DEFAULT_REPLANS, report_html
+        from vla_attention.analyze.show.atomic_file import write_text
 
         page = report_html(
             self.analysis(**settings),

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from analyze.metrics.sinks import SinkRule
-    from analyze.question import AnalysisSettings
+    from vla_attention.analyze.measures.question import AnalysisSettings
+    from vla_attention.analyze.measures.sinks import SinkRule
 
 
 def add_stores(parser: argparse.ArgumentParser) -> None:
@@ -73,7 +73,7 @@ def add_sink_rule(parser: argparse._ArgumentGroup) -> None:
 
 def sink_rule(arguments: argparse.Namespace) -> SinkRule:
     """The rule that --sink-factor and --sink-share give."""
-    from analyze.metrics.sinks import SinkRule
+    from vla_attention.analyze.measures.sinks import SinkRule
 
     given = {"factor": arguments.sink_factor, "share": arguments.sink_share}
     return SinkRule(**{name: value for name, value in given.items() if value is not None})
@@ -83,7 +83,7 @@ def settings_of(arguments: argparse.Namespace) -> AnalysisSettings:
     """What the parsed arguments ask for; arguments that a command does not have keep their defaults."""
     from dataclasses import fields
 
-    from analyze.question import AnalysisSettings
+    from vla_attention.analyze.measures.question import AnalysisSettings
 
     given = {"groups": "group"}
     values: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""An opened store, without the studies: what is in it, masses, ratios, labelled arrays. See `analyze.api`."""
+"""An opened store, without the studies: what is in it, masses, ratios, labelled arrays. See `vla_attention.analyze.api`."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Literal, Unpack
 
 import polars as pl
 
-from analyze.keywords import Settings, analysis_settings
-from analyze.pipeline import Analysis, analyse
-from analyze.question import AnalysisSettings, Question, ask
-from analyze.stores.reader import Store
-from schemas.errors import BadArgument, did_you_mean, listing
-from schemas.store import RootAttributes
+from vla_attention.analyze.measures.question import AnalysisSettings, Question, ask
+from vla_attention.analyze.measures.settings import Settings, analysis_settings
+from vla_attention.analyze.ratios.analysis import Analysis, analyse
+from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
+from vla_attention.schemas.stores.reader import Store
+from vla_attention.schemas.stores.store_format import RootAttributes
 
 if TYPE_CHECKING:
     import xarray
@@ -30,7 +30,7 @@ _GROUP_MEASURES = ("mass", "fraction", "keys", "density", "lift")
 
 
 class Opened:
-    """The part of `analyze.api.OpenStores` that is about masses and ratios; its examples run as tests like those there."""
+    """The part of `vla_attention.analyze.api.OpenStores` that is about masses and ratios; its examples run as tests like those there."""
 
     def __init__(self, stores: Sequence[Store]) -> None:
         self.stores = tuple(stores)
@@ -45,7 +45,7 @@ class Opened:
     def episodes(self) -> pl.DataFrame:
         """One row per episode, from its attributes; reads no rows.
 
-        >>> analyze.open(store).episodes.select("task_id", "episode_index", "success", "num_replans").rows()
+        >>> va.open(store).episodes.select("task_id", "episode_index", "success", "num_replans").rows()
         [(0, 0, False, 3), (0, 1, True, 3), (1, 0, False, 3), (1, 1, True, 3)]
         """
         names = [
@@ -74,7 +74,7 @@ class Opened:
     def ask(self, **settings: Unpack[Settings]) -> Question:
         """The checked question behind the tables, for the functions of the package's modules.
 
-        >>> analyze.open(store).ask(grouping="cameras", layers=2).selection.blocks
+        >>> va.open(store).ask(grouping="cameras", layers=2).selection.blocks
         (2,)
         """
         return ask(self.stores, analysis_settings(**settings))
@@ -93,9 +93,9 @@ class Opened:
         """Masses, fractions, lifts and ratios as `vla-analyze ratios` gives them.
 
         `level`: "tasks" (per task and over all, with intervals), "episodes", "replans" or "steps" (every replan, layer, denoise step).
-        Columns: `analyze.measures.aggregate` and `analyze.measures.tables`.
+        Columns: `vla_attention.analyze.measures.aggregate` and `vla_attention.analyze.measures.steps`.
 
-        >>> run = analyze.open(store)
+        >>> run = va.open(store)
         >>> run.ratios("steps", groups={"bowl": "word:bowl", "rest": "*"}, layers=2, denoise="last").height
         12
         >>> run.ratios("episodes", grouping="cameras", tasks=0).select("task_id", "layer").unique().height
@@ -110,7 +110,7 @@ class Opened:
 
         Columns beside the identity: group, mass, fraction, keys, density, lift.
 
-        >>> masses = analyze.open(store).masses(grouping="instruction", per_head=True)
+        >>> masses = va.open(store).masses(grouping="instruction", per_head=True)
         >>> masses.group_by("group").agg(pl.col("keys").mean()).filter(group="linguistic")["keys"].to_list()
         [5.0]
         """
@@ -133,7 +133,7 @@ class Opened:
     def summary(self, **settings: Unpack[Settings]) -> str:
         """The text that `vla-analyze STORE` prints.
 
-        >>> analyze.open(store).summary().splitlines()[0]
+        >>> va.open(store).summary().splitlines()[0]
         'ATTENTION SUMMARY'
         """
         return self.analysis(**settings).summary
@@ -141,44 +141,44 @@ class Opened:
     def describe(self) -> str:
         """What the stores hold: run, layout, words, objects, tasks; the text of `vla-analyze STORE --list`.
 
-        >>> "akita_black_bowl_1" in analyze.open(store).describe()
+        >>> "akita_black_bowl_1" in va.open(store).describe()
         True
         """
-        from analyze.stores.contents import describe_store
+        from vla_attention.analyze.stores.contents import describe_store
 
         return "\n\n".join(describe_store(store) for store in self.stores)
 
     def contributions(self, **settings: Unpack[Settings]) -> pl.DataFrame:
-        """Norms of what seeing and reading add to the residual stream (`analyze.measures.contributions`), where they were recorded.
+        """Norms of what seeing and reading add to the residual stream (`vla_attention.analyze.measures.contributions`), where they were recorded.
 
-        >>> analyze.open(store).contributions(layers=0)["contribution_ratio"].is_finite().all()
+        >>> va.open(store).contributions(layers=0)["contribution_ratio"].is_finite().all()
         True
 
         Raises:
             BadArgument: the stores hold no contributions.
         """
-        from analyze.answers.export import chosen_tables
+        from vla_attention.analyze.export.tables import chosen_tables
 
         return chosen_tables(self.analysis(**settings), ["contributions"])["contributions"]
 
     def to_xarray(
         self, rows: bool = False, most_gigabytes: float = 4.0, **settings: Unpack[Settings]
     ) -> xarray.Dataset:
-        """Masses of every head as labelled arrays, or with `rows` the rows themselves; see `analyze.answers.labelled_arrays`.
+        """Masses of every head as labelled arrays, or with `rows` the rows themselves; see `vla_attention.analyze.export.labelled_arrays`.
 
         (episode, replan) is one axis `sample`. Rows that would take more memory than `most_gigabytes` are refused. Needs the extra
         `xarray`.
 
-        >>> analyze.open(store).to_xarray(grouping="cameras")["mass"].dims
+        >>> va.open(store).to_xarray(grouping="cameras")["mass"].dims
         ('sample', 'layer', 'denoise', 'head', 'group')
-        >>> analyze.open(store).to_xarray(rows=True, layers=2)["rows"].shape
+        >>> va.open(store).to_xarray(rows=True, layers=2)["rows"].shape
         (12, 1, 2, 2, 39)
 
         Raises:
             MissingDependency: xarray is not installed.
             BadArgument: the rows are larger than allowed.
         """
-        from analyze.answers.labelled_arrays import masses_array, rows_array
+        from vla_attention.analyze.export.labelled_arrays import masses_array, rows_array
 
         question = self.ask(**settings)
         return rows_array(question, int(most_gigabytes * 1e9)) if rows else masses_array(question)

@@ -52,8 +52,8 @@ print(sum(part.size for part in out))
 
 def make_store(path: Path, episodes: int, replans: int) -> None:
     """Write the store; fifty episodes take a minute or two."""
-    from tests.libero_tokens import libero_tokens
-    from tests.store_kit import StoreSpec, write_store
+    from tests.kit.libero_tokens import libero_tokens
+    from tests.kit.store_kit import StoreSpec, write_store
 
     spec = StoreSpec(
         suite="libero_10",
@@ -104,7 +104,7 @@ def main() -> None:
     print(f"{store}: {size / 1e9:.2f} GB in {sum(1 for _ in store.rglob('*'))} files; {os.cpu_count()} cores")
     weights = np.random.default_rng(0).random((978, 4)).astype(np.float32)
     np.save(scratch / "weights.npy", weights)
-    ours = [sys.executable, "-m", "analyze"]
+    ours = [sys.executable, "-m", "vla_attention.analyze"]
     rest = [str(store), "--output", str(scratch / "out")]
     cases = {
         "default": [*ours, *rest],
@@ -145,9 +145,9 @@ def span_tables(store: Path) -> None:
 
     One BLAS thread, as `vla-analyze` has it: episodes are measured by threads of its own.
     """
-    from analyze.pipeline import analyse
-    from analyze.question import AnalysisSettings, ask
-    from analyze.stores.reader import open_store
+    from vla_attention.analyze.measures.question import AnalysisSettings, ask
+    from vla_attention.analyze.ratios.analysis import analyse
+    from vla_attention.schemas.stores.reader import open_store
 
     began = time.perf_counter()
     opened = [open_store(store)]

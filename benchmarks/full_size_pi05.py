@@ -114,11 +114,11 @@ def write_checkpoint(folder: Path, checkpoint_format: str, dtype: str) -> None:
 
 def load_and_run(folder: Path, checkpoint_format: str, dtype: str) -> dict[str, float]:
     """Load the policy and run one replan with the default recording; seconds, and peak resident memory in GB."""
-    from capture.attention import AttentionRecorder, RecordingPlan
-    from capture.environments.base import Observation
-    from capture.policies.pi import loading
-    from capture.policies.pi.embedded import TOKENIZER_PATH
-    from capture.policies.pi.tokenizer import PromptTokenizer
+    from vla_attention.capture.environments.base import Observation
+    from vla_attention.capture.policies.pi import loading
+    from vla_attention.capture.policies.pi.embedded import TOKENIZER_PATH
+    from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
+    from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan
 
     class FullSizeTokenizer(PromptTokenizer):
         """The small tokenizer that comes along, passed off as PaliGemma's, which may not be handed on."""

@@ -29,9 +29,9 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from analyze.measures import aggregate
-from analyze.statistics.bootstrap import bootstrap_intervals
-from schemas.grouping import Grouping, Ratio
+from vla_attention.analyze.measures import aggregate
+from vla_attention.analyze.statistics.bootstrap import bootstrap_intervals
+from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 
 GROUPING = Grouping(
     "two", {"visual": ("role:image",), "linguistic": ("role:instruction",)}, Ratio(("visual",), ("linguistic",))
@@ -145,11 +145,11 @@ def simulate(case: Case, num_stores: int, seed: int) -> dict[tuple[str, str], fl
 
 def through_files(case: Case, num_stores: int, seed: int) -> dict[tuple[str, str], float]:
     """The same with stores that are written by the capture side's writer, read back, and analysed whole."""
-    from analyze.pipeline import analyse
-    from analyze.question import AnalysisSettings, ask
-    from analyze.stores.reader import open_store
-    from schemas.layout import Role
-    from tests.store_kit import StoreSpec, write_store
+    from tests.kit.store_kit import StoreSpec, write_store
+    from vla_attention.analyze.measures.question import AnalysisSettings, ask
+    from vla_attention.analyze.ratios.analysis import analyse
+    from vla_attention.schemas.layout import Role
+    from vla_attention.schemas.stores.reader import open_store
 
     generator = np.random.default_rng([seed, 1])
     found: dict[tuple[str, str], list[float]] = {}
@@ -199,7 +199,7 @@ def main() -> None:
         f"Coverage in % of intervals of nominal 95 %, {arguments.stores} stores of each size (standard error {error:.1f} overall)."
     )
     print(
-        "p: plain percentile interval, w: widened as in analyze.statistics.small_samples; width: mean of log(high / low), widened.\n"
+        "p: plain percentile interval, w: widened as in vla_attention.analyze.statistics.small_samples; width: mean of log(high / low), widened.\n"
     )
     print("                  differences of     one task       population     these tasks")
     print("tasks x episodes tasks episodes      p       w       p       w       p       w    width")

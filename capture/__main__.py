@@ -6,9 +6,9 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from capture.command import check_writable, run_analysis, run_capture_command
-from capture.termination import Termination
-from schemas.errors import BadArgument
+from vla_attention.capture.command import check_writable, run_analysis, run_capture_command
+from vla_attention.capture.jobs.termination import Termination
+from vla_attention.schemas.errors import BadArgument
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -18,25 +18,25 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: Sequence[str], termination: Termination) -> int:
-    from capture.arguments import build_parser
+    from vla_attention.capture.arguments import build_parser
 
     arguments = build_parser().parse_args(argv)
     if arguments.policy == "parity":
         return _parity(arguments)
     if arguments.policy == "status":
-        from capture.status import run_status
+        from vla_attention.capture.jobs.status import run_status
 
         return run_status(arguments.stores, arguments.expected, as_json=arguments.json, check=arguments.check)
     if arguments.policy == "tasks":
-        from capture.task_list import print_tasks
+        from vla_attention.capture.task_list import print_tasks
 
         return print_tasks(arguments.suite, array=arguments.array)
     return _capture(arguments, termination)
 
 
 def _capture(arguments: argparse.Namespace, termination: Termination) -> int:
-    from capture.arguments import run_settings
-    from capture.store_writer import refuse_existing
+    from vla_attention.capture.arguments import run_settings
+    from vla_attention.capture.store.store_writer import refuse_existing
 
     settings = run_settings(arguments)
     # A store in the way, or no place for one, is found before minutes are spent on loading a model.
@@ -46,9 +46,9 @@ def _capture(arguments: argparse.Namespace, termination: Termination) -> int:
     if arguments.output_dir is not None:
         check_writable(arguments.output_dir, "--output-dir")
 
-    from capture.device import choose_device
-    from capture.policy_choice import build_policy
-    from capture.run import run_capture, say
+    from vla_attention.capture.device import choose_device
+    from vla_attention.capture.policy_choice import build_policy
+    from vla_attention.capture.run import run_capture, say
 
     device = choose_device(arguments.device)
     policy = build_policy(arguments, device)
@@ -62,17 +62,17 @@ def _capture(arguments: argparse.Namespace, termination: Termination) -> int:
 
 
 def _parity(arguments: argparse.Namespace) -> int:
-    from capture.device import choose_device
-    from capture.policies.cosmos.case import case_kind
+    from vla_attention.capture.device import choose_device
+    from vla_attention.capture.policies.cosmos.case import case_kind
 
     device = choose_device(arguments.device)
     if case_kind(arguments.case) is not None:
-        from capture.policies.cosmos.parity import run_cosmos_parity
+        from vla_attention.capture.policies.cosmos.parity import run_cosmos_parity
 
         if arguments.format is not None or arguments.limit is not None:
             raise BadArgument("Cosmos cases have one format and their own limits; leave out --format and --limit.")
         return run_cosmos_parity([arguments.case], as_json=arguments.json, device=device)
-    from capture.policies.pi.parity import run_parity
+    from vla_attention.capture.policies.pi.parity import run_parity
 
     return run_parity(arguments.case, arguments.format, limit=arguments.limit, as_json=arguments.json, device=device)
 

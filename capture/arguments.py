@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from capture.environments.base import EnvironmentSettings
-from capture.environments.suites import SUITES, check_task_id, find_suite
-from capture.settings import RecordingSettings, RunSettings
-from schemas.command_line import OneSentenceParser
-from schemas.errors import BadArgument, listing
-from schemas.precision import DEFAULT_MANTISSA_BITS, parse_precision
-from schemas.store import STORE_SUFFIX
+from vla_attention.capture.environments.base import EnvironmentSettings
+from vla_attention.capture.environments.suites import SUITES, check_task_id, find_suite
+from vla_attention.capture.settings import RecordingSettings, RunSettings
+from vla_attention.schemas.command_line import OneSentenceParser
+from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.precision import DEFAULT_MANTISSA_BITS, parse_precision
+from vla_attention.schemas.stores.store_format import STORE_SUFFIX
 
 EMBEDDED = "embedded"
 DUMMY = "dummy"

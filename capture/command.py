@@ -10,10 +10,10 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from capture.job import ask_for_requeue, this_worker
-from capture.termination import EXIT_TERMINATED, Terminated, Termination, listening_for_sigterm
-from schemas.command_line import run_command
-from schemas.errors import BadArgument
+from vla_attention.capture.jobs.job import ask_for_requeue, this_worker
+from vla_attention.capture.jobs.termination import EXIT_TERMINATED, Terminated, Termination, listening_for_sigterm
+from vla_attention.schemas.command_line import run_command
+from vla_attention.schemas.errors import BadArgument
 
 
 def run_capture_command(program: str, command: Callable[[Termination], int], max_requeues: Callable[[], int]) -> int:
@@ -48,7 +48,7 @@ def check_writable(path: Path, option: str) -> None:
 
 def run_analysis(arguments: argparse.Namespace, store: Path, output: Path | None, more: Sequence[str] = ()) -> int:
     """Run stage two as a process of its own (the two stages share a store, not code); returns its exit code."""
-    command = [sys.executable, "-m", "analyze", str(store)]
+    command = [sys.executable, "-m", "vla_attention.analyze", str(store)]
     if output is not None:
         command += ["--output", str(output)]
     if arguments.save_viz:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument
 
 
 def choose_device(name: str) -> str:

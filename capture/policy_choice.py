@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 
-from capture.policies.base import Policy
+from vla_attention.capture.policies.base import Policy
 
 
 def build_policy(arguments: argparse.Namespace, device: str) -> Policy:
     """Build the policy of `vla-capture pi` or `vla-capture cosmos` on a device."""
     if arguments.policy == "cosmos":
-        from capture.policies.cosmos.build import build_cosmos_policy
-        from capture.policies.cosmos.config import DEFAULT_CONFIG_NAME
+        from vla_attention.capture.policies.cosmos.build import build_cosmos_policy
+        from vla_attention.capture.policies.cosmos.config import DEFAULT_CONFIG_NAME
 
         return build_cosmos_policy(
             arguments.checkpoint,
@@ -32,7 +32,7 @@ def build_policy(arguments: argparse.Namespace, device: str) -> Policy:
             prefer_s=arguments.prefer_s,
             prefer_call=arguments.prefer_call,
         )
-    from capture.policies.pi.build import build_pi_policy
+    from vla_attention.capture.policies.pi.build import build_pi_policy
 
     return build_pi_policy(
         arguments.checkpoint,

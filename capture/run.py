@@ -7,21 +7,21 @@ from typing import Literal, cast
 
 import numpy as np
 
-from capture.disk_estimate import describe, estimate_disk
-from capture.environments.suites import check_initial_state_index, list_tasks
-from capture.episode_loop import EpisodeLoop, say
-from capture.job import this_worker
-from capture.machine import describe_machine
-from capture.policies.base import Policy
-from capture.policies.identity import identify
-from capture.rollout import EpisodeResult, check_protocol, max_replans
-from capture.run_records import PlannedTask, RecordKeeper, forget_runs, planned_tasks, read_records
-from capture.settings import RecordingSettings, RunSettings
-from capture.store_writer import RunStore, open_run
-from capture.termination import Termination
-from schemas.errors import BadArgument, listing
-from schemas.layers import select_layers
-from schemas.store import FORMAT_NAME, FORMAT_VERSION, Protocol, Recording, RootAttributes
+from vla_attention.capture.environments.suites import check_initial_state_index, list_tasks
+from vla_attention.capture.jobs.job import this_worker
+from vla_attention.capture.jobs.run_records import PlannedTask, RecordKeeper, forget_runs, planned_tasks, read_records
+from vla_attention.capture.jobs.termination import Termination
+from vla_attention.capture.machine import describe_machine
+from vla_attention.capture.policies.base import Policy
+from vla_attention.capture.policies.identity import identify
+from vla_attention.capture.recording.episode_loop import EpisodeLoop, say
+from vla_attention.capture.recording.rollout import EpisodeResult, check_protocol, max_replans
+from vla_attention.capture.settings import RecordingSettings, RunSettings
+from vla_attention.capture.store.disk_estimate import describe, estimate_disk
+from vla_attention.capture.store.store_writer import RunStore, open_run
+from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.layers import select_layers
+from vla_attention.schemas.stores.store_format import FORMAT_NAME, FORMAT_VERSION, Protocol, Recording, RootAttributes
 
 _QUERIES = {"mean": "the mean over", "steps": "the action steps' means over", "all": "each of"}
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capture.environments.base import EnvironmentSettings
-from capture.environments.suites import Suite
+from vla_attention.capture.environments.base import EnvironmentSettings
+from vla_attention.capture.environments.suites import Suite
 
 if TYPE_CHECKING:
-    from capture.store_writer import WriteMode
+    from vla_attention.capture.store.store_writer import WriteMode
 
 
 @dataclass(frozen=True)

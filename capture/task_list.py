@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from capture.environments.base import EnvironmentSettings
-from capture.environments.suites import find_suite, list_tasks
-from schemas.errors import BadArgument
+from vla_attention.capture.environments.base import EnvironmentSettings
+from vla_attention.capture.environments.suites import find_suite, list_tasks
+from vla_attention.schemas.errors import BadArgument
 
 
 def print_tasks(suite_name: str, array: bool) -> int:
     """Print a line per task, or with `array` only the range of ids (which needs no simulator: login nodes have none)."""
-    from capture.arguments import ALL_SUITES, STANDARD_SUITES
+    from vla_attention.capture.arguments import ALL_SUITES, STANDARD_SUITES
 
     if array:
         names = STANDARD_SUITES if suite_name == ALL_SUITES else (suite_name,)

@@ -1,1 +1,1 @@
-"""The contract between the two stages: token layout, groupings, store, results. numpy at most; no torch, no zarr I/O."""
+"""The contract between the two stages: token layout, groupings, store, results. No torch; zarr only where stores are read."""

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from typing import NoReturn
 
-from schemas.errors import UserError
+from vla_attention.schemas.errors import UserError
 
 
 class OneSentenceParser(argparse.ArgumentParser):

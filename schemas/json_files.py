@@ -1,4 +1,4 @@
-"""The JSON Schema files in `schemas/json/`, made from the dataclasses: `python -m schemas.json_files` writes them anew."""
+"""The JSON Schema files in `schemas/json/`, made from the dataclasses: `python -m vla_attention.schemas.json_files` writes them anew."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-from schemas.grouping import GroupingFile
-from schemas.jsonable import json_schema
-from schemas.results import EpisodeResult
-from schemas.store import EpisodeAttributes, RootAttributes
+from vla_attention.schemas.groupings.grouping import GroupingFile
+from vla_attention.schemas.jsonable import json_schema
+from vla_attention.schemas.results import EpisodeResult
+from vla_attention.schemas.stores.store_format import EpisodeAttributes, RootAttributes
 
 FOLDER = Path(__file__).parent / "json"
 

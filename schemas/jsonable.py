@@ -14,7 +14,7 @@ import typing
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
-from schemas.errors import UserError, did_you_mean, listing
+from vla_attention.schemas.errors import UserError, did_you_mean, listing
 
 T = TypeVar("T")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from schemas.errors import BadArgument, listing
+from vla_attention.schemas.errors import BadArgument, listing
 
 #: Policy families whose published scripts number attention calls instead of blocks.
 CALL_NUMBERED_FAMILIES = ("pi0", "pi05")

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.errors import BadArgument, unknown_name
+from vla_attention.schemas.errors import BadArgument, unknown_name
 
 SiteName = Literal["joint", "self", "cross"]
 SpanKind = Literal["image", "text", "state", "action", "latent"]

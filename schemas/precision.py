@@ -11,7 +11,7 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument
 
 #: Explicit mantissa bits of float32; keeping all of them is "exact".
 FLOAT32_MANTISSA_BITS = 23

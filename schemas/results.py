@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from schemas.errors import UserError
+from vla_attention.schemas.errors import UserError
 
 RESULTS_PREFIX = "attention_ratio_results_"
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.layout import Role, SiteLayout
+from vla_attention.schemas.layout import Role, SiteLayout
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""From rows and groups to masses, ratios and contribution norms, as tables of steps, replans, episodes and tasks."""
+"""From a question to tables: masses, aggregation over replans and episodes, contribution norms, sinks, maps of patches."""

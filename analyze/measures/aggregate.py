@@ -17,7 +17,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from analyze.statistics.bootstrap import (
+from vla_attention.analyze.statistics.bootstrap import (
     DEFAULT_LEVEL,
     DEFAULT_RESAMPLES,
     DEFAULT_SEED,
@@ -32,7 +32,7 @@ from analyze.statistics.bootstrap import (
     resample_episodes,
     summarize,
 )
-from schemas.grouping import Grouping
+from vla_attention.schemas.groupings.grouping import Grouping
 
 LAYERS_AVG = "layers_avg"
 #: What makes an episode one; the rest of these columns is constant inside it.

@@ -16,16 +16,16 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from analyze.measures.aggregate import LAYERS_AVG
-from analyze.measures.masses import ratio
-from analyze.output.summary import WIDTH
-from analyze.output.text_table import format_interval, format_number, text_table
-from analyze.statistics.bootstrap import POSITIVE, bootstrap_interval, mean_over_episodes
-from analyze.stores.parallel import map_episodes
-from analyze.stores.reader import Store, StoredEpisode
-from analyze.stores.selection import Selection
-from schemas.segments import Segment
-from schemas.store import RootAttributes
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG
+from vla_attention.analyze.measures.masses import ratio
+from vla_attention.analyze.ratios.summary import WIDTH
+from vla_attention.analyze.show.text_table import format_interval, format_number, text_table
+from vla_attention.analyze.statistics.bootstrap import POSITIVE, bootstrap_interval, mean_over_episodes
+from vla_attention.analyze.stores.parallel import map_episodes
+from vla_attention.analyze.stores.selection import Selection
+from vla_attention.schemas.segments import Segment
+from vla_attention.schemas.stores.reader import Store, StoredEpisode
+from vla_attention.schemas.stores.store_format import RootAttributes
 
 #: Roles on each side of the headline: what is seen now, and what is read.
 VISUAL_ROLES = ("image",)

@@ -13,20 +13,20 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from analyze.measures.aggregate import LAYERS_AVG
-from analyze.measures.contributions import joint_norm, selected_gram
-from analyze.measures.masses import ratio
-from analyze.measures.tables import SelectedEpisode
-from analyze.output.summary import WIDTH
-from analyze.output.text_table import format_interval, format_number, text_table
-from analyze.question import Question
-from analyze.statistics.bootstrap import POSITIVE
-from analyze.statistics.episode_intervals import means_with_intervals
-from analyze.stores.parallel import map_episodes
-from schemas.errors import listing
-from schemas.grouping import Grouping
-from schemas.resolve import ResolvedGrouping
-from schemas.segments import segment_members, weights_on_segments
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG
+from vla_attention.analyze.measures.contributions import joint_norm, selected_gram
+from vla_attention.analyze.measures.masses import ratio
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.steps import SelectedEpisode
+from vla_attention.analyze.ratios.summary import WIDTH
+from vla_attention.analyze.show.text_table import format_interval, format_number, text_table
+from vla_attention.analyze.statistics.bootstrap import POSITIVE
+from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
+from vla_attention.analyze.stores.parallel import map_episodes
+from vla_attention.schemas.errors import listing
+from vla_attention.schemas.groupings.grouping import Grouping
+from vla_attention.schemas.groupings.resolve import ResolvedGrouping
+from vla_attention.schemas.segments import segment_members, weights_on_segments
 
 _EPISODE = ("suite", "task_id", "episode_index")
 

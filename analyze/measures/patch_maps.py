@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from analyze.measures.tables import SelectedEpisode
-from analyze.stores.rows import layer_rows
-from analyze.stores.selection import Selection
-from schemas.layout import Role
+from vla_attention.analyze.measures.steps import SelectedEpisode
+from vla_attention.analyze.stores.rows import layer_rows
+from vla_attention.analyze.stores.selection import Selection
+from vla_attention.schemas.layout import Role
 
 
 def seen_cameras(item: SelectedEpisode) -> tuple[str, ...]:

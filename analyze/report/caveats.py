@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from analyze.measures.aggregate import overall_layer, overall_rows
-from analyze.output.summary import FEW_EPISODES, LINGUISTIC_BELOW, VISUAL_ABOVE, verdict
-from analyze.output.text_table import format_number
-from analyze.pipeline import Analysis
-from analyze.plots.style import plural
-from analyze.question import Question
-from schemas.errors import listing
-from schemas.grouping import Grouping
-from schemas.layout import Role
-from schemas.precision import FLOAT32_MANTISSA_BITS, mass_error_bound
+from vla_attention.analyze.measures.aggregate import overall_layer, overall_rows
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.ratios.analysis import Analysis
+from vla_attention.analyze.ratios.summary import FEW_EPISODES, LINGUISTIC_BELOW, VISUAL_ABOVE, verdict
+from vla_attention.analyze.show.plot_style import plural
+from vla_attention.analyze.show.text_table import format_number
+from vla_attention.schemas.errors import listing
+from vla_attention.schemas.groupings.grouping import Grouping
+from vla_attention.schemas.layout import Role
+from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, mass_error_bound
 
 #: Less than this share of attention is not worth a sentence.
 _WORTH_SAYING = 0.005

@@ -7,7 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 import polars as pl
 
-from analyze.answers.overlay_data import (
+from vla_attention.analyze.measures.patch_maps import seen_cameras
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.steps import SelectedEpisode
+from vla_attention.analyze.overlay.overlay_data import (
     EpisodeOverlay,
     camera_names,
     chosen_replans,
@@ -15,15 +18,12 @@ from analyze.answers.overlay_data import (
     episode_overlay,
     orientation_note,
 )
-from analyze.answers.overlays import Scale, color_bar, scale_for, upright
-from analyze.measures.patch_maps import seen_cameras
-from analyze.measures.tables import SelectedEpisode
-from analyze.output.terminal import progress_bar
-from analyze.output.text_table import format_number
-from analyze.question import Question
-from analyze.report.markup import paragraph, text
-from analyze.report.pictures import photograph, png_uri
-from analyze.report.sections import Section
+from vla_attention.analyze.report.markup import paragraph, text
+from vla_attention.analyze.report.pictures import photograph, png_uri
+from vla_attention.analyze.report.sections import Section
+from vla_attention.analyze.show.patch_pictures import Scale, color_bar, scale_for, upright
+from vla_attention.analyze.show.progress import progress_bar
+from vla_attention.analyze.show.text_table import format_number
 
 #: Pixels of the longer side of a camera picture in the page.
 LARGEST_SIDE = 224

@@ -10,16 +10,20 @@ from string import Template
 
 import polars as pl
 
-from analyze.measures.aggregate import overall_layer, overall_rows
-from analyze.metrics.sinks import merged_sinks, sinks_table
-from analyze.output.terminal import progress_bar
-from analyze.pipeline import Analysis
-from analyze.plots.style import plural
-from analyze.report.caveats import Caveat, caveats, role_shares
-from analyze.report.further import layer_figures, object_section, sink_section, time_section, word_section
-from analyze.report.markup import text
-from analyze.report.overlay_section import overlay_section
-from analyze.report.sections import (
+from vla_attention.analyze.measures.aggregate import overall_layer, overall_rows
+from vla_attention.analyze.measures.sinks import merged_sinks, sinks_table
+from vla_attention.analyze.ratios.analysis import Analysis
+from vla_attention.analyze.report.caveats import Caveat, caveats, role_shares
+from vla_attention.analyze.report.markup import text
+from vla_attention.analyze.report.overlay_section import overlay_section
+from vla_attention.analyze.report.question_sections import (
+    layer_figures,
+    object_section,
+    sink_section,
+    time_section,
+    word_section,
+)
+from vla_attention.analyze.report.sections import (
     Section,
     caveat_section,
     contribution_section,
@@ -29,6 +33,8 @@ from analyze.report.sections import (
     run_section,
     task_section,
 )
+from vla_attention.analyze.show.plot_style import plural
+from vla_attention.analyze.show.progress import progress_bar
 
 DEFAULT_EPISODES, DEFAULT_REPLANS = 4, 24
 
@@ -118,7 +124,7 @@ def assemble(analysis: Analysis, sections: Sequence[Section]) -> str:
 
 
 def _resource(name: str) -> str:
-    return resources.files("analyze.report").joinpath(name).read_text(encoding="utf-8")
+    return resources.files("vla_attention.analyze.report").joinpath(name).read_text(encoding="utf-8")
 
 
 def _version() -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from analyze.report.markup import data_uri, text
+from vla_attention.analyze.report.markup import data_uri, text
 
 #: A table larger than this stays out of the page; the command that draws the picture writes it into a file.
 MOST_DATA_BYTES = 200_000

@@ -9,15 +9,14 @@ from pathlib import Path
 
 import polars as pl
 
-from analyze.measures.aggregate import LAYERS_AVG, layer_order, overall_layer, overall_rows
-from analyze.measures.contributions import contribution_rows
-from analyze.output.text_table import format_interval, format_number
-from analyze.pipeline import Analysis, describe_heads
-from analyze.plots.attention_fractions import plot_attention_fractions
-from analyze.plots.ratio_distribution import plot_ratio_distribution
-from analyze.plots.ratio_per_task import plot_ratio_per_task
-from analyze.report.caveats import Caveat, verdict_sentence
-from analyze.report.markup import (
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG, layer_order, overall_layer, overall_rows
+from vla_attention.analyze.measures.contributions import contribution_rows
+from vla_attention.analyze.ratios.analysis import Analysis, describe_heads
+from vla_attention.analyze.ratios.plot_attention_fractions import plot_attention_fractions
+from vla_attention.analyze.ratios.plot_ratio_distribution import plot_ratio_distribution
+from vla_attention.analyze.ratios.plot_ratio_per_task import plot_ratio_per_task
+from vla_attention.analyze.report.caveats import Caveat, verdict_sentence
+from vla_attention.analyze.report.markup import (
     Cell,
     attribute,
     interval_cell,
@@ -29,11 +28,12 @@ from analyze.report.markup import (
     text,
     text_cell,
 )
-from analyze.report.pictures import drawn
-from analyze.statistics.bootstrap import DEFAULT_RESAMPLES
-from schemas.errors import listing
-from schemas.jsonable import to_json
-from schemas.precision import FLOAT32_MANTISSA_BITS
+from vla_attention.analyze.report.pictures import drawn
+from vla_attention.analyze.show.text_table import format_interval, format_number
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_RESAMPLES
+from vla_attention.schemas.errors import listing
+from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
 
 
 @dataclass(frozen=True)
@@ -377,5 +377,5 @@ def method_section() -> Section:
     return Section(
         "methods",
         "How it is computed",
-        resources.files("analyze.report").joinpath("methods.html").read_text(encoding="utf-8"),
+        resources.files("vla_attention.analyze.report").joinpath("methods.html").read_text(encoding="utf-8"),
     )

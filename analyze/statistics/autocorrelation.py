@@ -16,8 +16,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import ArrayLike, NDArray
 
-from analyze.measures.aggregate import EPISODE_KEYS
-from schemas.grouping import Grouping
+from vla_attention.analyze.measures.aggregate import EPISODE_KEYS
+from vla_attention.schemas.groupings.grouping import Grouping
 
 #: With fewer replans than this, there is no pair of lags to look at.
 FEWEST = 4

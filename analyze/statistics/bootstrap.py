@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analyze.statistics.small_samples import widen, widening
+from vla_attention.analyze.statistics.small_samples import widen, widening
 
 DEFAULT_RESAMPLES = 2000
 DEFAULT_LEVEL = 0.95

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analyze.statistics.bootstrap import NO_LIMITS, Interval, Resamples, interval_of_values
+from vla_attention.analyze.statistics.bootstrap import NO_LIMITS, Interval, Resamples, interval_of_values
 
 #: Fewer episodes than this of one outcome are no basis for a comparison.
 FEWEST = 2

@@ -7,7 +7,7 @@ from typing import Any
 
 import polars as pl
 
-from analyze.statistics.bootstrap import (
+from vla_attention.analyze.statistics.bootstrap import (
     DEFAULT_LEVEL,
     DEFAULT_RESAMPLES,
     DEFAULT_SEED,
@@ -28,7 +28,7 @@ def means_with_intervals(
     level: float = DEFAULT_LEVEL,
     num_resamples: int = DEFAULT_RESAMPLES,
 ) -> pl.DataFrame:
-    """Mean over episodes of each value, with the two-level interval of `analyze.statistics.bootstrap`, for every thing.
+    """Mean over episodes of each value, with the two-level interval of `vla_attention.analyze.statistics.bootstrap`, for every thing.
 
     A thing that only some episodes have is about these: tasks and episodes are drawn from them alone. Values that are null or
     not finite take no part in their mean.

@@ -1,1 +1,1 @@
-"""Stores on disk: reading, selecting, verifying, copying, describing. Zarr is touched nowhere else."""
+"""Stored episodes as an analysis takes them: selected, read row by row, described."""

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from analyze.stores.reader import Store, StoredEpisode
-from analyze.stores.selection import select_episodes
-from schemas.errors import listing
-from schemas.layers import block_of_labels
-from schemas.layout import Role, Span
-from schemas.precision import FLOAT32_MANTISSA_BITS, mass_error_bound
-from schemas.selectors import SELECTOR_KINDS
-from schemas.vocabulary import EpisodeTokens, collect_vocabulary
+from vla_attention.analyze.stores.selection import select_episodes
+from vla_attention.schemas.errors import listing
+from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vocabulary
+from vla_attention.schemas.layers import block_of_labels
+from vla_attention.schemas.layout import Role, Span
+from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, mass_error_bound
+from vla_attention.schemas.stores.reader import Store, StoredEpisode
 
 
 def describe_store(store: Store, tasks: Sequence[int] | None = None) -> str:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analyze.stores.reader import StoredEpisode
-from analyze.stores.selection import Selection
+from vla_attention.analyze.stores.selection import Selection
+from vla_attention.schemas.stores.reader import StoredEpisode
 
 
 @dataclass(frozen=True)

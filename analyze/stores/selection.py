@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from analyze.stores.reader import Store, StoredEpisode
-from schemas.errors import BadArgument, listing, unknown_name
-from schemas.layers import LayerSelection, block_of_labels, select_layers
-from schemas.store import RootAttributes, StoreError, parse_episode_name
+from vla_attention.schemas.errors import BadArgument, listing, unknown_name
+from vla_attention.schemas.layers import LayerSelection, block_of_labels, select_layers
+from vla_attention.schemas.stores.reader import Store, StoredEpisode
+from vla_attention.schemas.stores.store_format import RootAttributes, StoreError, parse_episode_name
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.vocabulary import SceneObject
+from vla_attention.schemas.groupings.vocabulary import SceneObject
 
 ROBOT = "robot"
 """Name of the one scene object that is the arm, its gripper and its mount."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument
 
 
 def overlap_lengths(pixels: int, cells: int, visible: float = 1.0) -> NDArray[np.float64]:

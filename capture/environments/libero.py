@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.environments.base import ROBOT, EnvironmentSettings, SceneObject, Task
-from capture.environments.libero_installation import find_assets, load_libero, package_folder
-from capture.environments.simulator import SimulatedEnvironment
-from capture.environments.suites import Suite
-from schemas.errors import BadArgument
+from vla_attention.capture.environments.base import ROBOT, EnvironmentSettings, SceneObject, Task
+from vla_attention.capture.environments.libero_installation import find_assets, load_libero, package_folder
+from vla_attention.capture.environments.simulator import SimulatedEnvironment
+from vla_attention.capture.environments.suites import Suite
+from vla_attention.schemas.errors import BadArgument
 
 
 def load_initial_states(path: Path) -> NDArray[np.float64]:

@@ -21,10 +21,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from capture.environments.base import Task
-from capture.environments.simulator import import_robosuite, readable_device_choice
-from capture.environments.suites import Suite
-from schemas.errors import MissingDependency, UserError
+from vla_attention.capture.environments.base import Task
+from vla_attention.capture.environments.simulator import import_robosuite, readable_device_choice
+from vla_attention.capture.environments.suites import Suite
+from vla_attention.schemas.errors import MissingDependency, UserError
 
 ASSETS_VARIABLE = "VLA_LIBERO_ASSETS"
 ASSETS_SOURCE = "lerobot/libero-assets"

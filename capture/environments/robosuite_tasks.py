@@ -11,10 +11,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from capture.environments.base import ROBOT, Task
-from capture.environments.simulator import SimulatedEnvironment
-from capture.environments.suites import Suite
-from schemas.vocabulary import ObjectKind, SceneObject
+from vla_attention.capture.environments.base import ROBOT, Task
+from vla_attention.capture.environments.simulator import SimulatedEnvironment
+from vla_attention.capture.environments.suites import Suite
+from vla_attention.schemas.groupings.vocabulary import ObjectKind, SceneObject
 
 
 @dataclass(frozen=True)

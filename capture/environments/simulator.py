@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.environments.base import (
+from vla_attention.capture.environments.base import (
     BACKGROUND,
     ROBOT,
     EnvironmentSettings,
@@ -31,8 +31,8 @@ from capture.environments.base import (
     StepResult,
     Task,
 )
-from capture.environments.suites import Suite, check_initial_state_index
-from schemas.errors import BadArgument, MissingDependency, unknown_name
+from vla_attention.capture.environments.suites import Suite, check_initial_state_index
+from vla_attention.schemas.errors import BadArgument, MissingDependency, unknown_name
 
 CAMERAS = ("agentview", "robot0_eye_in_hand")
 ACTION_SIZE = 7
@@ -223,7 +223,7 @@ class SimulatedEnvironment:
             self._set_initial_state(initial_state_index)
         import mujoco
 
-        from capture.environments.segmentation import owners_of_bodies
+        from vla_attention.capture.environments.segmentation import owners_of_bodies
 
         model = self._simulator.sim.model
         self._digest = hashlib.sha256(self._flat_state().tobytes()).hexdigest()
@@ -293,7 +293,7 @@ class SimulatedEnvironment:
 
     def segmentation(self, camera: str) -> NDArray[np.int32]:
         """Return the object of every pixel of the last picture; see `Environment.segmentation`."""
-        from capture.environments.segmentation import draw_object_indices
+        from vla_attention.capture.environments.segmentation import draw_object_indices
 
         if camera not in self.cameras:
             raise unknown_name("camera", camera, self.cameras)

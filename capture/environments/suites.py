@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from capture.environments.base import Environment, EnvironmentSettings, Task
-from schemas.errors import BadArgument, unknown_name
+from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Task
+from vla_attention.schemas.errors import BadArgument, unknown_name
 
 
 @dataclass(frozen=True)
@@ -60,10 +60,10 @@ def check_initial_state_index(task: Task, index: int) -> None:
 def list_tasks(suite: Suite, settings: EnvironmentSettings) -> tuple[Task, ...]:
     """Return the suite's tasks in order. Reads names only: no simulator, no assets, no torch."""
     if suite.kind == "libero":
-        from capture.environments.libero_installation import list_libero_tasks
+        from vla_attention.capture.environments.libero_installation import list_libero_tasks
 
         return list_libero_tasks(suite)
-    from capture.environments.robosuite_tasks import list_robosuite_tasks
+    from vla_attention.capture.environments.robosuite_tasks import list_robosuite_tasks
 
     return list_robosuite_tasks(suite)
 
@@ -75,9 +75,9 @@ def make_environment(suite: Suite, task_id: int, settings: EnvironmentSettings) 
         raise BadArgument(f"The image size is {settings.image_size}; it must be at least 1 pixel (published: 256).")
     task = list_tasks(suite, settings)[task_id]
     if suite.kind == "libero":
-        from capture.environments.libero import LiberoEnvironment
+        from vla_attention.capture.environments.libero import LiberoEnvironment
 
         return LiberoEnvironment(suite, task, settings)
-    from capture.environments.robosuite_tasks import RobosuiteEnvironment
+    from vla_attention.capture.environments.robosuite_tasks import RobosuiteEnvironment
 
     return RobosuiteEnvironment(suite, task, settings)

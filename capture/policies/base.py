@@ -16,10 +16,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from capture.attention import RowCollector
-from capture.environments.base import Observation
-from schemas.errors import unknown_name
-from schemas.layout import PatchGrid, Prompt, SiteLayout
+from vla_attention.capture.environments.base import Observation
+from vla_attention.capture.recording.attention import RowCollector
+from vla_attention.schemas.errors import unknown_name
+from vla_attention.schemas.layout import PatchGrid, Prompt, SiteLayout
 
 
 @dataclass(frozen=True)

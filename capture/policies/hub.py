@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from schemas.errors import MissingDependency, UserError
+from vla_attention.schemas.errors import MissingDependency, UserError
 
 #: `ORG/NAME`.
 HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")

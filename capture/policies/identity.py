@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from capture.policies.base import Policy
-from schemas.store import PolicyCameraView, PolicyIdentity
+from vla_attention.capture.policies.base import Policy
+from vla_attention.schemas.stores.store_format import PolicyCameraView, PolicyIdentity
 
 #: Named fields of `PolicyIdentity`, or facts of the machine and not of the policy.
 _NOT_CONFIG = ("policy", "family", "checkpoint", "checkpoint_format", "weights_digest", "untrained", "device")

@@ -13,20 +13,20 @@ import pytest
 import zarr
 from polars.testing import assert_frame_equal
 
-import analyze
-import analyze.api
-import analyze.keywords
-import analyze.opened
-from analyze.__main__ import main
-from analyze.api import OpenStores
-from analyze.keywords import Settings, analysis_settings
-from analyze.question import AnalysisSettings
-from schemas.errors import BadArgument
-from schemas.precision import mass_error_bound
-from schemas.store import StoreError, StoreNotFound
-from tests.store_kit import small_layout, write_store
+import vla_attention as va
+import vla_attention.analyze.api
+import vla_attention.analyze.measures.settings
+import vla_attention.analyze.opened
+from tests.kit.store_kit import small_layout, write_store
+from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.api import OpenStores
+from vla_attention.analyze.measures.question import AnalysisSettings
+from vla_attention.analyze.measures.settings import Settings, analysis_settings
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.precision import mass_error_bound
+from vla_attention.schemas.stores.store_format import StoreError, StoreNotFound
 
-MODULES = (analyze, analyze.api, analyze.opened, analyze.keywords)
+MODULES = (va, vla_attention.analyze.api, vla_attention.analyze.opened, vla_attention.analyze.measures.settings)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def other(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(store) -> OpenStores:
-    return analyze.open(store)
+    return va.open(store)
 
 
 def examples(module: ModuleType) -> list[doctest.DocTest]:
@@ -54,7 +54,7 @@ def examples(module: ModuleType) -> list[doctest.DocTest]:
     ids=lambda test: test.name,
 )
 def test_examples(test, store, other, tmp_path):
-    test.globs.update(store=store, other=other, folder=tmp_path, analyze=analyze, pl=pl)
+    test.globs.update(store=store, other=other, folder=tmp_path, va=va, pl=pl)
     result = doctest.DocTestRunner(verbose=False).run(test)
     assert result.failed == 0
     assert result.attempted > 0
@@ -87,10 +87,12 @@ def test_masses_in_long_form_are_sums_over_the_raw_rows(run, store):
 
 
 def test_answers_are_kept_and_the_oldest_go(store, monkeypatch):
-    run = analyze.open(store)
+    run = va.open(store)
     asked = []
-    real = analyze.opened.analyse
-    monkeypatch.setattr(analyze.opened, "analyse", lambda question: (asked.append(question), real(question))[1])
+    real = vla_attention.analyze.opened.analyse
+    monkeypatch.setattr(
+        vla_attention.analyze.opened, "analyse", lambda question: (asked.append(question), real(question))[1]
+    )
     run.ratios("tasks")
     run.ratios("episodes")
     run.summary()
@@ -137,7 +139,7 @@ def test_keywords_are_the_settings_of_the_commands():
         (lambda run: run.ratios(ratio=("a", "b", "c")), r"expected 'A,B/C' or a pair"),
         (lambda run: run.ratios(layers=1), r"were not recorded"),
         (lambda run: run.to_xarray(rows=True, most_gigabytes=1e-6), r"more than the 1 kB"),
-        (lambda run: analyze.open([]), r"No store was given"),
+        (lambda run: va.open([]), r"No store was given"),
     ],
 )
 def test_mistakes_say_what_exists(run, call, message):
@@ -146,15 +148,15 @@ def test_mistakes_say_what_exists(run, call, message):
 
 
 def test_stores_are_opened_by_path_text_or_several(store, other, tmp_path):
-    assert analyze.open(str(store)).episodes.height == 4
+    assert va.open(str(store)).episodes.height == 4
     second = write_store(tmp_path / "second.zarr", suite="second", contributions=True)
-    both = analyze.open([store, second])
+    both = va.open([store, second])
     assert both.episodes["suite"].unique().sort().to_list() == ["made_up", "second"]
     assert both.ratios()["scope"].unique().sort().to_list() == ["all", "combined", "task"]
     with pytest.raises(StoreNotFound):
-        analyze.open(tmp_path / "absent.zarr")
+        va.open(tmp_path / "absent.zarr")
     with pytest.raises(StoreError, match="both hold"):
-        analyze.open([store, other])
+        va.open([store, other])
 
 
 def test_what_it_is_can_be_seen(run, store):
@@ -165,7 +167,7 @@ def test_what_it_is_can_be_seen(run, store):
 
 
 def test_an_empty_store_can_be_opened_and_says_that_it_is_empty(tmp_path):
-    run = analyze.open(write_store(tmp_path / "a.zarr", tasks=()))
+    run = va.open(write_store(tmp_path / "a.zarr", tasks=()))
     assert run.episodes.height == 0
     assert "0 episodes" in repr(run)
     with pytest.raises(StoreError, match="no complete episode"):
@@ -173,7 +175,7 @@ def test_an_empty_store_can_be_opened_and_says_that_it_is_empty(tmp_path):
 
 
 def test_the_guides_examples(tmp_path, monkeypatch):
-    guide = Path(analyze.__file__).parents[1] / "docs" / "python.md"
+    guide = Path(__file__).parents[2] / "docs" / "python.md"
     (tmp_path / "runs").mkdir()
     write_store(tmp_path / "runs" / "libero_10.zarr", suite="libero_10")
     monkeypatch.chdir(tmp_path)

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from analyze.commands import COMMANDS
+from vla_attention.analyze.commands import COMMANDS
 
 #: Each takes a tenth of a second or more to import.
 HEAVY = ("numpy", "polars", "zarr", "matplotlib", "tqdm", "xarray", "pandas", "torch")
@@ -26,9 +26,9 @@ assert not heavy, heavy
 @pytest.mark.parametrize(
     ("module", "words"),
     [
-        ("analyze.results.parse_results", ["--help"]),
-        ("analyze", ["--help"]),
-        *(("analyze", [command, "--help"]) for command in COMMANDS),
+        ("vla_attention.analyze.published.command", ["--help"]),
+        ("vla_attention.analyze", ["--help"]),
+        *(("vla_attention.analyze", [command, "--help"]) for command in COMMANDS),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else value,
 )
@@ -41,6 +41,6 @@ def test_help_imports_no_library(module, words):
 
 
 def test_importing_the_package_imports_no_library():
-    code = f"import sys, analyze; print([name for name in {HEAVY!r} if name in sys.modules], analyze.open)"
+    code = f"import sys, vla_attention as va; print([name for name in {HEAVY!r} if name in sys.modules], va.open)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.startswith("[] <function open")

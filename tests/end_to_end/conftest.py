@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from capture.__main__ import main as capture
+from vla_attention.capture.__main__ import main as capture
 
 #: The policy of test size gives four actions a call.
 DUMMY = ("pi", "--checkpoint", "dummy", "--replan-steps", "4", "--max-steps", "12")

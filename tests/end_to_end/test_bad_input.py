@@ -7,8 +7,8 @@ import shutil
 
 import pytest
 
-from analyze.__main__ import main as analyze
-from capture.__main__ import main as capture
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.capture.__main__ import main as capture
 
 DUMMY = ["pi", "--checkpoint", "dummy", "--replan-steps", "4"]
 

@@ -14,8 +14,8 @@ import pytest
 import xarray as xr
 import zarr
 
-from analyze.__main__ import main as analyze
-from capture.__main__ import main as capture
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.capture.__main__ import main as capture
 
 pytestmark = pytest.mark.simulator
 
@@ -274,7 +274,7 @@ def test_capture_is_interrupted_cleanly(monkeypatch, tmp_path, capsys):
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("capture.episode_loop.run_episode", interrupt)
+    monkeypatch.setattr("vla_attention.capture.recording.episode_loop.run_episode", interrupt)
     code = capture(
         ["pi", "--checkpoint", "dummy", "--replan-steps", "4", "--task-id", "0", "--store", str(tmp_path / "a.zarr")]
     )

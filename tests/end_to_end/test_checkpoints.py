@@ -11,11 +11,11 @@ import pytest
 import zarr
 from safetensors.torch import load_file, save_file
 
-from analyze.__main__ import main as analyze
-from capture.__main__ import main as capture
-from capture.policies.pi.embedded import TOKENIZER_PATH
-from schemas.errors import listing
-from tests.small_tokenizer import train_small_tokenizer
+from tests.kit.small_tokenizer import train_small_tokenizer
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.capture.__main__ import main as capture
+from vla_attention.capture.policies.pi.embedded import TOKENIZER_PATH
+from vla_attention.schemas.errors import listing
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "pi"
 #: folder -> what the manifest says of it: format, prompt, normalisation, executed actions
@@ -83,7 +83,7 @@ def test_a_checkpoint_drives_the_simulator_and_its_store_is_analysed(name, small
 
 
 def test_the_three_formats_of_one_model_have_one_digest(small_tokenizer):
-    from capture.policies.pi.loading import load_pi_policy
+    from vla_attention.capture.policies.pi.loading import load_pi_policy
 
     digests = {
         load_pi_policy(GOLDEN / name, small_tokenizer).provenance()["weights_digest"]

@@ -9,8 +9,8 @@ import polars as pl
 import pytest
 import zarr
 
-from analyze.__main__ import main as analyze
-from capture.__main__ import main as capture
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.capture.__main__ import main as capture
 
 pytestmark = pytest.mark.simulator
 

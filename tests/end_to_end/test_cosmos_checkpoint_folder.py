@@ -16,14 +16,14 @@ import pytest
 import torch
 import zarr
 
-from analyze.__main__ import main as analyze
-from capture.__main__ import main as capture
-from capture.environments.base import EnvironmentSettings
-from capture.environments.suites import find_suite, list_tasks
-from capture.policies.cosmos.config import CosmosConfig, DitConfig, VaeConfig
-from capture.policies.cosmos.dummy_folder import WEIGHTS_NAME, write_dummy_folder
-from capture.policies.cosmos.embedded import DUMMY_CONFIG
-from capture.policies.cosmos.locate import EMBEDDINGS_NAME, STATISTICS_NAME
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.capture.__main__ import main as capture
+from vla_attention.capture.environments.base import EnvironmentSettings
+from vla_attention.capture.environments.suites import find_suite, list_tasks
+from vla_attention.capture.policies.cosmos.config import CosmosConfig, DitConfig, VaeConfig
+from vla_attention.capture.policies.cosmos.dummy_folder import WEIGHTS_NAME, write_dummy_folder
+from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG
+from vla_attention.capture.policies.cosmos.locate import EMBEDDINGS_NAME, STATISTICS_NAME
 
 #: The published policy's 28 blocks, nine latent frames of 14 x 14 tokens, 512 text positions and five calls; narrow inside.
 PUBLISHED_SHAPE = replace(

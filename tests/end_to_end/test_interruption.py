@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from analyze.__main__ import main as analyze
-from capture.__main__ import main as capture
-from capture.claims import Claims, holders
-from capture.evaluate import main_pi
-from capture.job import Worker
-from capture.status import store_status
-from capture.termination import EXIT_TERMINATED, Terminated, Termination
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.capture.__main__ import main as capture
+from vla_attention.capture.jobs.claims import Claims, holders
+from vla_attention.capture.jobs.job import Worker
+from vla_attention.capture.jobs.status import store_status
+from vla_attention.capture.jobs.termination import EXIT_TERMINATED, Terminated, Termination
+from vla_attention.capture.published.evaluate import main_pi
 
 pytestmark = pytest.mark.simulator
 
@@ -33,7 +33,7 @@ def test_sigterm_drops_the_episode_in_flight_and_resuming_completes_the_store(tm
     log = tmp_path / "log"
     with log.open("w") as out:
         process = subprocess.Popen(
-            [sys.executable, "-m", "capture", *arguments],
+            [sys.executable, "-m", "vla_attention.capture", *arguments],
             stdout=out,
             stderr=subprocess.STDOUT,
             env=os.environ | {"MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl"), "SLURM_JOB_ID": ""},
@@ -69,7 +69,7 @@ def test_an_episode_of_another_process_is_waited_for_and_left_to_it(tmp_path, mo
     assert capture([*arguments, "--num-episodes", "1"]) == 0
     other = Claims(store, NODE)
     assert other.acquire("task000_episode001") is None
-    monkeypatch.setattr("capture.episode_loop._LOOK_EVERY_S", 0.05)
+    monkeypatch.setattr("vla_attention.capture.recording.episode_loop._LOOK_EVERY_S", 0.05)
     seen: list[bool] = []
 
     def release_when_the_rest_is_done() -> None:
@@ -147,7 +147,7 @@ def test_within_an_episode_a_signal_waits_for_a_check():
 
 def test_a_job_that_slurm_still_wants_to_run_is_requeued(tmp_path, monkeypatch):
     """With a scontrol of our own that notes what it is asked for."""
-    from capture.job import ask_for_requeue
+    from vla_attention.capture.jobs.job import ask_for_requeue
 
     notes, state = tmp_path / "notes", tmp_path / "state"
     script = tmp_path / "scontrol"

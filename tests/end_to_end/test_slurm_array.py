@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analyze.__main__ import main as analyze
-from analyze.stores.reader import open_store
-from capture.claims import holders
-from capture.evaluate import main_pi
-from capture.status import store_status
-from schemas.store import PARTIAL_SUFFIX
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.capture.jobs.claims import holders
+from vla_attention.capture.jobs.status import store_status
+from vla_attention.capture.published.evaluate import main_pi
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import PARTIAL_SUFFIX
 
 pytestmark = [
     pytest.mark.simulator,

@@ -6,13 +6,15 @@ import tomllib
 import jsonschema
 import pytest
 
-from analyze.measures.aggregate import add_layers_avg, per_replan
-from analyze.results.results_file import write_results_of_suites
-from schemas.json_files import FOLDER, schema_documents, schema_text, write_schema_files
-from schemas.jsonable import to_json
-from schemas.layout import PatchGrid, Piece, Prompt, SiteLayout, Span
-from schemas.segments import Segment
-from schemas.store import (
+from tests.kit.synthetic import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps
+from vla_attention.analyze.measures.aggregate import add_layers_avg, per_replan
+from vla_attention.analyze.published.results_file import write_results_of_suites
+from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.json_files import FOLDER, schema_documents, schema_text, write_schema_files
+from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.layout import PatchGrid, Piece, Prompt, SiteLayout, Span
+from vla_attention.schemas.segments import Segment
+from vla_attention.schemas.stores.store_format import (
     ArrayRecord,
     EpisodeAttributes,
     PolicyCameraView,
@@ -21,8 +23,6 @@ from schemas.store import (
     Recording,
     RootAttributes,
 )
-from schemas.vocabulary import SceneObject
-from tests.analyze.synthetic import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps
 
 DOCUMENTS = schema_documents()
 
@@ -35,7 +35,7 @@ def check(name, document):
 @pytest.mark.parametrize("name", DOCUMENTS)
 def test_files_in_the_repository_are_what_the_code_makes(name):
     text = (FOLDER / name).read_text(encoding="utf-8")
-    assert text == schema_text(DOCUMENTS[name]), "out of date: run python -m schemas.json_files"
+    assert text == schema_text(DOCUMENTS[name]), "out of date: run python -m vla_attention.schemas.json_files"
 
 
 def test_there_are_no_other_schema_files():

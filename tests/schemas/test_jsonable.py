@@ -7,7 +7,7 @@ from typing import Literal
 import jsonschema
 import pytest
 
-from schemas.jsonable import MalformedDocument, from_json, json_schema, to_json
+from vla_attention.schemas.jsonable import MalformedDocument, from_json, json_schema, to_json
 
 
 @dataclass(frozen=True)

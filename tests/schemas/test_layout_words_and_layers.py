@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import pytest
 
-from schemas.errors import BadArgument, did_you_mean, listing
-from schemas.layers import select_layers
-from schemas.layout import PatchGrid, Piece, Prompt, Role, SiteLayout, Span, find_role
-from schemas.words import find_phrase, split_words, words_of
+from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
+from vla_attention.schemas.groupings.words import find_phrase, split_words, words_of
+from vla_attention.schemas.layers import select_layers
+from vla_attention.schemas.layout import PatchGrid, Piece, Prompt, Role, SiteLayout, Span, find_role
 
 
 def span(name: str, start: int, stop: int, **more) -> Span:

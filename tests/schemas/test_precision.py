@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from schemas.errors import BadArgument
-from schemas.precision import FLOAT32_MANTISSA_BITS, mass_error_bound, parse_precision, round_mantissa
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, mass_error_bound, parse_precision, round_mantissa
 
 PROBABILITIES = hnp.arrays(
     np.float32, st.integers(1, 40), elements=st.floats(np.float32(1e-30), 1, width=32) | st.just(np.float32(0))

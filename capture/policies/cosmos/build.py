@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import torch
 
-from capture.policies.cosmos.calls import select_call
-from capture.policies.cosmos.checkpoint import CosmosOptions, load_cosmos_policy
-from capture.policies.cosmos.config import DEFAULT_CONFIG_NAME, find_config
-from capture.policies.cosmos.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, random_policy
-from capture.policies.cosmos.policy import ACTION_FRAME, CosmosPolicy
-from schemas.errors import BadArgument, listing
+from vla_attention.capture.policies.cosmos.calls import select_call
+from vla_attention.capture.policies.cosmos.checkpoint import CosmosOptions, load_cosmos_policy
+from vla_attention.capture.policies.cosmos.config import DEFAULT_CONFIG_NAME, find_config
+from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, random_policy
+from vla_attention.capture.policies.cosmos.policy import ACTION_FRAME, CosmosPolicy
+from vla_attention.schemas.errors import BadArgument, listing
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _UNTRAINED = {"embedded": EMBEDDED_CONFIG, "dummy": DUMMY_CONFIG}

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from capture.policies.cosmos.config import CosmosConfig
-from capture.policies.cosmos.sampler import noise_levels
-from schemas.errors import BadArgument
+from vla_attention.capture.policies.cosmos.config import CosmosConfig
+from vla_attention.capture.policies.cosmos.sampler import noise_levels
+from vla_attention.schemas.errors import BadArgument
 
 
 def select_call(config: CosmosConfig, prefer_s: int | None, prefer_call: str) -> int:

@@ -11,7 +11,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from capture.policies.cosmos.config import (
+from vla_attention.capture.policies.cosmos.config import (
     LIBERO_FRAMES,
     CosmosConfig,
     DitConfig,
@@ -19,12 +19,12 @@ from capture.policies.cosmos.config import (
     SamplerConfig,
     VaeConfig,
 )
-from capture.policies.cosmos.dit import Dit
-from capture.policies.cosmos.dit_weights import build_dit, dit_tensors, infer_dit_config
-from capture.policies.cosmos.model import CosmosModel
-from capture.policies.cosmos.tensor_files import read_tensors
-from capture.policies.cosmos.vae import build_encoder
-from schemas.errors import UserError, listing
+from vla_attention.capture.policies.cosmos.dit import Dit
+from vla_attention.capture.policies.cosmos.dit_weights import build_dit, dit_tensors, infer_dit_config
+from vla_attention.capture.policies.cosmos.model import CosmosModel
+from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
+from vla_attention.capture.policies.cosmos.vae import build_encoder
+from vla_attention.schemas.errors import UserError, listing
 
 CASE_FILE = "case.json"
 CaseKind = Literal["dit_forward", "policy_sample"]

@@ -10,9 +10,9 @@ from typing import Any
 
 import torch
 
-from capture.policies.cosmos.config import DEFAULT_CONFIG_NAME, CosmosConfig, find_config
-from capture.policies.cosmos.dit_weights import build_dit, dit_tensors, infer_dit_config
-from capture.policies.cosmos.locate import (
+from vla_attention.capture.policies.cosmos.config import DEFAULT_CONFIG_NAME, CosmosConfig, find_config
+from vla_attention.capture.policies.cosmos.dit_weights import build_dit, dit_tensors, infer_dit_config
+from vla_attention.capture.policies.cosmos.locate import (
     EMBEDDINGS_NAME,
     STATISTICS_NAME,
     find_beside,
@@ -21,15 +21,15 @@ from capture.policies.cosmos.locate import (
     find_vae,
     find_weights,
 )
-from capture.policies.cosmos.model import CosmosModel
-from capture.policies.cosmos.policy import ACTION_FRAME, CosmosPolicy, CosmosSource
-from capture.policies.cosmos.preprocess import read_statistics
-from capture.policies.cosmos.t5_encoder import T5Encoder
-from capture.policies.cosmos.t5_pickle import read_embeddings
-from capture.policies.cosmos.tensor_files import read_tensors
-from capture.policies.cosmos.text import PieceTokenizer, PrecomputedText
-from capture.policies.cosmos.vae import build_encoder, infer_vae_config
-from schemas.errors import BadArgument
+from vla_attention.capture.policies.cosmos.model import CosmosModel
+from vla_attention.capture.policies.cosmos.policy import ACTION_FRAME, CosmosPolicy, CosmosSource
+from vla_attention.capture.policies.cosmos.preprocess import read_statistics
+from vla_attention.capture.policies.cosmos.t5_encoder import T5Encoder
+from vla_attention.capture.policies.cosmos.t5_pickle import read_embeddings
+from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
+from vla_attention.capture.policies.cosmos.text import PieceTokenizer, PrecomputedText
+from vla_attention.capture.policies.cosmos.vae import build_encoder, infer_vae_config
+from vla_attention.schemas.errors import BadArgument
 
 
 @dataclass(frozen=True)

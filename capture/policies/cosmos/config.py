@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from schemas.errors import BadArgument, unknown_name
+from vla_attention.schemas.errors import BadArgument, unknown_name
 
 #: The text encoder's positions after the real tokens are exact zeros; a real token's embedding never is.
 TEXT_LENGTH = 512

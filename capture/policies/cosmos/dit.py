@@ -13,8 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from capture.attention import RowSink, attend
-from capture.policies.cosmos.config import DitConfig
+from vla_attention.capture.policies.cosmos.config import DitConfig
+from vla_attention.capture.recording.attention import RowSink, attend
 
 NORM_EPS = 1e-6
 

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from capture.policies.cosmos.config import DitConfig
-from capture.policies.cosmos.dit import Dit
-from capture.policies.cosmos.tensor_files import UnreadableTensors
-from schemas.errors import UserError, listing
+from vla_attention.capture.policies.cosmos.config import DitConfig
+from vla_attention.capture.policies.cosmos.dit import Dit
+from vla_attention.capture.policies.cosmos.tensor_files import UnreadableTensors
+from vla_attention.schemas.errors import UserError, listing
 
 Shapes = dict[str, tuple[int, ...]]
 

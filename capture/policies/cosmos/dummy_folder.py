@@ -13,16 +13,16 @@ from typing import Any
 
 import torch
 
-from capture.policies.cosmos.config import CosmosConfig
-from capture.policies.cosmos.dit_weights import COUNTER_PREFIX, EXTRA_STATE, PREFIX
-from capture.policies.cosmos.embedded import (
+from vla_attention.capture.policies.cosmos.config import CosmosConfig
+from vla_attention.capture.policies.cosmos.dit_weights import COUNTER_PREFIX, EXTRA_STATE, PREFIX
+from vla_attention.capture.policies.cosmos.embedded import (
     BUILTIN_RANGES,
     TOKENIZER_PATH,
     random_dit_weights,
     random_vae_weights,
 )
-from capture.policies.cosmos.locate import EMBEDDINGS_NAME, STATISTICS_NAME, VAE_NAME
-from capture.policies.cosmos.text import PieceTokenizer, SeededText
+from vla_attention.capture.policies.cosmos.locate import EMBEDDINGS_NAME, STATISTICS_NAME, VAE_NAME
+from vla_attention.capture.policies.cosmos.text import PieceTokenizer, SeededText
 
 WEIGHTS_NAME = "Cosmos-Policy-Dummy.pt"
 

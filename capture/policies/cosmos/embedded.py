@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from capture.policies.cosmos.config import CosmosConfig, DitConfig, SamplerConfig, VaeConfig
-from capture.policies.cosmos.dit_weights import build_dit, expected_shapes
-from capture.policies.cosmos.model import CosmosModel
-from capture.policies.cosmos.policy import ACTION_FRAME, CosmosPolicy, CosmosSource
-from capture.policies.cosmos.preprocess import Statistics, make_statistics
-from capture.policies.cosmos.text import PieceTokenizer, SeededText
-from capture.policies.cosmos.vae import build_encoder, expected_vae_shapes
+from vla_attention.capture.policies.cosmos.config import CosmosConfig, DitConfig, SamplerConfig, VaeConfig
+from vla_attention.capture.policies.cosmos.dit_weights import build_dit, expected_shapes
+from vla_attention.capture.policies.cosmos.model import CosmosModel
+from vla_attention.capture.policies.cosmos.policy import ACTION_FRAME, CosmosPolicy, CosmosSource
+from vla_attention.capture.policies.cosmos.preprocess import Statistics, make_statistics
+from vla_attention.capture.policies.cosmos.text import PieceTokenizer, SeededText
+from vla_attention.capture.policies.cosmos.vae import build_encoder, expected_vae_shapes
 
 #: The small sentencepiece model that comes with this package.
 TOKENIZER_PATH = Path(__file__).parents[1] / "pi" / "embedded" / "tokenizer.model"

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from capture.policies.cosmos.config import CosmosConfig
+from vla_attention.capture.policies.cosmos.config import CosmosConfig
 
 
 def fill_frame(values: Tensor, shape: tuple[int, int, int]) -> Tensor:

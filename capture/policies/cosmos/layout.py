@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.policies.base import PolicyCamera
-from capture.policies.cosmos.config import CosmosConfig
-from capture.policies.cosmos.preprocess import visible_area
-from schemas.layout import PatchGrid, Role, SiteLayout, Span, roles_from_spans
+from vla_attention.capture.policies.base import PolicyCamera
+from vla_attention.capture.policies.cosmos.config import CosmosConfig
+from vla_attention.capture.policies.cosmos.preprocess import visible_area
+from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, roles_from_spans
 
 SELF: Final = "self"
 CROSS: Final = "cross"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from capture.policies.hub import HUB_NAME, fetch_from_hub, snapshots_folder
-from schemas.errors import BadArgument, UserError, listing
+from vla_attention.capture.policies.hub import HUB_NAME, fetch_from_hub, snapshots_folder
+from vla_attention.schemas.errors import BadArgument, UserError, listing
 
 POLICY_REPOSITORY = "nvidia/Cosmos-Policy-LIBERO-Predict2-2B"
 #: Where the image encoder is published; the policy's own repository does not have it.

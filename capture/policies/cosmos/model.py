@@ -10,15 +10,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from capture.attention import RowCollector
-from capture.policies.cosmos.config import CosmosConfig
-from capture.policies.cosmos.dit import BlockObserver, Dit
-from capture.policies.cosmos.latents import condition_mask, fill_frame
-from capture.policies.cosmos.layout import cross_layout, self_layout
-from capture.policies.cosmos.observer import CallObserver
-from capture.policies.cosmos.preprocess import pixels
-from capture.policies.cosmos.sampler import flow_time, noise_levels, sample, seeded_noise
-from capture.policies.cosmos.vae import CausalEncoder
+from vla_attention.capture.policies.cosmos.config import CosmosConfig
+from vla_attention.capture.policies.cosmos.dit import BlockObserver, Dit
+from vla_attention.capture.policies.cosmos.latents import condition_mask, fill_frame
+from vla_attention.capture.policies.cosmos.layout import cross_layout, self_layout
+from vla_attention.capture.policies.cosmos.observer import CallObserver
+from vla_attention.capture.policies.cosmos.preprocess import pixels
+from vla_attention.capture.policies.cosmos.sampler import flow_time, noise_levels, sample, seeded_noise
+from vla_attention.capture.policies.cosmos.vae import CausalEncoder
+from vla_attention.capture.recording.attention import RowCollector
 
 PROPRIO_FRAME = "proprio"
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import torch.nn.functional as F
 from torch import Tensor
 
-from capture.attention import RowCollector, RowSink, UpdateSink
-from capture.contributions import Projection
-from capture.policies.cosmos.dit import Attention
+from vla_attention.capture.policies.cosmos.dit import Attention
+from vla_attention.capture.recording.attention import RowCollector, RowSink, UpdateSink
+from vla_attention.capture.recording.contributions import Projection
 
 
 def projection(output_weight: Tensor, gate: Tensor) -> Projection:

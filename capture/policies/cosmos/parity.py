@@ -13,15 +13,15 @@ import PIL
 import torch
 from torch import Tensor
 
-from capture.attention import RowSink
-from capture.contributions import part_contributions
-from capture.policies.cosmos.case import CosmosCase, UnusableCase, read_case
-from capture.policies.cosmos.dit import Attention
-from capture.policies.cosmos.latents import condition_mask, read_actions, read_value
-from capture.policies.cosmos.model import CallTrace, CosmosModel
-from capture.policies.cosmos.observer import projection
-from capture.policies.cosmos.preprocess import make_statistics, model_picture
-from capture.policies.cosmos.sampler import sample, seeded_noise
+from vla_attention.capture.policies.cosmos.case import CosmosCase, UnusableCase, read_case
+from vla_attention.capture.policies.cosmos.dit import Attention
+from vla_attention.capture.policies.cosmos.latents import condition_mask, read_actions, read_value
+from vla_attention.capture.policies.cosmos.model import CallTrace, CosmosModel
+from vla_attention.capture.policies.cosmos.observer import projection
+from vla_attention.capture.policies.cosmos.preprocess import make_statistics, model_picture
+from vla_attention.capture.policies.cosmos.sampler import sample, seeded_noise
+from vla_attention.capture.recording.attention import RowSink
+from vla_attention.capture.recording.contributions import part_contributions
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.attention import RowCollector
-from capture.environments.base import Observation
-from capture.policies.base import PolicyInput, camera_frame, weights_digest
-from capture.policies.cosmos.config import CosmosConfig
-from capture.policies.cosmos.latents import action_shares, query_pools, read_actions, read_value
-from capture.policies.cosmos.layout import CROSS, SELF, cameras, self_roles
-from capture.policies.cosmos.model import CosmosModel, Recorders
-from capture.policies.cosmos.preprocess import Statistics, model_picture, proprio_of, upright
-from capture.policies.cosmos.sampler import flow_time
-from capture.policies.cosmos.text import TextSource
-from schemas.errors import BadArgument
+from vla_attention.capture.environments.base import Observation
+from vla_attention.capture.policies.base import PolicyInput, camera_frame, weights_digest
+from vla_attention.capture.policies.cosmos.config import CosmosConfig
+from vla_attention.capture.policies.cosmos.latents import action_shares, query_pools, read_actions, read_value
+from vla_attention.capture.policies.cosmos.layout import CROSS, SELF, cameras, self_roles
+from vla_attention.capture.policies.cosmos.model import CosmosModel, Recorders
+from vla_attention.capture.policies.cosmos.preprocess import Statistics, model_picture, proprio_of, upright
+from vla_attention.capture.policies.cosmos.sampler import flow_time
+from vla_attention.capture.policies.cosmos.text import TextSource
+from vla_attention.capture.recording.attention import RowCollector
+from vla_attention.schemas.errors import BadArgument
 
 ACTION_FRAME, VALUE_FRAME = "action", "value"
 

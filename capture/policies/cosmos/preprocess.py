@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from schemas.errors import BadArgument, UserError
+from vla_attention.schemas.errors import BadArgument, UserError
 
 JPEG_QUALITY = 95
 #: Share of the area that the reference crops out of the middle when the policy was trained with image augmentation.

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from capture.policies.cosmos.config import SamplerConfig
+from vla_attention.capture.policies.cosmos.config import SamplerConfig
 
 #: (noisy latents float32, sigma, number of the evaluation) -> estimate of the clean latents, float32
 Denoiser = Callable[[Tensor, float, int], Tensor]

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from capture.policies.cosmos.locate import T5_TOKENIZER
-from schemas.errors import BadArgument, MissingDependency, UserError
+from vla_attention.capture.policies.cosmos.locate import T5_TOKENIZER
+from vla_attention.schemas.errors import BadArgument, MissingDependency, UserError
 
 
 class EncoderUnusable(UserError, ValueError):

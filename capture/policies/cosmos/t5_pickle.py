@@ -16,8 +16,8 @@ import torch
 import torch._utils
 from torch import Tensor
 
-from capture.policies.cosmos.tensor_files import RefusedPickle
-from schemas.errors import UnknownName, UserError, listing
+from vla_attention.capture.policies.cosmos.tensor_files import RefusedPickle
+from vla_attention.schemas.errors import UnknownName, UserError, listing
 
 
 class EmbeddingsNotFound(UserError, FileNotFoundError):

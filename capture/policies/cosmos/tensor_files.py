@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
-from schemas.errors import UserError
+from vla_attention.schemas.errors import UserError
 
 
 class TensorFileNotFound(UserError, FileNotFoundError):

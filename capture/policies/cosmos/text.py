@@ -14,10 +14,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from capture.policies.cosmos.t5_encoder import T5Encoder
-from capture.policies.cosmos.t5_pickle import BadEmbeddings, TextEmbeddings
-from schemas.errors import BadArgument, UserError
-from schemas.layout import ROLE_DTYPE, Piece, Prompt, Role
+from vla_attention.capture.policies.cosmos.t5_encoder import T5Encoder
+from vla_attention.capture.policies.cosmos.t5_pickle import BadEmbeddings, TextEmbeddings
+from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.layout import ROLE_DTYPE, Piece, Prompt, Role
 
 #: T5 ends every text with this token, which has a position and no characters.
 END_TOKENS = 1

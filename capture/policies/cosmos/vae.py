@@ -15,9 +15,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from capture.policies.cosmos.config import VaeConfig
-from capture.policies.cosmos.dit_weights import Shapes, check_shapes
-from schemas.errors import MissingDependency
+from vla_attention.capture.policies.cosmos.config import VaeConfig
+from vla_attention.capture.policies.cosmos.dit_weights import Shapes, check_shapes
+from vla_attention.schemas.errors import MissingDependency
 
 #: Pixel frames of every latent frame but the first, which has one.
 FRAMES_PER_LATENT = 4

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import torch
 
-from capture.policies.pi.config import GEMMA_VARIANTS, GemmaConfig, find_config, find_variant
-from capture.policies.pi.embedded import dummy_policy, embedded_policy
-from capture.policies.pi.formats import detect_format, find_format
-from capture.policies.pi.loading import CheckpointOptions, load_pi_policy
-from capture.policies.pi.locate import find_checkpoint, find_tokenizer
-from capture.policies.pi.policy import PiPolicy
-from schemas.errors import BadArgument, listing
+from vla_attention.capture.policies.pi.config import GEMMA_VARIANTS, GemmaConfig, find_config, find_variant
+from vla_attention.capture.policies.pi.embedded import dummy_policy, embedded_policy
+from vla_attention.capture.policies.pi.formats import detect_format, find_format
+from vla_attention.capture.policies.pi.loading import CheckpointOptions, load_pi_policy
+from vla_attention.capture.policies.pi.locate import find_checkpoint, find_tokenizer
+from vla_attention.capture.policies.pi.policy import PiPolicy
+from vla_attention.schemas.errors import BadArgument, listing
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _UNTRAINED = {"embedded": embedded_policy, "dummy": dummy_policy}

@@ -14,9 +14,9 @@ from zipfile import BadZipFile
 import numpy as np
 import torch
 
-from capture.policies.pi.config import CAMERA_SLOTS, GemmaConfig, PiConfig, SiglipConfig
-from capture.policies.pi.formats import CheckpointFormat, read_json_object
-from schemas.errors import BadArgument, UserError, listing, unknown_name
+from vla_attention.capture.policies.pi.config import CAMERA_SLOTS, GemmaConfig, PiConfig, SiglipConfig
+from vla_attention.capture.policies.pi.formats import CheckpointFormat, read_json_object
+from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 
 CaseFormat = Literal["orbax", "openpi", "lerobot"]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from capture.policies.pi.flow_time import MAX_PERIOD, MIN_PERIOD, TimeConvention
-from schemas.errors import BadArgument, unknown_name
+from vla_attention.capture.policies.pi.flow_time import MAX_PERIOD, MIN_PERIOD, TimeConvention
+from vla_attention.schemas.errors import BadArgument, unknown_name
 
 #: openpi's camera slots, in the order of their keys. Which camera fills which slot is the preprocessing's business.
 CAMERA_SLOTS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")

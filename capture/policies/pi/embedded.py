@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from capture.policies.pi.config import GemmaConfig, PiConfig, SiglipConfig, find_variant
-from capture.policies.pi.model import PiModel
-from capture.policies.pi.policy import PiPolicy, PiSource
-from capture.policies.pi.preprocess import NormStats, Statistics
-from capture.policies.pi.processing import OPENPI_REPLAN_STEPS, OpenpiProcessing
-from capture.policies.pi.strict import Shapes, expected_shapes, model_from_state
-from capture.policies.pi.tokenizer import PromptTokenizer
+from vla_attention.capture.policies.pi.config import GemmaConfig, PiConfig, SiglipConfig, find_variant
+from vla_attention.capture.policies.pi.model import PiModel
+from vla_attention.capture.policies.pi.policy import PiPolicy, PiSource
+from vla_attention.capture.policies.pi.preprocess import NormStats, Statistics
+from vla_attention.capture.policies.pi.processing import OPENPI_REPLAN_STEPS, OpenpiProcessing
+from vla_attention.capture.policies.pi.strict import Shapes, expected_shapes, model_from_state
+from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
 
 TOKENIZER_PATH = Path(__file__).parent / "embedded" / "tokenizer.model"
 

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from schemas.errors import UserError, listing, unknown_name
+from vla_attention.schemas.errors import UserError, listing, unknown_name
 
 CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot"]
 CHECKPOINT_FORMATS: tuple[CheckpointFormat, ...] = get_args(CheckpointFormat)

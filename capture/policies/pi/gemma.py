@@ -14,9 +14,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from capture.attention import RowSink, UpdateSink, attend
-from capture.contributions import Projection
-from capture.policies.pi.config import GemmaConfig
+from vla_attention.capture.policies.pi.config import GemmaConfig
+from vla_attention.capture.recording.attention import RowSink, UpdateSink, attend
+from vla_attention.capture.recording.contributions import Projection
 
 RMS_NORM_EPS = 1e-6
 ROPE_THETA = 10_000.0

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from capture.policies.pi.config import PiConfig
-from capture.policies.pi.jax_lora import LoraPair, find_lora_pairs, merge_lora
-from capture.policies.pi.strict import CheckpointMismatch, Shapes, check_shapes, expected_shapes
+from vla_attention.capture.policies.pi.config import PiConfig
+from vla_attention.capture.policies.pi.jax_lora import LoraPair, find_lora_pairs, merge_lora
+from vla_attention.capture.policies.pi.strict import CheckpointMismatch, Shapes, check_shapes, expected_shapes
 
 VISION = "paligemma_with_expert.paligemma.model.vision_tower.vision_model."
 PROJECTOR = "paligemma_with_expert.paligemma.model.multi_modal_projector.linear."

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import torch
 
-from capture.policies.pi.checkpoint import TensorFile, open_tensors
-from capture.policies.pi.config import PiConfig
-from capture.policies.pi.formats import detect_format
-from capture.policies.pi.lerobot_config import LerobotConfig, read_lerobot_config
-from capture.policies.pi.lerobot_pipeline import read_lerobot_pipeline
-from capture.policies.pi.lerobot_processing import LerobotProcessing, slots
-from capture.policies.pi.model import PiModel
-from capture.policies.pi.sizes import infer_config, is_pi05
-from capture.policies.pi.strict import CheckpointMismatch
+from vla_attention.capture.policies.pi.checkpoint import TensorFile, open_tensors
+from vla_attention.capture.policies.pi.config import PiConfig
+from vla_attention.capture.policies.pi.formats import detect_format
+from vla_attention.capture.policies.pi.lerobot_config import LerobotConfig, read_lerobot_config
+from vla_attention.capture.policies.pi.lerobot_pipeline import read_lerobot_pipeline
+from vla_attention.capture.policies.pi.lerobot_processing import LerobotProcessing, slots
+from vla_attention.capture.policies.pi.model import PiModel
+from vla_attention.capture.policies.pi.sizes import infer_config, is_pi05
+from vla_attention.capture.policies.pi.strict import CheckpointMismatch
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 

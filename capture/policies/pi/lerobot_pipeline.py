@@ -15,10 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
-from capture.policies.pi.formats import UnreadableCheckpoint, UnsupportedCheckpoint, read_json_object
-from capture.policies.pi.lerobot_config import ACTION_FEATURE, STATE_FEATURE, LerobotConfig, UnsupportedLerobotFeature
-from capture.policies.pi.preprocess import UnusableNormStats
-from schemas.errors import listing
+from vla_attention.capture.policies.pi.formats import UnreadableCheckpoint, UnsupportedCheckpoint, read_json_object
+from vla_attention.capture.policies.pi.lerobot_config import (
+    ACTION_FEATURE,
+    STATE_FEATURE,
+    LerobotConfig,
+    UnsupportedLerobotFeature,
+)
+from vla_attention.capture.policies.pi.preprocess import UnusableNormStats
+from vla_attention.schemas.errors import listing
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 

@@ -15,12 +15,12 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from capture.policies.pi.lerobot_config import IMAGES, LerobotConfig, UnsupportedLerobotFeature
-from capture.policies.pi.lerobot_pipeline import LerobotPipeline
-from capture.policies.pi.preprocess import ENVIRONMENT_ACTION_DIM
-from capture.policies.pi.processing import STATE_DIM
-from capture.policies.pi.tokenizer import PromptFormat
-from schemas.errors import listing
+from vla_attention.capture.policies.pi.lerobot_config import IMAGES, LerobotConfig, UnsupportedLerobotFeature
+from vla_attention.capture.policies.pi.lerobot_pipeline import LerobotPipeline
+from vla_attention.capture.policies.pi.preprocess import ENVIRONMENT_ACTION_DIM
+from vla_attention.capture.policies.pi.processing import STATE_DIM
+from vla_attention.capture.policies.pi.tokenizer import PromptFormat
+from vla_attention.schemas.errors import listing
 
 #: LeRobot's names for the pictures of its LIBERO environment, and the simulator's cameras behind them.
 LIBERO_CAMERAS = {IMAGES + "image": "agentview", IMAGES + "image2": "robot0_eye_in_hand"}

@@ -7,18 +7,18 @@ from pathlib import Path
 
 import torch
 
-from capture.policies.pi.case import CASE_FILE, read_config
-from capture.policies.pi.checkpoint import load_openpi_torch
-from capture.policies.pi.config import PiConfig, find_config
-from capture.policies.pi.formats import CheckpointFormat, detect_format
-from capture.policies.pi.lerobot import load_lerobot, load_lerobot_weights
-from capture.policies.pi.model import PiModel
-from capture.policies.pi.orbax import implied_config_name, list_leaves, load_openpi_jax
-from capture.policies.pi.policy import PiPolicy, PiSource
-from capture.policies.pi.preprocess import read_norm_stats
-from capture.policies.pi.processing import OpenpiProcessing, Processing
-from capture.policies.pi.tokenizer import PromptTokenizer
-from schemas.errors import BadArgument
+from vla_attention.capture.policies.pi.case import CASE_FILE, read_config
+from vla_attention.capture.policies.pi.checkpoint import load_openpi_torch
+from vla_attention.capture.policies.pi.config import PiConfig, find_config
+from vla_attention.capture.policies.pi.formats import CheckpointFormat, detect_format
+from vla_attention.capture.policies.pi.lerobot import load_lerobot, load_lerobot_weights
+from vla_attention.capture.policies.pi.model import PiModel
+from vla_attention.capture.policies.pi.orbax import implied_config_name, list_leaves, load_openpi_jax
+from vla_attention.capture.policies.pi.policy import PiPolicy, PiSource
+from vla_attention.capture.policies.pi.preprocess import read_norm_stats
+from vla_attention.capture.policies.pi.processing import OpenpiProcessing, Processing
+from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
+from vla_attention.schemas.errors import BadArgument
 
 
 def load_pi_model(

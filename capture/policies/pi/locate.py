@@ -11,8 +11,14 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from capture.policies.hub import HUB_NAME, CheckpointUnavailable, fetch_from_hub, first_line, snapshots_folder
-from schemas.errors import BadArgument, MissingDependency, listing
+from vla_attention.capture.policies.hub import (
+    HUB_NAME,
+    CheckpointUnavailable,
+    fetch_from_hub,
+    first_line,
+    snapshots_folder,
+)
+from vla_attention.schemas.errors import BadArgument, MissingDependency, listing
 
 #: What a policy needs of a hub repository; nothing else is fetched.
 HUB_FILES = (

@@ -14,11 +14,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from capture.attention import RowCollector
-from capture.policies.pi.config import PiConfig
-from capture.policies.pi.flow_time import denoise_times, embed_times
-from capture.policies.pi.gemma import GemmaModel, KeysValues, Rotation
-from capture.policies.pi.siglip import Projector, VisionTower
+from vla_attention.capture.policies.pi.config import PiConfig
+from vla_attention.capture.policies.pi.flow_time import denoise_times, embed_times
+from vla_attention.capture.policies.pi.gemma import GemmaModel, KeysValues, Rotation
+from vla_attention.capture.policies.pi.siglip import Projector, VisionTower
+from vla_attention.capture.recording.attention import RowCollector
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from capture.policies.pi.config import PiConfig, find_config
-from capture.policies.pi.formats import UnreadableCheckpoint, detect_format, read_json_object
-from capture.policies.pi.jax_lora import merge_lora
-from capture.policies.pi.jax_weights import plan_leaves
-from capture.policies.pi.model import PiModel
-from capture.policies.pi.strict import Shapes, build_model, check_shapes, expected_shapes, expected_tensors
-from schemas.errors import MissingDependency
+from vla_attention.capture.policies.pi.config import PiConfig, find_config
+from vla_attention.capture.policies.pi.formats import UnreadableCheckpoint, detect_format, read_json_object
+from vla_attention.capture.policies.pi.jax_lora import merge_lora
+from vla_attention.capture.policies.pi.jax_weights import plan_leaves
+from vla_attention.capture.policies.pi.model import PiModel
+from vla_attention.capture.policies.pi.strict import (
+    Shapes,
+    build_model,
+    check_shapes,
+    expected_shapes,
+    expected_tensors,
+)
+from vla_attention.schemas.errors import MissingDependency
 
 
 @dataclass(frozen=True)

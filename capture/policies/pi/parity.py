@@ -12,11 +12,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from capture.attention import RowCollector
-from capture.policies.pi.case import CHECKPOINT_FOLDERS, Case, CaseFormat, UnusableCase, find_case_format, read_case
-from capture.policies.pi.loading import load_pi_model
-from capture.policies.pi.model import PiModel
-from schemas.errors import BadArgument, listing
+from vla_attention.capture.policies.pi.case import (
+    CHECKPOINT_FOLDERS,
+    Case,
+    CaseFormat,
+    UnusableCase,
+    find_case_format,
+    read_case,
+)
+from vla_attention.capture.policies.pi.loading import load_pi_model
+from vla_attention.capture.policies.pi.model import PiModel
+from vla_attention.capture.recording.attention import RowCollector
+from vla_attention.schemas.errors import BadArgument, listing
 
 #: Largest difference of attention and actions that passes, by the precision of the case. In float32 the reference itself
 #: moves by 1.6e-5 between its compiled and its eager run; in bfloat16 it moves attention by up to 0.05 from float32.

@@ -13,17 +13,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from capture.attention import RowCollector
-from capture.environments.base import Observation
-from capture.noise import noise_seed
-from capture.policies.base import PolicyCamera, PolicyInput, camera_frame, initial_noise, weights_digest
-from capture.policies.pi.config import PiConfig
-from capture.policies.pi.flow_time import denoise_times
-from capture.policies.pi.model import PiModel
-from capture.policies.pi.preprocess import libero_state, pad_to
-from capture.policies.pi.processing import Processing
-from capture.policies.pi.tokenizer import PromptTokenizer, TokenizedPrompt, check_vocabulary
-from schemas.layout import PatchGrid, Role, SiteLayout, Span, roles_from_spans
+from vla_attention.capture.environments.base import Observation
+from vla_attention.capture.policies.base import PolicyCamera, PolicyInput, camera_frame, initial_noise, weights_digest
+from vla_attention.capture.policies.pi.config import PiConfig
+from vla_attention.capture.policies.pi.flow_time import denoise_times
+from vla_attention.capture.policies.pi.model import PiModel
+from vla_attention.capture.policies.pi.preprocess import libero_state, pad_to
+from vla_attention.capture.policies.pi.processing import Processing
+from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, TokenizedPrompt, check_vocabulary
+from vla_attention.capture.recording.attention import RowCollector
+from vla_attention.capture.recording.noise import noise_seed
+from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, roles_from_spans
 
 PROMPT_SPAN, STATE_SPAN, ACTION_SPAN = "prompt", "state", "actions"
 

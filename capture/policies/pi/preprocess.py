@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from schemas.errors import UserError, listing
+from vla_attention.schemas.errors import UserError, listing
 
 NormalisationMode = Literal["quantile", "z-score"]
 

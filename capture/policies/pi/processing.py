@@ -14,9 +14,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from capture.policies.pi.config import PiConfig
-from capture.policies.pi.preprocess import NormalisationMode, NormStats, environment_actions, model_image
-from capture.policies.pi.tokenizer import PromptFormat
+from vla_attention.capture.policies.pi.config import PiConfig
+from vla_attention.capture.policies.pi.preprocess import NormalisationMode, NormStats, environment_actions, model_image
+from vla_attention.capture.policies.pi.tokenizer import PromptFormat
 
 #: Which environment camera fills which slot (openpi's LIBERO inputs); other slots are black and masked.
 CAMERA_OF_SLOT = {"base_0_rgb": "agentview", "left_wrist_0_rgb": "robot0_eye_in_hand"}

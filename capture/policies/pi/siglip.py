@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from capture.attention import attend
-from capture.policies.pi.config import SiglipConfig
+from vla_attention.capture.policies.pi.config import SiglipConfig
+from vla_attention.capture.recording.attention import attend
 
 LAYER_NORM_EPS = 1e-6
 

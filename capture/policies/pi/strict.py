@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable, Mapping
 import torch
 from torch import Tensor
 
-from capture.policies.pi.config import PiConfig
-from capture.policies.pi.model import PiModel
-from schemas.errors import UserError
+from vla_attention.capture.policies.pi.config import PiConfig
+from vla_attention.capture.policies.pi.model import PiModel
+from vla_attention.schemas.errors import UserError
 
 Shapes = dict[str, tuple[int, ...]]
 

@@ -16,9 +16,9 @@ import numpy as np
 import sentencepiece
 from numpy.typing import NDArray
 
-from capture.policies.pi.config import PALIGEMMA_VOCABULARY
-from schemas.errors import BadArgument, UserError
-from schemas.layout import ROLE_DTYPE, Piece, Prompt, Role
+from vla_attention.capture.policies.pi.config import PALIGEMMA_VOCABULARY
+from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.layout import ROLE_DTYPE, Piece, Prompt, Role
 
 #: Pieces of Gemma's vocabulary, which PaliGemma's begins with.
 GEMMA_VOCABULARY = 256_000

@@ -12,9 +12,9 @@ import pytest
 
 pytest.importorskip("robosuite")
 
-from capture.environments.base import Environment, EnvironmentSettings, Observation
-from capture.environments.robosuite_tasks import BUILTIN_TASKS, initial_state_seed
-from capture.environments.suites import find_suite, make_environment
+from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Observation
+from vla_attention.capture.environments.robosuite_tasks import BUILTIN_TASKS, initial_state_seed
+from vla_attention.capture.environments.suites import find_suite, make_environment
 
 SUITE = find_suite("robosuite")
 SETTINGS = EnvironmentSettings()
@@ -147,7 +147,7 @@ def test_success_is_the_simulators_own_judgement() -> None:
 def test_an_environment_left_open_ends_without_noise_or_log_file() -> None:
     code = (
         "import logging\n"
-        "from capture.environments import EnvironmentSettings, find_suite, make_environment\n"
+        "from vla_attention.capture.environments import EnvironmentSettings, find_suite, make_environment\n"
         "environment = make_environment(find_suite('robosuite'), 0, EnvironmentSettings(image_size=32))\n"
         "environment.reset(0, 7)\n"
         "environment.step(environment.wait_action, observe=True)\n"

@@ -12,11 +12,11 @@ import pytest
 pytest.importorskip("libero")
 pytest.importorskip("robosuite")
 
-from capture.environments.base import EnvironmentSettings, Observation
-from capture.environments.libero import LiberoEnvironment, load_initial_states, parent_of_region
-from capture.environments.libero_installation import load_libero, package_folder
-from capture.environments.suites import find_suite, make_environment
-from schemas.errors import BadArgument, UnknownName
+from vla_attention.capture.environments.base import EnvironmentSettings, Observation
+from vla_attention.capture.environments.libero import LiberoEnvironment, load_initial_states, parent_of_region
+from vla_attention.capture.environments.libero_installation import load_libero, package_folder
+from vla_attention.capture.environments.suites import find_suite, make_environment
+from vla_attention.schemas.errors import BadArgument, UnknownName
 
 SUITE, TASK_ID, SEED, INDEX = "libero_spatial", 7, 7, 3
 CAMERAS = ("agentview", "robot0_eye_in_hand")

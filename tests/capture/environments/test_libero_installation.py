@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from capture.environments import libero_installation
-from capture.environments.base import EnvironmentSettings
-from capture.environments.libero_installation import (
+from vla_attention.capture.environments import libero_installation
+from vla_attention.capture.environments.base import EnvironmentSettings
+from vla_attention.capture.environments.libero_installation import (
     ASSET_SUBFOLDERS,
     ASSETS_SOURCE,
     ASSETS_VARIABLE,
@@ -20,8 +20,8 @@ from capture.environments.libero_installation import (
     instruction_of,
     list_libero_tasks,
 )
-from capture.environments.suites import SUITES, find_suite, list_tasks
-from schemas.errors import MissingDependency, UserError
+from vla_attention.capture.environments.suites import SUITES, find_suite, list_tasks
+from vla_attention.schemas.errors import MissingDependency, UserError
 
 try:
     libero_installation.package_folder()
@@ -107,8 +107,8 @@ def test_nothing_is_asked_printed_or_left_at_home(tmp_path: Path, libero_assets:
     code = (
         "import os, sys\n"
         "from pathlib import Path\n"
-        "from capture.environments.libero_installation import list_libero_tasks, load_libero\n"
-        "from capture.environments.suites import SUITES\n"
+        "from vla_attention.capture.environments.libero_installation import list_libero_tasks, load_libero\n"
+        "from vla_attention.capture.environments.suites import SUITES\n"
         "load_libero(Path(sys.argv[1]))\n"
         "from libero.libero import get_assets_path\n"
         "assert get_assets_path() == sys.argv[1]\n"

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from capture.environments.coverage import overlap_lengths, patch_coverage
-from schemas.errors import BadArgument
+from vla_attention.capture.environments.coverage import overlap_lengths, patch_coverage
+from vla_attention.schemas.errors import BadArgument
 
 STRAIGHT = {"flip_rows": False, "flip_columns": False}
 TURNED = {"flip_rows": True, "flip_columns": True}

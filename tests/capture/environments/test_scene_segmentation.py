@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from capture.environments.segmentation import decode_identities, owners_of_bodies
+from vla_attention.capture.environments.segmentation import decode_identities, owners_of_bodies
 
 BACKGROUND = 9
 

@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from capture.environments.base import EnvironmentSettings
-from capture.environments.suites import (
+from vla_attention.capture.environments.base import EnvironmentSettings
+from vla_attention.capture.environments.suites import (
     SUITES,
     check_initial_state_index,
     check_task_id,
@@ -16,7 +16,7 @@ from capture.environments.suites import (
     list_tasks,
     make_environment,
 )
-from schemas.errors import BadArgument, UnknownName
+from vla_attention.schemas.errors import BadArgument, UnknownName
 
 SETTINGS = EnvironmentSettings()
 
@@ -71,8 +71,8 @@ def test_builtin_tasks_are_numbered_and_described() -> None:
 def test_the_registry_imports_no_simulator() -> None:
     code = (
         "import sys\n"
-        "from capture.environments.suites import SUITES, list_tasks\n"
-        "from capture.environments.base import EnvironmentSettings\n"
+        "from vla_attention.capture.environments.suites import SUITES, list_tasks\n"
+        "from vla_attention.capture.environments.base import EnvironmentSettings\n"
         "for suite in SUITES:\n"
         "    if suite.kind == 'robosuite': list_tasks(suite, EnvironmentSettings())\n"
         "print({'torch', 'mujoco', 'robosuite', 'libero'} & set(sys.modules))\n"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, make_observation
 
-from capture.policies.cosmos.dummy_folder import write_dummy_folder
-from capture.policies.cosmos.embedded import DUMMY_CONFIG, dummy_policy
+from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, make_observation
+from vla_attention.capture.policies.cosmos.dummy_folder import write_dummy_folder
+from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, dummy_policy
 
 
 @pytest.fixture(scope="package", autouse=True)

@@ -7,13 +7,13 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, make_observation
 
-from capture.policies.cosmos.build import build_cosmos_policy
-from capture.policies.cosmos.checkpoint import CosmosOptions, load_cosmos_policy
-from capture.policies.cosmos.dummy_folder import WEIGHTS_NAME
-from capture.policies.cosmos.embedded import TOKENIZER_PATH, random_policy
-from capture.policies.cosmos.locate import (
+from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, make_observation
+from vla_attention.capture.policies.cosmos.build import build_cosmos_policy
+from vla_attention.capture.policies.cosmos.checkpoint import CosmosOptions, load_cosmos_policy
+from vla_attention.capture.policies.cosmos.dummy_folder import WEIGHTS_NAME
+from vla_attention.capture.policies.cosmos.embedded import TOKENIZER_PATH, random_policy
+from vla_attention.capture.policies.cosmos.locate import (
     EMBEDDINGS_NAME,
     POLICY_REPOSITORY,
     STATISTICS_NAME,
@@ -22,11 +22,11 @@ from capture.policies.cosmos.locate import (
     CheckpointNotFound,
     UnsupportedCheckpoint,
 )
-from capture.policies.cosmos.preprocess import StatisticsNotFound
-from capture.policies.cosmos.t5_pickle import EmbeddingsNotFound
-from capture.policies.hub import CheckpointUnavailable
-from schemas.errors import BadArgument, UnknownName
-from schemas.layout import Role
+from vla_attention.capture.policies.cosmos.preprocess import StatisticsNotFound
+from vla_attention.capture.policies.cosmos.t5_pickle import EmbeddingsNotFound
+from vla_attention.capture.policies.hub import CheckpointUnavailable
+from vla_attention.schemas.errors import BadArgument, UnknownName
+from vla_attention.schemas.layout import Role
 
 #: The dummy's pictures are smaller than the published configuration says.
 SMALL = CosmosOptions(image_size=64, num_denoising_steps=3)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from cosmos_helpers import GOLDEN, recorders_of
 
-from capture.attention import AttentionRecorder, RecordingPlan
-from capture.policies.cosmos.case import read_case
-from capture.policies.cosmos.observer import CallObserver
-from schemas.segments import segments_of
+from tests.kit.cosmos_helpers import GOLDEN, recorders_of
+from vla_attention.capture.policies.cosmos.case import read_case
+from vla_attention.capture.policies.cosmos.observer import CallObserver
+from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan
+from vla_attention.schemas.segments import segments_of
 
 
 def grams_of(policy, prepared):

@@ -8,13 +8,13 @@ import json
 
 import pytest
 import torch
-from cosmos_helpers import GOLDEN
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from capture.policies.cosmos.config import DitConfig, VaeConfig
-from capture.policies.cosmos.dit import Dit, rotate
-from capture.policies.cosmos.dit_weights import (
+from tests.kit.cosmos_helpers import GOLDEN
+from vla_attention.capture.policies.cosmos.config import DitConfig, VaeConfig
+from vla_attention.capture.policies.cosmos.dit import Dit, rotate
+from vla_attention.capture.policies.cosmos.dit_weights import (
     CheckpointMismatch,
     build_dit,
     check_shapes,
@@ -22,9 +22,9 @@ from capture.policies.cosmos.dit_weights import (
     expected_shapes,
     infer_dit_config,
 )
-from capture.policies.cosmos.embedded import DUMMY_CONFIG, random_dit_weights
-from capture.policies.cosmos.parity import EverythingObserver
-from capture.policies.cosmos.vae import expected_vae_shapes, infer_vae_config
+from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, random_dit_weights
+from vla_attention.capture.policies.cosmos.parity import EverythingObserver
+from vla_attention.capture.policies.cosmos.vae import expected_vae_shapes, infer_vae_config
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from capture.policies.cosmos.config import CosmosConfig, SamplerConfig
-from capture.policies.cosmos.embedded import DUMMY_CONFIG
-from capture.policies.cosmos.latents import action_shares, fill_frame, query_pools, read_actions, read_value
-from capture.policies.cosmos.sampler import flow_time, noise_levels, sample, seeded_noise
+from vla_attention.capture.policies.cosmos.config import CosmosConfig, SamplerConfig
+from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG
+from vla_attention.capture.policies.cosmos.latents import (
+    action_shares,
+    fill_frame,
+    query_pools,
+    read_actions,
+    read_value,
+)
+from vla_attention.capture.policies.cosmos.sampler import flow_time, noise_levels, sample, seeded_noise
 
 
 def test_a_frame_repeats_its_numbers_and_cuts_the_last_copy():

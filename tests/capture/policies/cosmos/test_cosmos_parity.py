@@ -8,10 +8,10 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from cosmos_helpers import GOLDEN, LARGE_GOLDEN
 
-from capture.policies.cosmos.case import UnusableCase, case_kind, read_case
-from capture.policies.cosmos.parity import describe, run_case, run_cosmos_parity
+from tests.kit.cosmos_helpers import GOLDEN, LARGE_GOLDEN
+from vla_attention.capture.policies.cosmos.case import UnusableCase, case_kind, read_case
+from vla_attention.capture.policies.cosmos.parity import describe, run_case, run_cosmos_parity
 
 CASES = [path.name for path in sorted(GOLDEN.iterdir()) if path.is_dir()]
 LARGE_CASES = ["dit_libero_T9", "policy_T9_64px", "policy_T9_224px_slim"]
@@ -121,6 +121,6 @@ def test_rows_do_not_depend_on_what_is_recorded(case_copy):
 
 
 def run_forward_observed(dit, given):
-    from capture.policies.cosmos.parity import EverythingObserver
+    from vla_attention.capture.policies.cosmos.parity import EverythingObserver
 
     return dit(*given, EverythingObserver())

@@ -9,17 +9,17 @@ import sys
 import numpy as np
 import pytest
 import torch
-from cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, KeepAll, make_observation, recorders_of
 
-from capture.attention import AttentionRecorder, RecordingPlan
-from capture.policies.base import PolicyCamera
-from capture.policies.cosmos.build import build_cosmos_policy
-from capture.policies.cosmos.calls import select_call
-from capture.policies.cosmos.config import LIBERO_FRAMES, CosmosConfig, FrameConfig
-from capture.policies.cosmos.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, random_policy
-from capture.policies.cosmos.layout import cross_layout, self_layout
-from schemas.errors import BadArgument, MissingDependency, UnknownName
-from schemas.layout import Role
+from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, KeepAll, make_observation, recorders_of
+from vla_attention.capture.policies.base import PolicyCamera
+from vla_attention.capture.policies.cosmos.build import build_cosmos_policy
+from vla_attention.capture.policies.cosmos.calls import select_call
+from vla_attention.capture.policies.cosmos.config import LIBERO_FRAMES, CosmosConfig, FrameConfig
+from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, random_policy
+from vla_attention.capture.policies.cosmos.layout import cross_layout, self_layout
+from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan
+from vla_attention.schemas.errors import BadArgument, MissingDependency, UnknownName
+from vla_attention.schemas.layout import Role
 
 
 def recorders_for(policy, queries="mean"):

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from capture.policies.cosmos.config import VaeConfig
-from capture.policies.cosmos.dit_weights import CheckpointMismatch
-from capture.policies.cosmos.embedded import BUILTIN_RANGES, builtin_statistics, random_vae_weights
-from capture.policies.cosmos.preprocess import (
+from vla_attention.capture.policies.cosmos.config import VaeConfig
+from vla_attention.capture.policies.cosmos.dit_weights import CheckpointMismatch
+from vla_attention.capture.policies.cosmos.embedded import BUILTIN_RANGES, builtin_statistics, random_vae_weights
+from vla_attention.capture.policies.cosmos.preprocess import (
     BadStatistics,
     StatisticsNotFound,
     crop_and_enlarge,
@@ -95,7 +95,7 @@ def state():
 def test_thirteen_frames_give_what_all_thirty_three_do(state):
     from diffusers import AutoencoderKLWan
 
-    from capture.policies.cosmos.vae import build_encoder, vae_names
+    from vla_attention.capture.policies.cosmos.vae import build_encoder, vae_names
 
     names = vae_names(SMALL_VAE)
     whole = AutoencoderKLWan(base_dim=4)
@@ -124,7 +124,7 @@ def test_thirteen_frames_give_what_all_thirty_three_do(state):
 
 
 def test_the_picture_before_shows_in_the_next_latent(state):
-    from capture.policies.cosmos.vae import build_encoder
+    from vla_attention.capture.policies.cosmos.vae import build_encoder
 
     encoder = build_encoder(SMALL_VAE, state)
     one, two, other = (torch.full((1, 3, 1, 32, 32), level) for level in (0.1, -0.4, 0.9))
@@ -133,7 +133,7 @@ def test_the_picture_before_shows_in_the_next_latent(state):
 
 
 def test_another_models_encoder_is_refused(state):
-    from capture.policies.cosmos.vae import build_encoder
+    from vla_attention.capture.policies.cosmos.vae import build_encoder
 
     wrong = {name: tensor for name, tensor in state.items() if name != "decoder.head.2.bias"}
     with pytest.raises(CheckpointMismatch, match=r"the image encoder; 1 missing: decoder\.head\.2\.bias"):

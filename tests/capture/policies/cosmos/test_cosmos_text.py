@@ -8,21 +8,26 @@ import sys
 
 import pytest
 import torch
-from cosmos_helpers import INSTRUCTION
 
-from capture.policies.cosmos.embedded import TOKENIZER_PATH
-from capture.policies.cosmos.t5_encoder import EncoderUnusable, T5Encoder
-from capture.policies.cosmos.t5_pickle import BadEmbeddings, EmbeddingsNotFound, TextEmbeddings, read_embeddings
-from capture.policies.cosmos.tensor_files import (
+from tests.kit.cosmos_helpers import INSTRUCTION
+from vla_attention.capture.policies.cosmos.embedded import TOKENIZER_PATH
+from vla_attention.capture.policies.cosmos.t5_encoder import EncoderUnusable, T5Encoder
+from vla_attention.capture.policies.cosmos.t5_pickle import (
+    BadEmbeddings,
+    EmbeddingsNotFound,
+    TextEmbeddings,
+    read_embeddings,
+)
+from vla_attention.capture.policies.cosmos.tensor_files import (
     RefusedPickle,
     TensorFileNotFound,
     UnreadableTensors,
     read_tensors,
 )
-from capture.policies.cosmos.text import PieceTokenizer, PrecomputedText, SeededText, TokenizerUnusable
-from schemas.errors import BadArgument, MissingDependency, UnknownName
-from schemas.layout import Role
-from schemas.words import words_of
+from vla_attention.capture.policies.cosmos.text import PieceTokenizer, PrecomputedText, SeededText, TokenizerUnusable
+from vla_attention.schemas.errors import BadArgument, MissingDependency, UnknownName
+from vla_attention.schemas.groupings.words import words_of
+from vla_attention.schemas.layout import Role
 
 
 class Malicious:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from pi_golden import GOLDEN, LARGE_GOLDEN, GoldenCase, load_case, make_observation
 
-from capture.environments.base import Observation
-from capture.policies.pi.embedded import dummy_policy, embedded_policy
+from tests.kit.pi_golden import GOLDEN, LARGE_GOLDEN, GoldenCase, load_case, make_observation
+from vla_attention.capture.environments.base import Observation
+from vla_attention.capture.policies.pi.embedded import dummy_policy, embedded_policy
 
 
 @pytest.fixture(scope="package", autouse=True)

@@ -7,17 +7,17 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from pi_golden import GOLDEN, KeepAll, load_case, read_manifest
 from safetensors.torch import load_file, save_file
 
-from capture.policies.pi.checkpoint import load_openpi_torch, model_names
-from capture.policies.pi.config import NAMED_CONFIGS, SiglipConfig, find_config, find_variant
-from capture.policies.pi.formats import CheckpointNotFound, UnreadableCheckpoint
-from capture.policies.pi.jax_weights import from_jax_flat, plan_leaves
-from capture.policies.pi.model import PiModel
-from capture.policies.pi.sizes import infer_config
-from capture.policies.pi.strict import CheckpointMismatch, check_shapes, expected_shapes
-from schemas.errors import BadArgument, UnknownName, UserError
+from tests.kit.pi_golden import GOLDEN, KeepAll, load_case, read_manifest
+from vla_attention.capture.policies.pi.checkpoint import load_openpi_torch, model_names
+from vla_attention.capture.policies.pi.config import NAMED_CONFIGS, SiglipConfig, find_config, find_variant
+from vla_attention.capture.policies.pi.formats import CheckpointNotFound, UnreadableCheckpoint
+from vla_attention.capture.policies.pi.jax_weights import from_jax_flat, plan_leaves
+from vla_attention.capture.policies.pi.model import PiModel
+from vla_attention.capture.policies.pi.sizes import infer_config
+from vla_attention.capture.policies.pi.strict import CheckpointMismatch, check_shapes, expected_shapes
+from vla_attention.schemas.errors import BadArgument, UnknownName, UserError
 
 STORED = GOLDEN / "pi05_batch2" / "checkpoint_openpi_torch"
 TABLE = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"

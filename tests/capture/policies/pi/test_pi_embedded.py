@@ -5,13 +5,13 @@ import time
 import numpy as np
 import pytest
 import torch
-from pi_golden import make_observation
 
-from capture.attention import AttentionRecorder, RecordingPlan
-from capture.policies.base import weights_digest
-from capture.policies.pi.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, build_random_model, builtin_stats
-from capture.policies.pi.policy import site_layout
-from schemas.layout import Role
+from tests.kit.pi_golden import make_observation
+from vla_attention.capture.policies.base import weights_digest
+from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, build_random_model, builtin_stats
+from vla_attention.capture.policies.pi.policy import site_layout
+from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan
+from vla_attention.schemas.layout import Role
 
 INSTRUCTION = "put the black bowl on the plate"
 #: of EMBEDDED_CONFIG with seed 0; a change breaks comparisons with every store recorded before

@@ -3,10 +3,15 @@
 import json
 
 import pytest
-from pi_golden import GOLDEN
 
-from capture.policies.pi.formats import UnreadableCheckpoint, UnsupportedCheckpoint, detect_format, find_format
-from schemas.errors import UnknownName
+from tests.kit.pi_golden import GOLDEN
+from vla_attention.capture.policies.pi.formats import (
+    UnreadableCheckpoint,
+    UnsupportedCheckpoint,
+    detect_format,
+    find_format,
+)
+from vla_attention.schemas.errors import UnknownName
 
 
 def make(folder, *names, config=None):

@@ -6,21 +6,21 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from pi_golden import GOLDEN, make_observation
 from safetensors.torch import load_file, save_file
 
-from capture.policies.base import Policy
-from capture.policies.pi.formats import UnreadableCheckpoint, UnsupportedCheckpoint
-from capture.policies.pi.lerobot_config import UnsupportedLerobotFeature, read_lerobot_config
-from capture.policies.pi.lerobot_pipeline import LerobotNormaliser, read_lerobot_pipeline
-from capture.policies.pi.lerobot_processing import lerobot_image
-from capture.policies.pi.loading import CheckpointOptions, load_pi_policy
-from capture.policies.pi.preprocess import UnusableNormStats, libero_state
-from capture.policies.pi.strict import CheckpointMismatch
-from capture.policies.pi.tokenizer import PromptTokenizer, digitise_state
-from schemas.errors import BadArgument, UserError
-from schemas.layout import Role
-from tests.small_tokenizer import train_small_tokenizer
+from tests.kit.pi_golden import GOLDEN, make_observation
+from tests.kit.small_tokenizer import train_small_tokenizer
+from vla_attention.capture.policies.base import Policy
+from vla_attention.capture.policies.pi.formats import UnreadableCheckpoint, UnsupportedCheckpoint
+from vla_attention.capture.policies.pi.lerobot_config import UnsupportedLerobotFeature, read_lerobot_config
+from vla_attention.capture.policies.pi.lerobot_pipeline import LerobotNormaliser, read_lerobot_pipeline
+from vla_attention.capture.policies.pi.lerobot_processing import lerobot_image
+from vla_attention.capture.policies.pi.loading import CheckpointOptions, load_pi_policy
+from vla_attention.capture.policies.pi.preprocess import UnusableNormStats, libero_state
+from vla_attention.capture.policies.pi.strict import CheckpointMismatch
+from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, digitise_state
+from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.layout import Role
 
 FOLDER = GOLDEN / "lerobot_preproc"
 CASE = json.loads((FOLDER / "case.json").read_text())

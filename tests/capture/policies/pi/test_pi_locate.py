@@ -4,17 +4,17 @@ import sys
 import types
 
 import pytest
-from pi_golden import GOLDEN
 
-from capture.policies.hub import CheckpointUnavailable, hub_cache
-from capture.policies.pi.embedded import TOKENIZER_PATH
-from capture.policies.pi.locate import (
+from tests.kit.pi_golden import GOLDEN
+from vla_attention.capture.policies.hub import CheckpointUnavailable, hub_cache
+from vla_attention.capture.policies.pi.embedded import TOKENIZER_PATH
+from vla_attention.capture.policies.pi.locate import (
     HUB_FILES,
     find_checkpoint,
     find_tokenizer,
     openpi_cache,
 )
-from schemas.errors import BadArgument, MissingDependency, UserError
+from vla_attention.schemas.errors import BadArgument, MissingDependency, UserError
 
 URL = "gs://openpi-assets/checkpoints/pi05_libero"
 

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from pi_golden import KeepAll, read_manifest, read_manifest_dtypes
 
-from capture.attention import AttentionRecorder, RecordingPlan
-from capture.policies.pi.config import find_config
-from capture.policies.pi.flow_time import denoise_times, embed_times
-from capture.policies.pi.model import PiModel
-from capture.policies.pi.strict import expected_shapes, model_from_state
+from tests.kit.pi_golden import KeepAll, read_manifest, read_manifest_dtypes
+from vla_attention.capture.policies.pi.config import find_config
+from vla_attention.capture.policies.pi.flow_time import denoise_times, embed_times
+from vla_attention.capture.policies.pi.model import PiModel
+from vla_attention.capture.policies.pi.strict import expected_shapes, model_from_state
+from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan
 
 LIMIT = 5e-5
 _JUNK = "paligemma_with_expert.gemma_expert.lm_head.weight"

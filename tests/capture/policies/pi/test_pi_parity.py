@@ -5,10 +5,10 @@ import shutil
 
 import numpy as np
 import pytest
-from pi_golden import GOLDEN, LARGE_GOLDEN
 from safetensors.torch import load_file, save_file
 
-from capture.__main__ import main
+from tests.kit.pi_golden import GOLDEN, LARGE_GOLDEN
+from vla_attention.capture.__main__ import main
 
 CASES = {
     "pi05_batch2": ("openpi", "lerobot"),

@@ -6,21 +6,21 @@ import json
 import numpy as np
 import pytest
 import torch
-from pi_golden import GOLDEN, make_observation
 from safetensors.torch import save_file
 
-from capture.attention import AttentionRecorder, RecordingPlan
-from capture.environments.base import Observation
-from capture.policies.base import Policy, initial_noise, weights_digest
-from capture.policies.pi.config import find_config
-from capture.policies.pi.embedded import DUMMY_CONFIG, TOKENIZER_PATH, build_random_model, builtin_stats
-from capture.policies.pi.loading import load_pi_policy
-from capture.policies.pi.policy import PiPolicy, PiSource, site_layout
-from capture.policies.pi.preprocess import model_image
-from capture.policies.pi.processing import OpenpiProcessing
-from capture.policies.pi.tokenizer import PromptTokenizer, TokenizerNotFound, check_vocabulary
-from schemas.errors import BadArgument, UnknownName
-from schemas.layout import Role
+from tests.kit.pi_golden import GOLDEN, make_observation
+from vla_attention.capture.environments.base import Observation
+from vla_attention.capture.policies.base import Policy, initial_noise, weights_digest
+from vla_attention.capture.policies.pi.config import find_config
+from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, TOKENIZER_PATH, build_random_model, builtin_stats
+from vla_attention.capture.policies.pi.loading import load_pi_policy
+from vla_attention.capture.policies.pi.policy import PiPolicy, PiSource, site_layout
+from vla_attention.capture.policies.pi.preprocess import model_image
+from vla_attention.capture.policies.pi.processing import OpenpiProcessing
+from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, TokenizerNotFound, check_vocabulary
+from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan
+from vla_attention.schemas.errors import BadArgument, UnknownName
+from vla_attention.schemas.layout import Role
 
 INSTRUCTION = "put the black bowl on the plate"
 

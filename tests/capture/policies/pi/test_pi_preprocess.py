@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from pi_golden import GOLDEN
 from PIL import Image
 
-from capture.policies.pi.preprocess import (
+from tests.kit.pi_golden import GOLDEN
+from vla_attention.capture.policies.pi.preprocess import (
     NormStats,
     NormStatsNotFound,
     Statistics,
@@ -21,9 +21,9 @@ from capture.policies.pi.preprocess import (
     read_norm_stats,
     resize_with_pad,
 )
-from capture.policies.pi.processing import image_tensor
-from capture.policies.pi.tokenizer import digitise_state
-from schemas.errors import UserError
+from vla_attention.capture.policies.pi.processing import image_tensor
+from vla_attention.capture.policies.pi.tokenizer import digitise_state
+from vla_attention.schemas.errors import UserError
 
 FOLDER = GOLDEN / "libero_preproc"
 MODES = {"z-score": "z", "quantile": "q"}

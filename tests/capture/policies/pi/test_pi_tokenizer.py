@@ -5,12 +5,17 @@ import json
 
 import numpy as np
 import pytest
-from pi_golden import GOLDEN
 
-from capture.policies.pi.embedded import TOKENIZER_PATH
-from capture.policies.pi.tokenizer import PromptTokenizer, TokenizerNotFound, UnreadableTokenizer, clean_instruction
-from schemas.errors import BadArgument
-from schemas.layout import Role
+from tests.kit.pi_golden import GOLDEN
+from vla_attention.capture.policies.pi.embedded import TOKENIZER_PATH
+from vla_attention.capture.policies.pi.tokenizer import (
+    PromptTokenizer,
+    TokenizerNotFound,
+    UnreadableTokenizer,
+    clean_instruction,
+)
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.layout import Role
 
 STATE = np.array([0.1, -0.2, 1.5, -1.5, 0.0, 0.99, -1.0, 1.0])
 STATE_TEXT = "140 102 255 -1 128 254 0 255"

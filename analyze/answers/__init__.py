@@ -1,1 +1,0 @@
-"""What single commands compute and say: groups, words, objects, time, comparisons, overlays, export."""

@@ -1,0 +1,1 @@
+"""`vla-analyze compare`: runs paired by initial state and seed."""

@@ -1,0 +1,80 @@
+"""`vla-analyze compare`: two or more runs, paired where they share initial states and seeds."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from vla_attention.analyze.arguments import add_grouping, add_output, add_selection, report_files, settings_of
+from vla_attention.schemas.command_line import OneSentenceParser
+
+_EXAMPLES = """examples:
+  vla-analyze compare runs/base.zarr runs/finetuned.zarr
+  vla-analyze compare base=runs/base.zarr tuned=runs/finetuned.zarr other=runs/other.zarr --layers 8 9
+  vla-analyze compare base=runs/b_spatial.zarr,runs/b_goal.zarr tuned=runs/t_spatial.zarr,runs/t_goal.zarr
+  vla-analyze compare runs/libero_spatial.zarr runs/libero_goal.zarr --allow-mismatch suite
+
+Episodes pair when suite, task, initial state and seed are equal. Everything but the weights and their
+names must agree, or be allowed by name: family, suite, seed, wait_steps, replan_steps, max_steps,
+layers, denoise_steps, heads, queries, depth, layout, cameras, processing, simulator.
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of `vla-analyze compare RUN RUN ...`."""
+    parser = OneSentenceParser(
+        prog="vla-analyze compare",
+        description="Differences of other runs to the first one, per task, layer and overall, with intervals;\n"
+        "paired where runs share initial states and seeds.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "runs",
+        nargs="+",
+        metavar="RUN",
+        help="STORE, or NAME=STORE[,STORE ...] for a run of several stores; two or more",
+    )
+    parser.add_argument(
+        "--allow-mismatch",
+        action="append",
+        default=[],
+        metavar="FIELD",
+        help="compare although the runs differ in this field; may be repeated",
+    )
+    add_grouping(parser)
+    add_selection(parser)
+    add_output(parser, "results/A-vs-B/compare")
+    return parser
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the comparison; write tables and pictures."""
+    from vla_attention.analyze.compare.comparison import compare
+    from vla_attention.analyze.compare.runs import open_runs, parse_runs
+    from vla_attention.analyze.compare.text import comparison_text
+    from vla_attention.analyze.show.table_files import write_parquet
+
+    runs = open_runs(parse_runs(arguments.runs), settings_of(arguments), arguments.allow_mismatch)
+    comparison = compare(runs, arguments.allow_mismatch)
+    print(comparison_text(comparison, runs))
+    joined = "-vs-".join(comparison.names).replace("/", "-")
+    folder: Path = (
+        arguments.output or Path("results") / (joined if len(joined) <= 100 else f"{joined[:99]}…") / "compare"
+    )
+    files = write_parquet(
+        folder,
+        comparison=comparison.differences,
+        pairs=comparison.pairs,
+        runs=comparison.estimates,
+        unpaired=comparison.unpaired,
+    )
+    if not arguments.no_plots:
+        from vla_attention.analyze.compare.plot_forest import plot_forest
+        from vla_attention.analyze.compare.plot_paired_differences import plot_paired_differences
+
+        files += plot_forest(comparison, folder)
+        for name in comparison.runs_with_common_tasks:
+            files += plot_paired_differences(comparison, name, folder)
+    report_files(folder, files)
+    return 0

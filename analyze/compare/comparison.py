@@ -1,0 +1,386 @@
+"""Differences between runs: paired where they share initial states and seeds, otherwise between independent episodes.
+
+Two episodes are a pair when suite, task, initial state (by its digest) and seed are equal: the same scene, the same noise,
+other weights. Differences inside pairs are free of what makes scenes differ, and their intervals are two-level bootstraps over
+tasks and pairs. The first run is what the others are compared with; every difference is other run minus first run.
+
+Quantities, one value per episode: `log2_ratio` (mean over replans of log2 of the ratio: 1 more is twice the ratio),
+`{group}_fraction` (mean over replans), and `success` (0 or 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from vla_attention.analyze.compare.runs import Run, check_comparable, noted_differences
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG, episodes_table
+from vla_attention.analyze.statistics.bootstrap import (
+    POSITIVE,
+    SHARE,
+    Interval,
+    Resamples,
+    bootstrap_intervals,
+    geometric_mean_over_episodes,
+    mean_over_episodes,
+    resample_episodes,
+)
+from vla_attention.analyze.statistics.effect_sizes import contrast
+from vla_attention.analyze.time.time_courses import replans_of
+from vla_attention.schemas.groupings.grouping import Grouping
+
+LOG2_RATIO, SUCCESS = "log2_ratio", "success"
+#: What makes two episodes a pair; `occurrence` tells apart episodes of one run that began alike.
+PAIR_KEYS = ("suite", "task_id", "initial_state_digest", "seed", "occurrence")
+_LEVEL = 0.95
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Runs side by side.
+
+    Attributes:
+        names: the runs, the first one being what the others are compared with.
+        grouping: groups of the comparison.
+        quantities: what is compared, in order.
+        estimates: one row per (run, suite, layer): `ratio` (geometric mean), every fraction and the success rate, each with
+            `_low` and `_high`; `uniform_ratio`; `num_tasks`, `num_episodes`; `episodes_without_ratio` (no finite
+            positive ratio in any replan) and `num_nonfinite` (replans without a finite ratio).
+        differences: one row per (run, scope, layer, quantity) for every run but the first: scope "task", "suite" (only
+            when there are several) or "all"; `paired`; `num_pairs`, `num_first`, `num_other`, `num_tasks`; `mean_first`, `mean_other`,
+            `difference`, `low`, `high`; `effect` (mean / standard deviation of the paired differences, or Hedges' g).
+        pairs: one row per (run, pair, layer): both episodes, and per quantity `X_first`, `X_other`, `X_difference`.
+        unpaired: one row per episode that has no partner: `run`, `compared_with`, its suite, task and episode index.
+        notes: lines on what differs between the runs and was allowed or does not matter.
+    """
+
+    names: tuple[str, ...]
+    grouping: Grouping
+    quantities: tuple[str, ...]
+    estimates: pl.DataFrame
+    differences: pl.DataFrame
+    pairs: pl.DataFrame
+    unpaired: pl.DataFrame
+    notes: tuple[str, ...]
+
+    @property
+    def runs_with_common_tasks(self) -> tuple[str, ...]:
+        """The runs that have a task in common with the first one."""
+        known = set(self.differences.filter(pl.col("scope") == "task")["run"])
+        return tuple(name for name in self.names if name in known)
+
+
+def comparison_table(runs: Sequence[Run], allowed: Sequence[str] = ()) -> pl.DataFrame:
+    """The table `Comparison.differences` of some runs."""
+    return compare(runs, allowed).differences
+
+
+def compare(runs: Sequence[Run], allowed: Sequence[str] = (), seed: int | None = None) -> Comparison:
+    """Compare every run with the first one.
+
+    Args:
+        runs: two or more, see `runs.open_runs`.
+        allowed: fields that may differ, see `runs.check_comparable`.
+        seed: of the bootstrap; the first run's setting unless given.
+
+    Raises:
+        MixedPolicies, RunsDiffer: see `runs.check_comparable`.
+    """
+    notes = [*check_comparable(runs, allowed), *noted_differences(runs)]
+    notes += [line for run in runs for line in run.question.skipped]
+    grouping = runs[0].question.grouping
+    seed = runs[0].question.settings.seed if seed is None else seed
+    tables = [_episode_values(run, "seed" in allowed) for run in runs]
+    filled = [name for name in grouping.names if any((table[f"{name}_mass"] > 0).any() for table in tables)]
+    quantities = ((LOG2_RATIO,) if grouping.ratio else ()) + tuple(f"{name}_fraction" for name in filled) + (SUCCESS,)
+    estimates = pl.concat(
+        [_estimates(run.name, table, quantities, seed) for run, table in zip(runs, tables, strict=True)]
+    )
+    differences, pairs, unpaired = [], [], []
+    for run, table in zip(runs[1:], tables[1:], strict=True):
+        joined = _pair(tables[0], table, quantities)
+        pairs.append(joined.select(pl.lit(run.name).alias("run"), pl.all()))
+        unpaired += [_without_partner(tables[0], joined, "first", runs[0].name, run.name)]
+        unpaired += [_without_partner(table, joined, "other", run.name, runs[0].name)]
+        rows = _paired(joined, quantities, seed) if joined.height else _unpaired(tables[0], table, quantities, seed)
+        differences.append(rows.select(pl.lit(run.name).alias("run"), pl.all()))
+    return Comparison(
+        names=tuple(run.name for run in runs),
+        grouping=grouping,
+        quantities=quantities,
+        estimates=estimates,
+        differences=pl.concat(differences),
+        pairs=pl.concat(pairs),
+        unpaired=pl.concat(unpaired),
+        notes=tuple(notes),
+    )
+
+
+def _episode_values(run: Run, ignore_seed: bool) -> pl.DataFrame:
+    """One row per (episode, layer) with every quantity and what pairs it; layers are named as block numbers."""
+    question = run.question
+    table = episodes_table(replans_of(question), question.grouping)
+    origin = pl.DataFrame(
+        [
+            (
+                item.store.suite,
+                item.episode.attributes.task_id,
+                item.episode.attributes.episode_index,
+                item.episode.attributes.initial_state_digest,
+                # With another seed allowed, episodes pair by their initial state alone.
+                None if ignore_seed else item.store.attributes.protocol.seed,
+            )
+            for item in question.selected
+        ],
+        schema={
+            "suite": pl.String,
+            "task_id": pl.Int64,
+            "episode_index": pl.Int64,
+            "initial_state_digest": pl.String,
+            "seed": pl.Int64,
+        },
+        orient="row",
+    ).with_columns(
+        pl.col("episode_index")
+        .rank("ordinal")
+        .over("suite", "task_id", "initial_state_digest", "seed")
+        .alias("occurrence")
+    )
+    # Two runs may name one block by different numbers (7 and 25); what is compared is the block.
+    table = table.with_columns(
+        pl.when(pl.col("layer") == LAYERS_AVG)
+        .then(pl.lit(LAYERS_AVG))
+        .otherwise(pl.col("block").cast(pl.String))
+        .alias("layer"),
+        pl.col("success").cast(pl.Float64),
+    ).unique(["suite", "task_id", "episode_index", "layer"], keep="first", maintain_order=True)
+    if question.grouping.ratio:
+        table = table.with_columns((pl.col("log_ratio_mean") / np.log(2.0)).alias(LOG2_RATIO))
+    return table.join(origin, on=["suite", "task_id", "episode_index"], how="left").sort(
+        "suite", "task_id", "episode_index", "block", nulls_last=True
+    )
+
+
+def _pair(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str]) -> pl.DataFrame:
+    """Pairs (pair, layer) with `X_first`, `X_other` and `X_difference`, and both episode indices."""
+    # A seed that was allowed to differ is null, and null equals nothing in a join.
+    keys = [*(key for key in PAIR_KEYS if key != "seed" or first["seed"].null_count() == 0), "layer"]
+
+    def side(table: pl.DataFrame, name: str, *more: str) -> pl.DataFrame:
+        values = (pl.col(quantity).alias(f"{quantity}_{name}") for quantity in quantities)
+        return table.select(*keys, *more, pl.col("episode_index").alias(f"episode_{name}"), *values)
+
+    joined = side(first, "first", "instruction", "block").join(side(other, "other"), on=keys, how="inner")
+    return joined.with_columns(
+        (pl.col(f"{q}_other") - pl.col(f"{q}_first")).alias(f"{q}_difference") for q in quantities
+    ).sort("suite", "task_id", "episode_first", "block", nulls_last=True)
+
+
+def _without_partner(table: pl.DataFrame, joined: pl.DataFrame, side: str, run: str, other: str) -> pl.DataFrame:
+    keys = ["suite", "task_id", "episode_index"]
+    found = joined.select("suite", "task_id", pl.col(f"episode_{side}").alias("episode_index")).unique()
+    alone = table.select(keys).unique(maintain_order=True).join(found, on=keys, how="anti", maintain_order="left")
+    return alone.select(pl.lit(run).alias("run"), pl.lit(other).alias("compared_with"), pl.all())
+
+
+def _paired(joined: pl.DataFrame, quantities: Sequence[str], seed: int) -> pl.DataFrame:
+    draws = _Draws(seed)
+    rows: list[dict[str, Any]] = []
+    for scope, part in _scopes(joined):
+        tasks = _tasks(part)
+        resamples = draws.of(tasks)
+        values = [_numbers(part, f"{quantity}_difference") for quantity in quantities]
+        statistics = [mean_over_episodes(value) for value in values]
+        intervals = bootstrap_intervals(statistics, resamples, _LEVEL)
+        for quantity, value, statistic, interval in zip(quantities, values, statistics, intervals, strict=True):
+            used = statistic.used
+            certain = quantity == SUCCESS and bool(used.any()) and not np.ptp(value[used])
+            rows.append(
+                {
+                    **scope,
+                    "quantity": quantity,
+                    "paired": True,
+                    "num_tasks": len(set(tasks[used])),
+                    "num_pairs": int(used.sum()),
+                    "num_first": int(used.sum()),
+                    "num_other": int(used.sum()),
+                    "mean_first": _mean(_numbers(part, f"{quantity}_first")[used]),
+                    "mean_other": _mean(_numbers(part, f"{quantity}_other")[used]),
+                    "difference": statistic.value,
+                    # When all pairs end alike, resamples do so too: that is no certainty about success.
+                    **_ends(None if certain else interval),
+                    "effect": _standardised(value[used]),
+                }
+            )
+    return pl.DataFrame(rows, schema=_DIFFERENCE_SCHEMA)
+
+
+def _unpaired(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str], seed: int) -> pl.DataFrame:
+    """Differences of means of independent episodes. Tasks that both runs have are drawn together, others in each run alone."""
+    both = pl.concat(
+        [
+            table.select(*PAIR_KEYS, "instruction", "layer", "block", *quantities, pl.lit(number).alias("_run"))
+            for number, table in enumerate((first, other))
+        ]
+    )
+    rows: list[dict[str, Any]] = []
+    for scope, part in _scopes(both):
+        is_other = part["_run"].to_numpy() == 1
+        tasks = _tasks(part)
+        if is_other.all() or not is_other.any():
+            continue  # a task of one run only
+        resamples = _independent_draws(tasks, is_other, seed)
+        for quantity in quantities:
+            values = _numbers(part, quantity)
+            certain = quantity == SUCCESS and not np.ptp(values[is_other]) and not np.ptp(values[~is_other])
+            found = contrast(values, is_other, resamples, _LEVEL)
+            rows.append(
+                {
+                    **scope,
+                    "quantity": quantity,
+                    "paired": False,
+                    "num_tasks": len(set(tasks)),
+                    "num_pairs": 0,
+                    "num_first": found.num_second,
+                    "num_other": found.num_first,
+                    "mean_first": found.mean_second,
+                    "mean_other": found.mean_first,
+                    "difference": found.difference,
+                    **_ends(None if certain else found.difference_interval),
+                    "effect": found.hedges_g,
+                }
+            )
+    return pl.DataFrame(rows, schema=_DIFFERENCE_SCHEMA)
+
+
+def _independent_draws(tasks: NDArray[np.int64], is_other: NDArray[np.bool_], seed: int) -> Resamples:
+    if set(tasks[is_other]) == set(tasks[~is_other]):
+        # Both runs have the same tasks: what a draw of tasks does to one, it does to the other.
+        return resample_episodes(tasks, seed=seed)
+    parts = [
+        resample_episodes(tasks[member], seed=seed + number) for number, member in enumerate((~is_other, is_other))
+    ]
+    counts = np.empty((len(parts[0].counts), len(tasks)))
+    counts[:, ~is_other], counts[:, is_other] = parts[0].counts, parts[1].counts
+    return Resamples(counts, tasks)
+
+
+_DIFFERENCE_SCHEMA = {
+    "scope": pl.String,
+    "suite": pl.String,
+    "task_id": pl.Int64,
+    "instruction": pl.String,
+    "layer": pl.String,
+    "block": pl.Int64,
+    "quantity": pl.String,
+    "paired": pl.Boolean,
+    "num_tasks": pl.Int64,
+    "num_pairs": pl.Int64,
+    "num_first": pl.Int64,
+    "num_other": pl.Int64,
+    "mean_first": pl.Float64,
+    "mean_other": pl.Float64,
+    "difference": pl.Float64,
+    "low": pl.Float64,
+    "high": pl.Float64,
+    "effect": pl.Float64,
+}
+
+
+def _scopes(table: pl.DataFrame) -> list[tuple[dict[str, Any], pl.DataFrame]]:
+    """Every (task, layer), every (suite, layer) when there are several suites, then every layer over all tasks."""
+    scopes = []
+    for part in table.partition_by("suite", "task_id", "layer", maintain_order=True):
+        row = part.row(0, named=True)
+        names = {name: row[name] for name in ("suite", "task_id", "instruction", "layer", "block")}
+        scopes.append(({"scope": "task", **names}, part))
+    only = table["suite"][0] if table["suite"].n_unique() == 1 else None
+    wider = [("all", only, part) for part in table.partition_by("layer", maintain_order=True)]
+    if only is None:
+        of_suites = table.partition_by("suite", "layer", maintain_order=True)
+        wider = [("suite", part["suite"][0], part) for part in of_suites] + wider
+    for scope, suite, part in wider:
+        names = {"suite": suite, "task_id": None, "instruction": None}
+        scopes.append(({"scope": scope, **names, "layer": part["layer"][0], "block": part["block"][0]}, part))
+    return scopes
+
+
+def _estimates(run: str, table: pl.DataFrame, quantities: Sequence[str], seed: int) -> pl.DataFrame:
+    draws = _Draws(seed)
+    rows = []
+    for part in table.partition_by("suite", "layer", maintain_order=True):
+        tasks = _tasks(part)
+        statistics = {
+            ("ratio" if quantity == LOG2_RATIO else quantity): geometric_mean_over_episodes(
+                _numbers(part, "log_ratio_mean")
+            )
+            if quantity == LOG2_RATIO
+            else mean_over_episodes(_numbers(part, quantity), SHARE)
+            for quantity in quantities
+        }
+        if LOG2_RATIO in quantities:
+            statistics["ratio_lift"] = mean_over_episodes(_numbers(part, "ratio_lift"), POSITIVE)
+        row: dict[str, Any] = {
+            "run": run,
+            "suite": part["suite"][0],
+            "layer": part["layer"][0],
+            "block": part["block"][0],
+        }
+        row |= {"num_tasks": len(set(tasks)), "num_episodes": part.height}
+        if LOG2_RATIO in quantities:
+            row["uniform_ratio"] = mean_over_episodes(_numbers(part, "uniform_ratio")).value
+            row["episodes_without_ratio"] = statistics["ratio"].num_left_out
+            row["num_nonfinite"] = int(part["num_nonfinite"].sum())
+        intervals = bootstrap_intervals(list(statistics.values()), draws.of(tasks), _LEVEL)
+        for (name, statistic), interval in zip(statistics.items(), intervals, strict=True):
+            ends = _ends(interval)
+            # When all episodes end alike, resamples do so too: that is no certainty about a success rate.
+            if name == SUCCESS and statistic.value in (0.0, 1.0):
+                ends = _ends(None)
+            row |= {name: statistic.value, f"{name}_low": ends["low"], f"{name}_high": ends["high"]}
+        rows.append(row)
+    text = dict.fromkeys(("run", "suite", "layer"), pl.String)
+    counts = ("block", "num_tasks", "num_episodes", "episodes_without_ratio", "num_nonfinite")
+    whole = dict.fromkeys(counts, pl.Int64)
+    return pl.DataFrame(rows, schema={name: {**text, **whole}.get(name, pl.Float64) for name in rows[0]})
+
+
+class _Draws:
+    """Resamples by the pattern of tasks: layers and quantities of the same episodes share theirs."""
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+        self._known: dict[bytes, Resamples] = {}
+
+    def of(self, tasks: NDArray[np.int64]) -> Resamples:
+        key = (tasks - tasks[0]).tobytes()
+        if key not in self._known:
+            self._known[key] = resample_episodes(tasks, seed=self._seed)
+        return self._known[key]
+
+
+def _tasks(part: pl.DataFrame) -> NDArray[np.int64]:
+    return part.select(pl.struct("suite", "task_id").rank("dense").cast(pl.Int64)).to_series().to_numpy()
+
+
+def _numbers(part: pl.DataFrame, column: str) -> NDArray[np.float64]:
+    return part[column].cast(pl.Float64).fill_null(float("nan")).to_numpy()
+
+
+def _mean(values: NDArray[np.float64]) -> float | None:
+    return float(values.mean()) if len(values) else None
+
+
+def _standardised(differences: NDArray[np.float64]) -> float | None:
+    """Mean / standard deviation (ddof 1) of paired differences (Cohen 1988, d_z); None without any spread."""
+    spread = float(differences.std(ddof=1)) if len(differences) > 1 else 0.0
+    return float(differences.mean() / spread) if spread > 0 else None
+
+
+def _ends(interval: Interval | None) -> dict[str, float | None]:
+    return {"low": interval.low if interval else None, "high": interval.high if interval else None}

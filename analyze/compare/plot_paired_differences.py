@@ -1,0 +1,141 @@
+"""`paired_differences_RUN`: every pair's difference, per task, with the task's mean and interval, and the mean over tasks."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import polars as pl
+
+from vla_attention.analyze.compare.comparison import LOG2_RATIO, Comparison
+from vla_attention.analyze.compare.plot_forest import factor_axis
+from vla_attention.analyze.compare.text import overall_layer_of
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG
+from vla_attention.analyze.show.plot_style import (
+    DATA_COLOR,
+    NOTE_COLOR,
+    drawn_in_our_style,
+    explain,
+    named,
+    new_figure,
+    plural,
+    save_figure,
+    title,
+    wrapped,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+#: From this many tasks on, a row is one line high.
+_MANY = 24
+
+
+def stem_of(name: str) -> str:
+    """File name of the picture of a run."""
+    return "paired_differences_" + re.sub(r"[^A-Za-z0-9._-]+", "_", name)
+
+
+@drawn_in_our_style
+def plot_paired_differences(
+    comparison: Comparison, name: str, folder: Path, layer: str | None = None, level: float = 0.95
+) -> list[Path]:
+    """Draw one run against the first one; returns the paths of png, pdf and csv. `layer`: "layers_avg" unless given."""
+    layer = layer or overall_layer_of(comparison.estimates)
+    quantity = comparison.quantities[0]
+    of_run = (pl.col("run") == name, pl.col("layer") == layer)
+    rows = comparison.differences.filter(*of_run, pl.col("quantity") == quantity, pl.col("scope") != "suite")
+    pairs = comparison.pairs.filter(*of_run)
+    tasks = rows.filter(pl.col("scope") == "task")
+    few = tasks.height <= _MANY
+    figure = new_figure(9, 1.7 + (0.42 if few else 0.2) * (rows.height + 0.5))
+    which = "mean over layers" if layer == LAYERS_AVG else f"block {layer}"
+    first = comparison.names[0]
+    paired = pairs.height > 0
+    note = (
+        f"{plural(pairs.height, 'pair')} of episodes of {plural(tasks.height, 'task')}, equal in task, initial state "
+        "and seed. n counts pairs."
+        if paired
+        else "Not paired: no two episodes are equal in task, initial state and seed. n counts episodes of either run."
+    )
+    title(figure, f"{name} against {first}: {named(comparison.grouping)}, {which}", note)
+    axes = figure.subplots()
+    if tasks.is_empty():
+        explain(axes, "The runs have no task in common.")
+        return save_figure(figure, folder, stem_of(name), rows)
+    is_ratio = quantity == LOG2_RATIO
+    dots = pairs[f"{quantity}_difference"].drop_nulls().to_numpy()
+    values = np.concatenate([rows[column].drop_nulls().to_numpy() for column in ("difference", "low", "high")] + [dots])
+    values = values[np.isfinite(values)]
+    if not values.size:
+        explain(axes, "No pair has a finite ratio in both runs.")
+        return save_figure(figure, folder, stem_of(name), rows)
+    if is_ratio:
+        factor_axis(axes.xaxis, np.append(2.0**values, 1.0))
+        axes.set_xlabel(f"ratio of {wrapped(name, 30, 1)} as a factor of that of {wrapped(first, 30, 1)} (logarithmic)")
+    else:
+        axes.set_xlabel(f"difference in the fraction of '{quantity.removesuffix('_fraction')}', {name} minus {first}")
+    axes.axvline(1.0 if is_ratio else 0.0, color=NOTE_COLOR, linewidth=1.0, zorder=1)
+    generator = np.random.default_rng(0)
+    for place, row in enumerate(rows.iter_rows(named=True)):
+        _draw_row(axes, place, row, pairs, quantity, generator, few)
+    several = tasks["suite"].n_unique() > 1
+    axes.set_yticks(range(rows.height), [_label(row, several, few) for row in rows.iter_rows(named=True)])
+    axes.set_ylim(rows.height - 0.4, -0.6)
+    axes.tick_params(axis="y", length=0)
+    axes.grid(axis="x")
+    axes.plot([], [], "o", color=DATA_COLOR, markersize=6, label="mean")
+    if rows["low"].is_not_null().any():
+        axes.plot([], [], color=DATA_COLOR, linewidth=2, label=f"{level:.0%} bootstrap interval")
+    if paired:
+        axes.scatter([], [], s=14, color="#56B4E9", linewidths=0, label="single pair")
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.1, handlelength=1.5)
+    return save_figure(figure, folder, stem_of(name), rows)
+
+
+def _draw_row(
+    axes: Axes, place: int, row: dict, pairs: pl.DataFrame, quantity: str, generator: np.random.Generator, few: bool
+) -> None:
+    def scaled(values: Any) -> Any:
+        return 2.0**values if quantity == LOG2_RATIO else values
+
+    total = row["scope"] != "task"
+    if total:
+        axes.axhspan(place - 0.5, place + 0.5, color="#F0F0F0", linewidth=0, zorder=0)
+    else:
+        own = pairs.filter((pl.col("suite") == row["suite"]) & (pl.col("task_id") == row["task_id"]))
+        values = own[f"{quantity}_difference"].drop_nulls().to_numpy()
+        values = values[np.isfinite(values)]
+        jitter = generator.uniform(-0.22, 0.22, len(values)) if len(values) > 1 else np.zeros(len(values))
+        axes.scatter(
+            scaled(values), place + jitter, s=14 if few else 8, color="#56B4E9", alpha=0.8, linewidths=0, zorder=2
+        )
+    if row["low"] is not None:
+        ends = [scaled(row["low"]), scaled(row["high"])]
+        axes.plot(ends, [place, place], color=DATA_COLOR, linewidth=2.0 if few else 1.4, zorder=3)
+    if row["difference"] is not None:
+        axes.plot(
+            scaled(row["difference"]), place, "D" if total else "o", color=DATA_COLOR, markersize=6.5 if few else 4.5,
+            markeredgecolor="white", zorder=4,
+        )  # fmt: skip
+    else:
+        axes.text(
+            0.01,
+            place,
+            "no difference to show",
+            transform=axes.get_yaxis_transform(),
+            va="center",
+            size=7,
+            color=NOTE_COLOR,
+        )
+    n = f"n = {row['num_pairs']}" if row["paired"] else f"n = {row['num_first']}, {row['num_other']}"
+    axes.text(1.01, place, n, transform=axes.get_yaxis_transform(), va="center", size=7, color=NOTE_COLOR)
+
+
+def _label(row: dict, several: bool, few: bool) -> str:
+    if row["scope"] == "all":
+        return "all tasks"
+    number = f"{row['suite']} {row['task_id']}" if several else str(row["task_id"])
+    return wrapped(f"{number}: {row['instruction']}", 52 if few else 60, 2 if few else 1)

@@ -1,0 +1,199 @@
+"""What `vla-analyze compare` prints."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+
+import polars as pl
+
+from vla_attention.analyze.compare.comparison import LOG2_RATIO, SUCCESS, Comparison
+from vla_attention.analyze.compare.runs import Run
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG
+from vla_attention.analyze.show.text_table import format_interval, format_number, text_table
+from vla_attention.schemas.errors import listing
+from vla_attention.schemas.stores.store_format import episode_name
+
+WIDTH = 100
+
+
+def overall_layer_of(table: pl.DataFrame) -> str:
+    """The layer that speaks for the whole: "layers_avg" where there is one."""
+    layers = table["layer"].unique(maintain_order=True).to_list()
+    return LAYERS_AVG if LAYERS_AVG in layers else layers[0]
+
+
+def comparison_text(comparison: Comparison, runs: Sequence[Run]) -> str:
+    """The whole text, at most 100 columns wide."""
+    layer = overall_layer_of(comparison.estimates)
+    parts = [_header(comparison, runs, layer), _estimates_section(comparison, layer)]
+    for name in comparison.names[1:]:
+        parts.append(_difference_section(comparison, name, layer))
+        if name in comparison.runs_with_common_tasks:
+            parts.append(_tasks_section(comparison, name, layer))
+    parts.append(_layers_section(comparison))
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _header(comparison: Comparison, runs: Sequence[Run], layer: str) -> str:
+    lines = ["COMPARISON OF RUNS", "=" * WIDTH]
+    if any(store.attributes.policy.untrained for run in runs for store in run.stores):
+        lines += _wrapped(
+            "WARNING: a policy has untrained (random) weights; differences to it say nothing about any policy.", ""
+        )
+    for run in runs:
+        policy = run.stores[0].attributes.policy
+        stores = ", ".join(str(store.path) for store in run.stores)
+        lines += _wrapped(f"{run.name}: {policy.name} ({policy.checkpoint}), {listing(run.suites)}; {stores}", "  ")
+    which = layer if layer == LAYERS_AVG else f"block {layer}"
+    lines += _wrapped(
+        f"Grouping '{comparison.grouping.name}', site {runs[0].question.site}, {which}; differences are run "
+        f"minus {comparison.names[0]}. Intervals: 95%, bootstrap over tasks and episodes.",
+        "",
+    )
+    for note in comparison.notes:
+        lines += _wrapped(f"note: {note}", "  ")
+    return "\n".join(lines)
+
+
+def _estimates_section(comparison: Comparison, layer: str) -> str:
+    rows = comparison.estimates.filter(pl.col("layer") == layer)
+    ratio = LOG2_RATIO in comparison.quantities
+    header = ["run", "suite", "episodes", "success"] + (["ratio", "interval", "uniform", "lift"] if ratio else [])
+    fractions = [name for name in comparison.quantities if name.endswith("_fraction")][: 2 if ratio else 5]
+    header += [name.removesuffix("_fraction")[:14] for name in fractions]
+    body = []
+    for row in rows.iter_rows(named=True):
+        cells = [row["run"][:24], row["suite"][:16], str(row["num_episodes"]), f"{100 * row[SUCCESS]:.0f}%"]
+        if ratio:
+            cells += [format_number(row["ratio"]), format_interval(row["ratio_low"], row["ratio_high"])]
+            cells += [format_number(row["uniform_ratio"]), format_number(row["ratio_lift"])]
+        body.append(cells + [_percent(row[name]) for name in fractions])
+    note = (
+        "ratio: geometric mean over episodes; uniform: what uniform attention gives; lift: ratio / uniform."
+        if ratio
+        else ""
+    )
+    lines = [_title("EACH RUN"), text_table(header, body, left=(0, 1)), *_wrapped(note, "")]
+    for row in rows.iter_rows(named=True) if ratio else ():
+        if row["num_nonfinite"] or row["episodes_without_ratio"]:
+            lines += _wrapped(
+                f"{row['run']}, {row['suite']}: {row['num_nonfinite']} replans have no finite ratio and are in no ratio; "
+                f"{row['episodes_without_ratio']} of {row['num_episodes']} episodes have none at all.",
+                "",
+            )
+    return "\n".join(lines)
+
+
+def _difference_section(comparison: Comparison, name: str, layer: str) -> str:
+    first = comparison.names[0]
+    rows = comparison.differences.filter(pl.col("run") == name, pl.col("scope") == "all", pl.col("layer") == layer)
+    lines = [_title(f"{name} AGAINST {first}")]
+    lines += _pairing(comparison, name, rows)
+    header = ["quantity", "n", first[:14], name[:14], "difference", "interval", "factor", "effect"]
+    body = []
+    for row in rows.iter_rows(named=True):
+        is_ratio = row["quantity"] == LOG2_RATIO
+        n = str(row["num_pairs"]) if row["paired"] else f"{row['num_first']}/{row['num_other']}"
+        factor = "" if not is_ratio or row["difference"] is None else f"x {format_number(2.0 ** row['difference'])}"
+        body.append(
+            [
+                row["quantity"] if len(row["quantity"]) <= 26 else f"{row['quantity'][:25]}…",
+                n,
+                format_number(row["mean_first"]),
+                format_number(row["mean_other"]),
+                _signed(row["difference"]),
+                format_interval(row["low"], row["high"]),
+                factor,
+                _signed(row["effect"]),
+            ]
+        )
+    lines.append(text_table(header, body, left=(0,)))
+    paired = bool(rows["paired"].any())
+    effect = "mean / standard deviation of the paired differences" if paired else "Hedges' g, in standard deviations"
+    lines += _wrapped(f"effect: {effect}. A difference of 1 in log2_ratio is a factor of 2 in the ratio.", "")
+    return "\n".join(lines)
+
+
+def _pairing(comparison: Comparison, name: str, rows: pl.DataFrame) -> list[str]:
+    first = comparison.names[0]
+    alone = {
+        run: comparison.unpaired.filter(pl.col("run") == run, pl.col("compared_with") == other)
+        for run, other in ((first, name), (name, first))
+    }
+    if not rows["paired"].any():
+        return _wrapped(
+            f"NOT PAIRED: no episode of {name} has the suite, task, initial state and seed of one of {first}, so this compares means "
+            "of independent episodes; differences between scenes are in it, and intervals are wider for that.",
+            "",
+        )
+    pairs = comparison.pairs.filter(pl.col("run") == name).select("suite", "task_id", "episode_first").unique().height
+    text = f"{pairs} pair{'' if pairs == 1 else 's'} of episodes with the same task, initial state and seed."
+    for run, table in alone.items():
+        if table.height:
+            names = [episode_name(row["task_id"], row["episode_index"]) for row in table.iter_rows(named=True)]
+            text += f" Of {run}, {table.height} have no partner and are left out: {listing(names, 6)}."
+    return _wrapped(text, "")
+
+
+def _tasks_section(comparison: Comparison, name: str, layer: str) -> str:
+    quantity = comparison.quantities[0]
+    rows = comparison.differences.filter(
+        pl.col("run") == name, pl.col("scope") != "all", pl.col("layer") == layer, pl.col("quantity") == quantity
+    )
+    several = rows["suite"].n_unique() > 1
+    header = ["task", "n", "difference", "interval"]
+    body = [
+        [
+            f"{row['suite']} {'all' if row['task_id'] is None else row['task_id']}" if several else str(row["task_id"]),
+            str(row["num_pairs"]) if row["paired"] else f"{row['num_first']}/{row['num_other']}",
+            _signed(row["difference"]),
+            format_interval(row["low"], row["high"]),
+        ]
+        for row in rows.iter_rows(named=True)
+    ]
+    texts = [row["instruction"] or "" for row in rows.iter_rows(named=True)]
+    table = text_table(header, body, left=(0,), last="instruction", texts=texts, width=WIDTH)
+    return "\n".join([_title(f"PER TASK  {quantity}, {name} minus {comparison.names[0]}"), table])
+
+
+def _layers_section(comparison: Comparison) -> str:
+    rows = comparison.differences.filter(pl.col("scope") == "all", pl.col("quantity") == comparison.quantities[0])
+    layers = [layer for layer in rows["layer"].unique(maintain_order=True) if layer != LAYERS_AVG]
+    if len(layers) < 2:
+        return ""
+    cells = {(row["run"], row["layer"]): row for row in rows.iter_rows(named=True)}
+    others = comparison.names[1:4]
+    header = ["block"] + [text for name in others for text in (name[:20], "interval")]
+    body = []
+    for layer in layers:
+        line = [layer]
+        for name in others:
+            row = cells.get((name, layer))
+            line += (
+                ["-", "-"] if row is None else [_signed(row["difference"]), format_interval(row["low"], row["high"])]
+            )
+        body.append(line)
+    more = (
+        f" (the first {len(others)} runs; the others are in the table)"
+        if len(others) < len(comparison.names) - 1
+        else ""
+    )
+    title = f"PER LAYER  {comparison.quantities[0]}, run minus {comparison.names[0]}{more}"
+    return "\n".join([_title(title), text_table(header, body, left=(0,))])
+
+
+def _signed(value: float | None) -> str:
+    return format_number(value) if value is None or value <= 0 else f"+{format_number(value)}"
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.1f}%"
+
+
+def _title(text: str) -> str:
+    return "\n".join([*textwrap.wrap(text, WIDTH), "-" * WIDTH])
+
+
+def _wrapped(text: str, indent: str) -> list[str]:
+    return textwrap.wrap(text, WIDTH, subsequent_indent=indent, break_on_hyphens=False)

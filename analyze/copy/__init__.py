@@ -1,0 +1,1 @@
+"""`vla-analyze copy`: a smaller copy of a store."""

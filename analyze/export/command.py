@@ -1,0 +1,98 @@
+"""`vla-analyze export`: tables as CSV or Parquet, masses and rows as NetCDF."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from vla_attention.analyze.arguments import (
+    add_grouping,
+    add_selection,
+    add_stores,
+    output_folder,
+    report_files,
+    settings_of,
+)
+from vla_attention.schemas.command_line import OneSentenceParser
+from vla_attention.schemas.errors import BadArgument
+
+_TABLES = ("steps", "replans", "episodes", "tasks", "contributions")
+_EXAMPLES = """examples:
+  vla-analyze export runs/libero_10.zarr --csv
+  vla-analyze export runs/libero_10.zarr --parquet --table steps --per-head --grouping cameras
+  vla-analyze export runs/libero_10.zarr --netcdf --group bowl=word:bowl --group rest='*'
+  vla-analyze export runs/libero_10.zarr --netcdf --rows --layers 25 --tasks 0
+
+Tables: steps (every replan, layer and denoise step), replans, episodes, tasks (with intervals), contributions (norms, where
+recorded). The NetCDF file, attention.nc, has (episode, replan) as one axis `sample`, so that nothing is padded; open it with
+xarray.open_dataset, or anything that reads HDF5.
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of `vla-analyze export STORE ...`."""
+    parser = OneSentenceParser(
+        prog="vla-analyze export",
+        description="Numbers for other programs: tables as CSV or Parquet; masses, and rows if wanted, as NetCDF.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_stores(parser)
+    kinds = parser.add_argument_group("kinds (at least one)")
+    kinds.add_argument("--csv", action="store_true", help="tables as NAME.csv")
+    kinds.add_argument("--parquet", action="store_true", help="tables as NAME.parquet")
+    kinds.add_argument("--netcdf", action="store_true", help="masses as attention.nc (needs the extra 'xarray')")
+    kinds.add_argument(
+        "--table",
+        action="append",
+        choices=_TABLES,
+        metavar="NAME",
+        help=f"which table; may be repeated: {', '.join(_TABLES)} (default: episodes, tasks, steps)",
+    )
+    kinds.add_argument(
+        "--rows", action="store_true", help="with --netcdf: also the rows themselves; size is said first"
+    )
+    add_grouping(parser)
+    selection = add_selection(parser)
+    selection.add_argument("--per-head", action="store_true", help="keep heads apart in the steps table")
+    output = parser.add_argument_group("output")
+    output.add_argument("--output", type=Path, metavar="PATH", help="folder (default: results/STORE/export)")
+    output.add_argument("--seed", type=int, default=0, help="seed of the bootstrap (default: 0)")
+    return parser
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write what was asked for."""
+    kinds = [kind for kind in ("csv", "parquet", "netcdf") if getattr(arguments, kind)]
+    tables_wanted = arguments.csv or arguments.parquet
+    if not kinds:
+        raise BadArgument("Nothing to export to; give --csv, --parquet or --netcdf, or several of them.")
+    if arguments.rows and not arguments.netcdf:
+        raise BadArgument("--rows goes with --netcdf: rows do not fit into a table.")
+    if arguments.table and not tables_wanted:
+        raise BadArgument("--table goes with --csv or --parquet; --netcdf always holds masses.")
+    # Imported after the arguments were read: `--help` must not wait for polars and zarr.
+    from vla_attention.analyze.measures.question import ask
+    from vla_attention.schemas.stores.reader import open_store
+
+    question = ask([open_store(path) for path in arguments.stores], settings_of(arguments))
+    for line in question.skipped:
+        print(line)
+    folder = output_folder(arguments, "export")
+    written: list[Path] = []
+    if tables_wanted:
+        from vla_attention.analyze.export.tables import DEFAULT_TABLES, chosen_tables, write_tables
+        from vla_attention.analyze.ratios.analysis import analyse
+
+        names = list(dict.fromkeys(arguments.table or DEFAULT_TABLES))
+        written += write_tables(folder, chosen_tables(analyse(question), names), kinds)
+    if arguments.netcdf:
+        from vla_attention.analyze.export.labelled_arrays import rows_size, write_netcdf
+        from vla_attention.analyze.show.progress import progress_bar
+
+        if arguments.rows:
+            print(f"rows: {rows_size(question)}, before compression")
+        with progress_bar(len(question.selected) * (1 + arguments.rows), "episodes") as advance:
+            written.append(write_netcdf(question, folder / "attention.nc", arguments.rows, advance))
+    report_files(folder, written)
+    return 0

@@ -1,0 +1,322 @@
+"""Masses and rows as labelled arrays (xarray), and as NetCDF files.
+
+Episodes have different lengths, so that (episode, replan) is one axis, `sample`, with coordinates that say which episode and which
+environment step each sample is; nothing is padded. Heads are always kept apart; stored queries are averaged.
+
+    mass       (sample, layer, denoise, head, group)   sum of probability x weight
+    row_sum    (sample, layer, denoise, head)          what the row sums to, before storage rounded it
+    num_keys   (sample, group), num_valid (sample)     keys of the group; keys that can hold information
+    rows       (sample, layer, denoise, head, key)     only on request: the probabilities themselves
+    key_role   (sample, key)                           with rows: codes of the roles of `vla_attention.schemas.layout.Role`
+
+xarray and h5netcdf are the extra `xarray`; nothing here imports them before an array is asked for.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.steps import SelectedEpisode, episode_masses, resolve_all
+from vla_attention.analyze.show.atomic_file import replacing
+from vla_attention.analyze.stores.parallel import map_episodes
+from vla_attention.analyze.stores.rows import layer_rows
+from vla_attention.schemas.errors import BadArgument, MissingDependency
+from vla_attention.schemas.groupings.resolve import ResolvedGrouping
+from vla_attention.schemas.layout import Role, SiteLayout
+from vla_attention.schemas.precision import mass_error_bound
+
+if TYPE_CHECKING:
+    import xarray
+
+ROW_DIMENSIONS = ("sample", "layer", "denoise", "head", "key")
+_MASS_DIMENSIONS = (*ROW_DIMENSIONS[:-1], "group")
+#: Rows are stored in pieces of about this size, each of whole (head, key) planes of one layer and denoise step.
+_CHUNK_BYTES = 1 << 18
+
+
+@dataclass(frozen=True)
+class RowsSize:
+    """How large the rows of a question are: lengths of the axes, and bytes in float32 before compression."""
+
+    shape: tuple[int, int, int, int, int]
+
+    @property
+    def num_bytes(self) -> int:
+        """Bytes in float32, uncompressed."""
+        return 4 * int(np.prod([int(length) for length in self.shape], dtype=object))
+
+    def __str__(self) -> str:
+        samples, layers, steps, heads, keys = self.shape
+        return (
+            f"{samples} samples x {layers} layers x {steps} denoise steps x {heads} heads x {keys} keys, "
+            f"{_bytes(self.num_bytes)} in float32"
+        )
+
+
+def rows_size(question: Question) -> RowsSize:
+    """The size of a question's rows, before any is read."""
+    selection = question.selection
+    samples = sum(item.episode.attributes.num_replans for item in question.selected)
+    keys = question.selected[0].tokens.layout.num_keys
+    return RowsSize((samples, len(selection.layers), len(selection.denoise), len(selection.heads), keys))
+
+
+def masses_array(question: Question, progress: Callable[[int], object] | None = None) -> xarray.Dataset:
+    """The masses of a question's groups; `progress` is called with 1 after each episode.
+
+    Raises:
+        MissingDependency: xarray is not installed.
+    """
+    xr = _needed("xarray")
+    selection = replace(question.selection, per_head=True)
+    resolved = resolve_all(question.grouping, question.selected, question.vocabulary)
+
+    def measure(pair: tuple[SelectedEpisode, ResolvedGrouping]) -> tuple[NDArray[Any], ...]:
+        mass, row_sum = episode_masses(*pair, selection, question.site)
+        keys, valid = pair[1].num_keys, pair[1].num_valid
+        # The last mass is that of all valid keys.
+        return (
+            mass[..., :-1],
+            row_sum,
+            np.broadcast_to(keys, (len(mass), keys.shape[1])),
+            np.broadcast_to(valid, len(mass)),
+        )
+
+    parts = map_episodes(measure, list(zip(question.selected, resolved, strict=True)), progress)
+    mass, row_sum, keys, valid = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    cells = _MASS_DIMENSIONS[:-1]
+    return xr.Dataset(
+        {
+            "mass": (_MASS_DIMENSIONS, mass, {"long_name": "attention mass", "units": "1"}),
+            "row_sum": (cells, row_sum, {"long_name": "sum of the row as computed", "units": "1"}),
+            "num_keys": (
+                ("sample", "group"), keys, {"long_name": "number of keys, fractional for objects"}
+            ),
+            "num_valid": ("sample", valid, {"long_name": "number of valid keys"}),
+        },
+        coords={**_sample_coordinates(question), **_axis_coordinates(question), "group": list(question.grouping.names)},
+        attrs=_attributes(question),
+    )  # fmt: skip
+
+
+def rows_array(
+    question: Question, most_bytes: int | None = None, progress: Callable[[int], object] | None = None
+) -> xarray.Dataset:
+    """The rows of a question in memory, with the roles of their keys.
+
+    Raises:
+        BadArgument: they would take more than `most_bytes`.
+        MissingDependency: xarray is not installed.
+    """
+    xr = _needed("xarray")
+    size = rows_size(question)
+    if most_bytes is not None and size.num_bytes > most_bytes:
+        raise BadArgument(
+            f"The rows would take {size}, more than the {_bytes(most_bytes)} that are allowed; choose fewer layers, denoise steps, "
+            "heads or tasks, allow more, or write them to a file with vla-analyze export --netcdf --rows."
+        )
+    rows = np.empty(size.shape, dtype=np.float32)
+    for part, values in _parts(question, progress):
+        rows[part] = values
+    variables = {
+        name: (dimensions, values, attributes) for name, dimensions, values, attributes in _key_variables(question)
+    }
+    return xr.Dataset(
+        {"rows": (ROW_DIMENSIONS, rows, _rows_attributes(question))},
+        coords={**_sample_coordinates(question), **_axis_coordinates(question), **variables},
+        attrs=_attributes(question),
+    )
+
+
+def write_netcdf(
+    question: Question, path: Path, rows: bool = False, progress: Callable[[int], object] | None = None
+) -> Path:
+    """Write masses and, if asked for, rows into one NetCDF-4 file, which appears whole. Rows are never held at once.
+
+    `progress` is called with 1 after each episode, once for masses and once for rows.
+
+    Raises:
+        MissingDependency: xarray or h5netcdf is not installed.
+        BadArgument: the file cannot be written.
+    """
+    h5netcdf = _needed("h5netcdf")
+    _needed("h5py")
+    masses = masses_array(question, progress)
+    compressed = {name: {"zlib": True, "complevel": 4} for name in ("mass", "row_sum")}
+    try:
+        with replacing(path) as temporary:
+            masses.to_netcdf(temporary, engine="h5netcdf", encoding=compressed)
+            if rows:
+                with h5netcdf.File(temporary, "a") as file:
+                    _write_rows(file, question, progress)
+    except OSError as error:
+        raise BadArgument(f"Cannot write {path}: {error.strerror or error}; give another --output.") from None
+    return path
+
+
+def _write_rows(file: Any, question: Question, progress: Callable[[int], object] | None) -> None:
+    size = rows_size(question)
+    samples, _, _, heads, keys = size.shape
+    file.dimensions["key"] = keys
+    for name, dimensions, values, attributes in _key_variables(question):
+        kind = values.dtype if values.dtype.kind != "U" else _text_type()
+        variable = file.create_variable(name, dimensions, kind)
+        variable[...] = values if values.dtype.kind != "U" else values.astype(object)
+        for key, value in attributes.items():
+            variable.attrs[key] = value
+    chunk = (max(1, min(samples, _CHUNK_BYTES // (4 * heads * keys))), 1, 1, heads, keys)
+    variable = file.create_variable(
+        "rows", ROW_DIMENSIONS, np.float32, chunks=chunk, compression="gzip", compression_opts=4, shuffle=True
+    )
+    for key, value in _rows_attributes(question).items():
+        variable.attrs[key] = value
+    # What tells xarray which variables describe axes.
+    about_keys = [name for name, *_ in _key_variables(question)]
+    variable.attrs["coordinates"] = " ".join([*_SAMPLE_COORDINATES, "block", "denoise_time", *about_keys])
+    for part, values in _parts(question, progress):
+        variable[part] = values
+
+
+def _parts(question: Question, progress: Callable[[int], object] | None) -> Any:
+    """(index, values): where a piece of rows (replan, head, key) belongs, for every episode, layer and denoise step."""
+    start = 0
+    for item in question.selected:
+        stop = start + item.episode.attributes.num_replans
+        for part in layer_rows(item.episode, question.selection, question.site):
+            yield (slice(start, stop), part.layer, part.denoise), part.rows
+        start = stop
+        if progress is not None:
+            progress(1)
+
+
+_SAMPLE_COORDINATES = (
+    "suite", "store", "task_id", "instruction", "episode_index", "success", "num_steps", "replan", "env_step",
+)  # fmt: skip
+
+
+def _sample_coordinates(question: Question) -> dict[str, tuple[str, NDArray[Any]]]:
+    """Which episode and which environment step every sample is."""
+    columns: dict[str, list[Any]] = {name: [] for name in _SAMPLE_COORDINATES}
+    for item in question.selected:
+        attributes = item.episode.attributes
+        constant = {
+            "suite": item.store.suite,
+            "store": item.store.path.name,
+            **{
+                name: getattr(attributes, name)
+                for name in ("task_id", "instruction", "episode_index", "success", "num_steps")
+            },
+        }
+        for name, value in constant.items():
+            columns[name] += [value] * attributes.num_replans
+        columns["replan"] += range(attributes.num_replans)
+        columns["env_step"] += item.episode.read("env_step").tolist()
+    return {name: ("sample", np.array(values)) for name, values in columns.items()}
+
+
+def _axis_coordinates(question: Question) -> dict[str, Any]:
+    selection = question.selection
+    times = [item.episode.read("denoise_time")[list(selection.denoise)] for item in question.selected]
+    counts = [item.episode.attributes.num_replans for item in question.selected]
+    same = all(np.array_equal(times[0], other) for other in times)
+    return {
+        "layer": ("layer", np.array(selection.layer_labels), {"long_name": "layer, as the user numbers it"}),
+        "block": ("layer", np.array(selection.blocks), {"long_name": "transformer block"}),
+        "denoise": ("denoise", np.array(selection.denoise_steps), {"long_name": "denoise step"}),
+        "denoise_time": ("denoise", times[0]) if same else (("sample", "denoise"), np.repeat(times, counts, axis=0)),
+        "head": ("head", np.array(selection.head_numbers)),
+    }
+
+
+def _key_variables(question: Question) -> list[tuple[str, tuple[str, ...], NDArray[Any], Mapping[str, Any]]]:
+    """Name, dimensions, values and attributes of what every key is."""
+    layout = question.selected[0].tokens.layout
+    codes = {"flag_values": np.array([int(role) for role in Role], dtype=np.uint8)}
+    roles = []
+    for item in question.selected:
+        stored = item.tokens.key_role
+        roles.append(np.broadcast_to(stored, (item.episode.attributes.num_replans, stored.shape[1])))
+    meanings = {**codes, "flag_meanings": " ".join(role.label for role in Role)}
+    return [
+        ("key_span", ("key",), _of_span(layout, [span.name for span in layout.spans]), {}),
+        ("key_kind", ("key",), _of_span(layout, [span.kind for span in layout.spans]), {}),
+        ("key_camera", ("key",), _of_span(layout, [span.camera or "" for span in layout.spans]), {}),
+        *_patches(layout),
+        ("key_role", ("sample", "key"), np.concatenate(roles), meanings),
+    ]
+
+
+def _of_span(layout: SiteLayout, names: list[str]) -> NDArray[np.str_]:
+    return np.array(names)[layout.span_of_key()]
+
+
+def _patches(layout: SiteLayout) -> list[tuple[str, tuple[str, ...], NDArray[Any], Mapping[str, Any]]]:
+    """Row and column of every patch, from the top left; -1 for keys that are no patch."""
+    rows, columns = (np.full(layout.num_keys, -1, dtype=np.int32) for _ in range(2))
+    for span in layout.spans:
+        if span.grid is not None:
+            patch = np.arange(span.num_keys)
+            rows[span.start : span.stop] = patch // span.grid.columns
+            columns[span.start : span.stop] = patch % span.grid.columns
+    note = {"comment": "from the top left; -1: no patch"}
+    return [("patch_row", ("key",), rows, note), ("patch_column", ("key",), columns, note)]
+
+
+def _rows_attributes(question: Question) -> dict[str, Any]:
+    bits = question.stores[0].attributes.recording.mantissa_bits
+    return {
+        "long_name": "attention probability, mean over the stored queries",
+        "units": "1",
+        "relative_error": mass_error_bound(bits),
+    }
+
+
+def _attributes(question: Question) -> dict[str, Any]:
+    """What the arrays are about; text and numbers only, so that every format can hold it."""
+    root, grouping = question.stores[0].attributes, question.grouping
+    attributes: dict[str, Any] = {
+        "title": f"attention of the action queries, site '{question.site}'",
+        "site": question.site,
+        "stores": [str(store.path) for store in question.stores],
+        "policy": root.policy.name,
+        "checkpoint": root.policy.checkpoint,
+        "policy_digest": root.policy.digest,
+        "untrained": int(root.policy.untrained),
+        "queries": root.recording.queries,
+        "mantissa_bits": root.recording.mantissa_bits,
+        "grouping": grouping.name,
+        "groups": json.dumps({name: list(selectors) for name, selectors in grouping.groups.items()}),
+    }
+    if grouping.ratio is not None:
+        sides = (grouping.ratio.numerator, grouping.ratio.denominator)
+        attributes["ratio"] = " / ".join("+".join(side) for side in sides)
+    return attributes
+
+
+def _needed(module: str) -> Any:
+    try:
+        return import_module(module)
+    except ImportError:
+        raise MissingDependency(
+            f"Labelled arrays and NetCDF need {module}, which is not installed; pip install 'vla-attention[xarray]'."
+        ) from None
+
+
+def _text_type() -> Any:
+    return _needed("h5py").string_dtype()
+
+
+def _bytes(count: int) -> str:
+    for size, unit in ((10**12, "TB"), (10**9, "GB"), (10**6, "MB")):
+        if count >= size:
+            return f"{count / size:.1f} {unit}"
+    return f"{count / 1000:.0f} kB"

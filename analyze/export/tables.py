@@ -1,0 +1,50 @@
+"""Tables as files for other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import polars as pl
+
+from vla_attention.analyze.ratios.analysis import Analysis
+from vla_attention.analyze.show.table_files import write_csv, write_parquet
+from vla_attention.schemas.errors import BadArgument
+
+#: Tables that can be exported, and what a row of each is.
+TABLES = {
+    "steps": "one row per episode, replan, layer, denoise step (and head, with --per-head)",
+    "replans": "one row per episode, replan, layer",
+    "episodes": "one row per episode, layer",
+    "tasks": "one row per task or all tasks, layer; with intervals",
+    "contributions": "norms of contributions, where they were recorded",
+}
+DEFAULT_TABLES = ("episodes", "tasks", "steps")
+
+
+def chosen_tables(analysis: Analysis, names: Sequence[str]) -> dict[str, pl.DataFrame]:
+    """Tables of an analysis by name.
+
+    Raises:
+        BadArgument: contributions are wanted and were not recorded.
+    """
+    tables: dict[str, pl.DataFrame] = {}
+    for name in names:
+        table: pl.DataFrame | None = getattr(analysis, name)
+        if table is None:
+            raise BadArgument(
+                "These stores hold no contributions, so that there is no such table; record them with vla-capture "
+                "--contributions, or choose other tables."
+            )
+        tables[name] = table
+    return tables
+
+
+def write_tables(folder: Path, tables: dict[str, pl.DataFrame], kinds: Sequence[str]) -> list[Path]:
+    """Write tables in each of the kinds `csv` and `parquet`; returns the paths."""
+    written = []
+    if "csv" in kinds:
+        written += write_csv(folder, **tables)
+    if "parquet" in kinds:
+        written += write_parquet(folder, **tables)
+    return written

@@ -1,0 +1,1 @@
+"""`vla-analyze groups`: what a grouping takes, before any number."""

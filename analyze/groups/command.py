@@ -1,0 +1,67 @@
+"""`vla-analyze groups`: what a grouping takes, before any number is computed."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from vla_attention.analyze.arguments import add_grouping, add_stores, output_folder, report_files, settings_of
+from vla_attention.schemas.command_line import OneSentenceParser
+
+_EXAMPLES = """examples:
+  vla-analyze groups runs/libero_10.zarr --grouping cameras
+  vla-analyze groups runs/libero_10.zarr --grouping mine.toml --task 3 --episode 1 --replan 5
+  vla-analyze groups runs/libero_10.zarr --group nouns='word:bowl | word:plate' --group bowl=object:akita_black_bowl_1
+  vla-analyze groups runs/libero_10.zarr --group content=words:content --group stop=words:stop
+  vla-analyze groups runs/cosmos.zarr --site cross --group content=words:content
+
+The language of selectors is in docs/groupings.md.
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of `vla-analyze groups STORE ...`."""
+    parser = OneSentenceParser(
+        prog="vla-analyze groups",
+        description="What a grouping takes, before any number is computed: keys by span and role, words with their pieces, "
+        "overlaps, what no group takes, and a picture of the patches. Reads no attention.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_stores(parser)
+    add_grouping(parser)
+    selection = parser.add_argument_group("selection")
+    selection.add_argument(
+        "--site", metavar="NAME", help="softmax family: joint (pi), self or cross (Cosmos); default: the first one"
+    )
+    selection.add_argument("--tasks", type=int, nargs="+", metavar="N", help="task ids (default: all)")
+    example = parser.add_argument_group("example in the picture")
+    example.add_argument("--task", type=int, metavar="N", help="its task (default: the first one)")
+    example.add_argument("--episode", type=int, metavar="N", help="its episode (default: the task's first one)")
+    example.add_argument("--replan", type=int, default=0, metavar="N", help="its replan (default: 0)")
+    output = parser.add_argument_group("output")
+    output.add_argument("--output", type=Path, metavar="PATH", help="folder (default: results/STORE/groups)")
+    output.add_argument("--no-plots", action="store_true", help="text and tables only")
+    return parser
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print what the groups take; write tables and the picture."""
+    from vla_attention.analyze.groups.group_preview import check_replan, find_example, preview_groups, preview_text
+    from vla_attention.analyze.measures.question import ask
+    from vla_attention.analyze.show.table_files import write_parquet
+    from vla_attention.schemas.stores.reader import open_store
+
+    question = ask([open_store(path) for path in arguments.stores], settings_of(arguments))
+    example = find_example(question.selected, arguments.task, arguments.episode)
+    replan = check_replan(example, arguments.replan)
+    preview = preview_groups(question)
+    print(preview_text(question, preview))
+    folder = output_folder(arguments, "groups")
+    files = write_parquet(folder, groups=preview.groups, group_words=preview.words, group_overlaps=preview.overlaps)
+    if not arguments.no_plots:
+        from vla_attention.analyze.groups.plot_patches import plot_group_patches
+
+        files += plot_group_patches(example, question.grouping, replan, folder)
+    report_files(folder, files)
+    return 0

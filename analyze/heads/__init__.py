@@ -1,0 +1,1 @@
+"""`vla-analyze heads`: heads, layers, depth and denoise steps; entropy, largest keys and sinks of single rows."""

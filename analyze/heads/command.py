@@ -1,0 +1,95 @@
+"""`vla-analyze heads`: heads, layers and denoise steps; entropy, sinks, depth."""
+
+from __future__ import annotations
+
+import argparse
+
+from vla_attention.analyze.arguments import (
+    add_grouping,
+    add_output,
+    add_selection,
+    add_sink_rule,
+    add_stores,
+    output_folder,
+    report_files,
+    settings_of,
+    sink_rule,
+)
+from vla_attention.schemas.command_line import OneSentenceParser
+
+_EXAMPLES = """examples:
+  vla-analyze heads runs/libero_10.zarr
+  vla-analyze heads runs/libero_10.zarr --layers 5 6 7 --top 10
+  vla-analyze heads runs/libero_10.zarr --group bowl=object:akita_black_bowl_1 --group words=role:instruction --ratio bowl/words
+  vla-analyze heads runs/libero_10.zarr --sink-factor 20 --sink-share 0.25
+  vla-analyze heads runs/libero_10.zarr --no-rows     (masses only: a moment, also for large stores)
+
+A sink is a key that takes more than --sink-factor times its uniform share in at least --sink-share of a task's rows.
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of `vla-analyze heads STORE ...`."""
+    parser = OneSentenceParser(
+        prog="vla-analyze heads",
+        description="Who looks and who reads: the most visual and most linguistic heads, how much heads differ, layers, depth and "
+        "denoise steps, with intervals over tasks and episodes; and of single rows entropy, effective number of keys, mass of the "
+        "largest keys and sinks.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_stores(parser)
+    add_grouping(parser)
+    add_selection(parser)
+    rows = parser.add_argument_group("rows and heads")
+    rows.add_argument("--top", type=int, default=5, metavar="N", help="heads listed on either end (default: 5)")
+    rows.add_argument(
+        "--top-k",
+        type=int,
+        nargs="+",
+        default=[1, 5, 10],
+        metavar="K",
+        help="numbers of largest keys (default: 1 5 10)",
+    )
+    rows.add_argument(
+        "--no-rows", action="store_true", help="do not read the rows: no entropy, no largest keys, no sinks"
+    )
+    add_sink_rule(rows)
+    add_output(parser, "results/STORE/heads")
+    return parser
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Measure; print the text, write tables and pictures."""
+    from vla_attention.analyze.heads.head_study import study_heads
+    from vla_attention.analyze.heads.row_metrics import RowOptions
+    from vla_attention.analyze.heads.text import heads_text
+    from vla_attention.analyze.measures.question import ask
+    from vla_attention.analyze.show.table_files import write_parquet
+    from vla_attention.schemas.errors import BadArgument
+    from vla_attention.schemas.stores.reader import open_store
+
+    if arguments.top < 1:
+        raise BadArgument(f"--top {arguments.top} lists no head; expected at least 1.")
+    options = None if arguments.no_rows else RowOptions(tuple(arguments.top_k), sink_rule(arguments))
+    question = ask([open_store(path) for path in arguments.stores], settings_of(arguments))
+    study = study_heads(question, options)
+    folder = output_folder(arguments, "heads")
+    tables = {"heads": study.heads, "dispersion": study.dispersion, "depth": study.depth, "denoise": study.denoise}
+    if study.rows is not None and study.sinks is not None:
+        tables |= {"row_metrics": study.rows, "sinks": study.sinks}
+    files = write_parquet(folder, **tables)
+    print(heads_text(study, arguments.top))
+    if not arguments.no_plots:
+        from vla_attention.analyze.heads.plot_denoise_profile import plot_denoise_profile
+        from vla_attention.analyze.heads.plot_head_grid import plot_head_grid
+        from vla_attention.analyze.heads.plot_layer_time import plot_layer_time
+        from vla_attention.analyze.ratios.plot_layer_profile import plot_layer_profile
+
+        grouping = question.grouping
+        files += plot_head_grid(study.heads, grouping, folder)
+        files += plot_layer_profile(study.tasks, grouping, folder)
+        files += plot_layer_time(study.replans, grouping, folder, arguments.seed)
+        files += plot_denoise_profile(study.denoise, grouping, folder)
+    report_files(folder, files)
+    return 0

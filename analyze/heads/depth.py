@@ -1,0 +1,102 @@
+"""Depth: at which layers a group is attended to, as a centre of gravity, by masses and by contributions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import polars as pl
+from numpy.typing import ArrayLike, NDArray
+
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG
+from vla_attention.analyze.measures.group_contributions import group_contribution_table
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_SEED, NO_LIMITS
+from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
+from vla_attention.schemas.groupings.grouping import Grouping
+from vla_attention.schemas.groupings.resolve import ResolvedGrouping
+
+
+def depth_centre(amounts: ArrayLike, blocks: ArrayLike) -> NDArray[np.float64]:
+    """Centre of gravity over layers: sum over l of l x a_l / sum over l of a_l, with block indices l.
+
+    As the "center of gravity" of Tenney et al. (2019), "BERT Rediscovers the NLP Pipeline", section 3, which weighs layers in
+    the same way. The same amount at every layer gives the mean block.
+
+    Args:
+        amounts: (..., layer), at least 0: masses of a group, or norms of its contributions.
+        blocks: (layer,) block indices. The centre is one over these layers, whatever lies between them.
+
+    Returns:
+        (...); NaN where all amounts are 0 or one is not finite.
+    """
+    amount, block = np.asarray(amounts, dtype=np.float64), np.asarray(blocks, dtype=np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (amount * block).sum(axis=-1) / amount.sum(axis=-1)
+
+
+def depth_table(
+    episodes: pl.DataFrame, grouping: Grouping, norms: pl.DataFrame | None = None, seed: int = DEFAULT_SEED
+) -> pl.DataFrame:
+    """One row per group that has any amount: the mean over episodes of its centre, with a two-level interval (95 %).
+
+    Columns: group; of: "mass", or "contribution" (the norm of what the group's keys add to the residual stream; norms grow with
+    depth where a network's updates do, so read this centre beside those of other groups); num_episodes, num_tasks,
+    centre_episodes (with a centre); centre, centre_low, centre_high; even: the centre of the same amount at every layer;
+    first_block, last_block, num_layers: the layers that it is a centre over.
+
+    Args:
+        episodes: `aggregate.episodes_table`. A block that was named by two layer numbers counts once.
+        grouping: the groups.
+        norms: suite, task_id, episode_index, block and per group `{g}_norm` (see `contribution_norms`), where there are any.
+        seed: of the bootstrap.
+    """
+    single = episodes.filter(pl.col("layer") != LAYERS_AVG)
+    parts = [_centres(single, {name: f"{name}_mass" for name in grouping.names}, "mass")]
+    if norms is not None:
+        parts.append(
+            _centres(
+                norms,
+                {name: f"{name}_norm" for name in grouping.names if f"{name}_norm" in norms.columns},
+                "contribution",
+            )
+        )
+    blocks = single["block"].unique().sort()
+    # A single layer leaves a centre no room, and no interval could be widened inside of that.
+    limits = (float(blocks[0]), float(blocks[-1])) if len(blocks) > 1 else NO_LIMITS
+    table = means_with_intervals(pl.concat(parts), ("group", "of"), {"centre": limits}, seed)
+    return table.filter(pl.col("centre").is_not_null()).with_columns(
+        pl.lit(float(np.mean(blocks.to_numpy()))).alias("even"),
+        pl.lit(blocks[0], dtype=pl.Int64).alias("first_block"),
+        pl.lit(blocks[-1], dtype=pl.Int64).alias("last_block"),
+        pl.lit(len(blocks), dtype=pl.Int64).alias("num_layers"),
+    )
+
+
+def _centres(table: pl.DataFrame, columns: Mapping[str, str], of: str) -> pl.DataFrame:
+    """One row per (group, episode) with its centre, from one row per (episode, block)."""
+    keys = ("suite", "task_id", "episode_index")
+    once = table.unique([*keys, "block"], keep="first", maintain_order=True).sort(*keys, "block")
+    episodes = once.select(keys).unique(maintain_order=True)
+    blocks = once["block"].unique().sort().to_numpy()
+    rows = []
+    for name, column in columns.items():
+        amounts = once[column].fill_null(0.0).to_numpy().reshape(episodes.height, len(blocks))
+        rows.append(
+            episodes.select(
+                pl.all(),
+                pl.lit(name).alias("group"),
+                pl.lit(of).alias("of"),
+                pl.Series("centre", depth_centre(amounts, blocks)).fill_nan(None),
+            )
+        )
+    return pl.concat(rows)
+
+
+def contribution_norms(question: Question, resolved: Sequence[ResolvedGrouping]) -> pl.DataFrame | None:
+    """`group_contributions.group_contribution_table`, mean over replans and denoise steps: one row per (episode, block)."""
+    table = group_contribution_table(question, resolved)
+    if table is None:
+        return None
+    norms = [f"{name}_norm" for name in question.grouping.names if f"{name}_norm" in table.columns]
+    return table.group_by("suite", "task_id", "episode_index", "block", maintain_order=True).agg(pl.col(norms).mean())

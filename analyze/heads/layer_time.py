@@ -1,0 +1,78 @@
+"""Layers over the course of episodes: what each layer does at each part of the episodes' time."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG, layer_order
+from vla_attention.analyze.statistics.bootstrap import (
+    DEFAULT_SEED,
+    bootstrap_intervals,
+    mean_over_episodes,
+    resample_episodes,
+)
+from vla_attention.analyze.time.phases import on_episode_time
+from vla_attention.schemas.groupings.grouping import Grouping
+
+MOST_BINS = 20
+#: Of a grouping without a ratio, so many groups are followed.
+_MOST_GROUPS = 3
+_EPISODE = ("suite", "task_id", "episode_index")
+
+
+def layer_time_table(
+    replans: pl.DataFrame, grouping: Grouping, num_bins: int | None = None, seed: int = DEFAULT_SEED
+) -> pl.DataFrame:
+    """Means over episodes with two-level intervals (95 %) for every layer and equal part of the episodes' time.
+
+    An episode's time is divided as in `phases.on_episode_time`. Columns: quantity, layer, block, bin, start, stop (0..1), num_episodes
+    (with a finite value), mean, low, high. The quantity with a ratio is `log2_lift`, log2 of ratio over uniform ratio (`log2_ratio`
+    where a side has no keys and there is no uniform ratio); else the fraction `{g}_fraction` of each of the first groups with mass.
+
+    Args:
+        replans: `aggregate.add_layers_avg` or `aggregate.per_replan`.
+        grouping: the groups.
+        num_bins: parts of the time; `MOST_BINS` unless no episode has as many replans.
+        seed: of the bootstrap.
+    """
+    single = replans.filter(pl.col("layer") != LAYERS_AVG)
+    if grouping.ratio is not None:
+        quantities = ["log2_ratio" if single["uniform_ratio"].is_null().all() else "log2_lift"]
+        single = single.with_columns(pl.col("ratio_lift").log(2.0).alias("log2_lift"))
+    else:
+        having = [name for name in grouping.names if (single[f"{name}_mass"] > 0).any()] or list(grouping.names)
+        quantities = [f"{name}_fraction" for name in having[:_MOST_GROUPS]]
+    layers = [layer for layer in layer_order(single) if layer != LAYERS_AVG]
+    blocks = dict(single.select("layer", "block").unique().iter_rows())
+    bins = num_bins or min(MOST_BINS, int(single["replan"].to_numpy().max()) + 1)
+    place = {layer: i for i, layer in enumerate(layers)}
+    values, tasks = [], []
+    for key, part in single.sort(*_EPISODE, "replan").group_by(_EPISODE, maintain_order=True):
+        at = part["replan"].rank("dense").to_numpy().astype(np.int64) - 1
+        column = part["layer"].replace_strict(place, return_dtype=pl.Int64).to_numpy()
+        table = np.full((at.max() + 1, len(layers), len(quantities)), np.nan)
+        table[at, column] = part.select(pl.col(quantities).fill_null(float("nan"))).to_numpy()
+        starts = part["env_step"].unique().sort().to_numpy()
+        timed = on_episode_time(table.reshape(len(table), -1), starts - starts[0], int(part["num_steps"][0]), bins)
+        values.append(timed.reshape(bins, len(layers), len(quantities)))
+        tasks.append(f"{key[0]}\t{key[1]}")
+    stacked = np.stack(values).transpose(0, 3, 2, 1).reshape(len(values), -1)  # (episode, quantity x layer x bin)
+    statistics = [mean_over_episodes(stacked[:, i]) for i in range(stacked.shape[1])]
+    intervals = bootstrap_intervals(statistics, resample_episodes(np.array(tasks), seed=seed))
+    quantity, layer, part_of = (axis.ravel() for axis in np.indices((len(quantities), len(layers), bins)))
+    return pl.DataFrame(
+        {
+            "quantity": [quantities[i] for i in quantity],
+            "layer": [layers[i] for i in layer],
+            "block": [blocks[layers[i]] for i in layer],
+            "bin": part_of,
+            "start": part_of / bins,
+            "stop": (part_of + 1) / bins,
+            "num_episodes": [int(statistic.used.sum()) for statistic in statistics],
+            "mean": [statistic.value for statistic in statistics],
+            "low": [interval.low if interval else None for interval in intervals],
+            "high": [interval.high if interval else None for interval in intervals],
+        },
+        schema_overrides=dict.fromkeys(("mean", "low", "high"), pl.Float64),
+    )

@@ -1,0 +1,33 @@
+"""`denoise_profile`: ratio and fractions at every recorded denoise step, with intervals over episodes and the uniform baseline."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import polars as pl
+
+from vla_attention.analyze.show.plot_style import drawn_in_our_style, named, new_figure, plural, save_figure, title
+from vla_attention.analyze.show.profile import draw_profile, shown_groups
+from vla_attention.schemas.groupings.grouping import Grouping
+
+STEM = "denoise_profile"
+
+
+@drawn_in_our_style
+def plot_denoise_profile(table: pl.DataFrame, grouping: Grouping, folder: Path) -> list[Path]:
+    """Draw from `metrics.denoise.denoise_table`; returns the paths of png, pdf and csv."""
+    figure = new_figure(max(6.6, 3.6 + 0.45 * table.height), 3.2 if grouping.ratio is None else 5.1)
+    note = f"Means over {plural(table['num_episodes'][0], 'episode')} of {plural(table['num_tasks'][0], 'task')} and over all layers."
+    if table.height == 1:
+        note += " One denoise step was recorded or selected: there is no course to see."
+    if grouping.ratio is not None and table["nonfinite_layers"].sum():
+        note += f" {table['nonfinite_layers'].sum()} ratios of single layers are not finite and in no mean."
+    title(figure, f"Denoise steps, {named(grouping)}", note)
+    labels = [f"{step}\n({time:.3g})" for step, time in table.select("denoise_step", "denoise_time").iter_rows()]
+    draw_profile(figure, table, grouping, labels, "denoise step (in brackets its time, which ends at 0)")
+    columns = [f"{name}_fraction{end}" for name in shown_groups(table, grouping) for end in ("", "_low", "_high")]
+    if grouping.ratio is not None:
+        columns = ["ratio_mean", "ratio_mean_low", "ratio_mean_high", "uniform_ratio", "num_nonfinite", *columns]
+    return save_figure(
+        figure, folder, STEM, table.select("denoise_step", "denoise_time", "num_episodes", "num_replans", *columns)
+    )

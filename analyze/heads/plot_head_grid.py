@@ -1,0 +1,97 @@
+"""`head_grid`: every head of every layer, coloured by how much more or less than uniform attention it gives to one side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from vla_attention.analyze.heads.head_measures import main_group
+from vla_attention.analyze.show.heat_map import draw_log2_map, label_axis, map_height
+from vla_attention.analyze.show.plot_style import (
+    drawn_in_our_style,
+    explain,
+    named,
+    new_figure,
+    plural,
+    ratio_name,
+    save_figure,
+    title,
+)
+from vla_attention.schemas.groupings.grouping import Grouping
+
+STEM = "head_grid"
+
+
+@drawn_in_our_style
+def plot_head_grid(heads: pl.DataFrame, grouping: Grouping, folder: Path) -> list[Path]:
+    """Draw from `metrics.heads.heads_table`; returns the paths of png, pdf and csv.
+
+    With a ratio its lift over the uniform ratio (the ratio itself where a side has no keys), else the lift of the first
+    group that has mass. A dot: the 95 % interval of the head holds the uniform value.
+    """
+    quantity = _quantity(heads, grouping)
+    layers = heads["layer"].unique(maintain_order=True).to_list()
+    numbers = heads["head"].unique(maintain_order=True).to_list()
+    log2, low, high = (
+        _grid(heads, column, len(layers)) for column in (quantity, f"{quantity}_low", f"{quantity}_high")
+    )
+    label, about = "times uniform attention", f"{_name(grouping, heads)} relative to uniform attention"
+    if quantity == "log2_ratio":
+        label, about = "ratio", f"{_name(grouping, heads)} (no uniform baseline)"
+    if quantity.endswith("_lift") and quantity != "log2_lift":
+        with np.errstate(divide="ignore"):
+            log2, low, high = np.log2(log2), np.log2(low), np.log2(high)
+    if grouping.ratio is not None:
+        log2 = _with_limits(heads, log2)
+    uncertain = (low <= 0) & (high >= 0)
+    figure = new_figure(max(5.6, 2.4 + 0.34 * len(numbers)), max(2.6, 1.7 + map_height(len(layers), len(numbers))))
+    title(figure, f"Heads, {named(grouping)}: {about}", _note(heads, log2, bool((uncertain & np.isfinite(log2)).any())))
+    axes = figure.subplots()
+    if np.isnan(log2).all():
+        explain(axes, f"No head has any attention on {_name(grouping, heads)}.")
+    else:
+        draw_log2_map(figure, axes, log2, uncertain, label)
+        label_axis(axes, "x", [str(number) for number in numbers])
+        label_axis(axes, "y", [str(layer) for layer in layers])
+        axes.set_xlabel("head")
+        axes.set_ylabel("layer")
+    return save_figure(figure, folder, STEM, heads)
+
+
+def _quantity(heads: pl.DataFrame, grouping: Grouping) -> str:
+    if grouping.ratio is None:
+        return f"{main_group(heads, grouping)}_lift"
+    return (
+        "log2_ratio" if heads["log2_lift"].is_null().all() and heads["log2_ratio"].is_not_null().any() else "log2_lift"
+    )
+
+
+def _name(grouping: Grouping, heads: pl.DataFrame) -> str:
+    return main_group(heads, grouping) if grouping.ratio is None else ratio_name(grouping.ratio)
+
+
+def _grid(heads: pl.DataFrame, column: str, num_layers: int) -> NDArray[np.float64]:
+    return heads[column].cast(pl.Float64).fill_null(float("nan")).to_numpy().reshape(num_layers, -1)
+
+
+def _with_limits(heads: pl.DataFrame, log2: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where no replan of no episode has a finite logarithm: infinite or zero, whichever side has all the mass."""
+    above, below = (_grid(heads, f"{side}_fraction", len(log2)) > 0 for side in ("numerator", "denominator"))
+    missing = np.isnan(log2)
+    return np.where(missing & above & ~below, np.inf, np.where(missing & below & ~above, -np.inf, log2))
+
+
+def _note(heads: pl.DataFrame, log2: NDArray[np.float64], dots: bool) -> str:
+    episodes, tasks = int(heads["num_episodes"][0]), int(heads["num_tasks"][0])
+    text = f"Means over {plural(episodes, 'episode')} of {plural(tasks, 'task')}."
+    if dots:
+        text += " Dot: the head's 95 % bootstrap interval holds the uniform value. By chance alone one head in twenty lacks its dot."
+    infinite = int(np.isinf(log2).sum())
+    if infinite:
+        text += f" ∞ or 0: {plural(infinite, 'head')} with no mass on one side at any replan."
+    if np.isnan(log2).any():
+        text += " Grey: no mass on either side."
+    return text

@@ -1,0 +1,88 @@
+"""`layer_time`: every layer over the course of the episodes, coloured around the uniform baseline."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+
+from vla_attention.analyze.heads.layer_time import layer_time_table
+from vla_attention.analyze.show.heat_map import draw_log2_map, label_axis, map_height
+from vla_attention.analyze.show.plot_style import (
+    drawn_in_our_style,
+    explain,
+    named,
+    new_figure,
+    plural,
+    ratio_name,
+    save_figure,
+    title,
+    wrapped,
+)
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_SEED
+from vla_attention.schemas.groupings.grouping import Grouping
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+STEM = "layer_time"
+
+
+@drawn_in_our_style
+def plot_layer_time(replans: pl.DataFrame, grouping: Grouping, folder: Path, seed: int = DEFAULT_SEED) -> list[Path]:
+    """Draw from the table of replans (`aggregate.add_layers_avg`); returns the paths of png, pdf and csv.
+
+    With a ratio one map of its lift over the uniform ratio; else a map of fractions for each of the first groups. A dot: the 95 %
+    interval of the cell holds the uniform value.
+    """
+    table = layer_time_table(replans, grouping, seed=seed)
+    quantities = table["quantity"].unique(maintain_order=True).to_list()
+    layers, bins = table["layer"].unique(maintain_order=True).to_list(), table["bin"].n_unique()
+    figure = new_figure(max(6.4, 3.6 * len(quantities) + 1.0), max(2.7, 1.6 + map_height(len(layers), bins)))
+    episodes = replans.select("suite", "task_id", "episode_index").unique()
+    note = f"Means over {plural(episodes.height, 'episode')} of {plural(episodes.select('suite', 'task_id').n_unique(), 'task')}."
+    shared = figure.subplots(1, len(quantities), squeeze=False, sharey=True)[0]
+    undefined, dots = False, False
+    for axes, quantity in zip(shared, quantities, strict=True):
+        part = table.filter(pl.col("quantity") == quantity)
+        mean, low, high = (
+            part[column].fill_null(float("nan")).to_numpy().reshape(len(layers), bins)
+            for column in ("mean", "low", "high")
+        )
+        if np.isnan(mean).all():
+            explain(axes, "No ratio is finite and above 0." if grouping.ratio else "No group has any mass.")
+            continue
+        undefined = undefined or bool(np.isnan(mean).any())
+        if grouping.ratio is not None:
+            label = "times uniform attention" if quantity == "log2_lift" else "ratio"
+            uncertain = (low <= 0) & (high >= 0)
+            dots = dots or bool(uncertain.any())
+            draw_log2_map(figure, axes, mean, uncertain, label)
+        else:
+            image = axes.imshow(mean, origin="lower", aspect="auto", interpolation="none", cmap="cividis", vmin=0.0)
+            bar = figure.colorbar(image, ax=axes, shrink=0.9, aspect=24, pad=0.02)
+            bar.outline.set_visible(False)
+            axes.set_title(wrapped(quantity.removesuffix("_fraction"), 30, 1))
+            bar.set_label("fraction")
+        label_axis(axes, "y", layers)
+        _time_axis(axes, bins)
+        if axes is shared[0]:
+            axes.set_ylabel("layer")
+    if dots:
+        note += " Dot: the cell's 95 % bootstrap interval holds the uniform value."
+    if undefined and grouping.ratio is not None:
+        note += " Grey: no finite logarithm (infinite, undefined or zero ratios take no part)."
+    about = ""
+    if grouping.ratio is not None:
+        base = "relative to uniform attention" if quantities == ["log2_lift"] else "(no uniform baseline)"
+        about = f": {ratio_name(grouping.ratio)} {base}"
+    title(figure, f"Layers over the episodes' time, {named(grouping)}{about}", note)
+    return save_figure(figure, folder, STEM, table)
+
+
+def _time_axis(axes: Axes, bins: int) -> None:
+    positions = np.linspace(-0.5, bins - 0.5, 6)
+    axes.set_xticks(positions, [f"{share:.1f}" for share in np.linspace(0, 1, 6)])
+    axes.set_xlabel("episode time (0: first replan, 1: end)")

@@ -1,0 +1,222 @@
+"""Entropy, effective keys, top-k mass and sinks of every row, in one pass over the stored rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from vla_attention.analyze.heads.entropy import effective_keys, entropies, top_mass
+from vla_attention.analyze.measures.masses import masses
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.sinks import KeyShares, SinkRule, is_first, key_sums
+from vla_attention.analyze.measures.steps import SelectedEpisode, resolve_all, with_valid
+from vla_attention.analyze.show.progress import progress_bar
+from vla_attention.analyze.stores.parallel import map_episodes
+from vla_attention.analyze.stores.rows import layer_rows
+from vla_attention.analyze.stores.selection import Selection
+from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.groupings.resolve import ResolvedGrouping
+
+DEFAULT_TOP = (1, 5, 10)
+
+
+@dataclass(frozen=True)
+class RowOptions:
+    """What is measured on rows: the numbers k of keys in top-k masses, and the rule for sinks.
+
+    Raises `BadArgument` for a k below 1, or one that is named twice.
+    """
+
+    top: tuple[int, ...] = DEFAULT_TOP
+    rule: SinkRule = field(default_factory=SinkRule)
+
+    def __post_init__(self) -> None:
+        """Check the numbers of keys."""
+        if not self.top or min(self.top) < 1 or len(set(self.top)) != len(self.top):
+            raise BadArgument(
+                f"Cannot take the top {listing(self.top)} keys; expected different whole numbers from 1 on."
+            )
+
+
+@dataclass(frozen=True)
+class RowMeasures:
+    """What one episode's rows give. Axes begin with (replan, layer, denoise, head).
+
+    Attributes:
+        entropy: nats, over the chosen groups and, last, over all valid keys: (..., group + 1) float32.
+        top: share of the k largest keys: (..., k) float32.
+        mass: masses of all groups and, last, of all valid keys: (..., group + 1) float32, or None when they are not wanted.
+        shares: how much each key takes.
+    """
+
+    entropy: NDArray[np.float32]
+    top: NDArray[np.float32]
+    mass: NDArray[np.float32] | None
+    shares: KeyShares
+
+
+def empty_measures(
+    items: Sequence[SelectedEpisode],
+    selection: Selection,
+    options: RowOptions,
+    num_entropies: int,
+    num_masses: int | None = None,
+) -> list[RowMeasures]:
+    """Room for every episode's measures, to be filled by `measure_rows`: parts of a few large arrays.
+
+    Allocated before anything is read: small results between the large passing arrays of the reading would leave the heap
+    full of holes, and the process twice as large.
+    """
+    cells = (len(selection.layers), len(selection.denoise), len(selection.heads))
+    ends = np.cumsum([item.tokens.num_replans for item in items])
+    entropy = np.empty((ends[-1], *cells, num_entropies), dtype=np.float32)
+    top = np.empty((ends[-1], *cells, len(options.top)), dtype=np.float32)
+    mass = None if num_masses is None else np.empty((ends[-1], *cells, num_masses), dtype=np.float32)
+    shares = np.zeros((len(items), 2, items[0].tokens.layout.num_keys))
+    parts = [slice(end - item.tokens.num_replans, end) for item, end in zip(items, ends, strict=True)]
+    return [
+        RowMeasures(entropy[part], top[part], None if mass is None else mass[part], KeyShares(*share))
+        for part, share in zip(parts, shares, strict=True)
+    ]
+
+
+def measure_rows(
+    item: SelectedEpisode,
+    resolved: ResolvedGrouping,
+    question: Question,
+    options: RowOptions,
+    shown: Sequence[str],
+    out: RowMeasures,
+) -> None:
+    """Read an episode's rows once, a layer and a denoise step at a time; rows are means over the stored queries.
+
+    Args:
+        item: the episode.
+        resolved: the groups on its keys.
+        question: the site and the selection; heads are always kept apart.
+        options: what is measured.
+        shown: the groups inside which an entropy is wanted, over their valid keys.
+        out: takes the measures; masses if it has room for them.
+    """
+    valid, selection = item.valid, question.selection
+    weights = with_valid(resolved.weights, valid)
+    # Keys that can never hold information are half of a usual site: without them everything takes half the time.
+    used = np.flatnonzero(valid.any(axis=0))
+    inside = valid[:, used]
+    columns = [*(resolved.names.index(name) for name in shown), weights.shape[2] - 1]
+    within = np.ascontiguousarray(weights[:, used][:, :, columns] * inside[:, :, None])
+    above, held, count = np.zeros(len(used), np.int64), np.zeros(len(used)), 0
+    for part in layer_rows(item.episode, selection, question.site):
+        rows = part.rows if len(used) == part.rows.shape[2] else part.rows[:, :, used]
+        out.entropy[:, part.layer, part.denoise] = entropies(rows, within)
+        out.top[:, part.layer, part.denoise] = top_mass(rows, inside, options.top)
+        if out.mass is not None:
+            out.mass[:, part.layer, part.denoise] = masses(part.rows, weights)
+        if is_first(selection, part.layer):
+            more, sums = key_sums(rows, inside, options.rule.factor)
+            above, held, count = above + more, held + sums, count + rows.shape[0] * rows.shape[1]
+    out.shares.above[used], out.shares.held[used] = above / count, held / count
+
+
+def row_frame(
+    item: SelectedEpisode, shown: Sequence[str], selection: Selection, measures: RowMeasures, options: RowOptions
+) -> pl.DataFrame:
+    """One row per (replan, layer, denoise step, head) of an episode.
+
+    Columns: suite, task_id, episode_index, replan, layer, block, denoise_step, head; `entropy` (nats) and `effective_keys`
+    (its exp) over the valid keys; `top{k}_mass`, the share of the valid keys' mass on the k largest; `{g}_entropy` and
+    `{g}_effective_keys` inside each group, over its valid keys, null where it has no mass or none.
+    """
+    shape = measures.entropy.shape[:4]
+    attributes = item.episode.attributes
+
+    def along(values: Any, axis: int) -> NDArray[Any]:
+        expanded = np.asarray(values, dtype=np.int64).reshape([-1 if i == axis else 1 for i in range(4)])
+        return np.broadcast_to(expanded, shape).ravel()
+
+    columns: dict[str, NDArray[Any]] = {
+        "replan": along(np.arange(shape[0]), 0),
+        "layer": along(selection.layer_labels, 1),
+        "block": along(selection.blocks, 1),
+        "denoise_step": along(selection.denoise_steps, 2),
+        "head": along(selection.head_numbers, 3),
+    }
+    for i, prefix in ((len(shown), ""), *((i, f"{name}_") for i, name in enumerate(shown))):
+        entropy = measures.entropy[..., i].ravel()
+        columns[f"{prefix}entropy"], columns[f"{prefix}effective_keys"] = entropy, effective_keys(entropy)
+        if not prefix:
+            columns |= {f"top{k}_mass": measures.top[..., j].ravel() for j, k in enumerate(options.top)}
+    return pl.DataFrame(columns).select(
+        pl.lit(item.store.suite).alias("suite"),
+        pl.lit(attributes.task_id, dtype=pl.Int64).alias("task_id"),
+        pl.lit(attributes.episode_index, dtype=pl.Int64).alias("episode_index"),
+        pl.col("replan", "layer", "block", "denoise_step", "head"),
+        pl.col(pl.Float32).fill_nan(None),
+    )
+
+
+def row_table(
+    items: Sequence[SelectedEpisode],
+    measures: Sequence[RowMeasures],
+    shown: Sequence[str],
+    selection: Selection,
+    options: RowOptions,
+) -> pl.DataFrame:
+    """`row_frame` of all episodes."""
+    return pl.concat(
+        row_frame(item, shown, selection, measured, options) for item, measured in zip(items, measures, strict=True)
+    )
+
+
+def episode_layer_means(rows: pl.DataFrame, items: Sequence[SelectedEpisode]) -> pl.DataFrame:
+    """Means of `row_table` (of these episodes) over replans, denoise steps and heads: one row per (episode, layer), float64."""
+    keys = ("suite", "task_id", "episode_index", "layer", "block")
+    measured = [name for name, kind in rows.schema.items() if kind == pl.Float32]
+    per_replan, start, parts = rows.height // sum(item.tokens.num_replans for item in items), 0, []
+    # A million rows grouped at once would take as much memory as all that came before.
+    for item in items:
+        part = rows.slice(start, item.tokens.num_replans * per_replan)
+        parts.append(part.group_by(keys, maintain_order=True).agg(pl.col(measured).mean().cast(pl.Float64)))
+        start += part.height
+    return pl.concat(parts).sort("suite", "task_id", "episode_index", maintain_order=True)
+
+
+def groups_with_valid_keys(items: Sequence[SelectedEpisode], resolved: Sequence[ResolvedGrouping]) -> tuple[str, ...]:
+    """The groups that have a valid key anywhere: only inside these is there an entropy."""
+    having: set[int] = set()
+    for item, groups in zip(items, resolved, strict=True):
+        having |= set(np.flatnonzero(groups.weights.max(axis=0)[item.valid.any(axis=0)].any(axis=0)).tolist())
+    return tuple(name for i, name in enumerate(resolved[0].names) if i in having)
+
+
+def measure_all_rows(
+    question: Question,
+    resolved: Sequence[ResolvedGrouping],
+    options: RowOptions,
+    shown: Sequence[str],
+    with_masses: bool = False,
+) -> list[RowMeasures]:
+    """`measure_rows` of every episode, a few at a time; shows progress."""
+    num_masses = len(question.grouping.names) + 1 if with_masses else None
+    room = empty_measures(question.selected, question.selection, options, len(shown) + 1, num_masses)
+
+    def measure(i: int) -> None:
+        measure_rows(question.selected[i], resolved[i], question, options, shown, room[i])
+
+    with progress_bar(len(room), "episodes' rows") as advance:
+        map_episodes(measure, range(len(room)), advance)
+    return room
+
+
+def row_metrics_table(question: Question, options: RowOptions | None = None) -> pl.DataFrame:
+    """Entropy, effective keys and top-k mass of every stored row, in the columns of `row_frame`."""
+    chosen = options or RowOptions()
+    resolved = resolve_all(question.grouping, question.selected, question.vocabulary)
+    shown = groups_with_valid_keys(question.selected, resolved)
+    measures = measure_all_rows(question, resolved, chosen, shown)
+    return row_table(question.selected, measures, shown, question.selection, chosen)

@@ -1,0 +1,325 @@
+"""What `vla-analyze heads` prints."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from typing import Any
+
+import polars as pl
+
+from vla_attention.analyze.heads.head_measures import main_group, ranked_heads
+from vla_attention.analyze.heads.head_study import HeadStudy
+from vla_attention.analyze.heads.row_metrics import episode_layer_means
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG, overall_rows
+from vla_attention.analyze.measures.sinks import SinkRule, merged_sinks
+from vla_attention.analyze.show.text_header import WIDTH, header
+from vla_attention.analyze.show.text_table import format_interval, format_number, text_table
+from vla_attention.analyze.statistics.bootstrap import POSITIVE
+from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
+from vla_attention.schemas.errors import listing
+from vla_attention.schemas.groupings.grouping import Grouping
+
+#: Sinks that are printed; the table has all.
+_MOST_SINKS = 12
+
+
+def heads_text(study: HeadStudy, top: int) -> str:
+    """The whole text, at most `WIDTH` columns wide; `top`: heads listed on either end."""
+    parts = [_header(study), _ranking(study, top), _dispersion(study), _layers(study), _depth(study), _denoise(study)]
+    if study.rows is not None:
+        parts += [_rows_by_layer(study), _sinks(study)]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def row_summary(study: HeadStudy) -> pl.DataFrame:
+    """Per layer the means over episodes, with two-level intervals, of what `rows` holds; one row per layer."""
+    assert study.rows is not None
+    measured = [name for name, kind in study.rows.schema.items() if kind == pl.Float32]
+    episodes = episode_layer_means(study.rows, study.question.selected)
+    limits = dict.fromkeys(measured, POSITIVE)
+    # Fractions of a key may be fewer than one, and their entropy below 0.
+    limits |= {name: (float("-inf"), float("inf")) for name in measured if name.endswith("entropy")}
+    order = study.tasks.filter(pl.col("layer") != LAYERS_AVG)["layer_number"].unique().sort().to_list()
+    table = means_with_intervals(episodes, ("layer", "block"), limits, study.question.settings.seed)
+    return table.sort(
+        pl.col("layer").replace_strict({layer: i for i, layer in enumerate(order)}, return_dtype=pl.Int64)
+    )
+
+
+def _header(study: HeadStudy) -> str:
+    question, chosen = study.question, study.question.selection
+    layer = LAYERS_AVG if len(chosen.layer_labels) > 1 else str(chosen.layer_labels[0])
+    lines = header(question, "HEADS, LAYERS, DENOISE STEPS", layer)
+    told = [
+        f"Layers {listing(chosen.layer_labels, 40)}; denoise steps {listing(chosen.denoise_steps, 40)}; heads "
+        f"{listing(chosen.head_numbers, 40)}",
+        f"Grouping '{question.grouping.name}'; {_measure_name(study.heads, question.grouping)}",
+        *([chosen.note] if chosen.note else []),
+        *question.notes,
+        "Intervals: 95 %, two-level bootstrap over tasks and episodes; - with fewer than two episodes",
+    ]
+    return "\n".join([*lines, *(part for line in told for part in textwrap.wrap(line, WIDTH))])
+
+
+def _measure_name(heads: pl.DataFrame, grouping: Grouping) -> str:
+    if grouping.ratio is None:
+        return f"no ratio, so heads are compared by their fraction of '{main_group(heads, grouping)}'"
+    return f"ratio = {' + '.join(grouping.ratio.numerator)} / {' + '.join(grouping.ratio.denominator)}"
+
+
+def _ranking(study: HeadStudy, top: int) -> str:
+    grouping = study.question.grouping
+    ranked = ranked_heads(study.heads, grouping)
+    if ranked.is_empty():
+        return _title("HEADS") + "\nNo head has any mass on either side of the ratio."
+    if grouping.ratio is None:
+        most, least = f"MOST ON '{main_group(study.heads, grouping)}'", "LEAST"
+    elif grouping.compares_modalities:
+        most, least = "MOST VISUAL HEADS", "MOST LINGUISTIC HEADS"
+    else:
+        most, least = "HEADS WITH THE HIGHEST RATIO", "HEADS WITH THE LOWEST RATIO"
+    shown = min(top, ranked.height)
+    first, last = ranked.head(shown), ranked.tail(min(shown, ranked.height - shown)).reverse()
+    lines = [_title(most), _head_rows(first, study)]
+    if last.height:
+        lines += ["", _title(least), _head_rows(last, study)]
+    note = (
+        f"{ranked.height} heads. The ends of so many are extreme partly by chance: their intervals are those of heads chosen "
+        "beforehand."
+    )
+    if grouping.ratio is not None:
+        note = (
+            "ratio: geometric mean over replans and episodes. lift: ratio / uniform ratio, 1 = uniform attention. "
+            + note
+        )
+        left_out = int(study.heads.unique(["block", "head"])["num_nonfinite"].sum())
+        if left_out:
+            note += f" {left_out} (head, replan) ratios are infinite, undefined or 0 and in no geometric mean."
+    return "\n".join([*lines, *textwrap.wrap(note, WIDTH)])
+
+
+def _head_rows(rows: pl.DataFrame, study: HeadStudy) -> str:
+    grouping = study.question.grouping
+    table = []
+    for row in rows.iter_rows(named=True):
+        cells = [str(row["layer"]), str(row["head"])]
+        if grouping.ratio is not None:
+            limit = row["ratio_of_means"]  # where no replan has a finite logarithm: infinite, or 0
+            cells += [
+                format_number(limit if row["log2_ratio"] is None else 2 ** row["log2_ratio"]),
+                _interval(row, "log2_ratio", power=True),
+                format_number(_power(row["log2_lift"])),
+                _interval(row, "log2_lift", power=True),
+                _percent(row["numerator_fraction"]),
+                _percent(row["denominator_fraction"]),
+            ]
+        else:
+            name = main_group(study.heads, grouping)
+            cells += [
+                _percent(row[f"{name}_fraction"]),
+                _percent_interval(row, f"{name}_fraction"),
+                format_number(row[f"{name}_lift"]),
+                _interval(row, f"{name}_lift"),
+            ]
+        table.append(cells)
+    header = ["layer", "head"]
+    if grouping.ratio is not None:
+        sides = ["above", "below"]
+        if grouping.compares_modalities:
+            sides = ["visual", "linguistic"]
+        header += ["ratio", "interval", "lift", "interval", *sides]
+    else:
+        header += ["fraction", "interval", "lift", "interval"]
+    return text_table(header, table)
+
+
+def _dispersion(study: HeadStudy) -> str:
+    if study.dispersion["fraction_std"].is_null().all():
+        return ""
+    grouping = study.question.grouping
+    what = "the numerator's fraction" if grouping.ratio else f"the fraction of '{main_group(study.heads, grouping)}'"
+    header = ["layer", "heads", "std", "interval", "std / mean", "interval"]
+    header += ["std of log2 ratio", "interval"] if grouping.ratio else []
+    rows = []
+    for row in study.dispersion.iter_rows(named=True):
+        cells = [str(row["layer"]), str(row["num_heads"])]
+        for name in ("fraction_std", "fraction_cv", *(["log2_ratio_std"] if grouping.ratio else [])):
+            cells += [format_number(row[name]), _interval(row, name)]
+        rows.append(cells)
+    return "\n".join(
+        [_title(f"HOW MUCH HEADS DIFFER  spread of {what} over the heads of a layer"), text_table(header, rows)]
+    )
+
+
+def _layers(study: HeadStudy) -> str:
+    grouping = study.question.grouping
+    rows = overall_rows(study.tasks).filter(pl.col("layer") != LAYERS_AVG).sort("layer_number")
+    return "\n".join(
+        [_title("LAYERS  mean over heads"), _profile(rows, "layer", [str(n) for n in rows["layer"]], grouping)]
+    )
+
+
+def _profile(rows: pl.DataFrame, label: str, labels: Sequence[str], grouping: Grouping) -> str:
+    """Ratio or first fractions of rows of `tasks_table`."""
+    table = []
+    groups = [name for name in grouping.names if rows[f"{name}_fraction"].sum() > 0][:3]
+    for name, row in zip(labels, rows.iter_rows(named=True), strict=True):
+        if grouping.ratio is not None:
+            cells = [format_number(row["ratio_mean"]), _interval(row, "ratio_mean")]
+            cells += [
+                format_number(row["uniform_ratio"]),
+                format_number(row["ratio_lift"]),
+                _interval(row, "ratio_lift"),
+            ]
+        else:
+            cells = [
+                cell
+                for group in groups
+                for cell in (_percent(row[f"{group}_fraction"]), _percent_interval(row, f"{group}_fraction"))
+            ]
+        table.append([name, *cells])
+    if grouping.ratio is not None:
+        return text_table([label, "ratio", "interval", "uniform", "lift", "interval"], table)
+    return text_table([label, *(cell for group in groups for cell in (group[:18], "interval"))], table)
+
+
+def _depth(study: HeadStudy) -> str:
+    table = study.depth
+    if table.is_empty():
+        return ""
+    first, last, count = (table[name][0] for name in ("first_block", "last_block", "num_layers"))
+    if count < 2:
+        return (
+            _title("DEPTH") + f"\nA centre of gravity over layers needs two of them; this is about block {first} alone."
+        )
+    rows = [
+        [
+            row["group"][:30],
+            "mass" if row["of"] == "mass" else "contribution",
+            format_number(row["centre"]),
+            _interval(row, "centre"),
+        ]
+        for row in table.iter_rows(named=True)
+    ]
+    every = count == last - first + 1
+    whole = every and first == 0 and last + 1 == study.question.stores[0].attributes.policy.num_layers
+    over = "all" if whole else f"only {count} of {study.question.stores[0].attributes.policy.num_layers}"
+    note = (
+        f"Mean block, weighted by a group's mass (or the norm of its contribution) at each, over {over} blocks, {first} to "
+        f"{last}; the same amount everywhere gives {format_number(table['even'][0])}."
+    )
+    return "\n".join(
+        [
+            _title("DEPTH  centre of gravity over blocks"),
+            text_table(["group", "of", "centre", "interval"], rows, left=(0, 1)),
+            *textwrap.wrap(note, WIDTH),
+        ]
+    )
+
+
+def _denoise(study: HeadStudy) -> str:
+    rows = study.denoise
+    if rows.height < 2:
+        return ""
+    labels = [f"{step} ({time:.3g})" for step, time in rows.select("denoise_step", "denoise_time").iter_rows()]
+    return "\n".join(
+        [
+            _title("DENOISE STEPS  (and their times), mean over layers and heads"),
+            _profile(rows, "step", labels, study.question.grouping),
+        ]
+    )
+
+
+def _rows_by_layer(study: HeadStudy) -> str:
+    assert study.options is not None
+    summary = row_summary(study)
+    groups = [name for name in study.question.grouping.names if f"{name}_effective_keys" in summary.columns][:3]
+    header = ["layer", "entropy", "eff. keys", "interval", *(f"top {k}" for k in study.options.top)]
+    header += [f"in {name[:14]}" for name in groups]
+    rows = []
+    for row in summary.iter_rows(named=True):
+        cells = [
+            str(row["layer"]),
+            format_number(row["entropy"]),
+            format_number(row["effective_keys"]),
+            _interval(row, "effective_keys"),
+        ]
+        cells += [_percent(row[f"top{k}_mass"]) for k in study.options.top]
+        cells += [format_number(row[f"{name}_effective_keys"]) for name in groups]
+        rows.append(cells)
+    keys = [item.valid.sum(axis=1).mean() for item in study.question.selected]
+    note = (
+        "Of single rows, renormalised over valid keys (masked and padded ones excluded), then averaged. entropy: nats. eff. keys: "
+        f"exp(entropy), the number of keys that sharing evenly would have it, of {format_number(sum(keys) / len(keys))}. top k: "
+        "share of the k largest keys. in GROUP: effective keys of the row cut down to the group."
+    )
+    return "\n".join(
+        [_title("ROWS  how spread out attention is"), text_table(header, rows), *textwrap.wrap(note, WIDTH)]
+    )
+
+
+def _sinks(study: HeadStudy) -> str:
+    assert study.options is not None
+    assert study.sinks is not None
+    assert study.key_shares is not None
+    rule = study.options.rule
+    return "\n".join([_title(f"SINKS  keys that take {rule}"), sinks_text(study.sinks, study.key_shares, rule)])
+
+
+def sinks_text(sinks: pl.DataFrame, key_shares: pl.DataFrame, rule: SinkRule) -> str:
+    """The sinks as a table over tasks, or the key that comes nearest to being one."""
+    num_tasks = key_shares.select("suite", "task_id").n_unique()
+    if sinks.is_empty():
+        nearest = key_shares.sort("share_of_rows", "mean_mass", descending=True).row(0, named=True)
+        text = (
+            f"None. The key that comes nearest, {nearest['description']} ({nearest['role']}), takes that much in "
+            f"{nearest['share_of_rows']:.0%} of the rows of task {nearest['task_id']}, and on average "
+            f"{format_number(nearest['times_uniform'])} x its uniform share. Other rules: --sink-factor, --sink-share."
+        )
+        return "\n".join(textwrap.wrap(text, WIDTH))
+    merged = merged_sinks(sinks)
+    header = ["key", "role", "tasks", "rows", "mass", "x uniform"]
+    rows = [
+        [
+            str(row["key"]),
+            row["role"],
+            f"{row['num_tasks']} of {num_tasks}",
+            _percent(row["share_of_rows"]),
+            _percent(row["mean_mass"]),
+            format_number(row["times_uniform"]),
+        ]
+        for row in merged.head(_MOST_SINKS).iter_rows(named=True)
+    ]
+    texts = merged.head(_MOST_SINKS)["description"].to_list()
+    lines = [text_table(header, rows, left=(0, 1), last="what it is", texts=texts, width=WIDTH)]
+    if merged.height > _MOST_SINKS:
+        lines.append(f"{merged.height - _MOST_SINKS} more in sinks.parquet.")
+    note = (
+        "Searched task by task. rows: share of the (replan, layer, denoise step, head) rows in which the key takes that much; mass: "
+        "mean share of the valid keys' mass. Numbers without these keys: vla-analyze ratios --without-sinks, with the same "
+        "--sink-factor and --sink-share."
+    )
+    return "\n".join([*lines, *textwrap.wrap(note, WIDTH)])
+
+
+def _power(value: float | None) -> float | None:
+    return None if value is None else 2.0**value
+
+
+def _interval(row: dict[str, Any], name: str, power: bool = False) -> str:
+    low, high = row[f"{name}_low"], row[f"{name}_high"]
+    return format_interval(_power(low), _power(high)) if power else format_interval(low, high)
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.1f}%"
+
+
+def _percent_interval(row: dict[str, Any], name: str) -> str:
+    low, high = row[f"{name}_low"], row[f"{name}_high"]
+    return "-" if low is None or high is None else f"[{100 * low:.1f}, {100 * high:.1f}]%"
+
+
+def _title(text: str) -> str:
+    return "\n".join([*textwrap.wrap(text, WIDTH), "-" * WIDTH])

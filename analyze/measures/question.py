@@ -1,0 +1,135 @@
+"""What is asked of which rows: stores, a selection of episodes and axes, a site and a grouping, all checked against what exists.
+
+Every command and every method of the Python API begins with `ask`; what comes out of it is what the measuring modules take.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from vla_attention.analyze.measures.steps import SelectedEpisode, load_tokens, vocabulary_of
+from vla_attention.analyze.show.progress import progress_bar
+from vla_attention.analyze.stores.selection import Selection, check_combinable, choose_site, select, select_episodes
+from vla_attention.schemas.errors import listing
+from vla_attention.schemas.groupings.builtin_groupings import find_grouping
+from vla_attention.schemas.groupings.grouping import Grouping, parse_group_argument, parse_ratio_argument, with_groups
+from vla_attention.schemas.groupings.vocabulary import Vocabulary
+from vla_attention.schemas.stores.reader import Store, StoredEpisode
+from vla_attention.schemas.stores.store_format import StoreError
+from vla_attention.schemas.stores.verify import episode_faults
+
+DEFAULT_GROUPING = "default"
+
+
+@dataclass(frozen=True)
+class AnalysisSettings:
+    """What a user asks for; None means the default (see `vla_attention.analyze.arguments`)."""
+
+    grouping: str | None = None
+    groups: tuple[str, ...] = ()
+    ratio: str | None = None
+    layers: tuple[int, ...] | None = None
+    denoise: tuple[str, ...] | None = None
+    heads: tuple[int, ...] | None = None
+    per_head: bool = False
+    tasks: tuple[int, ...] | None = None
+    site: str | None = None
+    seed: int = 0
+    skip_corrupt: bool = False
+
+
+@dataclass(frozen=True)
+class Question:
+    """Settings held against stores.
+
+    Attributes:
+        stores: the stores, of one policy and one kind of recording.
+        settings: what the user asked for.
+        selection: positions along the stored axes.
+        site: the softmax family that is looked at.
+        selected: the episodes, each with its store and its tokens.
+        grouping: the groups of keys.
+        vocabulary: the names that selectors may use over the episodes.
+        skipped: one line for every episode that was left out because it is damaged or empty (`skip_corrupt`).
+        notes: further lines that belong beside every number, for instance which keys were taken out.
+    """
+
+    stores: tuple[Store, ...]
+    settings: AnalysisSettings
+    selection: Selection
+    site: str
+    selected: tuple[SelectedEpisode, ...]
+    grouping: Grouping
+    vocabulary: Vocabulary
+    skipped: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def episodes(self) -> list[tuple[Store, StoredEpisode]]:
+        """The episodes, each with its store."""
+        return [(item.store, item.episode) for item in self.selected]
+
+
+def ask(stores: Sequence[Store], settings: AnalysisSettings) -> Question:
+    """Check what is wanted against what the stores hold. Reads the episodes' attributes and roles, no rows.
+
+    Raises:
+        UserError: a subclass that says what does not fit; see the functions of `vla_attention.analyze.stores.selection` and `vla_attention.schemas.groupings.resolve`.
+    """
+    check_combinable(stores)
+    root = stores[0].attributes
+    selection = select(root, settings.layers, settings.denoise, settings.heads, settings.per_head)
+    site = choose_site(root, settings.site)
+    chosen = [(store, episode) for store in stores for episode in select_episodes(store, settings.tasks)]
+    skipped: list[str] = []
+    if settings.skip_corrupt:
+        chosen, skipped = _without_faulty(chosen)
+    _refuse_empty(chosen)
+    selected = tuple(load_tokens(chosen, site))
+    vocabulary = vocabulary_of(selected)
+    grouping = choose_grouping(settings, vocabulary)
+    return Question(tuple(stores), settings, selection, site, selected, grouping, vocabulary, tuple(skipped))
+
+
+def choose_grouping(settings: AnalysisSettings, vocabulary: Vocabulary) -> Grouping:
+    """The grouping that the settings name, with command-line groups added and the ratio replaced if asked."""
+    base = None
+    if settings.grouping is not None or not settings.groups:
+        base = find_grouping(settings.grouping or DEFAULT_GROUPING, vocabulary)
+    grouping = base
+    if settings.groups:
+        grouping = with_groups(base, [parse_group_argument(text) for text in settings.groups])
+    assert grouping is not None
+    return grouping if settings.ratio is None else replace(grouping, ratio=parse_ratio_argument(settings.ratio))
+
+
+def _without_faulty(
+    chosen: Sequence[tuple[Store, StoredEpisode]],
+) -> tuple[list[tuple[Store, StoredEpisode]], list[str]]:
+    """The episodes that read back whole and hold a replan, and a line on each of the others. Reads everything once."""
+    kept, skipped = [], []
+    with progress_bar(len(chosen), "episodes checked") as advance:
+        for store, episode in chosen:
+            faults = episode_faults(store, episode)
+            if faults:
+                skipped.append(f"{episode.name} of {store.path} is left out: {faults[0].problem}")
+            elif episode.attributes.num_replans == 0:
+                skipped.append(f"{episode.name} of {store.path} is left out: it holds no replan")
+            else:
+                kept.append((store, episode))
+            advance(1)
+    if not kept:
+        raise StoreError(
+            f"None of the {len(chosen)} selected episodes can be used; the first: {skipped[0]}. Capture them again."
+        )
+    return kept, skipped
+
+
+def _refuse_empty(chosen: Sequence[tuple[Store, StoredEpisode]]) -> None:
+    empty = [f"{episode.name} of {store.path}" for store, episode in chosen if not episode.attributes.num_replans]
+    if empty:
+        raise StoreError(
+            f"{listing(empty)} hold{'s' if len(empty) == 1 else ''} no replan, so there is no attention to measure; leave "
+            "such episodes out with --skip-corrupt."
+        )

@@ -1,0 +1,192 @@
+"""`object_shares`: what the image attention goes to over time, by object in one episode and by class over all episodes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from vla_attention.analyze.measures.steps import SelectedEpisode
+from vla_attention.analyze.objects.objects_in_view import ALL_CAMERAS, CLASSES
+from vla_attention.analyze.show.plot_style import (
+    BASELINE_COLOR,
+    FURTHER_COLORS,
+    drawn_in_our_style,
+    new_figure,
+    plural,
+    ratio_axis,
+    save_figure,
+    shortened,
+    title,
+    whole_numbers,
+)
+from vla_attention.analyze.statistics.bootstrap import (
+    DEFAULT_SEED,
+    SHARE,
+    EpisodeStatistic,
+    Resamples,
+    bootstrap_intervals,
+    mean_over_episodes,
+    ratio_of_means_over_episodes,
+    resample_episodes,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+STEM = "object_shares"
+CLASS_COLORS = dict(zip(CLASSES, ("#D55E00", "#0072B2", "#009E73", "#9A9A9A"), strict=True))
+_PHASES = np.linspace(0.0, 1.0, 21)
+#: Objects beside robot and background that have a colour of their own; the others are shown together.
+_MOST = 9
+_OTHERS = "other objects"
+_EPISODE = ("suite", "task_id", "episode_index")
+
+
+@drawn_in_our_style
+def plot_object_shares(
+    times: pl.DataFrame, example: SelectedEpisode, folder: Path, seed: int = DEFAULT_SEED
+) -> list[Path]:
+    """Draw from `object_attention.object_tables`, `times`, over all cameras together; returns the paths of png, pdf and csv.
+
+    Left: shares of the example episode's image attention, stacked by object. Middle: mean over episodes by class, over the
+    episode's time from 0 to 1 (replans interpolated linearly), with pointwise intervals; dashed: covered area, what uniform
+    attention gives. Right: lift at each time, sum of the episodes' shares / sum of their covered areas.
+    """
+    whole = times.filter(pl.col("camera") == ALL_CAMERAS)
+    attributes = example.episode.attributes
+    own = whole.filter(
+        (pl.col("suite") == example.store.suite)
+        & (pl.col("task_id") == attributes.task_id)
+        & (pl.col("episode_index") == attributes.episode_index)
+    )
+    figure = new_figure(14.5, 4.7)
+    num_episodes = whole.select(_EPISODE).unique().height
+    num_tasks = whole.select(_EPISODE[:2]).unique().height
+    title(
+        figure,
+        "Share of the image attention by object, all cameras, mean over layers and heads",
+        f"Left: {example.episode.name}, '{attributes.instruction}'. Middle and right: mean over "
+        f"{plural(num_episodes, 'episode')} of {plural(num_tasks, 'task')} with 95 % bootstrap interval at each time; dashed: what "
+        "uniform attention gives (in the middle: the covered area).",
+    )
+    left, middle, right = figure.subplots(1, 3)
+    shown = _draw_example(left, own)
+    classes = _draw_classes(middle, right, whole, seed)
+    return save_figure(figure, folder, STEM, pl.concat([shown, classes], how="diagonal"))
+
+
+def _draw_example(axes: Axes, own: pl.DataFrame) -> pl.DataFrame:
+    objects = own.filter(pl.col("kind") == "object")
+    ranked = (
+        objects.group_by("item", "object_class")
+        .agg(pl.col("share").mean())
+        .sort(["share", "item"], descending=[True, False])
+    )
+    plain = [row["item"] for row in ranked.iter_rows(named=True) if row["object_class"] in CLASSES[:2]]
+    kept = plain[:_MOST]
+    named = objects.with_columns(
+        pl.when(pl.col("object_class").is_in(CLASSES[2:]) | pl.col("item").is_in(kept))
+        .then(pl.col("item"))
+        .otherwise(pl.lit(_OTHERS))
+        .alias("shown")
+    )
+    series = named.group_by("shown", "object_class", "env_step").agg(pl.col("share").sum(), pl.col("area_share").sum())
+    kinds = {row["item"]: row["object_class"] for row in ranked.iter_rows(named=True)}
+    # From below: objects of interest, other objects, robot, background.
+    order = sorted(kept, key=lambda name: CLASSES.index(kinds[name]))
+    order += [_OTHERS] if len(plain) > _MOST else []
+    order += [name for kind in CLASSES[2:] for name, of in kinds.items() if of == kind]
+    steps = np.unique(own["env_step"].to_numpy())
+    bottom = np.zeros(len(steps))
+    further = iter(FURTHER_COLORS)
+    for name in order:
+        part = series.filter(pl.col("shown") == name).group_by("env_step").agg(pl.col("share").sum()).sort("env_step")
+        share = np.nan_to_num(100 * part["share"].to_numpy().astype(float))
+        kind = kinds.get(name, CLASSES[1])
+        color = CLASS_COLORS[kind] if kind in CLASSES[2:] else "#4D4D4D" if name == _OTHERS else next(further)
+        label = shortened(name, 26) + (" (of interest)" if kind == CLASSES[0] else "")
+        if len(steps) > 1:
+            axes.fill_between(steps, bottom, bottom + share, color=color, linewidth=0, label=label)
+        else:
+            axes.bar(steps, share, 2.0, bottom, color=color, label=label)
+        bottom += share
+    axes.set_xlabel("environment step")
+    axes.set_ylabel("share of image attention (%)")
+    axes.set_ylim(0, max(float(bottom.max()), 1.0))
+    whole_numbers(axes.xaxis)
+    if len(steps) > 1:
+        axes.set_xlim(steps[0], steps[-1])
+    handles, labels = axes.get_legend_handles_labels()
+    # In the order of the layers on the page, from the top.
+    axes.legend(handles[::-1], labels[::-1], loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
+    return series.select(
+        pl.lit("example").alias("panel"), pl.col("shown").alias("name"), pl.col("env_step").cast(pl.Float64).alias("time"),
+        "share", "area_share",
+    ).sort("name", "time")  # fmt: skip
+
+
+def _draw_classes(axes: Axes, lift_axes: Axes, whole: pl.DataFrame, seed: int) -> pl.DataFrame:
+    rows: list[dict[str, Any]] = []
+    for name in CLASSES:
+        part = whole.filter((pl.col("kind") == "class") & (pl.col("item") == name))
+        if part.is_empty():
+            continue
+        share, area, tasks = _by_phase(part)
+        resamples = resample_episodes(tasks, seed=seed)
+        shares = _with_intervals([mean_over_episodes(column, SHARE) for column in share.T], resamples)
+        lifts = _with_intervals(
+            [ratio_of_means_over_episodes(*columns) for columns in zip(share.T, area.T, strict=True)], resamples
+        )
+        covered, color = area.mean(axis=0), CLASS_COLORS[name]
+        label = name if len(tasks) == whole.select(_EPISODE).unique().height else f"{name} (n = {len(tasks)})"
+        axes.plot(_PHASES, 100 * covered, color=color, linestyle="--", linewidth=1.0)
+        for target, factor, (value, low, high) in ((axes, 100, shares), (lift_axes, 1, lifts)):
+            target.plot(_PHASES, factor * value, color=color, label=label)
+            target.fill_between(_PHASES, factor * low, factor * high, color=color, alpha=0.2, linewidth=0)
+        rows += [
+            {"panel": "mean", "name": name, "time": float(_PHASES[i]), "area_share": float(covered[i]), "num_episodes": len(tasks)}
+            | {f"{what}{end}": float(values[i]) for what, three in (("share", shares), ("lift", lifts))
+               for end, values in zip(("", "_low", "_high"), three, strict=True)}
+            for i in range(len(_PHASES))
+        ]  # fmt: skip
+    data = pl.DataFrame(rows).with_columns(pl.col(pl.Float64).fill_nan(None))
+    top = 100 * max(data.select(pl.max_horizontal("share", "share_high", "area_share").max()).item() or 0.0, 0.01)
+    axes.set_ylim(0, 1.05 * top)
+    axes.set_ylabel("share of image attention (%)")
+    lift_axes.axhline(1.0, color=BASELINE_COLOR, linestyle="--", linewidth=1.0)
+    ratio_axis(lift_axes.yaxis, np.append(data.select("lift", "lift_low", "lift_high").to_numpy().astype(float), 1.0))
+    lift_axes.set_ylabel("lift: share of attention / share of area (logarithmic)")
+    for target in (axes, lift_axes):
+        target.set_xlabel("time in the episode (0: first replan, 1: last)")
+        target.set_xlim(0, 1)
+        target.grid(axis="y")
+        target.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
+    return data
+
+
+def _with_intervals(
+    statistics: list[EpisodeStatistic], resamples: Resamples
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Value, low and high of each statistic; NaN where there is none."""
+    intervals = bootstrap_intervals(statistics, resamples)
+    values = [np.nan if statistic.value is None else statistic.value for statistic in statistics]
+    low = [interval.low if interval else np.nan for interval in intervals]
+    high = [interval.high if interval else np.nan for interval in intervals]
+    return np.array(values), np.array(low), np.array(high)
+
+
+def _by_phase(part: pl.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.float64], list[str]]:
+    """Share and area (episode, phase) by linear interpolation over each episode's replans, and the episodes' tasks."""
+    shares, areas, tasks = [], [], []
+    for key, episode in part.group_by(_EPISODE, maintain_order=True):
+        ordered = episode.sort("replan")
+        last = ordered.height - 1
+        phase = ordered["replan"].to_numpy() / last if last else np.zeros(1)
+        shares.append(np.interp(_PHASES, phase, ordered["share"].cast(pl.Float64).to_numpy()))
+        areas.append(np.interp(_PHASES, phase, ordered["area_share"].to_numpy()))
+        tasks.append(f"{key[0]}\t{key[1]}")
+    return np.array(shares), np.array(areas), tasks

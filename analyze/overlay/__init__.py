@@ -1,0 +1,1 @@
+"""`vla-analyze overlay`: attention on the stored pictures, as strips and videos."""

@@ -1,0 +1,286 @@
+"""What an episode's overlays show: patch maps with their pictures, the ratio beside them, and the outlines of groups."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from vla_attention.analyze.measures.aggregate import add_layers_avg, overall_layer, per_replan
+from vla_attention.analyze.measures.patch_maps import mean_rows, seen_cameras
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.steps import SelectedEpisode, steps_table
+from vla_attention.analyze.show.patch_pictures import (
+    Measure,
+    Scale,
+    outline,
+    overlay_image,
+    patch_values,
+    scale_for,
+    upright,
+)
+from vla_attention.schemas.errors import BadArgument, listing, unknown_name
+from vla_attention.schemas.groupings.grouping import Grouping, parse_group_argument, with_groups
+from vla_attention.schemas.groupings.resolve import check_names, resolve
+from vla_attention.schemas.layout import Role
+from vla_attention.schemas.stores.store_format import PolicyCameraView
+
+#: Colours of outlines, which none of the scale's colours are: cyan, green, white, pink.
+OUTLINE_COLORS = ((0, 229, 255), (118, 255, 3), (255, 255, 255), (255, 128, 171))
+#: A group's patches are those of which it takes at least this share.
+OUTLINE_WEIGHT = 0.5
+
+
+@dataclass(frozen=True)
+class EpisodeOverlay:
+    """One episode's attention on its cameras.
+
+    Attributes:
+        item: the episode.
+        env_step: environment step of each replan, (replan,).
+        views: how each shown camera's picture was turned.
+        maps: by camera, mass of every patch (replan, row, column) in the stored orientation.
+        image_mass: mass of all image keys of all cameras, (replan,).
+        uniform_mass: mass of all valid keys / their number, (replan,).
+        num_image_keys: image keys of all cameras.
+        ratio: ratio of the question's grouping at each replan (replan,), NaN where undefined; None when it has no ratio.
+        uniform_ratio: what uniform attention would give, (replan,); None as above.
+        outlines: by group and camera, which patches the group takes, (replan or 1, row, column).
+    """
+
+    item: SelectedEpisode
+    env_step: NDArray[np.int64]
+    views: dict[str, PolicyCameraView]
+    maps: dict[str, NDArray[np.float64]]
+    image_mass: NDArray[np.float64]
+    uniform_mass: NDArray[np.float64]
+    num_image_keys: int
+    ratio: NDArray[np.float64] | None
+    uniform_ratio: NDArray[np.float64] | None
+    outlines: dict[str, dict[str, NDArray[np.bool_]]]
+
+    @property
+    def num_replans(self) -> int:
+        """Number of replans."""
+        return len(self.env_step)
+
+    def has_frames(self, camera: str) -> bool:
+        """Whether the camera's pictures were stored."""
+        return f"frames/{camera}" in self.item.episode.attributes.arrays
+
+    def values(self, measure: Measure) -> dict[str, NDArray[np.float64]]:
+        """By camera, what overlays show (replan, row, column); see `overlays.patch_values`."""
+        return {
+            camera: patch_values(mass, self.image_mass, self.uniform_mass, measure)
+            for camera, mass in self.maps.items()
+        }
+
+    def scale(self, measure: Measure, replans: Sequence[int]) -> Scale:
+        """One scale for all cameras at these replans."""
+        shown = [values[list(replans)].ravel() for values in self.values(measure).values()]
+        return scale_for(np.concatenate(shown), measure, self.num_image_keys)
+
+
+def camera_names(question: Question, wanted: Sequence[str] | None) -> tuple[str, ...]:
+    """The cameras to show: those that the policy sees at the question's site, or the wanted ones among them.
+
+    Raises:
+        BadArgument: the site has no camera pictures among its keys.
+        UnknownName: a wanted camera is not one of them.
+    """
+    cameras = seen_cameras(question.selected[0])
+    if not cameras:
+        sites = [site.name for site in question.stores[0].attributes.sites if site.cameras]
+        raise BadArgument(
+            f"The keys of site '{question.site}' are no patches of pictures, so there is nothing to lay over one; "
+            f"sites with "
+            f"cameras: {listing(sites)}. Choose with --site."
+        )
+    for camera in wanted or ():
+        if camera not in cameras:
+            raise unknown_name("camera", camera, cameras)
+    return cameras if wanted is None else tuple(wanted)
+
+
+def outline_grouping(texts: Sequence[str]) -> Grouping | None:
+    """The groups of `--group NAME=SELECTOR`, which may share keys; None without any."""
+    if not texts:
+        return None
+    from dataclasses import replace
+
+    grouping = with_groups(None, [parse_group_argument(text) for text in texts])
+    named = {name: value for name, value in grouping.groups.items() if name != "rest" or value != ("*",)}
+    return replace(grouping, groups=named, overlap=True, ratio=None, allow_empty=tuple(named))
+
+
+def ratios_of(question: Question, item: SelectedEpisode) -> pl.DataFrame:
+    """The table of replans (see `vla_attention.analyze.measures.aggregate`) of one episode."""
+    steps = steps_table([item], question.grouping, question.selection, question.site)
+    return add_layers_avg(per_replan(steps, question.grouping), question.grouping)
+
+
+def episode_overlay(
+    question: Question,
+    item: SelectedEpisode,
+    cameras: Sequence[str],
+    replans: pl.DataFrame,
+    groups: Grouping | None = None,
+) -> EpisodeOverlay:
+    """Read one episode's attention, mean over the selected layers, denoise steps and heads.
+
+    Args:
+        question: what is asked.
+        item: one of its episodes.
+        cameras: which cameras (`camera_names`).
+        replans: table of replans that has at least this episode (`ratios_of`, or a whole analysis's).
+        groups: groups whose patches are outlined.
+    """
+    tokens = item.tokens
+    mean = mean_rows(item, question.selection, question.site)
+    image = tokens.static_roles == int(Role.IMAGE)
+    valid = np.broadcast_to(item.valid, mean.shape)
+    attributes = item.store.attributes.policy
+    by_name = {view.name: view for view in attributes.cameras}
+    maps, views = {}, {}
+    for camera in cameras:
+        span = tokens.layout.camera_span(camera)
+        assert span.grid is not None
+        maps[camera] = mean[:, span.start : span.stop].reshape(-1, span.grid.rows, span.grid.columns)
+        views[camera] = by_name.get(camera, PolicyCameraView(camera, camera, True, False))
+    ratio = uniform = None
+    if question.grouping.ratio is not None:
+        rows = _of_episode(replans, item)
+        ratio = rows["ratio"].fill_null(float("nan")).to_numpy()
+        uniform = rows["uniform_ratio"].fill_null(float("nan")).to_numpy()
+    return EpisodeOverlay(
+        item=item,
+        env_step=item.episode.read("env_step").astype(np.int64),
+        views=views,
+        maps=maps,
+        image_mass=(mean * image).sum(axis=1),
+        uniform_mass=(mean * valid).sum(axis=1) / valid.sum(axis=1),
+        num_image_keys=int(image.sum(axis=1).max()),
+        ratio=ratio,
+        uniform_ratio=uniform,
+        outlines=_outlines(item, cameras, groups),
+    )
+
+
+def _of_episode(replans: pl.DataFrame, item: SelectedEpisode) -> pl.DataFrame:
+    attributes = item.episode.attributes
+    own = replans.filter(
+        (pl.col("suite") == item.store.suite)
+        & (pl.col("task_id") == attributes.task_id)
+        & (pl.col("episode_index") == attributes.episode_index)
+    )
+    return own.filter(pl.col("layer") == overall_layer(own)).sort("replan")
+
+
+def _outlines(
+    item: SelectedEpisode, cameras: Sequence[str], groups: Grouping | None
+) -> dict[str, dict[str, NDArray[np.bool_]]]:
+    if groups is None:
+        return {}
+    weights = resolve(groups, item.tokens).weights
+    found: dict[str, dict[str, NDArray[np.bool_]]] = {}
+    for i, name in enumerate(groups.names):
+        found[name] = {}
+        for camera in cameras:
+            span = item.tokens.layout.camera_span(camera)
+            assert span.grid is not None
+            taken = weights[:, span.start : span.stop, i] >= OUTLINE_WEIGHT
+            found[name][camera] = taken.reshape(-1, span.grid.rows, span.grid.columns)
+    return found
+
+
+def check_outlines(question: Question, groups: Grouping | None) -> None:
+    """Raise `SelectorError` for a group that names what exists nowhere in the selection."""
+    if groups is not None:
+        check_names(groups, question.vocabulary, question.selected[0].tokens.layout)
+
+
+def draw(
+    overlay: EpisodeOverlay,
+    camera: str,
+    replan: int,
+    scale: Scale,
+    values: Mapping[str, NDArray[np.float64]],
+    smooth: bool = False,
+) -> NDArray[np.uint8]:
+    """One overlay (row, column, 3), turned as a person sees the scene, with outlines."""
+    frame = overlay.item.episode.read(f"frames/{camera}", replan) if overlay.has_frames(camera) else None
+    grid = overlay.item.tokens.layout.camera_span(camera).grid
+    assert grid is not None
+    image = overlay_image(frame, values[camera][replan], scale, smooth, (grid.image_height, grid.image_width))
+    for i, by_camera in enumerate(overlay.outlines.values()):
+        member = by_camera[camera]
+        color = OUTLINE_COLORS[i % len(OUTLINE_COLORS)]
+        image = outline(image, member[replan if len(member) > 1 else 0], color, max(1, image.shape[0] // 112))
+    return upright(image, overlay.views[camera])
+
+
+def overlay_table(overlay: EpisodeOverlay, replans: Sequence[int]) -> pl.DataFrame:
+    """The numbers that overlays show, one row per (camera, replan, patch).
+
+    `row` and `column` count in the stored picture, as selectors such as patch:CAMERA[r0:r1,c0:c1] do; `shown_row` and `shown_column`
+    in the picture as it is drawn.
+    """
+    lift, share = overlay.values("lift"), overlay.values("share")
+    frames = []
+    chosen = np.asarray(list(replans))
+    for camera, mass in overlay.maps.items():
+        place = np.indices(mass.shape[1:])
+        turned = upright(np.moveaxis(place, 0, -1), overlay.views[camera])
+        shown = np.empty_like(turned)
+        shown[turned[..., 0], turned[..., 1]] = np.moveaxis(place, 0, -1)
+        count, patches = len(chosen), mass[0].size
+        columns: dict[str, Any] = {
+            "camera": [camera] * (count * patches),
+            "replan": np.repeat(chosen, patches),
+            "env_step": np.repeat(overlay.env_step[chosen], patches),
+            "row": np.tile(place[0].ravel(), count),
+            "column": np.tile(place[1].ravel(), count),
+            "shown_row": np.tile(shown[..., 0].ravel(), count),
+            "shown_column": np.tile(shown[..., 1].ravel(), count),
+            "mass": mass[chosen].ravel(),
+            "share_percent": share[camera][chosen].ravel(),
+            "lift": lift[camera][chosen].ravel(),
+        }
+        if overlay.ratio is not None:
+            columns["ratio"] = np.repeat(overlay.ratio[chosen], patches)
+        frames.append(pl.DataFrame(columns))
+    return pl.concat(frames)
+
+
+def chosen_replans(overlay: EpisodeOverlay, wanted: Sequence[int] | None, most: int) -> tuple[int, ...]:
+    """The wanted replans, or `most` of them spread evenly from the first to the last."""
+    count = overlay.num_replans
+    if wanted is None:
+        return tuple(int(i) for i in np.unique(np.linspace(0, count - 1, min(most, count)).round()))
+    for replan in wanted:
+        if not 0 <= replan < count:
+            raise BadArgument(
+                f"There is no replan {replan} in {overlay.item.episode.name}; it has replans 0 to {count - 1}."
+            )
+    return tuple(wanted)
+
+
+def orientation_note(overlay: EpisodeOverlay) -> str:
+    """How the pictures were turned for people, as a sentence; empty when they are as stored."""
+    mirrored = [camera for camera, view in overlay.views.items() if view.mirrored]
+    turned = [camera for camera, view in overlay.views.items() if not view.upright]
+    notes = []
+    if mirrored:
+        which = "Pictures are" if len(mirrored) == len(overlay.views) else f"{listing(mirrored)}:"
+        notes.append(f"{which} shown as the scene is; the model sees left and right exchanged.")
+    if turned:
+        which = "Pictures are" if len(turned) == len(overlay.views) else f"{listing(turned)}:"
+        notes.append(f"{which} shown right way up; the model sees them upside down.")
+    missing = [camera for camera in overlay.views if not overlay.has_frames(camera)]
+    if missing:
+        notes.append(f"No pictures were stored of {listing(missing)}: attention alone, on grey.")
+    return " ".join(notes)

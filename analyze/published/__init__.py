@@ -1,0 +1,1 @@
+"""The results files of the published scripts and ours: written, read, parsed, compared."""

@@ -1,0 +1,206 @@
+"""`parse-attention-ratio-results`: summaries and pictures from results files, ours and those of the published scripts."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vla_attention.schemas.command_line import OneSentenceParser, run_command
+
+if TYPE_CHECKING:
+    from vla_attention.analyze.published.results_reader import ResultsFile
+    from vla_attention.analyze.published.results_tables import ResultsTables
+
+PROGRAM = "parse-attention-ratio-results"
+_EXAMPLES = """examples:
+  parse-attention-ratio-results --results results/attention_ratio/attention_ratio_results_libero_10.json
+  parse-attention-ratio-results --results results/libero_10/default --plot-all --output summary.txt --output-dir pictures
+  parse-attention-ratio-results --results 'results/attention_ratio_cosmos_*/attention_ratio_results_*.json' --plot-comparison
+
+Several files of one kind are also summarised together (COMBINED). Masses of latent frames (Cosmos scripts) are never pooled with
+masses of image and text keys; --plot-comparison shows both side by side.
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of `parse-attention-ratio-results`."""
+    parser = OneSentenceParser(
+        prog=PROGRAM,
+        description="Summaries and pictures from attention_ratio_results_SUITE.json files, ours or the published scripts'.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--results",
+        nargs="+",
+        required=True,
+        metavar="PATH",
+        help="results files, folders of them, or patterns for either",
+    )
+    parser.add_argument("--output", type=Path, metavar="FILE", help="also write the summary into this text file")
+    parser.add_argument(
+        "--output-dir",
+        type=Path,
+        default=Path("results/attention_ratio_analysis"),
+        metavar="FOLDER",
+        help="folder of the pictures (default: %(default)s)",
+    )
+    parser.add_argument("--plot-all", action="store_true", help="every picture")
+    parser.add_argument(
+        "--plot-distribution", action="store_true", help="how ratios are spread over replans and layers"
+    )
+    parser.add_argument("--plot-per-task", action="store_true", help="mean ratio per task with its interval")
+    parser.add_argument(
+        "--plot-fractions", action="store_true", help="visual, linguistic and other fractions per layer"
+    )
+    parser.add_argument("--plot-comparison", action="store_true", help="mean ratio of several files side by side")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code (2: a mistake in what was given, said in one sentence)."""
+    arguments = build_parser().parse_args(argv)
+    return run_command(PROGRAM, lambda: run(arguments), "nothing was left half written.")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Read, summarise, and draw what was asked for."""
+    # Imported after the arguments were read: `--help` must not wait for polars.
+    from vla_attention.analyze.published.results_reader import find_results, read_results_file
+    from vla_attention.analyze.published.results_tables import labels_of, results_tables
+    from vla_attention.analyze.published.results_text import summary_of_files
+    from vla_attention.analyze.show.progress import progress_bar
+    from vla_attention.schemas.errors import BadArgument
+
+    paths = find_results(arguments.results)
+    if arguments.plot_comparison and len(paths) < 2:
+        raise BadArgument(
+            f"--plot-comparison compares several results files, and --results leads to one ({paths[0]}); name more, or leave "
+            "--plot-comparison out."
+        )
+    files = []
+    with progress_bar(len(paths), "files") as advance:
+        for path in paths:
+            files.append(read_results_file(path))
+            advance(1)
+    labels = labels_of(files)
+    not_pooled = _why_not_pooled(files, arguments.plot_comparison)
+    tables = [results_tables([file], [label]) for file, label in zip(files, labels, strict=True)]
+    blocks = [summary_of_files(label, [file], table) for label, file, table in zip(labels, files, tables, strict=True)]
+    if len(files) > 1:
+        blocks.append(not_pooled or summary_of_files("COMBINED", files, results_tables(files, labels)))
+    text = "\n".join(blocks)
+    print(text)
+    written = []
+    if arguments.output is not None:
+        written += _write_summary(arguments.output, text)
+    written += _draw(arguments, files, labels, tables)
+    for path in written:
+        print(f"written: {path}")
+    return 0
+
+
+def _why_not_pooled(files: Sequence[ResultsFile], side_by_side: bool) -> str:
+    """Why there is no COMBINED, empty when there is one; files of different kinds are refused unless compared side by side."""
+    from vla_attention.analyze.published.results_tables import by_kind
+    from vla_attention.schemas.errors import listing
+    from vla_attention.schemas.results import ResultsError
+
+    kinds = by_kind(files)
+    if len(kinds) > 1:
+        parts = "; ".join(f"{listing([file.path for file in of_kind], 3)}: {kind}" for kind, of_kind in kinds.items())
+        if not side_by_side:
+            raise ResultsError(
+                f"These results files hold masses of different kinds, which cannot be summarised together ({parts}); give one kind at "
+                "a time, or see them side by side with --plot-comparison."
+            )
+        return _wrapped(f"No COMBINED: the files hold masses of different kinds ({parts}).")
+    repeated = sorted({file.suite for file in files if sum(file.suite == other.suite for other in files) > 1})
+    if repeated:
+        paths = [file.path for file in files if file.suite in repeated]
+        return _wrapped(
+            f"No COMBINED: {listing(paths, 4)} are about the same suite ({listing(repeated)}), that is, different runs of it."
+        )
+    return ""
+
+
+def _wrapped(text: str) -> str:
+    import textwrap
+
+    return textwrap.fill(text, 100, break_long_words=False, break_on_hyphens=False) + "\n"
+
+
+def _write_summary(path: Path, text: str) -> list[Path]:
+    from vla_attention.analyze.show.atomic_file import write_text
+    from vla_attention.schemas.errors import BadArgument
+
+    try:
+        write_text(path, text)
+    except OSError as error:
+        raise BadArgument(
+            f"Cannot write the summary to {path}: {error.strerror or error}; give another --output."
+        ) from None
+    return [path]
+
+
+def _draw(
+    arguments: argparse.Namespace, files: Sequence[ResultsFile], labels: Sequence[str], tables: Sequence[ResultsTables]
+) -> list[Path]:
+    """The pictures that were asked for; with several files, each file's label stands behind the picture's name."""
+    from vla_attention.schemas.errors import BadArgument
+
+    wanted = [
+        name
+        for name in ("distribution", "per_task", "fractions")
+        if arguments.plot_all or getattr(arguments, f"plot_{name}")
+    ]
+    compare = arguments.plot_comparison or (arguments.plot_all and len(files) > 1)
+    if not (wanted or compare):
+        return []
+    folder: Path = arguments.output_dir
+    written: list[Path] = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for label, table in zip(labels, tables, strict=True):
+            written += _draw_file(wanted, folder, label, table, several=len(files) > 1)
+        if compare:
+            from vla_attention.analyze.published.plot_results_comparison import plot_results_comparison
+
+            written += plot_results_comparison(tables, labels, folder)
+    except OSError as error:
+        raise BadArgument(
+            f"Cannot write pictures to {folder}: {error.strerror or error}; give another --output-dir."
+        ) from None
+    return written
+
+
+def _draw_file(wanted: Sequence[str], folder: Path, label: str, table: ResultsTables, several: bool) -> list[Path]:
+    from vla_attention.analyze.ratios import plot_attention_fractions, plot_ratio_distribution, plot_ratio_per_task
+
+    about = f"results file '{label}'"
+    end = f"_{label.replace('/', '_')}" if several else ""
+    note = "No uniform baseline: a results file does not hold the numbers of keys."
+    written: list[Path] = []
+    if "distribution" in wanted:
+        stem = plot_ratio_distribution.STEM + end
+        written += plot_ratio_distribution.plot_ratio_distribution(
+            table.replans, table.grouping, folder, stem=stem, about=about, note=note
+        )
+    if "per_task" in wanted:
+        stem = plot_ratio_per_task.STEM + end
+        written += plot_ratio_per_task.plot_ratio_per_task(
+            table.episodes, table.tasks, table.grouping, folder, stem=stem, about=about, note=note
+        )
+    if "fractions" in wanted:
+        stem = plot_attention_fractions.STEM + end
+        written += plot_attention_fractions.plot_attention_fractions(
+            table.tasks, table.grouping, folder, stem=stem, about=about, note=f"Masses: {table.grouping.description}."
+        )
+    return written
+
+
+if __name__ == "__main__":
+    sys.exit(main())

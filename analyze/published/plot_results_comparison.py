@@ -1,0 +1,180 @@
+"""`results_comparison`: several results files side by side: mean ratio with its interval, episodes as dots, and fractions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG, overall_layer, overall_rows
+from vla_attention.analyze.published.results_tables import ResultsTables
+from vla_attention.analyze.show.plot_style import (
+    FIXED_COLORS,
+    NOTE_COLOR,
+    drawn_in_our_style,
+    new_figure,
+    plural,
+    ratio_axis,
+    save_figure,
+    title,
+    wrapped,
+)
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+STEM = "results_comparison"
+#: Colour and marker of each kind of masses, in order of appearance.
+_KINDS = (("#0072B2", "o"), ("#D55E00", "D"), ("#009E73", "s"), ("#CC79A7", "^"), ("#E69F00", "v"), ("#56B4E9", "P"))
+_FRACTIONS = ("visual", "linguistic", "action", "rest")
+
+
+def comparison_table(tables: Sequence[ResultsTables], labels: Sequence[str]) -> pl.DataFrame:
+    """One row per results file, over all its episodes, in the layer that speaks for it ("layers_avg", else the first).
+
+    Columns: file, kind, layer, num_tasks, num_episodes, episodes_without_ratio, num_replans, num_nonfinite, success_rate,
+    ratio_mean with ratio_mean_low and ratio_mean_high (two-level bootstrap), ratio_std (over episodes) and, for every group of
+    `visual`, `linguistic`, `action` and `rest`, GROUP_fraction with its interval (null in a file without that group).
+    """
+    columns = ["num_tasks", "num_episodes", "episodes_without_ratio", "num_replans", "num_nonfinite", "success_rate"]
+    columns += ["ratio_mean", "ratio_mean_low", "ratio_mean_high", "ratio_std"]
+    rows = []
+    for table, label in zip(tables, labels, strict=True):
+        layer = overall_layer(table.tasks)
+        row = overall_rows(table.tasks).filter(layer=layer).row(0, named=True)
+        fractions = {
+            f"{name}_fraction{end}": row.get(f"{name}_fraction{end}")
+            for name in _FRACTIONS
+            for end in ("", "_low", "_high")
+        }
+        identity = {"file": label, "kind": table.grouping.description, "layer": layer}
+        rows.append({**identity, **{column: row[column] for column in columns}, **fractions})
+    floats = dict.fromkeys([*columns[6:], *fractions], pl.Float64)
+    return pl.DataFrame(rows, schema_overrides=floats, infer_schema_length=None)
+
+
+@drawn_in_our_style
+def plot_results_comparison(tables: Sequence[ResultsTables], labels: Sequence[str], folder: Path) -> list[Path]:
+    """Draw one row per results file; returns the paths of png, pdf and csv. A ratio that does not exist is said to."""
+    data = comparison_table(tables, labels)
+    few = data.height <= 24
+    kinds = data["kind"].unique(maintain_order=True).to_list()
+    figure = new_figure(10, 1.9 + (0.42 if few else 0.22) * (data.height + 0.5) + 0.16 * len(kinds))
+    note = (
+        f"n counts episodes. Means over episodes with {DEFAULT_LEVEL:.0%} intervals (two-level bootstrap over tasks and episodes). "
+        "No uniform baseline: results files do not hold the numbers of keys."
+    )
+    if len(kinds) > 1:
+        note += " Files of different kinds measure different things: compare within a kind."
+    layers = data["layer"].unique(maintain_order=True).to_list()
+    which = ", ".join(layer if layer == LAYERS_AVG else f"layer {layer}" for layer in layers)
+    suite = _common_suite(data)
+    of = f" of {suite}" if suite else ""
+    title(figure, f"{plural(data.height, 'results file')}{of}, {which}", note)
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=[1.5, 1])
+    _ratios(left, data, tables, kinds, few)
+    _stacked_fractions(right, data)
+    figure.legend(handles=left.get_legend_handles_labels()[0], loc="outside lower left", ncols=min(len(kinds) + 1, 2))
+    left.set_yticks(range(data.height), row_names(data, few))
+    left.set_ylim(data.height - 0.4, -0.6)
+    left.tick_params(axis="y", length=0)
+    right.tick_params(axis="y", length=0)
+    return save_figure(figure, folder, STEM, data)
+
+
+def row_names(data: pl.DataFrame, few: bool) -> list[str]:
+    """Labels of the rows, as long as there is room; with their row number in the data where shortening made two equal.
+
+    A suite that all files share is in the title, and layers are named only where files differ in them.
+    """
+    layers = [layer if layer == LAYERS_AVG else f"layer {layer}" for layer in data["layer"]]
+    names = []
+    for label, layer in zip(data["file"], layers, strict=True):
+        folder, _, suite = label.rpartition("/")
+        parts = [folder, suite] if _common_suite(data) is None or not folder else [folder]
+        if len(set(layers)) > 1:
+            parts[-1] += f" ({layer})"
+        parts = [part for part in parts if part]
+        joined = "/".join(parts)
+        if len(joined) <= 36:
+            names.append(joined)
+        else:
+            names.append(
+                "\n".join(map(_clipped, parts)) if few else "/".join(_clipped(part, 44 // len(parts)) for part in parts)
+            )
+    return [f"{i + 1}: {name}" if names.count(name) > 1 else name for i, name in enumerate(names)]
+
+
+def _common_suite(data: pl.DataFrame) -> str | None:
+    """The suite that all files are about, when folders tell them apart."""
+    suites = {label.rpartition("/")[2] for label in data["file"]}
+    return suites.pop() if len(suites) == 1 and data.height > 1 else None
+
+
+def _clipped(text: str, most: int = 40) -> str:
+    return text if len(text) <= most else f"{text[: most // 2]}…{text[-(most - most // 2 - 1) :]}"
+
+
+def _ratios(axes: Axes, data: pl.DataFrame, tables: Sequence[ResultsTables], kinds: list[str], few: bool) -> None:
+    generator = np.random.default_rng(0)
+    dots = [
+        table.episodes.filter(layer=layer)["ratio_mean"].drop_nulls().to_numpy()
+        for table, layer in zip(tables, data["layer"], strict=True)
+    ]
+    bounds = [data[f"ratio_mean{end}"].drop_nulls().to_numpy() for end in ("", "_low", "_high")]
+    ratio_axis(axes.xaxis, np.concatenate([*bounds, *dots]))
+    low, high = axes.get_xlim()
+    if low < 1 < high:
+        axes.axvline(1.0, color=NOTE_COLOR, linewidth=0.9, zorder=1)
+        axes.text(1.0, 1.0, "equal masses", transform=axes.get_xaxis_transform(), ha="center", va="bottom", size=7)
+    for position, (row, values) in enumerate(zip(data.iter_rows(named=True), dots, strict=True)):
+        color, marker = _KINDS[kinds.index(row["kind"]) % len(_KINDS)]
+        values = values[values > 0]
+        jitter = generator.uniform(-0.22, 0.22, len(values)) if len(values) > 1 else np.zeros(len(values))
+        axes.scatter(values, position + jitter, s=10 if few else 6, color=color, alpha=0.35, linewidths=0, zorder=2)
+        if row["ratio_mean"] is None or row["ratio_mean"] <= 0:
+            text = "no finite ratio" if row["ratio_mean"] is None else "mean ratio 0"
+            axes.text(0.01, position, text, transform=axes.get_yaxis_transform(), va="center", size=7, color=NOTE_COLOR)
+        else:
+            if row["ratio_mean_low"] is not None:
+                ends = [max(row["ratio_mean_low"], low), row["ratio_mean_high"]]
+                axes.plot(ends, [position, position], color=color, linewidth=2.0, zorder=3)
+            axes.plot(
+                row["ratio_mean"], position, marker, color=color, markersize=6.5, markeredgecolor="white", zorder=4
+            )
+        text = f"n = {row['num_episodes']}"
+        if row["episodes_without_ratio"]:
+            text += f" ({row['episodes_without_ratio']} without)"
+        axes.text(1.01, position, text, transform=axes.get_yaxis_transform(), va="center", size=7, color=NOTE_COLOR)
+    for i, kind in enumerate(kinds):
+        color, marker = _KINDS[i % len(_KINDS)]
+        axes.plot([], [], marker, color=color, markersize=6, label=wrapped(kind, 60, 2))
+    axes.scatter([], [], s=10, color=NOTE_COLOR, alpha=0.5, linewidths=0, label="single episode")
+    axes.grid(axis="x")
+    axes.set_xlabel("ratio of masses, visual / linguistic (logarithmic)")
+
+
+def _stacked_fractions(axes: Axes, data: pl.DataFrame) -> None:
+    start = np.zeros(data.height)
+    for name in _FRACTIONS:
+        values = data[f"{name}_fraction"].fill_null(0.0).to_numpy()
+        if data[f"{name}_fraction"].null_count() == data.height:
+            continue
+        label = "other" if name == "rest" else name
+        axes.barh(range(data.height), values, 0.6, start, color=FIXED_COLORS[name], edgecolor="white", label=label)
+        for position, (value, left) in enumerate(zip(values, start, strict=True)):
+            if value >= 0.09:
+                axes.text(
+                    left + value / 2, position, f"{100 * value:.0f}", ha="center", va="center", size=7, color="white"
+                )
+        start += values
+    axes.set_xlim(0, 1)
+    axes.set_xticks(np.linspace(0, 1, 5), [f"{value:.0%}" for value in np.linspace(0, 1, 5)])
+    axes.set_xlabel("mean fraction")
+    axes.legend(
+        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, borderaxespad=0.2, handlelength=1.0, columnspacing=1.0
+    )

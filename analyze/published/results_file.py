@@ -1,0 +1,148 @@
+"""The results file: from the table of replans to `attention_ratio_results_<suite>.json`, and back into objects."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import polars as pl
+
+from vla_attention.analyze.measures.aggregate import EPISODE_KEYS, LAYERS_AVG
+from vla_attention.analyze.show.atomic_file import replacing
+from vla_attention.schemas.groupings.grouping import Grouping
+from vla_attention.schemas.jsonable import MalformedDocument, from_json
+from vla_attention.schemas.results import EpisodeResult, FrameProxy, ResultsError, ResultsNotFound, results_file_name
+
+#: Fields that are absent, not null, when the grouping has no group of this name.
+_ACTION = "action"
+_SIDES = ("visual", "linguistic")
+_RATIO = "visual_linguistic_ratio"
+
+
+def episode_documents(
+    replans: pl.DataFrame, grouping: Grouping, proxy: FrameProxy | None = None
+) -> Iterator[dict[str, Any]]:
+    """Episodes of one or more suites from the table of replans (`aggregate.add_layers_avg`), in its order, as JSON documents.
+
+    visual is the sum of the ratio's numerator groups, linguistic that of its denominator groups; the fraction of either is
+    its mass / sum of all groups' masses. With a `proxy` the numbers are those of the published Cosmos scripts instead: masses are
+    sums over the queries (ours are means), and fractions are of visual + linguistic only.
+
+    Plain values rather than `vla_attention.schemas.results.EpisodeResult` objects, which describe them: a suite has a hundred thousand steps.
+    """
+    if grouping.ratio is None:
+        raise ResultsError(
+            f"Grouping '{grouping.name}' defines no ratio, so there is no visual/linguistic ratio to write into a results "
+            "file; expected a [ratio] with numerator and denominator groups (or --ratio A,B/C)."
+        )
+    sides = [*_SIDES, _ACTION] if _ACTION in grouping.names and proxy is None else list(_SIDES)
+    kinds = [f"{side}_{kind}" for side in sides for kind in ("mass", "fraction")]
+    table = _with_sides(replans, grouping, proxy).select(*EPISODE_KEYS, "layer", "replan", "step", _RATIO, *kinds)
+    extra = {} if proxy is None else proxy.fields()
+    for part in table.partition_by("suite", "task_id", "episode_index", maintain_order=True):
+        identity = part.select(EPISODE_KEYS).row(0, named=True)
+        summaries = {row["layer"]: row for row in _summaries(part, kinds).iter_rows(named=True)}
+        in_time = part.sort("replan", maintain_order=True).drop(*EPISODE_KEYS, "replan")
+        layers = in_time.partition_by("layer", as_dict=True, maintain_order=True, include_key=False)
+        steps = {str(layer): rows for (layer,), rows in layers.items()}
+        yield {
+            "task_id": identity["task_id"],
+            "episode_idx": identity["episode_index"],
+            "task_description": identity["instruction"],
+            "success": identity["success"],
+            "num_steps": identity["num_steps"],
+            "summary": {_layer_name(layer): _summary_document(summaries[layer], kinds) for layer in steps},
+            "per_step_ratios": {
+                _layer_name(layer): [step | extra for step in rows.to_dicts()] if extra else rows.to_dicts()
+                for layer, rows in steps.items()
+            },
+        }
+
+
+def episode_results(replans: pl.DataFrame, grouping: Grouping, proxy: FrameProxy | None = None) -> list[EpisodeResult]:
+    """`episode_documents` as objects."""
+    return from_json(list[EpisodeResult], list(episode_documents(replans, grouping, proxy)))
+
+
+def write_results(path: Path, episodes: Iterable[dict[str, Any]]) -> None:
+    """Write a results file atomically, as strict JSON with one episode per line."""
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        separator = "[\n"
+        for episode in episodes:
+            file.write(separator + json.dumps(episode, allow_nan=False, ensure_ascii=False))
+            separator = ",\n"
+        file.write("\n]\n" if separator == ",\n" else "[]\n")
+
+
+def write_results_of_suites(
+    folder: Path, replans: pl.DataFrame, grouping: Grouping, proxy: FrameProxy | None = None
+) -> list[Path]:
+    """Write `attention_ratio_results_<suite>.json` for every suite of the table and return the paths."""
+    paths = []
+    for (suite,), part in replans.partition_by("suite", as_dict=True, maintain_order=True).items():
+        path = folder / results_file_name(str(suite))
+        write_results(path, episode_documents(part, grouping, proxy))
+        paths.append(path)
+    return paths
+
+
+def read_results(path: Path) -> list[EpisodeResult]:
+    """Read a results file that this tool wrote; strict, and every error names the file."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ResultsNotFound(f"Cannot read results file {path}: {error}.") from None
+    try:
+        return from_json(list[EpisodeResult], json.loads(text, parse_constant=_refuse_constant))
+    except json.JSONDecodeError as error:
+        raise ResultsError(f"Results file {path} is not valid JSON: {error}.") from None
+    except (MalformedDocument, ResultsError) as error:
+        raise ResultsError(f"Results file {path}: {error}") from None
+
+
+def _refuse_constant(constant: str) -> NoReturn:
+    raise ResultsError(
+        f"it holds {constant}, which JSON does not have; files of the published scripts do, files of this tool write null."
+    )
+
+
+def _with_sides(replans: pl.DataFrame, grouping: Grouping, proxy: FrameProxy | None) -> pl.DataFrame:
+    """Add step, ratio (null where it is not finite), and the masses and fractions of the two sides."""
+    assert grouping.ratio is not None
+    visual = pl.sum_horizontal(f"{name}_mass" for name in grouping.ratio.numerator)
+    linguistic = pl.sum_horizontal(f"{name}_mass" for name in grouping.ratio.denominator)
+    queries = 1 if proxy is None else proxy.num_queries
+    total = visual + linguistic if proxy else pl.sum_horizontal(f"{name}_mass" for name in grouping.names)
+    # What the table calls after a group may be the name of a side.
+    return replans.with_columns(
+        pl.col("env_step").alias("step"),
+        pl.when(pl.col("ratio").is_finite()).then(pl.col("ratio")).alias(_RATIO),
+        (visual * queries).alias("visual_mass"),
+        (linguistic * queries).alias("linguistic_mass"),
+        (visual / total).fill_nan(None).alias("visual_fraction"),
+        (linguistic / total).fill_nan(None).alias("linguistic_fraction"),
+    )
+
+
+def _summaries(episode: pl.DataFrame, kinds: Sequence[str]) -> pl.DataFrame:
+    """One row per layer: number of steps, the finite ratios in five numbers, mean and std (ddof 0) of the others."""
+    ratio = pl.col(_RATIO)
+    spread = [ratio.mean(), ratio.std(ddof=0).alias("std"), ratio.median().alias("median")]
+    ends = [ratio.min().alias("min"), ratio.max().alias("max"), ratio.null_count().alias("num_nonfinite")]
+    others = [part for kind in kinds for part in (pl.col(kind).mean(), pl.col(kind).std(ddof=0).alias(f"{kind}_std"))]
+    return episode.group_by("layer").agg(pl.len().alias("num_steps"), *spread, *ends, *others)
+
+
+def _summary_document(row: dict[str, Any], kinds: Sequence[str]) -> dict[str, Any]:
+    spread = {name: row[name] for name in ("std", "median", "min", "max", "num_nonfinite")}
+    return {
+        _RATIO: {"mean": row[_RATIO], **spread},
+        **{kind: {"mean": row[kind], "std": row[f"{kind}_std"]} for kind in kinds},
+        "num_steps": row["num_steps"],
+    }
+
+
+def _layer_name(layer: str) -> str:
+    return layer if layer == LAYERS_AVG else f"layer_{layer}"

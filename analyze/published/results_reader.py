@@ -1,0 +1,373 @@
+"""Results files of anybody: finding them, and reading ours and those of the published scripts into one table.
+
+`vla_attention.analyze.published.results_file.read_results` is strict and reads what this tool wrote. Here the differences of the published scripts' files
+are accepted, and nothing else:
+
+    Infinity and NaN as ratios                       they become infinite and undefined, as null does in our files
+    a ratio of 0 where no ratio exists               undefined: both masses 0, or "layers_avg" of layers without a finite ratio
+    no "layers_avg", no action fields, no summary    as they are; see `ResultsFile`
+    fields that are not known here                   read over, and named in `ResultsFile.unused`
+    one episode that is not in a list                a list of one
+"""
+
+from __future__ import annotations
+
+import glob
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG
+from vla_attention.schemas.errors import listing
+from vla_attention.schemas.results import (
+    RESULTS_PREFIX,
+    EpisodeResult,
+    ResultsError,
+    ResultsNotFound,
+    StepRatio,
+    suite_of_results_file,
+)
+
+_LAYER = re.compile(r"layer_(\d+)$")
+#: The published scripts call a mass of up to this nothing, and write a ratio of 0 where both sides have nothing.
+NO_MASS = 1e-8
+#: Which latent frames stand for what in the Cosmos scripts' files; a file that names them is one of theirs, or compares with them.
+FRAME_FIELDS = ("query_frame", "visual_frame", "text_frame")
+_MASSES = ("visual_mass", "linguistic_mass")
+_FRACTIONS = ("visual_fraction", "linguistic_fraction")
+#: Fractions are quotients of sums in float32 or better.
+_ONE = 1 + 1e-4
+
+
+@dataclass(frozen=True)
+class ResultsKind:
+    """What a file's masses are, as far as the file says: numbers of different kinds are not pooled.
+
+    Attributes:
+        frames: the latent frames that stand for queries, seeing and reading (Cosmos scripts); None in the others' files.
+        has_action: there is an action mass, and it is part of what fractions are fractions of.
+    """
+
+    frames: tuple[str, str, str] | None
+    has_action: bool
+
+    def __str__(self) -> str:
+        if self.frames is None:
+            return "visual over linguistic keys, as the file's writer defined them" + (
+                "" if self.has_action else "; no action mass"
+            )
+        query, visual, text = self.frames
+        return f"latent frames, {visual} over {text}, queries {query}"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A number of a file's own summary: of which episode (position in the file), layer, measure and statistic."""
+
+    episode: int
+    layer: str
+    measure: str
+    statistic: str
+    value: float | None
+
+
+@dataclass(frozen=True)
+class ResultsFile:
+    """One results file.
+
+    Attributes:
+        path: where it lies.
+        suite: the suite that it is about, from its name.
+        kind: what its masses are.
+        episodes: one row per episode, in the file's order: episode (position), task_id, instruction, episode_index, success,
+            num_steps, num_replans (0 for an episode without steps).
+        steps: one row per (episode, replan, layer): episode (position), replan, env_step, layer (the number as a string, or
+            "layers_avg"), layer_number, ratio (infinite; null where undefined), visual_mass, linguistic_mass, visual_fraction,
+            linguistic_fraction (null where undefined) and, with `kind.has_action`, action_mass and action_fraction.
+        claims: the numbers of the file's own summaries.
+        zeros: how many ratios of 0 stand for "no ratio" and were read as undefined.
+        unused: names of fields that nothing here knows.
+    """
+
+    path: Path
+    suite: str
+    kind: ResultsKind
+    episodes: pl.DataFrame
+    steps: pl.DataFrame
+    claims: tuple[Claim, ...]
+    zeros: int
+    unused: tuple[str, ...]
+
+
+def find_results(given: Sequence[str]) -> list[Path]:
+    """Files that `--results` names: files, folders (their results files, or else every .json), or patterns for either.
+
+    Raises:
+        ResultsNotFound: one of the arguments leads to no file.
+    """
+    try:
+        return _found(given)
+    except OSError as error:
+        if isinstance(error, ResultsNotFound):
+            raise
+        raise ResultsNotFound(
+            f"Cannot look for results files in {listing(given, 3)}: {error.strerror or error}."
+        ) from None
+
+
+def _found(given: Sequence[str]) -> list[Path]:
+    found: dict[Path, Path] = {}
+    for text in given:
+        path = Path(text).expanduser()
+        matches = [path] if path.exists() else [Path(match) for match in sorted(glob.glob(str(path), recursive=True))]
+        files = [file for match in matches for file in (_files_of_folder(match) if match.is_dir() else [match])]
+        if not files:
+            raise ResultsNotFound(_nothing_found(text, path, matches))
+        for file in files:
+            found.setdefault(file.resolve(), file)
+    return list(found.values())
+
+
+def _files_of_folder(folder: Path) -> list[Path]:
+    return sorted(folder.glob(f"{RESULTS_PREFIX}*.json")) or sorted(folder.glob("*.json"))
+
+
+def _nothing_found(text: str, path: Path, matches: Sequence[Path]) -> str:
+    folder = matches[0] if matches else path.parent
+    while not folder.is_dir():
+        folder = folder.parent
+    near = sorted(folder.glob("*.json")) + sorted(folder.glob(f"*/{RESULTS_PREFIX}*.json"))
+    shown = f"near it, in {folder}: {listing([file.relative_to(folder) for file in near], 3)}"
+    if matches:
+        return f"There is no results file in {text}; expected {RESULTS_PREFIX}SUITE.json (or another .json); {shown}."
+    return f"Nothing matches --results {text}; expected a results file, a folder of them, or a pattern; {shown}."
+
+
+def read_results_file(path: Path) -> ResultsFile:
+    """Read one results file, ours or of the published scripts.
+
+    Raises:
+        ResultsNotFound: it cannot be opened.
+        ResultsError: it is no results file, or something in it does not fit; names the file, the episode and the field.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ResultsNotFound(f"Cannot read results file {path}: {error}.") from None
+    try:
+        document = json.loads(text)
+        return _Reading(path).read(document)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise ResultsError(f"{path} is not a results file: not valid JSON ({error}).") from None
+    except _Problem as problem:
+        raise ResultsError(f"{path}: {problem}") from None
+
+
+class _Problem(ValueError):
+    """What does not fit, without the file's name."""
+
+
+class _Reading:
+    """One pass over a document; collects rows, claims and what was noticed on the way."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.rows: list[dict[str, Any]] = []
+        self.claims: list[Claim] = []
+        self.unused: dict[str, None] = {}
+        self.kinds: dict[ResultsKind, str] = {}
+        self.zeros = 0
+
+    def read(self, document: object) -> ResultsFile:
+        """The whole file."""
+        if isinstance(document, dict) and "per_step_ratios" in document:
+            document = [document]
+        if not isinstance(document, list):
+            raise _Problem(f"it is not a results file: expected a list of episodes, found {_kind_of(document)}.")
+        if not document:
+            raise _Problem("it holds no episode: there is nothing to summarise.")
+        episodes = [self._episode(number, given) for number, given in enumerate(document)]
+        if not self.rows:
+            raise _Problem(f"none of its {len(episodes)} episodes has a single step: there is nothing to summarise.")
+        seen: dict[tuple[int, int], int] = {}
+        for episode in episodes:
+            identity = (episode["task_id"], episode["episode_index"])
+            if identity in seen:
+                raise _Problem(f"episodes {seen[identity]} and {episode['episode']} are both {_of(*identity)}.")
+            seen[identity] = episode["episode"]
+        kind = next(iter(self.kinds))
+        schema = {"ratio": pl.Float64, "visual_fraction": pl.Float64, "linguistic_fraction": pl.Float64}
+        return ResultsFile(
+            path=self.path,
+            suite=suite_of_results_file(self.path),
+            kind=kind,
+            episodes=pl.DataFrame(episodes),
+            steps=pl.DataFrame(
+                self.rows, schema_overrides={**schema, "layer_number": pl.Int64}, infer_schema_length=None
+            ),
+            claims=tuple(self.claims),
+            zeros=self.zeros,
+            unused=tuple(self.unused),
+        )
+
+    def _episode(self, number: int, given: object) -> dict[str, Any]:
+        where = f"episode {number}"
+        episode = _expect(given, dict, where)
+        names = [field.name for field in fields(EpisodeResult)]
+        needed = [field.name for field in fields(EpisodeResult) if field.default is MISSING and field.name != "summary"]
+        missing = [name for name in needed if name not in episode]
+        if missing:
+            what = "it is not a results file: " if number == 0 and len(missing) > 3 else ""
+            raise _Problem(f"{what}{where} lacks {listing(map(repr, missing))}.")
+        self._note_unused(episode, names)
+        identity = {
+            "episode": number,
+            "task_id": _whole(episode["task_id"], f"{where}, task_id"),
+            "instruction": _expect(episode["task_description"], str, f"{where}, task_description"),
+            "episode_index": _whole(episode["episode_idx"], f"{where}, episode_idx"),
+            "success": _expect(episode["success"], bool, f"{where}, success"),
+            "num_steps": _whole(episode["num_steps"], f"{where}, num_steps"),
+        }
+        where = f"{where} ({_of(identity['task_id'], identity['episode_index'])})"
+        steps = self._steps(number, _expect(episode["per_step_ratios"], dict, f"{where}, per_step_ratios"), where)
+        self._read_summary(number, _expect(episode.get("summary", {}), dict, f"{where}, summary"), where)
+        return {**identity, "num_replans": len({row["env_step"] for row in steps})}
+
+    def _steps(self, number: int, layers: Mapping[str, object], where: str) -> list[dict[str, Any]]:
+        rows: list[dict[str, Any]] = []
+        for name, given in layers.items():
+            label, layer_number = _layer_of(name, f"{where}, per_step_ratios")
+            before = -1
+            for position, step in enumerate(_expect(given, list, f"{where}, per_step_ratios.{name}")):
+                at = f"{where}, {name}[{position}]"
+                row = self._step(_expect(step, dict, at), at)
+                if step["visual_linguistic_ratio"] is None and label != LAYERS_AVG:
+                    # Our files write null for infinite and for undefined; the masses tell which of them it was.
+                    row["ratio"] = math.inf if row["visual_mass"] > NO_MASS >= row["linguistic_mass"] else None
+                if row["env_step"] <= before:
+                    raise _Problem(f"{at}.step is {row['env_step']}, after {before}: steps must rise.")
+                before = row["env_step"]
+                rows.append({"episode": number, "layer": label, "layer_number": layer_number, **row})
+        replans = {step: i for i, step in enumerate(sorted({row["env_step"] for row in rows}))}
+        single = [row for row in rows if row["layer"] != LAYERS_AVG]
+        for row in single:
+            row["replan"] = replans[row["env_step"]]
+            if row["ratio"] == 0 and max(row["visual_mass"], row["linguistic_mass"]) <= NO_MASS:
+                row["ratio"] = None
+                self.zeros += 1
+        measured = {row["env_step"] for row in single}
+        finite = {row["env_step"] for row in single if _is_finite(row["ratio"])}
+        for row in rows:
+            if row["layer"] == LAYERS_AVG:
+                row["replan"] = replans[row["env_step"]]
+                if row["ratio"] == 0 and row["env_step"] in measured - finite:
+                    row["ratio"] = None
+                    self.zeros += 1
+        self.rows += rows
+        return rows
+
+    def _step(self, step: Mapping[str, Any], where: str) -> dict[str, Any]:
+        has_action = "action_mass" in step
+        masses, fractions = [*_MASSES], [*_FRACTIONS]
+        if has_action:
+            masses, fractions = [*masses, "action_mass"], [*fractions, "action_fraction"]
+        has_frames = any(step.get(name) is not None for name in FRAME_FIELDS)
+        required = ["step", "visual_linguistic_ratio", *masses, *fractions, *(FRAME_FIELDS if has_frames else ())]
+        missing = [name for name in required if name not in step]
+        if missing:
+            raise _Problem(f"{where} lacks {listing(map(repr, missing))}.")
+        self._note_unused(step, [*(field.name for field in fields(StepRatio)), *FRAME_FIELDS, "selected_call_S"])
+        self._note_kind(step, has_frames, has_action, where)
+        row: dict[str, Any] = {"env_step": _whole(step["step"], f"{where}.step")}
+        for name in masses:
+            row[name] = _number(step[name], f"{where}.{name}", math.inf)
+            if not _is_finite(row[name]):
+                raise _Problem(f"{where}.{name} is {step[name]!r}; expected a finite mass.")
+        for name in fractions:
+            row[name] = _number(step[name], f"{where}.{name}", _ONE)
+        row["ratio"] = _number(step["visual_linguistic_ratio"], f"{where}.visual_linguistic_ratio", math.inf)
+        return row
+
+    def _note_kind(self, step: Mapping[str, Any], has_frames: bool, has_action: bool, where: str) -> None:
+        frames = None
+        if has_frames:
+            query, visual, text = (_expect(step[name], str, f"{where}.{name}") for name in FRAME_FIELDS)
+            frames = (query, visual, text)
+        kind = ResultsKind(frames, has_action)
+        if self.kinds and kind not in self.kinds:
+            other, first = next(iter(self.kinds.items()))
+            raise _Problem(f"{where} holds masses of another kind ({kind}) than {first} ({other}).")
+        self.kinds.setdefault(kind, where)
+
+    def _read_summary(self, number: int, summary: Mapping[str, object], where: str) -> None:
+        for name, given in summary.items():
+            label, _ = _layer_of(name, f"{where}, summary")
+            for measure, statistics in _expect(given, dict, f"{where}, summary.{name}").items():
+                if measure == "num_steps":
+                    continue
+                at = f"{where}, summary.{name}.{measure}"
+                for statistic, value in _expect(statistics, dict, at).items():
+                    if statistic != "num_nonfinite":
+                        claimed = _number(value, f"{at}.{statistic}", math.inf)
+                        self.claims.append(Claim(number, label, measure, statistic, claimed))
+
+    def _note_unused(self, given: Mapping[str, object], known: Sequence[str]) -> None:
+        for name in given:
+            if name not in known:
+                self.unused.setdefault(name)
+
+
+def _layer_of(name: str, where: str) -> tuple[str, int | None]:
+    if name == LAYERS_AVG:
+        return LAYERS_AVG, None
+    match = _LAYER.match(name)
+    if match is None:
+        raise _Problem(f"{where} has '{name}'; expected layer_N or {LAYERS_AVG}.")
+    return match[1], int(match[1])
+
+
+def _expect(value: Any, kind: type, where: str) -> Any:
+    if not isinstance(value, kind):
+        raise _Problem(f"{where} is {_kind_of(value)}; expected {_NAMES[kind]}.")
+    return value
+
+
+def _whole(value: Any, where: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise _Problem(f"{where} is {_kind_of(value)}; expected a whole number from 0.")
+    return value
+
+
+def _number(value: Any, where: str, most: float) -> float | None:
+    """A number from 0 to `most`; None for null and NaN."""
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise _Problem(f"{where} is {_kind_of(value)}; expected a number.")
+    if not 0 <= value <= most:
+        raise _Problem(f"{where} is {value}; expected a number from 0{'' if math.isinf(most) else ' to 1'}.")
+    return float(value)
+
+
+def _is_finite(value: float | None) -> bool:
+    return value is not None and math.isfinite(value)
+
+
+def _of(task_id: int, episode_index: int) -> str:
+    return f"task {task_id}, episode {episode_index}"
+
+
+_NAMES: dict[type, str] = {dict: "an object", list: "a list", str: "a text", bool: "true or false"}
+
+
+def _kind_of(value: object) -> str:
+    for kind, name in _NAMES.items():
+        if isinstance(value, kind):
+            return name if kind is not bool else repr(value).lower()
+    return "null" if value is None else f"the number {value}"

@@ -1,0 +1,231 @@
+"""Results files as the tables of `vla_attention.analyze.measures.aggregate`, so that pictures and intervals are the same as those from stores.
+
+A results file knows masses and fractions, but neither how many keys are on each side nor row sums: those columns are null, and
+with them the uniform baseline and every lift.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG, episodes_table, layer_order, tasks_table
+from vla_attention.analyze.published.results_reader import Claim, ResultsFile, ResultsKind
+from vla_attention.analyze.statistics.bootstrap import SampleSummary, summarize
+from vla_attention.schemas.groupings.grouping import Grouping, Ratio
+
+#: What neither visual nor linguistic nor action keys get, as far as the fractions tell.
+REST = "rest"
+#: Fractions that sum to 1 within this have no rest.
+_NO_REST = 1e-4
+#: A file's summary agrees with its steps within this (float32 sums, printed decimals).
+_TOLERANCE = 1e-5
+_STATISTICS = ("mean", "std", "median", "min", "max")
+_UNKNOWN = pl.lit(None, dtype=pl.Float64)
+
+
+@dataclass(frozen=True)
+class ResultsTables:
+    """Tables of one or several results files; column `suite` holds the files' labels, so that equal task ids stay apart."""
+
+    grouping: Grouping
+    replans: pl.DataFrame
+    episodes: pl.DataFrame
+    tasks: pl.DataFrame
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Numbers over the replans of one layer as the published parser gives them: finite ratios only, std with ddof 0."""
+
+    num_replans: int
+    num_infinite: int
+    num_undefined: int
+    mean: float | None
+    std: float | None
+    median: float | None
+    min: float | None
+    max: float | None
+    q25: float | None
+    q75: float | None
+
+    @property
+    def num_finite(self) -> int:
+        """How many ratios take part."""
+        return self.num_replans - self.num_infinite - self.num_undefined
+
+
+def spread_of(ratios: pl.Series) -> Spread:
+    """Summarise ratios (null: undefined)."""
+    values = ratios.cast(pl.Float64).fill_null(float("nan")).to_numpy()
+    finite = values[np.isfinite(values)]
+    known = summarize(values)
+    low, high = np.percentile(finite, [25, 75]).tolist() if finite.size else (None, None)
+    return Spread(
+        num_replans=len(values),
+        num_infinite=int(np.isinf(values).sum()),
+        num_undefined=int(np.isnan(values).sum()),
+        mean=known.mean,
+        std=known.std,
+        median=known.median,
+        min=known.min,
+        max=known.max,
+        q25=low,
+        q75=high,
+    )
+
+
+def results_tables(files: Sequence[ResultsFile], labels: Sequence[str]) -> ResultsTables:
+    """Tables over files of one kind; `labels` stand in the column `suite`."""
+    rows = pl.concat([_rows(file, label) for file, label in zip(files, labels, strict=True)])
+    grouping = _grouping(files[0].kind, rows)
+    replans = _replans(rows, grouping)
+    episodes = episodes_table(replans, grouping)
+    return ResultsTables(grouping, replans, episodes, tasks_table(episodes, grouping))
+
+
+def _rows(file: ResultsFile, label: str) -> pl.DataFrame:
+    episodes = file.episodes.with_columns(pl.lit(label).alias("suite")).drop("num_replans")
+    return file.steps.join(episodes, on="episode", how="left", maintain_order="left").drop("episode")
+
+
+def _grouping(kind: ResultsKind, rows: pl.DataFrame) -> Grouping:
+    names = ["visual", "linguistic", *(["action"] if kind.has_action else [])]
+    rest = 1 - pl.sum_horizontal(f"{name}_fraction" for name in names)
+    most = rows.select(pl.when(_defined(names)).then(rest).max()).item()
+    if most is not None and most > _NO_REST:
+        names.append(REST)
+    # Only the names are known. The selectors are never resolved: a results file has no keys.
+    groups = {name: (f"span:{name}",) for name in names}
+    return Grouping("results file", groups, Ratio(("visual",), ("linguistic",)), description=str(kind))
+
+
+def _defined(names: Sequence[str]) -> pl.Expr:
+    return pl.all_horizontal(pl.col(f"{name}_fraction").is_not_null() for name in names)
+
+
+def _replans(rows: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
+    names = [name for name in grouping.names if name != REST]
+    if REST in grouping.names:
+        rest = pl.when(_defined(names)).then(1 - pl.sum_horizontal(f"{name}_fraction" for name in names)).clip(0, 1)
+        total = pl.coalesce(
+            pl.when(pl.col(f"{name}_fraction") > 0).then(pl.col(f"{name}_mass") / pl.col(f"{name}_fraction"))
+            for name in names
+        )
+        rows = rows.with_columns(rest.alias(f"{REST}_fraction"), (rest * total).alias(f"{REST}_mass"))
+    not_finite = ~pl.col("ratio").is_finite().fill_null(False)
+    left_out = (
+        pl.when(pl.col("layer") != LAYERS_AVG)
+        .then(not_finite)
+        .sum()
+        .over("suite", "task_id", "episode_index", "replan")
+    )
+    return rows.with_columns(
+        pl.lit(None, dtype=pl.Int64).alias("block"),
+        _UNKNOWN.alias("row_sum"),
+        _UNKNOWN.alias("valid_mass"),
+        _UNKNOWN.alias("num_valid"),
+        *(_UNKNOWN.alias(f"{name}_{kind}") for name in grouping.names for kind in ("keys", "density", "lift")),
+        pl.col("visual_mass").alias("numerator_mass"),
+        pl.col("linguistic_mass").alias("denominator_mass"),
+        _UNKNOWN.alias("uniform_ratio"),
+        _UNKNOWN.alias("ratio_lift"),
+        pl.col("ratio").log(2.0).alias("log2_ratio"),
+        pl.when(pl.col("layer") == LAYERS_AVG)
+        .then(left_out)
+        .otherwise(not_finite)
+        .cast(pl.Int64)
+        .alias("nonfinite_layers"),
+    ).sort("suite", "task_id", "episode_index", "replan", "layer_number", nulls_last=True)
+
+
+def layers_of(file: ResultsFile) -> list[str]:
+    """Layers by number, "layers_avg" last."""
+    return layer_order(file.steps)
+
+
+def chosen_layer(file: ResultsFile) -> str:
+    """The layer that speaks for a file, as in the published parser: "layers_avg" where there is one, else the first."""
+    layers = layers_of(file)
+    return LAYERS_AVG if LAYERS_AVG in layers else layers[0]
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """A claim of a file's summary that its own steps do not bear out; `reason` where the cause is a known other definition."""
+
+    claim: Claim
+    computed: float | None
+    reason: str
+
+
+#: Why a summary's number may rightly differ from the one computed here.
+NO_FINITE_AS_ZERO = "its summary gives 0 where no ratio is finite; such a mean is undefined here"
+ZEROS_COUNTED = "its summary counts steps without a ratio as ratios of 0; here they are left out"
+
+
+def disagreements(file: ResultsFile) -> list[Disagreement]:
+    """Hold a file's own summaries against its steps; measures and statistics that are not known here are passed over."""
+    parts = {
+        (int(str(episode)), str(layer)): rows
+        for (episode, layer), rows in file.steps.partition_by("episode", "layer", as_dict=True).items()
+    }
+    known: dict[tuple[int, str, str], tuple[NDArray[np.float64], SampleSummary]] = {}
+    found = []
+    for claim in file.claims:
+        column = "ratio" if claim.measure == "visual_linguistic_ratio" else claim.measure
+        if column not in file.steps.columns or claim.statistic not in _STATISTICS:
+            continue
+        key = (claim.episode, claim.layer, column)
+        if key not in known:
+            rows = parts.get(key[:2])
+            values = np.zeros(0) if rows is None else rows[column].cast(pl.Float64).fill_null(float("nan")).to_numpy()
+            known[key] = (values, summarize(values))
+        values, summary = known[key]
+        computed = getattr(summary, claim.statistic)
+        if not _agrees(claim.value, computed):
+            found.append(Disagreement(claim, computed, _reason(claim, values)))
+    return found
+
+
+def _agrees(claimed: float | None, computed: float | None) -> bool:
+    if claimed is None or computed is None:
+        return claimed is computed
+    return abs(claimed - computed) <= _TOLERANCE * max(1.0, abs(claimed), abs(computed))
+
+
+def _reason(claim: Claim, values: NDArray[np.float64]) -> str:
+    if claim.measure != "visual_linguistic_ratio" or values.size == 0:
+        return ""
+    if not np.isfinite(values).any() and claim.value == 0:
+        return NO_FINITE_AS_ZERO
+    counted = np.where(np.isnan(values), 0.0, values)
+    return ZEROS_COUNTED if _agrees(claim.value, getattr(summarize(counted), claim.statistic)) else ""
+
+
+def labels_of(files: Sequence[ResultsFile]) -> list[str]:
+    """A name for each file: its suite, with as much of its folder as it takes to tell files of one suite apart."""
+    return [_label(i, files) for i in range(len(files))]
+
+
+def _label(number: int, files: Sequence[ResultsFile]) -> str:
+    file = files[number]
+    same = [(*other.path.resolve().parent.parts[1:], other.path.stem) for other in files if other.suite == file.suite]
+    own = (*file.path.resolve().parent.parts[1:], file.path.stem)
+    if len(same) == 1:
+        return file.suite
+    # x.json and attention_ratio_results_x.json are about one suite: there the file's name tells, else the folders do.
+    depth = next(depth for depth in range(1, len(own) + 1) if sum(path[-depth:] == own[-depth:] for path in same) == 1)
+    return file.path.stem if depth == 1 else "/".join((*own[-depth:-1], file.suite))
+
+
+def by_kind(files: Sequence[ResultsFile]) -> dict[ResultsKind, list[ResultsFile]]:
+    """Files by the kind of their masses, in order of appearance."""
+    kinds: dict[ResultsKind, list[ResultsFile]] = {}
+    for file in files:
+        kinds.setdefault(file.kind, []).append(file)
+    return kinds

@@ -1,0 +1,240 @@
+"""What `parse-attention-ratio-results` prints: the published parser's numbers, and what one should know beside them."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+
+import polars as pl
+
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG, overall_rows
+from vla_attention.analyze.published.results_reader import ResultsFile
+from vla_attention.analyze.published.results_tables import (
+    ResultsTables,
+    Spread,
+    chosen_layer,
+    disagreements,
+    layers_of,
+    spread_of,
+)
+from vla_attention.analyze.ratios.summary import LINGUISTIC_BELOW, VISUAL_ABOVE, WIDTH, verdict
+from vla_attention.analyze.show.text_table import format_interval, format_number, text_table
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.schemas.errors import listing
+
+_VERDICTS = {
+    "visual-dominant": "Model is VISUAL-dominant (prefers visual features)",
+    "linguistic-dominant": "Model is LINGUISTIC-dominant (prefers text instructions)",
+    "balanced": "Model shows BALANCED attention between visual and linguistic",
+}
+_CAVEAT = (
+    "Results files do not say how many keys are on each side, so there is no uniform baseline here. With hundreds of image keys and "
+    "a dozen words, uniform attention alone gives ratios of 35 to 50: the verdict (above "
+    f"{VISUAL_ABOVE} visual, below {LINGUISTIC_BELOW} linguistic) means little without it. vla-analyze prints it beside every ratio."
+)
+_FRAMES_CAVEAT = (
+    "Latent frames have equally many keys: uniform attention gives a ratio of 1. The usual text frame, frame0, is a blank placeholder "
+    "without language: an instruction enters through cross-attention, which these masses are not of. Masses may be sums over queries."
+)
+
+
+def summary_of_files(title: str, files: Sequence[ResultsFile], tables: ResultsTables) -> str:
+    """The block on one file, or on several of one kind pooled ("COMBINED")."""
+    episodes = pl.concat([file.episodes.with_columns(pl.lit(i).alias("file")) for i, file in enumerate(files)])
+    layer = LAYERS_AVG if LAYERS_AVG in _layers(files) else _layers(files)[0]
+    rows = pl.concat(_rows_of(files, layer))
+    spread = spread_of(rows["ratio"])
+    lines = ["=" * WIDTH, f"ATTENTION RATIO ANALYSIS: {title}", "=" * WIDTH, *_origin(files), ""]
+    lines += _dataset(episodes)
+    lines += [
+        "",
+        f"Visual/Linguistic Ratio ({_named(layer)}, {_count(spread.num_replans, 'replan')}):",
+        *_ratio(spread, layer),
+    ]
+    lines += _over_episodes(tables, layer)
+    lines += ["", f"Attention Fractions ({_named(layer)}):", *_fractions(rows)]
+    if len(_layers(files)) > 1:
+        lines += ["", "Per layer", *_per_layer(files)]
+    lines += ["", f"Per task ({_named(layer)})", *_per_task(episodes, files, layer)]
+    notes = [
+        _FRAMES_CAVEAT if files[0].kind.frames else _CAVEAT,
+        *(note for file in files for note in _notes(file, layer, named=len(files) > 1)),
+    ]
+    lines += ["", "Notes", *(line for note in notes for line in textwrap.wrap(note, WIDTH, **_BULLET))]
+    return "\n".join(lines) + "\n"
+
+
+_BULLET: dict = {"initial_indent": "  - ", "subsequent_indent": "    ", "break_on_hyphens": False}
+
+
+def _layers(files: Sequence[ResultsFile]) -> list[str]:
+    """Layers of all files by number, "layers_avg" last."""
+    found = dict.fromkeys(layer for file in files for layer in layers_of(file))
+    return sorted(found, key=lambda layer: (layer == LAYERS_AVG, int(layer) if layer != LAYERS_AVG else 0))
+
+
+def _rows_of(files: Sequence[ResultsFile], layer: str) -> list[pl.DataFrame]:
+    """Steps of that layer; where a pooled file does not have it, of the layer that speaks for the file."""
+    parts = []
+    for i, file in enumerate(files):
+        own = layer if layer in layers_of(file) else chosen_layer(file)
+        parts.append(file.steps.filter(pl.col("layer") == own).with_columns(pl.lit(i).alias("file")))
+    return parts
+
+
+def _origin(files: Sequence[ResultsFile]) -> list[str]:
+    lines = [f"file:   {file.path}" for file in files]
+    return [*lines, *textwrap.wrap(f"masses: {files[0].kind}", WIDTH, subsequent_indent=" " * 8)]
+
+
+def _dataset(episodes: pl.DataFrame) -> list[str]:
+    without = episodes.filter(pl.col("num_replans") == 0)
+    solved = int(episodes["success"].sum())
+    lines = [
+        "Dataset:",
+        f"  Episodes: {episodes.height}",
+        f"  Tasks: {episodes.select('file', 'task_id').n_unique()}",
+        f"  Success Rate: {_percent(solved / episodes.height)} ({solved} of {episodes.height})",
+    ]
+    if without.height:
+        named = [f"task {row['task_id']} episode {row['episode_index']}" for row in without.iter_rows(named=True)]
+        lines.append(f"  Without a single step, and so in no ratio: {listing(named, 6)}")
+    return lines
+
+
+def _ratio(spread: Spread, layer: str) -> list[str]:
+    why = "no layer with a finite ratio" if layer == LAYERS_AVG else "no mass on either side"
+    parts = {"infinite (no linguistic mass)": spread.num_infinite, f"undefined ({why})": spread.num_undefined}
+    left_out = ", ".join(f"{count} {what}" for what, count in parts.items() if count)
+    if not spread.num_finite:
+        return [f"  None of the {_count(spread.num_replans, 'ratio')} is finite: {left_out}."]
+    lines = [
+        f"  Mean:   {spread.mean:.3f} ± {spread.std:.3f}",
+        f"  Median: {spread.median:.3f}",
+        f"  Range:  [{spread.min:.3f}, {spread.max:.3f}]",
+        f"  IQR:    [{spread.q25:.3f}, {spread.q75:.3f}]",
+    ]
+    if left_out:
+        lines.append(f"  Left out of {spread.num_replans}: {left_out}")
+    return [*lines, f"  → {_VERDICTS[verdict(spread.mean)]}"]
+
+
+def _over_episodes(tables: ResultsTables, layer: str) -> list[str]:
+    """Replans of an episode are correlated: the interval is over episodes within tasks."""
+    rows = overall_rows(tables.tasks).filter(pl.col("layer") == layer)
+    if rows.is_empty() or rows["ratio_mean"][0] is None:
+        return []
+    row = rows.row(0, named=True)
+    taking_part = int(row["num_episodes"]) - int(row["episodes_without_ratio"])
+    text = f"  Mean over episodes (n = {taking_part}): {format_number(row['ratio_mean'])}"
+    if row["ratio_mean_low"] is None:
+        return [f"{text}; no interval from a single episode"]
+    interval = format_interval(row["ratio_mean_low"], row["ratio_mean_high"])
+    return [f"{text}, {DEFAULT_LEVEL:.0%} interval {interval} (two-level bootstrap: tasks, episodes)"]
+
+
+def _fractions(rows: pl.DataFrame) -> list[str]:
+    lines = []
+    for name in ("visual", "linguistic", "action"):
+        if f"{name}_fraction" in rows.columns:
+            known = rows[f"{name}_fraction"].cast(pl.Float64).drop_nulls()
+            text = (
+                f"{_percent(_float(known.mean()))} ± {_percent(_float(known.std(ddof=0)))}"
+                if len(known)
+                else "undefined"
+            )
+            lines.append(f"  {name.capitalize() + ':':<12}{text}")
+    return lines
+
+
+def _per_layer(files: Sequence[ResultsFile]) -> list[str]:
+    body = []
+    for layer in _layers(files):
+        rows = pl.concat([file.steps.filter(pl.col("layer") == layer) for file in files])
+        spread = spread_of(rows["ratio"])
+        body.append(
+            [
+                layer,
+                str(spread.num_replans),
+                _mean_std(spread),
+                *(format_number(value) for value in (spread.median, spread.min, spread.max)),
+                str(spread.num_infinite),
+                str(spread.num_undefined),
+                *(
+                    _percent(_float(rows[f"{name}_fraction"].cast(pl.Float64).mean()))
+                    for name in ("visual", "linguistic")
+                ),
+            ]
+        )
+    header = ["layer", "replans", "mean ± std", "median", "min", "max", "infinite", "undefined", "visual", "linguistic"]
+    return text_table(header, body, left=(0,), width=WIDTH).split("\n")
+
+
+def _per_task(episodes: pl.DataFrame, files: Sequence[ResultsFile], layer: str) -> list[str]:
+    rows = pl.concat(_rows_of(files, layer))
+    body, texts = [], []
+    for (number, task), part in episodes.partition_by("file", "task_id", as_dict=True, maintain_order=True).items():
+        own = rows.filter((pl.col("file") == number) & pl.col("episode").is_in(part["episode"].implode()))
+        spread = spread_of(own["ratio"])
+        name = str(task) if len(files) == 1 else f"{files[int(str(number))].suite} {task}"
+        success = _percent(_float(part["success"].cast(pl.Float64).mean()))
+        body.append([name, str(part.height), str(spread.num_replans), success, _mean_std(spread)])
+        texts.append(str(part["instruction"][0]))
+    header = ["task", "n", "replans", "success", "mean ± std"]
+    return text_table(header, body, left=(0,), last="instruction", texts=texts, width=WIDTH).split("\n")
+
+
+def _notes(file: ResultsFile, layer: str, named: bool) -> list[str]:
+    of = f"{file.path}: " if named else ""
+    notes = []
+    if layer not in layers_of(file) or (layer != LAYERS_AVG and not named and len(layers_of(file)) > 1):
+        own = chosen_layer(file)
+        notes.append(f"{of}There is no {LAYERS_AVG}; layer {own} speaks for the file, as in the published parser.")
+    lacking = (
+        file.episodes.filter(pl.col("num_replans") > 0).height
+        - file.steps.filter(layer=chosen_layer(file))["episode"].n_unique()
+    )
+    if lacking:
+        notes.append(f"{of}{_count(lacking, 'episode')} with steps, but without any in {_named(chosen_layer(file))}.")
+    if file.zeros:
+        notes.append(
+            f"{of}{file.zeros} ratios of 0 stand for 'no ratio' (nothing on either side, or no layer with a finite ratio) and are "
+            "read as undefined; the published parser counts them as 0."
+        )
+    found = disagreements(file)
+    for reason in sorted({item.reason for item in found if item.reason}):
+        count = sum(item.reason == reason for item in found)
+        notes.append(f"{of}Differs from the file's own summary in {_count(count, 'number')}: {reason}.")
+    unexplained = [item for item in found if not item.reason]
+    if unexplained:
+        first = unexplained[0]
+        episode = file.episodes.row(first.claim.episode, named=True)
+        notes.append(
+            f"{of}The file's own summary disagrees with its steps in {_count(len(unexplained), 'number')}; the first: task "
+            f"{episode['task_id']} episode {episode['episode_index']}, {_named(first.claim.layer)}, {first.claim.measure} "
+            f"{first.claim.statistic}: summary {format_number(first.claim.value)}, from the steps {format_number(first.computed)}. "
+            "Everything here is computed from the steps."
+        )
+    if file.unused:
+        notes.append(f"{of}Fields that are not used: {listing(file.unused, 20)}.")
+    return notes
+
+
+def _mean_std(spread: Spread) -> str:
+    return f"{format_number(spread.mean)} ± {format_number(spread.std)}" if spread.num_finite else "none finite"
+
+
+def _named(layer: str) -> str:
+    return layer if layer == LAYERS_AVG else f"layer {layer}"
+
+
+def _count(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.1f}%"
+
+
+def _float(value: object) -> float | None:
+    return value if isinstance(value, float) else None

@@ -1,0 +1,1 @@
+"""`vla-analyze STORE`: masses, fractions and ratios with intervals, the summary and the default plots."""

@@ -1,0 +1,101 @@
+"""`attention_fractions`: mean fraction of every group, stacked, per layer and over all layers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG, layer_order, overall_layer, overall_rows
+from vla_attention.analyze.show.plot_style import (
+    drawn_in_our_style,
+    group_styles,
+    named,
+    new_figure,
+    plural,
+    save_figure,
+    title,
+    wrapped,
+)
+from vla_attention.schemas.groupings.grouping import Grouping
+
+STEM = "attention_fractions"
+
+
+@drawn_in_our_style
+def plot_attention_fractions(
+    tasks: pl.DataFrame,
+    grouping: Grouping,
+    folder: Path,
+    *,
+    stem: str = STEM,
+    about: str | None = None,
+    note: str = "",
+) -> list[Path]:
+    """Draw from `aggregate.tasks_table` (its rows over everything); returns the paths of png, pdf and csv.
+
+    `stem`: the files' name. `about`: what the title says the fractions are of, the grouping unless given. `note`: a further sentence.
+    Fractions are means over episodes; they sum to 1 also where groups overlap, because each is a share of the summed masses.
+    """
+    rows = overall_rows(tasks)
+    layers = layer_order(rows)
+    if len(layers) == 2 and LAYERS_AVG in layers:
+        layers.remove(LAYERS_AVG)
+    by_layer = {row["layer"]: row for row in rows.iter_rows(named=True)}
+    fractions = np.array([[by_layer[layer][f"{name}_fraction"] or 0.0 for name in grouping.names] for layer in layers])
+    positions = np.arange(len(layers), dtype=float)
+    if layers[-1] == LAYERS_AVG:
+        positions[-1] += 0.6  # apart from the single layers
+    figure = new_figure(max(6.2, 3.4 + 0.42 * len(layers)), 4.6)
+    overall = by_layer[overall_layer(rows)]
+    counts = f"n = {plural(overall['num_episodes'], 'episode')} of {plural(overall['num_tasks'], 'task')}, means over episodes."
+    if grouping.overlap:
+        counts += " Groups overlap: a fraction is the share in the sum of all groups' masses."
+    title(figure, f"Attention fractions, {about or named(grouping)}", f"{counts} {note}")
+    axes = figure.subplots()
+    styles = group_styles(grouping.names)
+    bottom = np.zeros(len(layers))
+    for i, name in enumerate(grouping.names):
+        if rows[f"{name}_keys"].sum() == 0 and rows[f"{name}_keys"].null_count() == 0:
+            continue  # a group without a key, like state digits where the prompt has none (null: nobody knows)
+        style = styles[name]
+        empty = not fractions[:, i].any()
+        label = wrapped(name, 28, 1) + (" (0)" if empty else "")
+        axes.bar(
+            positions, fractions[:, i], 0.8, bottom, color=style["color"], hatch=style["hatch"], edgecolor="white",
+            linewidth=0.4, label=label,
+        )  # fmt: skip
+        for position, start, share in zip(positions, bottom, fractions[:, i], strict=True):
+            # Numbers only where they fit into their piece: height of the piece, width of the bar.
+            if share >= 0.045:
+                axes.text(
+                    position, start + share / 2, f"{100 * share:.0f}", ha="center", va="center", size=7,
+                    color=_ink(style["color"]), bbox=_patch(style) if style["hatch"] else None,
+                )  # fmt: skip
+        bottom += fractions[:, i]
+    if not fractions.any():
+        axes.text(0.5, 0.5, "no group has any mass", transform=axes.transAxes, ha="center")
+    axes.set_xticks(positions, layers)
+    axes.set_xlim(positions[0] - (0.6 if len(layers) > 1 else 1.2), positions[-1] + (0.6 if len(layers) > 1 else 1.2))
+    axes.set_ylim(0, 1)
+    axes.set_yticks(np.linspace(0, 1, 6), [f"{value:.0%}" for value in np.linspace(0, 1, 6)])
+    axes.set_xlabel("layer")
+    axes.set_ylabel("fraction of the groups' summed mass")
+    handles, labels = axes.get_legend_handles_labels()
+    # In the order of the stack, top to bottom.
+    axes.legend(handles[::-1], labels[::-1], loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    columns = [f"{name}_fraction{end}" for name in grouping.names for end in ("", "_low", "_high")]
+    data = rows.filter(pl.col("layer").is_in(layers)).select("layer", "block", "num_episodes", *columns)
+    return save_figure(figure, folder, stem, data)
+
+
+def _ink(color: str) -> str:
+    """Black or white, whichever is easier to read on a colour (relative luminance)."""
+    red, green, blue = (int(color[i : i + 2], 16) / 255 for i in (1, 3, 5))
+    return "white" if 0.299 * red + 0.587 * green + 0.114 * blue < 0.55 else "black"
+
+
+def _patch(style: dict[str, str]) -> dict:
+    """A plain background for a number on a hatched bar."""
+    return {"facecolor": style["color"], "edgecolor": "none", "pad": 1.0}

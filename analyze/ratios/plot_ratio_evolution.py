@@ -1,0 +1,240 @@
+"""`{prefix}_layer{N}_ratio_evolution`: one episode in one layer over time: ratio, masses, fractions, statistics."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG
+from vla_attention.analyze.show.plot_style import (
+    BASELINE_COLOR,
+    BASELINE_LABEL,
+    DATA_COLOR,
+    NOTE_COLOR,
+    drawn_in_our_style,
+    explain,
+    group_styles,
+    new_figure,
+    plural,
+    ratio_axis,
+    ratio_name,
+    save_figure,
+    title,
+    whole_numbers,
+    wrapped,
+)
+from vla_attention.analyze.show.text_table import format_number
+from vla_attention.analyze.statistics.bootstrap import geometric_mean, ratio_of_means_over_episodes, summarize
+from vla_attention.schemas.groupings.grouping import Grouping
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_SLUG_LENGTH = 60
+
+
+def evolution_stem(task_id: int, instruction: str, episode_index: int, layer: str) -> str:
+    """File name without ending: `task{id}_{slug}_ep{k}_layer{N}_ratio_evolution`, or `..._layers_avg_ratio_evolution`."""
+    slug = re.sub(r"[^a-z0-9]+", "_", instruction.lower()).strip("_")[:_SLUG_LENGTH].rstrip("_") or "task"
+    of_layer = layer if layer == LAYERS_AVG else f"layer{layer}"
+    return f"task{task_id}_{slug}_ep{episode_index}_{of_layer}_ratio_evolution"
+
+
+@drawn_in_our_style
+def plot_ratio_evolution(
+    episode: pl.DataFrame, grouping: Grouping, folder: Path, formats: Sequence[str] = ("png", "pdf")
+) -> list[Path]:
+    """Draw one episode in one layer: the rows of the table of replans that belong to them. Returns png, pdf and csv.
+
+    Groups without mass in this episode are left out of the legend.
+    """
+    episode = episode.sort("replan")
+    first = episode.row(0, named=True)
+    layer = first["layer"]
+    figure = new_figure(10, 6.8)
+    of_layer = "mean over layers" if layer == LAYERS_AVG else f"layer {layer} (block {first['block']})"
+    outcome = "success" if first["success"] else "failure"
+    note = f"{of_layer}; {outcome} after {first['num_steps']} steps; {plural(episode.height, 'replan')}; grouping '{grouping.name}'"
+    heading = f"{first['suite']} task {first['task_id']}, episode {first['episode_index']}: {first['instruction']}"
+    title(figure, heading, note)
+    ((ratio_axes, mass_axes), (fraction_axes, statistics_axes)) = figure.subplots(2, 2)
+    steps = episode["env_step"].to_numpy()
+    styles = group_styles(grouping.names)
+    drawn = [name for name in grouping.names if (episode[f"{name}_mass"].fill_null(0) > 0).any()]
+    _ratio_panel(ratio_axes, episode, steps, grouping)
+    _mass_panel(mass_axes, episode, steps, drawn, styles)
+    _fraction_panel(fraction_axes, episode, steps, drawn, styles)
+    _statistics_panel(statistics_axes, episode, grouping, drawn)
+    # Room at either end, so that a marker on the first or last replan does not sit on the frame.
+    room = 0.02 * (steps[-1] - steps[0]) or 2.5
+    for axes in (ratio_axes, mass_axes, fraction_axes):
+        if axes.spines["left"].get_visible():  # not those that hold an explanation
+            axes.set_xlim(steps[0] - room, steps[-1] + room)
+            axes.set_xlabel("environment step")
+            whole_numbers(axes.xaxis)
+    _group_legend(figure, drawn, styles)
+    columns = ["suite", "task_id", "episode_index", "layer", "replan", "env_step"]
+    columns += [f"{name}_{kind}" for name in grouping.names for kind in ("mass", "fraction", "lift")]
+    columns += ["ratio", "uniform_ratio", "ratio_lift"] if grouping.ratio else []
+    stem = evolution_stem(first["task_id"], first["instruction"], first["episode_index"], layer)
+    return save_figure(figure, folder, stem, episode.select(columns), formats)
+
+
+def plot_all_evolutions(
+    replans: pl.DataFrame,
+    grouping: Grouping,
+    folder: Path,
+    formats: Sequence[str] = ("png", "pdf"),
+    progress: Callable[[int], object] | None = None,
+) -> list[Path]:
+    """Draw every (episode, layer) of the table of replans; into a folder per suite when there are several.
+
+    About a second each, half of it for the pdf; `progress` is called with 1 after each.
+    """
+    paths = []
+    several = replans["suite"].n_unique() > 1
+    for part in replans.partition_by("suite", "task_id", "episode_index", "layer", maintain_order=True):
+        paths += plot_ratio_evolution(part, grouping, folder / part["suite"][0] if several else folder, formats)
+        if progress is not None:
+            progress(1)
+    return paths
+
+
+def _ratio_panel(axes: Axes, episode: pl.DataFrame, steps: NDArray[np.int64], grouping: Grouping) -> None:
+    axes.set_title("ratio", loc="left")
+    if grouping.ratio is None:
+        explain(axes, f"Grouping '{grouping.name}' defines no ratio.")
+        return
+    ratio = episode["ratio"].fill_null(float("nan")).to_numpy()
+    uniform = episode["uniform_ratio"].fill_null(float("nan")).to_numpy()
+    drawable = np.isfinite(ratio) & (ratio > 0)
+    if not drawable.any():
+        infinite = int(np.isinf(ratio).sum())
+        explain(
+            axes,
+            f"No finite ratio: {infinite} of {len(ratio)} are infinite (no denominator mass), the others undefined or 0.",
+        )
+        return
+    ratio_axis(axes.yaxis, np.concatenate([ratio, uniform]))
+    axes.plot(steps, np.where(drawable, ratio, np.nan), "o-", color=DATA_COLOR, markersize=3.5, label="ratio")
+    if np.isfinite(uniform).any():
+        # One point is no line: it is drawn across the panel.
+        if len(steps) == 1:
+            axes.axhline(uniform[0], linestyle="--", color=BASELINE_COLOR, linewidth=1.2, label=BASELINE_LABEL)
+        else:
+            axes.plot(steps, uniform, "--", color=BASELINE_COLOR, linewidth=1.2, label=BASELINE_LABEL)
+    if not drawable.all():
+        where = axes.get_xaxis_transform()
+        axes.plot(
+            steps[~drawable], np.full((~drawable).sum(), 0.985), "x", color="#D55E00", transform=where, markersize=5,
+            label="not finite or 0", clip_on=False,
+        )  # fmt: skip
+    axes.grid(axis="y")
+    axes.set_ylabel(f"{ratio_name(grouping.ratio)} (log axis)")
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.1)
+
+
+def _mass_panel(axes: Axes, episode: pl.DataFrame, steps: NDArray[np.int64], drawn: list[str], styles: dict) -> None:
+    axes.set_title("mass", loc="left")
+    dashes = {"": "-", "///": "--", "...": ":", "xxx": "-."}
+    for name in drawn:
+        style = styles[name]
+        axes.plot(
+            steps, episode[f"{name}_mass"].to_numpy(), dashes[style["hatch"]], marker="o", markersize=2.5, color=style["color"],
+        )  # fmt: skip
+    axes.set_ylim(bottom=0)
+    axes.set_ylabel("mass (mean over action queries)")
+    axes.grid(axis="y")
+
+
+def _fraction_panel(
+    axes: Axes, episode: pl.DataFrame, steps: NDArray[np.int64], drawn: list[str], styles: dict
+) -> None:
+    axes.set_title("fractions", loc="left")
+    if not drawn:
+        explain(axes, "No group has any mass in this episode.")
+        return
+    shares = [episode[f"{name}_fraction"].fill_null(0).to_numpy() for name in drawn]
+    bottom = np.zeros(len(steps))
+    for name, share in zip(drawn, shares, strict=True):
+        style = {
+            "facecolor": styles[name]["color"],
+            "hatch": styles[name]["hatch"],
+            "edgecolor": "white",
+            "linewidth": 0.3,
+        }
+        if len(steps) == 1:
+            axes.bar(steps, share, 2.0, bottom, **style)  # an area over one point would be invisible
+        else:
+            axes.fill_between(steps, bottom, bottom + share, **style)
+        bottom = bottom + share
+    axes.set_ylim(0, 1)
+    axes.set_yticks(np.linspace(0, 1, 6), [f"{value:.0%}" for value in np.linspace(0, 1, 6)])
+    axes.set_ylabel("fraction of the groups' summed mass")
+
+
+def _statistics_panel(axes: Axes, episode: pl.DataFrame, grouping: Grouping, drawn: list[str]) -> None:
+    axes.set_title("statistics over the replans", loc="left")
+    explain(axes, "")
+    lines: list[tuple[str, str]] = []
+    if grouping.ratio:
+        values = episode["ratio"].fill_null(float("nan")).to_numpy()
+        summary = summarize(values)
+        geometric, _ = geometric_mean(values)
+        of_means = ratio_of_means_over_episodes(episode["numerator_mass"], episode["denominator_mass"]).value
+        lines += [
+            ("ratio, mean ± std", _with_spread(format_number(summary.mean), format_number(summary.std), len(values))),
+            ("ratio, median", format_number(summary.median)),
+            ("ratio, min / max", f"{format_number(summary.min)} / {format_number(summary.max)}"),
+            ("ratio of mean masses", format_number(of_means)),
+            ("geometric mean of ratios", format_number(geometric)),
+            ("not finite, left out", f"{summary.num_nonfinite} of {len(values)}"),
+            ("ratio of uniform attention", format_number(_finite_mean(episode["uniform_ratio"]))),
+            ("lift (ratio / uniform)", format_number(_finite_mean(episode["ratio_lift"]))),
+        ]
+    room = 14 - len(lines)
+    largest = sorted(drawn, key=lambda name: -(episode[f"{name}_fraction"].mean() or 0.0))  # type: ignore[operator]
+    shown = [name for name in drawn if name in largest[: room - (len(drawn) > room)]]
+    for name in shown:
+        fraction = summarize(episode[f"{name}_fraction"].fill_null(float("nan")).to_numpy())
+        text = "-"
+        if fraction.mean is not None:
+            spread = f"{100 * (fraction.std or 0):.1f}"
+            text = _with_spread(f"{100 * fraction.mean:.1f}", spread, episode.height) + " %"
+        lines.append((f"{wrapped(name, 26, 1)}, fraction", text))
+    if len(shown) < len(drawn):
+        lines.append((f"and {len(drawn) - len(shown)} smaller groups", ""))
+    for number, (label, value) in enumerate(lines):
+        height = 0.97 - number * 0.072
+        axes.text(0.02, height, label, transform=axes.transAxes, va="top", size=8.5, color=NOTE_COLOR)
+        axes.text(0.97, height, value, transform=axes.transAxes, va="top", ha="right", size=8.5)
+
+
+def _with_spread(mean: str, spread: str, count: int) -> str:
+    """A single replan has no spread, and nothing finite has neither."""
+    return mean if count < 2 or mean == "-" else f"{mean} ± {spread}"
+
+
+def _finite_mean(series: pl.Series) -> float | None:
+    return summarize(series.cast(pl.Float64).fill_null(float("nan")).to_numpy()).mean
+
+
+def _group_legend(figure: Figure, drawn: list[str], styles: dict) -> None:
+    from matplotlib.patches import Patch
+
+    if not drawn:
+        return
+    handles = [
+        Patch(
+            facecolor=styles[name]["color"], hatch=styles[name]["hatch"], edgecolor="white", label=wrapped(name, 28, 1)
+        )
+        for name in drawn
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 6 if len(handles) <= 6 else 5))

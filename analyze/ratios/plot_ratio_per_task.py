@@ -1,0 +1,180 @@
+"""`ratio_per_task`: every task's mean ratio with its interval, single episodes as dots, and each task's uniform baseline."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG, overall_layer
+from vla_attention.analyze.show.plot_style import (
+    BASELINE_COLOR,
+    BASELINE_LABEL,
+    DATA_COLOR,
+    NOTE_COLOR,
+    drawn_in_our_style,
+    explain,
+    named,
+    new_figure,
+    plural,
+    ratio_axis,
+    ratio_name,
+    save_figure,
+    title,
+    wrapped,
+)
+from vla_attention.schemas.groupings.grouping import Grouping
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+STEM = "ratio_per_task"
+_COLUMNS = (
+    "ratio_mean",
+    "ratio_mean_low",
+    "ratio_mean_high",
+    "uniform_ratio",
+    "episodes_without_ratio",
+    "num_nonfinite",
+)
+#: From this many tasks on, a row is one line high.
+_MANY = 24
+
+
+@drawn_in_our_style
+def plot_ratio_per_task(
+    episodes: pl.DataFrame,
+    tasks: pl.DataFrame,
+    grouping: Grouping,
+    folder: Path,
+    layer: str | None = None,
+    level: float = 0.95,
+    *,
+    stem: str = STEM,
+    about: str | None = None,
+    note: str = "",
+) -> list[Path]:
+    """Draw from `aggregate.episodes_table` and `aggregate.tasks_table`; returns the paths of png, pdf and csv.
+
+    `layer`: which one, "layers_avg" unless given. `level` is that of the intervals in `tasks`. `stem`: the files' name.
+    `about`: what the title says the ratios are of, the grouping unless given. `note`: a further sentence.
+    """
+    layer = layer or overall_layer(tasks)
+    rows = tasks.filter((pl.col("layer") == layer) & (pl.col("scope") == "task"))
+    overall = tasks.filter((pl.col("layer") == layer) & (pl.col("scope") != "task"))
+    dots = episodes.filter(pl.col("layer") == layer)
+    identity = ["scope", "suite", "task_id", "instruction", "layer", "num_episodes"]
+    if grouping.ratio is None:
+        figure = new_figure(8, 3)
+        explain(figure.subplots(), f"Grouping '{grouping.name}' defines no ratio.")
+        return save_figure(figure, folder, stem, rows.select(identity))
+    data = pl.concat([rows, overall]).select(*identity, *_COLUMNS)
+    # One task is its own total.
+    shown = pl.concat([rows, overall]) if rows.height > 1 else rows
+    few = rows.height <= _MANY
+    figure = new_figure(9, 1.6 + (0.46 if few else 0.2) * (shown.height + 0.5))
+    name = layer if layer == LAYERS_AVG else f"layer {layer}"
+    title(figure, f"Ratio per task, {name}, {about or named(grouping)}", f"{_counts(rows, dots)} {note}")
+    axes = figure.subplots()
+    values = [data[column].drop_nulls().to_numpy() for column in _COLUMNS[:4]] + [
+        dots["ratio_mean"].drop_nulls().to_numpy()
+    ]
+    if not np.isfinite(np.concatenate(values[:3])).any():
+        left_out = int(dots["num_nonfinite"].sum())
+        explain(
+            axes,
+            f"No episode has a finite ratio: all {left_out} ratios are infinite (no denominator mass) or undefined.",
+        )
+        return save_figure(figure, folder, stem, data)
+    ratio_axis(axes.xaxis, np.concatenate(values))
+    _draw_rows(axes, shown, dots, few)
+    several = rows["suite"].n_unique() > 1
+    axes.set_yticks(range(shown.height), [_label(row, several, few) for row in shown.iter_rows(named=True)])
+    axes.set_ylim(shown.height - 0.4, -0.6)
+    axes.tick_params(axis="y", length=0)
+    axes.grid(axis="x")
+    axes.set_xlabel(f"ratio of masses, {ratio_name(grouping.ratio)} (logarithmic)")
+    _legend(
+        axes,
+        level,
+        with_interval=shown["ratio_mean_low"].is_not_null().any(),
+        with_baseline=shown["uniform_ratio"].is_not_null().any(),
+    )
+    return save_figure(figure, folder, stem, data)
+
+
+def _draw_rows(axes: Axes, shown: pl.DataFrame, dots: pl.DataFrame, few: bool) -> None:
+    generator = np.random.default_rng(0)
+    for position, row in enumerate(shown.iter_rows(named=True)):
+        total = row["scope"] != "task"
+        if total:
+            axes.axhspan(position - 0.5, position + 0.5, color="#F0F0F0", linewidth=0, zorder=0)
+        else:
+            own = dots.filter((pl.col("suite") == row["suite"]) & (pl.col("task_id") == row["task_id"]))
+            values = own["ratio_mean"].drop_nulls().to_numpy()
+            values = values[values > 0]
+            jitter = generator.uniform(-0.22, 0.22, len(values)) if len(values) > 1 else np.zeros(len(values))
+            axes.scatter(
+                values, position + jitter, s=14 if few else 8, color="#56B4E9", alpha=0.8, linewidths=0, zorder=2
+            )
+        mean, low, high = row["ratio_mean"], row["ratio_mean_low"], row["ratio_mean_high"]
+        if mean is not None and mean > 0:
+            if low is not None and high is not None:
+                axes.plot([low, high], [position, position], color=DATA_COLOR, linewidth=2.0 if few else 1.4, zorder=3)
+            size = 6.5 if few else 4.5
+            axes.plot(
+                mean,
+                position,
+                "D" if total else "o",
+                color=DATA_COLOR,
+                markersize=size,
+                zorder=4,
+                markeredgecolor="white",
+            )
+        else:
+            where = axes.get_yaxis_transform()
+            axes.text(0.01, position, "no finite ratio", transform=where, va="center", size=7, color=NOTE_COLOR)
+        uniform = row["uniform_ratio"]
+        if uniform is not None and uniform > 0:
+            axes.plot(
+                [uniform, uniform],
+                [position - 0.42, position + 0.42],
+                "--",
+                color=BASELINE_COLOR,
+                linewidth=1.2,
+                zorder=1,
+            )
+        left_out = f" ({row['episodes_without_ratio']} without)" if row["episodes_without_ratio"] else ""
+        text = f"n = {row['num_episodes']}{left_out}"
+        axes.text(1.01, position, text, transform=axes.get_yaxis_transform(), va="center", size=7, color=NOTE_COLOR)
+
+
+def _label(row: dict, several: bool, few: bool) -> str:
+    if row["scope"] == "combined":
+        return "all suites"
+    if row["scope"] == "all":
+        return f"all tasks of {row['suite']}"
+    number = f"{row['suite']} {row['task_id']}" if several else str(row["task_id"])
+    return wrapped(f"{number}: {row['instruction']}", 52 if few else 60, 2 if few else 1)
+
+
+def _legend(axes: Axes, level: float, with_interval: bool, with_baseline: bool) -> None:
+    axes.plot([], [], "o", color=DATA_COLOR, markersize=6, label="mean over episodes")
+    if with_interval:
+        axes.plot([], [], color=DATA_COLOR, linewidth=2, label=f"{level:.0%} bootstrap interval")
+    axes.scatter([], [], s=14, color="#56B4E9", linewidths=0, label="single episode")
+    if with_baseline:
+        axes.plot([], [], "--", color=BASELINE_COLOR, linewidth=1.2, label=BASELINE_LABEL)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderaxespad=0.1, handlelength=1.5)
+
+
+def _counts(rows: pl.DataFrame, dots: pl.DataFrame) -> str:
+    text = f"{plural(dots.height, 'episode')} of {plural(rows.height, 'task')}; n counts episodes."
+    left_out = int(dots["num_nonfinite"].sum())
+    if left_out:
+        text += f" {left_out} of {int(dots['num_replans'].sum())} ratios are not finite and not in any mean."
+    if rows["ratio_mean_low"].null_count() and rows["ratio_mean"].is_not_null().any():
+        text += " No interval where fewer than two episodes have a ratio."
+    return text

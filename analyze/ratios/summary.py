@@ -1,0 +1,313 @@
+"""The text summary: what was analysed, ratios beside what uniform attention would give, fractions, tasks, and what was left out."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import polars as pl
+
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG, layer_order, overall_layer, overall_rows
+from vla_attention.analyze.show.atomic_file import write_text
+from vla_attention.analyze.show.text_table import format_interval, format_number, text_table
+from vla_attention.schemas.errors import listing
+from vla_attention.schemas.groupings.grouping import Grouping
+
+WIDTH = 100
+#: Thresholds of the published interpretation guide, on the mean ratio.
+VISUAL_ABOVE, LINGUISTIC_BELOW = 1.5, 0.67
+#: Below this, intervals of single tasks are so wide that a word on it is due.
+FEW_EPISODES = 5
+
+
+@dataclass(frozen=True)
+class AnalysedRun:
+    """What the header of the summary says about the source of the numbers; the rest is read off the tables.
+
+    Attributes:
+        stores: paths or names of the stores.
+        policy: name of the policy and its checkpoint, as it should be shown.
+        untrained: the weights were never trained, and the numbers are no finding about any policy.
+        denoise_steps: denoise steps that were averaged over.
+        heads: what was done about heads, in words.
+        level: level of the intervals in `tasks_table`.
+        notes: further lines, for instance about translated layer numbers.
+    """
+
+    stores: Sequence[str]
+    policy: str
+    untrained: bool
+    denoise_steps: Sequence[int]
+    heads: str = "mean over all heads"
+    level: float = 0.95
+    notes: Sequence[str] = field(default_factory=tuple)
+
+
+def verdict(ratio: float | None) -> str:
+    """The published guide's word for a mean ratio: above 1.5, below 0.67, or between."""
+    if ratio is None or math.isnan(ratio):
+        return "undefined"
+    if ratio > VISUAL_ABOVE:
+        return "visual-dominant"
+    return "linguistic-dominant" if ratio < LINGUISTIC_BELOW else "balanced"
+
+
+def summary_text(run: AnalysedRun, grouping: Grouping, episodes: pl.DataFrame, tasks: pl.DataFrame) -> str:
+    """The whole summary, at most 100 columns wide, from `aggregate.episodes_table` and `aggregate.tasks_table`."""
+    parts = [_header(run, grouping, episodes)]
+    if grouping.ratio:
+        parts += [_ratio_section(run, grouping, tasks), _nonfinite_section(tasks)]
+    parts += [_groups_section(grouping, tasks, "fraction"), _groups_section(grouping, tasks, "lift")]
+    suites = tasks["suite"].drop_nulls().unique().sort().to_list()
+    if len(suites) > 1:
+        parts.append(_across_section(run, grouping, tasks, "all"))
+    for suite in suites:
+        of = f" OF {suite}" if len(suites) > 1 else ""
+        parts.append(_across_section(run, grouping, tasks.filter(pl.col("suite") == suite), "task", of))
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def write_summary(path: Path, text: str) -> None:
+    """Write the summary into a file, atomically."""
+    write_text(path, text)
+
+
+def _header(run: AnalysedRun, grouping: Grouping, episodes: pl.DataFrame) -> str:
+    overall = episodes.filter(pl.col("layer") == overall_layer(episodes))
+    num_tasks = overall.select("suite", "task_id").n_unique()
+    successes = int(overall["success"].sum())
+    layers = [layer for layer in layer_order(episodes) if layer != LAYERS_AVG]
+    blocks = dict(episodes.select("layer", "block").unique().iter_rows())
+    translated = [f"{layer} = block {blocks[layer]}" for layer in layers if str(blocks[layer]) != layer]
+    lines = ["ATTENTION SUMMARY", "=" * WIDTH]
+    if run.untrained:
+        warning = (
+            "WARNING: the policy has untrained (random) weights. These numbers show that the pipeline works; they say "
+            "nothing about any policy."
+        )
+        lines += ["!" * WIDTH, *textwrap.wrap(warning, WIDTH), "!" * WIDTH]
+    lines += _labelled("store", ", ".join(run.stores))
+    lines += _labelled("policy", run.policy + (" (UNTRAINED WEIGHTS)" if run.untrained else ""))
+    lines += _labelled("suite", ", ".join(sorted(overall["suite"].unique())))
+    lines += _labelled(
+        "episodes",
+        f"{overall.height} of {num_tasks} task{'' if num_tasks == 1 else 's'}, {successes} successful "
+        f"({_percent(successes / overall.height)}); {int(overall['num_replans'].sum())} replans",
+    )
+    lines += _labelled("layers", listing(layers, 40) + (f" ({', '.join(translated)})" if translated else ""))
+    lines += _labelled("averaged over", f"denoise steps {listing(run.denoise_steps, 40)}; {run.heads}")
+    lines += _labelled("grouping", f"{grouping.name}{': ' + grouping.description if grouping.description else ''}")
+    for name, selectors in grouping.groups.items():
+        absent = "" if overall[f"{name}_keys"].sum() else "   (no keys here)"
+        lines += textwrap.wrap(f"{name} = {' | '.join(selectors)}{absent}", WIDTH, **_indents(17, 21))
+    if grouping.ratio:
+        lines += _labelled("ratio", _ratio_definition(grouping))
+    for note in run.notes:
+        lines += _labelled("note", note)
+    return "\n".join(lines)
+
+
+def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: pl.DataFrame) -> str:
+    rows = overall_rows(tasks)
+    header = ["layer", "mean ± std", "median", "of means", "geom.", f"{run.level:.0%} interval"]
+    header += ["uniform", "lift"] + ["verdict"] * grouping.compares_modalities
+    body = [
+        [
+            row["layer"],
+            _mean_and_spread(row),
+            *(format_number(row[column]) for column in ("ratio_median", "ratio_of_means", "geometric_mean")),
+            format_interval(row["ratio_mean_low"], row["ratio_mean_high"]),
+            format_number(row["uniform_ratio"]),
+            format_number(row["ratio_lift"]),
+            *[verdict(row["ratio_mean"])] * grouping.compares_modalities,
+        ]
+        for row in _by_layer(rows)
+    ]
+    overall = rows.filter(pl.col("layer") == overall_layer(rows)).row(0, named=True)
+    legend = (
+        f"mean, std, median: of the episodes' mean ratios (n = {overall['num_episodes']}). of means: mean numerator mass / "
+        "mean denominator mass. geom.: geometric mean of the ratios. lift: ratio / uniform ratio, 1 = what uniform "
+        f"attention gives. {_interval_note(run, overall)}"
+    )
+    return "\n".join(
+        [
+            _title(f"RATIO  {_ratio_definition(grouping)}"),
+            text_table(header, body, left=(0, 8) if grouping.compares_modalities else (0,)),
+            "",
+            *textwrap.wrap(legend, WIDTH),
+            *textwrap.wrap(_baseline_sentence(grouping, overall), WIDTH),
+        ]
+    )
+
+
+def _interval_note(run: AnalysedRun, overall: dict[str, object]) -> str:
+    if overall["num_episodes"] == 1:
+        return "No interval: a single episode says nothing about how much episodes differ."
+    units = "tasks and episodes within tasks" if overall["num_tasks"] != 1 else "episodes of the one task"
+    about = ", for tasks like these" if overall["num_tasks"] != 1 else ""
+    return f"interval: of the mean{about}; bootstrap over {units}, widened for their number."
+
+
+def _baseline_sentence(grouping: Grouping, overall: dict[str, float]) -> str:
+    assert grouping.ratio is not None
+    uniform = overall["uniform_ratio"]
+    if uniform is None:
+        return (
+            "There is no uniform baseline, because a side of the ratio has no keys; the ratio means little without one."
+        )
+    above = sum(overall[f"{name}_keys"] for name in grouping.ratio.numerator)
+    below = sum(overall[f"{name}_keys"] for name in grouping.ratio.denominator)
+    baseline = (
+        f"Uniform attention alone gives ratio = {format_number(uniform)}, because there are on average {format_number(above)} keys "
+        f"on one side and {format_number(below)} on the other"
+    )
+    if not grouping.compares_modalities:
+        return f"{baseline}: read the ratio beside it, or read the lift."
+    return (
+        f"{baseline}, and that alone would be called '{verdict(uniform)}': the verdict (above {VISUAL_ABOVE} visual, below "
+        f"{LINGUISTIC_BELOW} linguistic) means little without the lift."
+    )
+
+
+def _nonfinite_section(tasks: pl.DataFrame) -> str:
+    lines = []
+    for row in _by_layer(overall_rows(tasks)):
+        of = f"layer {row['layer']}" if row["layer"] != LAYERS_AVG else LAYERS_AVG
+        if row["num_nonfinite"]:
+            without = row["episodes_without_ratio"]
+            lines.append(
+                f"{of}: {row['num_nonfinite']} of {row['num_replans']} replans"
+                + (f"; {without} of {row['num_episodes']} episodes have no finite ratio at all" if without else "")
+            )
+        zeros = row["geometric_left_out"] - row["num_nonfinite"]
+        if zeros:
+            lines.append(f"{of}: {zeros} ratios are 0 and left out of the geometric mean")
+        if row["layer"] == LAYERS_AVG and row["nonfinite_layers"]:
+            lines.append(f"{of}: {row['nonfinite_layers']} (replan, layer) ratios left out of the average over layers")
+    if not lines:
+        return ""
+    explanation = (
+        "Infinite (no denominator mass) or undefined (no mass on either side). Left out of mean, median and geometric "
+        "mean; the ratio of means and the fractions include these replans."
+    )
+    return "\n".join([_title("RATIOS THAT ARE NOT FINITE"), *textwrap.wrap(explanation, WIDTH), *lines])
+
+
+def _groups_section(grouping: Grouping, tasks: pl.DataFrame, kind: str) -> str:
+    """Layers by groups that have keys; in blocks of as many groups as the width allows."""
+    groups = [group for group in grouping.names if overall_rows(tasks)[f"{group}_keys"].sum()]
+    names = [name if len(name) <= 24 else name[:23] + "…" for name in groups]
+    cells = {
+        group: [
+            _percent(row[f"{group}_fraction"]) if kind == "fraction" else format_number(row[f"{group}_lift"])
+            for row in _by_layer(overall_rows(tasks))
+        ]
+        for group in groups
+    }
+    layers = [row["layer"] for row in _by_layer(overall_rows(tasks))]
+    room = WIDTH - max(map(len, [*layers, "layer"]))
+    blocks: list[list[int]] = [[]]
+    used = 0
+    for i, group in enumerate(groups):
+        width = 2 + max(map(len, [names[i], *cells[group]]))
+        if used + width > room and blocks[-1]:
+            blocks.append([])
+            used = 0
+        blocks[-1].append(i)
+        used += width
+    tables = [
+        text_table(
+            ["layer", *(names[i] for i in block)],
+            [[layer, *(cells[groups[i]][j] for i in block)] for j, layer in enumerate(layers)],
+            left=(0,),
+        )
+        for block in blocks
+    ]
+    if kind == "fraction":
+        title = "FRACTION of the summed masses of all groups" + (" (groups overlap)" if grouping.overlap else "")
+        note = ""
+    else:
+        title = "LIFT  mass per key, against the mean over valid keys"
+        note = "\n1 = what uniform attention gives."
+    return "\n".join([_title(title), "\n\n".join(tables)]) + note
+
+
+def _across_section(run: AnalysedRun, grouping: Grouping, tasks: pl.DataFrame, scope: str, of: str = "") -> str:
+    """A row per task (scope "task") or per suite (scope "all"), for the layer that speaks for the whole."""
+    layer = overall_layer(tasks)
+    rows = tasks.filter((pl.col("scope") == scope) & (pl.col("layer") == layer))
+    name = "suite" if scope == "all" else "task"
+    header = [name, "n", "success"]
+    if grouping.ratio:
+        header += ["mean", f"{run.level:.0%} interval", "of means", "geom.", "uniform", "lift"]
+    else:
+        header += [group if len(group) <= 12 else group[:11] + "…" for group in grouping.names[:5]]
+    body = []
+    for row in rows.iter_rows(named=True):
+        cells = [
+            row["suite"] if scope == "all" else str(row["task_id"]),
+            str(row["num_episodes"]),
+            _percent(row["success_rate"]),
+        ]
+        if grouping.ratio:
+            cells += [
+                format_number(row["ratio_mean"]),
+                format_interval(row["ratio_mean_low"], row["ratio_mean_high"]),
+                *(format_number(row[c]) for c in ("ratio_of_means", "geometric_mean", "uniform_ratio", "ratio_lift")),
+            ]
+        else:
+            cells += [_percent(row[f"{group}_fraction"]) for group in grouping.names[:5]]
+        body.append(cells)
+    last = "" if scope == "all" else "instruction"
+    texts = [row["instruction"] or "" for row in rows.iter_rows(named=True)]
+    shown = layer if layer == LAYERS_AVG else f"layer {layer}"
+    what = "ratio" if grouping.ratio else f"fractions of {listing(grouping.names[:5])}"
+    table = text_table(header, body, left=(0,), last=last, texts=texts if last else None, width=WIDTH)
+    fewest = rows["num_episodes"].min()
+    if grouping.ratio and scope == "task" and isinstance(fewest, int) and 1 < fewest < FEW_EPISODES:
+        warning = (
+            f"Intervals over fewer than {FEW_EPISODES} episodes of a task are wide, because so few show little of how much episodes "
+            "differ; more episodes narrow them quickly."
+        )
+        table = "\n".join([table, *textwrap.wrap(warning, WIDTH)])
+    return "\n".join([_title(f"PER {name.upper()}{of}  {what}, {shown}"), table])
+
+
+def _by_layer(rows: pl.DataFrame) -> list[dict]:
+    return list(rows.sort("layer_number", nulls_last=True).iter_rows(named=True))
+
+
+def _mean_and_spread(row: dict) -> str:
+    # One episode has no spread; its std of 0 would read as certainty.
+    if row["num_episodes"] - row["episodes_without_ratio"] < 2:
+        return format_number(row["ratio_mean"])
+    return f"{format_number(row['ratio_mean'])} ± {format_number(row['ratio_std'])}"
+
+
+def _ratio_definition(grouping: Grouping) -> str:
+    assert grouping.ratio is not None
+    sides = []
+    for names in (grouping.ratio.numerator, grouping.ratio.denominator):
+        # Sets of many objects are listed in full among the groups; here their names would hide the numbers.
+        shown = " + ".join(names[:4]) + (f" + {len(names) - 4} more" if len(names) > 4 else "")
+        sides.append(f"({shown})" if len(names) > 1 else shown)
+    return " / ".join(sides)
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None or math.isnan(value) else f"{100 * value:.1f}%"
+
+
+def _title(text: str) -> str:
+    return "\n".join([*textwrap.wrap(text, WIDTH), "-" * WIDTH])
+
+
+def _labelled(label: str, text: str) -> list[str]:
+    return textwrap.wrap(f"{label + ':':<15}{text}", WIDTH, subsequent_indent=" " * 15, break_on_hyphens=False)
+
+
+def _indents(first: int, rest: int) -> dict:
+    return {"initial_indent": " " * first, "subsequent_indent": " " * rest, "break_on_hyphens": False}

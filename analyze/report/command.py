@@ -1,0 +1,80 @@
+"""`vla-analyze report`: one self-contained HTML file."""
+
+from __future__ import annotations
+
+import argparse
+
+from vla_attention.analyze.arguments import add_grouping, add_selection, add_stores, settings_of
+from vla_attention.schemas.command_line import OneSentenceParser
+
+_EXAMPLES = """examples:
+  vla-analyze report runs/libero_10.zarr
+  vla-analyze report runs/libero_10.zarr --grouping instruction --layers 9 13 17 --output paper/report.html
+  vla-analyze report runs/a.zarr runs/b.zarr --episodes 8 --replans 10
+  vla-analyze report runs/cosmos.zarr --site self
+
+The file needs no network and nothing beside it: open it with a double click, mail it, print it.
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of `vla-analyze report STORE ...`."""
+    from pathlib import Path
+
+    parser = OneSentenceParser(
+        prog="vla-analyze report",
+        description="One self-contained HTML file: what was run, the ratio with its interval and with what has to be "
+        "known about it, tasks, layers, "
+        "contributions, overlays of some episodes, methods.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_stores(parser)
+    add_grouping(parser)
+    add_selection(parser)
+    shown = parser.add_argument_group("content")
+    shown.add_argument(
+        "--episodes", type=int, default=4, metavar="N", help="episodes with overlays (default: 4; 0: none)"
+    )
+    shown.add_argument("--replans", type=int, default=24, metavar="N", help="replans of each, at most (default: 24)")
+    shown.add_argument("--quick", action="store_true", help="leave out what reads every row: sinks, words, objects")
+    output = parser.add_argument_group("output")
+    output.add_argument("--output", type=Path, metavar="FILE", help="HTML file (default: results/STORE/report.html)")
+    output.add_argument("--seed", type=int, default=0, help="seed of the bootstrap (default: 0)")
+    return parser
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Analyse and write the page."""
+    from pathlib import Path
+
+    from vla_attention.analyze.measures.question import ask
+    from vla_attention.analyze.ratios.analysis import analyse
+    from vla_attention.analyze.report.page import report_html
+    from vla_attention.analyze.show.atomic_file import write_text
+    from vla_attention.analyze.show.plot_style import plural
+    from vla_attention.schemas.errors import BadArgument
+    from vla_attention.schemas.stores.reader import open_store
+
+    if arguments.episodes < 0 or arguments.replans < 1:
+        raise BadArgument(
+            f"Cannot show {arguments.episodes} episodes with {arguments.replans} replans each; expected --episodes "
+            f"from 0 and --replans from 1."
+        )
+    path = arguments.output or Path("results") / arguments.stores[0].stem / "report.html"
+    if path.is_dir() or path.suffix.lower() not in (".html", ".htm"):
+        raise BadArgument(f"Cannot write the report to {path}; expected --output FILE.html.")
+    stores = [open_store(store) for store in arguments.stores]
+    analysis = analyse(ask(stores, settings_of(arguments)))
+    page = report_html(analysis, arguments.episodes, arguments.replans, rows=not arguments.quick)
+    try:
+        write_text(path, page)
+    except OSError as error:
+        raise BadArgument(
+            f"Cannot write the report to {path}: {error.strerror or error}; give another --output."
+        ) from None
+    for line in analysis.question.skipped:
+        print(line)
+    size = len(page.encode()) / 1e6
+    print(f"{path}: {size:.1f} MB on {plural(len(analysis.question.selected), 'episode')}. Open it in a browser.")
+    return 0

@@ -1,0 +1,121 @@
+"""What the profiles over layers and over denoise steps share: a panel of ratios and a panel of fractions, with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+
+from vla_attention.analyze.show.plot_style import (
+    BASELINE_COLOR,
+    BASELINE_LABEL,
+    DATA_COLOR,
+    explain,
+    group_styles,
+    ratio_axis,
+    ratio_name,
+    wrapped,
+)
+from vla_attention.schemas.groupings.grouping import Grouping
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Lines that one panel carries.
+_MOST_GROUPS = 6
+_MOST_LABELS = 20
+
+
+def draw_profile(figure: Figure, rows: pl.DataFrame, grouping: Grouping, labels: Sequence[str], along: str) -> None:
+    """Draw rows of `aggregate.tasks_table`, one per position: ratio (if there is one) above, fractions below."""
+    panels = 1 if grouping.ratio is None else 2
+    every = figure.subplots(panels, 1, squeeze=False, sharex=False)[:, 0]
+    if grouping.ratio is not None:
+        _ratio_panel(every[0], rows, grouping)
+        if every[0].axison and every[0].get_xticks().size:
+            _positions(every[0], labels)
+    _fraction_panel(every[-1], rows, grouping)
+    _positions(every[-1], labels)
+    every[-1].set_xlabel(along)
+
+
+def shown_groups(rows: pl.DataFrame, grouping: Grouping) -> list[str]:
+    """Groups that a panel of fractions shows: those of the ratio first, then those with most mass; groups without mass never."""
+    means = {name: rows[f"{name}_fraction"].mean() for name in grouping.names}
+    having = [name for name in grouping.names if isinstance(means[name], float) and means[name] > 0]  # type: ignore[operator]
+    first = (*grouping.ratio.numerator, *grouping.ratio.denominator) if grouping.ratio else ()
+    ranked = sorted(having, key=lambda name: (name not in first, -means[name]))[:_MOST_GROUPS]  # type: ignore[operator]
+    return [name for name in grouping.names if name in ranked]
+
+
+def _ratio_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping) -> None:
+    assert grouping.ratio is not None
+    mean, low, high, uniform = (
+        rows[column].cast(pl.Float64).fill_null(float("nan")).to_numpy()
+        for column in ("ratio_mean", "ratio_mean_low", "ratio_mean_high", "uniform_ratio")
+    )
+    drawn = np.isfinite(mean) & (mean > 0)
+    if not drawn.any():
+        left_out = int(rows["num_nonfinite"].sum())
+        total = int(rows["num_replans"].sum())
+        rest = "" if left_out == total else f", the other {total - left_out} are 0"
+        explain(axes, f"No ratio to draw: {left_out} of {total} are infinite (no denominator mass) or undefined{rest}.")
+        return
+    ratio_axis(axes.yaxis, np.concatenate([mean, low, high, uniform]))
+    at = np.arange(len(mean))
+    # An interval may reach 0, which a logarithmic axis does not have: there it runs to the edge.
+    low = np.where(low > 0, low, np.where(np.isnan(low), np.nan, axes.get_ylim()[0]))
+    # The line breaks where there is no ratio: nothing is known there.
+    shown = np.where(drawn, mean, np.nan)
+    axes.plot(at, shown, "o-", color=DATA_COLOR, markersize=4.5, label="mean over episodes", zorder=3)
+    axes.vlines(at, low, high, color=DATA_COLOR, linewidth=2.2, alpha=0.55, zorder=2, label=_interval(low))
+    axes.plot(at, uniform, "--", color=BASELINE_COLOR, linewidth=1.2, label=BASELINE_LABEL)
+    if len(at) == 1 and np.isfinite(uniform[0]):
+        axes.plot([-0.4, 0.4], [uniform[0]] * 2, "--", color=BASELINE_COLOR, linewidth=1.2)
+    axes.set_ylabel(f"ratio, {ratio_name(grouping.ratio)}\n(logarithmic)")
+    axes.grid(axis="y")
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+
+
+def _fraction_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping) -> None:
+    styles = group_styles(grouping.names)
+    groups = shown_groups(rows, grouping)
+    at = np.arange(rows.height, dtype=float)
+    highest = 0.0
+    # Side by side, so that intervals of different groups do not cover each other; near their label where there are few positions.
+    apart = min(0.08, 0.012 * (rows.height + 0.2))
+    for i, name in enumerate(groups):
+        mean, low, high = (
+            rows[f"{name}_fraction{end}"].cast(pl.Float64).fill_null(float("nan")).to_numpy()
+            for end in ("", "_low", "_high")
+        )
+        where = at + (i - (len(groups) - 1) / 2) * apart
+        color = styles[name]["color"]
+        line = "--" if styles[name]["hatch"] else "-"
+        axes.plot(where, mean, f"o{line}", color=color, markersize=4, label=wrapped(name, 24, 1), zorder=3)
+        axes.vlines(where, low, high, color=color, linewidth=2.2, alpha=0.55, zorder=2)
+        highest = max(highest, float(np.nanmax(np.fmax(mean, high))))
+    if not groups:
+        explain(axes, "No group has any mass.")
+        return
+    # Room for the whole of the highest and of the lowest marker.
+    axes.set_ylim(-0.03 * highest, 1.06 * highest)
+    axes.set_ylabel("fraction of the groups'\nsummed mass")
+    axes.grid(axis="y")
+    having = sum((rows[f"{name}_fraction"].fill_null(0.0) > 0).any() for name in grouping.names)
+    heading = f"{len(groups)} of {having} groups" if having > len(groups) else None
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), title=heading, title_fontsize=8, alignment="left")
+
+
+def _positions(axes: Axes, labels: Sequence[str]) -> None:
+    step = -(-len(labels) // _MOST_LABELS)
+    positions = list(range(0, len(labels), step))
+    axes.set_xticks(positions, [labels[i] for i in positions])
+    axes.set_xlim(-0.6, len(labels) - 0.4)
+
+
+def _interval(low: np.ndarray) -> str:
+    return "95% bootstrap interval" if np.isfinite(low).any() else "no interval (one episode)"

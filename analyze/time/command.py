@@ -1,0 +1,81 @@
+"""`vla-analyze time`: over the course of an episode, around the first gripper closing, success against failure."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from vla_attention.analyze.arguments import (
+    add_grouping,
+    add_output,
+    add_selection,
+    add_stores,
+    output_folder,
+    report_files,
+    settings_of,
+)
+from vla_attention.schemas.command_line import OneSentenceParser
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_EXAMPLES = """examples:
+  vla-analyze time runs/libero_10.zarr
+  vla-analyze time runs/libero_10.zarr --layers 25 --bins 10
+  vla-analyze time runs/libero_10.zarr --grouping objects --window 5
+  vla-analyze time runs/libero_goal.zarr runs/libero_10.zarr --no-plots
+
+A replan's value stands until the next replan, as its actions do; a bin of the episode's time is the
+mean of that step function. The gripper closes at the first replan one of whose executed actions has a
+last number above 0 (robosuite's Panda gripper, which every suite of vla-capture drives).
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of `vla-analyze time STORE ...`."""
+    parser = OneSentenceParser(
+        prog="vla-analyze time",
+        description="Ratio and fractions over the course of an episode and around the first gripper closing,\n"
+        "success against failure with effect sizes, and how many independent replans an episode is worth.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_stores(parser)
+    time = parser.add_argument_group("time")
+    time.add_argument("--bins", type=int, default=20, metavar="N", help="parts of an episode's time (default: 20)")
+    time.add_argument(
+        "--window", type=int, default=8, metavar="N", help="replans shown before and after the closing (default: 8)"
+    )
+    add_grouping(parser)
+    add_selection(parser)
+    add_output(parser, "results/STORE/time")
+    return parser
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the findings; write tables and pictures."""
+    from vla_attention.analyze.measures.question import ask
+    from vla_attention.analyze.show.table_files import write_parquet
+    from vla_attention.analyze.time.text import time_text
+    from vla_attention.analyze.time.time_courses import TimeSettings, time_courses
+    from vla_attention.schemas.stores.reader import open_store
+
+    settings = TimeSettings(arguments.bins, arguments.window)
+    question = ask([open_store(path) for path in arguments.stores], settings_of(arguments))
+    courses = time_courses(question, settings)
+    print(time_text(question, courses, settings))
+    folder: Path = output_folder(arguments, "time")
+    files = write_parquet(
+        folder,
+        time_course=courses.course,
+        gripper_closing=courses.closing,
+        gripper_change=courses.change,
+        success_against_failure=courses.outcomes,
+        autocorrelation=courses.autocorrelation,
+    )
+    if not arguments.no_plots:
+        from vla_attention.analyze.time.plot_time_course import plot_time_courses
+
+        files += plot_time_courses(courses, question.grouping, folder)
+    report_files(folder, files)
+    return 0

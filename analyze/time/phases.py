@@ -1,0 +1,97 @@
+"""Where in an episode a replan is: on the episode's own time from 0 to 1, and around the first closing of the gripper.
+
+Pure functions on one episode's arrays. What lies between two replans is not made up: a replan's value stands until the next
+one, exactly as its actions do.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.schemas.stores.store_format import StoreError
+
+#: Every suite of the capture side drives robosuite's one-number Panda gripper: of the command, the last number of an action,
+#: only the sign counts; above 0 closes, below 0 opens, 0 leaves the fingers where they are. Episodes wait with -1: open.
+GRIPPER = -1
+
+
+def replan_starts(env_step: NDArray[np.int64], wait_steps: int, num_steps: int, name: str) -> NDArray[np.int64]:
+    """Policy steps (replan,) executed before each replan, from the environment steps of the store.
+
+    Raises:
+        StoreError: they do not increase from 0, or the episode ended before its last replan.
+    """
+    starts = np.asarray(env_step, dtype=np.int64) - wait_steps
+    if len(starts) == 0 or starts[0] != 0 or (np.diff(starts) <= 0).any() or starts[-1] >= num_steps:
+        raise StoreError(
+            f"The replans of {name} do not fit into its {num_steps} steps after {wait_steps} steps of waiting; check the store "
+            "with vla-analyze verify."
+        )
+    return starts
+
+
+def on_episode_time(
+    values: NDArray[np.float64], starts: NDArray[np.int64], num_steps: int, num_bins: int
+) -> NDArray[np.float64]:
+    """Means (bin, quantity) over equal parts of an episode's time, of values (replan, quantity).
+
+    The value at policy step s is that of the last replan at or before s. A bin's value is the mean of this step function over the
+    bin, that is the replans' mean with the shares of the bin that they last as weights. Values that are not finite take no
+    part; a bin with nothing else is NaN.
+
+    Args:
+        values: (replan, quantity).
+        starts: (replan,) policy steps before each replan, see `replan_starts`.
+        num_steps: policy steps of the episode.
+        num_bins: parts of equal length.
+    """
+    ends = np.append(starts[1:], num_steps)
+    edges = np.linspace(0.0, 1.0, num_bins + 1)
+    from_ = np.maximum(edges[:-1, None], starts[None, :] / num_steps)
+    to = np.minimum(edges[1:, None], ends[None, :] / num_steps)
+    # Ends that are equal but for rounding are no overlap.
+    share = np.where(to - from_ > 1e-12, to - from_, 0.0)
+    finite = np.isfinite(values)
+    weight = share @ finite.astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(weight > 0, (share @ np.where(finite, values, 0.0)) / weight, np.nan)
+
+
+def closing_replan(actions: NDArray[np.float64], starts: NDArray[np.int64], num_steps: int) -> int | None:
+    """The first replan one of whose executed actions closes the gripper; None when none does.
+
+    A replan's chunk is longer than what is executed of it: its first actions, up to the next replan or the end of the episode.
+    With an open gripper to begin with, this is the first closing command of the episode.
+
+    Args:
+        actions: (replan, horizon, action dimension), as given to the environment.
+        starts: (replan,) policy steps before each replan.
+        num_steps: policy steps of the episode.
+    """
+    executed = np.diff(np.append(starts, num_steps))
+    for replan, count in enumerate(executed):
+        if (actions[replan, :count, GRIPPER] > 0).any():
+            return replan
+    return None
+
+
+def around_event(values: NDArray[np.float64], event: int, window: int) -> NDArray[np.float64]:
+    """Values (offset, quantity) of the replans from `window` before to `window` after one; NaN outside the episode.
+
+    Offset 0 is the event's own replan. values: (replan, quantity).
+    """
+    result = np.full((2 * window + 1, values.shape[1]), np.nan)
+    first, last = max(0, event - window), min(len(values), event + window + 1)
+    result[first - event + window : last - event + window] = values[first:last]
+    return result
+
+
+def change_at_event(around: NDArray[np.float64], window: int) -> NDArray[np.float64]:
+    """Mean from offset 0 on minus mean before (quantity,), of finite values (offset, quantity); NaN when a side has none."""
+    sides = []
+    for part in (around[:window], around[window:]):
+        finite = np.isfinite(part)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            sides.append(np.where(finite, part, 0.0).sum(axis=0) / finite.sum(axis=0))
+    return sides[1] - sides[0]

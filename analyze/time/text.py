@@ -1,0 +1,196 @@
+"""What `vla-analyze time` prints."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping
+from typing import Any
+
+import polars as pl
+
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.show.text_table import format_interval, format_number, text_table
+from vla_attention.analyze.time.time_courses import (
+    ALL,
+    EPISODE_TIME,
+    FAILURE,
+    RATIO,
+    SUCCESS,
+    TimeCourses,
+    TimeSettings,
+)
+
+WIDTH = 100
+#: Rows of the printed course; the table and the pictures have every bin.
+_SHOWN = 10
+#: Groups of the printed course.
+_MOST_GROUPS = 5
+
+
+def time_text(question: Question, courses: TimeCourses, settings: TimeSettings) -> str:
+    """The whole text, at most 100 columns wide."""
+    parts = [_header(question, courses), _course_section(courses, settings)]
+    parts += [_gripper_section(courses, settings), outcomes_section(courses.outcomes), _counts_section(courses)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _header(question: Question, courses: TimeCourses) -> str:
+    of = courses.autocorrelation
+    layer = courses.layer if courses.layer == LAYERS_AVG else f"layer {courses.layer}"
+    lines = ["TIME COURSES", "=" * WIDTH]
+    if any(store.attributes.policy.untrained for store in question.stores):
+        lines += _wrapped(
+            "WARNING: the policy has untrained (random) weights; these numbers say nothing about any policy."
+        )
+    lines += _wrapped(f"stores: {', '.join(str(store.path) for store in question.stores)}")
+    lines += _wrapped(
+        f"{of.height} episodes of {of.select('suite', 'task_id').n_unique()} tasks, {int(of['success'].sum())} successful; "
+        f"{layer}; grouping '{question.grouping.name}'. Intervals: 95%, pointwise, bootstrap over tasks and episodes."
+    )
+    for line in question.skipped:
+        lines += _wrapped(line)
+    return "\n".join(lines)
+
+
+def _course_section(courses: TimeCourses, settings: TimeSettings) -> str:
+    rows = courses.course.filter(pl.col("alignment") == EPISODE_TIME, pl.col("outcome") == ALL)
+    groups = [name for name in courses.quantities if name != RATIO][:_MOST_GROUPS]
+    header = ["time"] + (["ratio", "interval", "uniform"] if RATIO in courses.quantities else [])
+    header += [_short(name, 12) for name in groups]
+    stride = max(1, -(-settings.num_bins // _SHOWN))
+    body = []
+    for part in rows.partition_by("position", maintain_order=True)[::stride]:
+        of = {row["quantity"]: row for row in part.iter_rows(named=True)}
+        first = part.row(0, named=True)
+        cells = [f"{first['position_low']:.2f}-{first['position_high']:.2f}"]
+        if RATIO in of:
+            cells += [format_number(of[RATIO]["value"]), _interval(of[RATIO]), format_number(of[RATIO]["uniform"])]
+        body.append(cells + [_percent(of[name]["value"]) for name in groups])
+    every = f" (one bin in {stride}; all are in the table)" if stride > 1 else ""
+    note = "The ratio is a geometric mean over episodes, fractions are means; a replan stands until the next one."
+    if courses.num_nonfinite:
+        note += f" {courses.num_nonfinite} replans without a finite ratio take no part in its course."
+    return "\n".join(
+        [_title(f"OVER THE EPISODE'S TIME, 0 to 1{every}"), text_table(header, body, left=(0,)), *_wrapped(note)]
+    )
+
+
+def _gripper_section(courses: TimeCourses, settings: TimeSettings) -> str:
+    heading = _title("AT THE FIRST GRIPPER CLOSING")
+    if courses.closing.is_empty():
+        return f"{heading}\nThe stores hold no actions, so there is nothing to align at."
+    closed = courses.closing.drop_nulls("closing_replan")
+    rule = (
+        f"The gripper closes in {closed.height} of {courses.closing.height} episodes (the first replan one of whose executed actions "
+        "has a last number above 0)"
+    )
+    if closed.is_empty():
+        return "\n".join([heading, *_wrapped(f"{rule}.")])
+    rule += (
+        f", at replan {format_number(closed['closing_replan'].cast(pl.Float64).median())} and episode time "  # type: ignore[arg-type]
+        f"{format_number(closed['closing_time'].median())} in the median."  # type: ignore[arg-type]
+    )
+    at_once = int((closed["closing_replan"] == 0).sum())
+    if at_once:
+        rule += f" In {at_once} of them it closes at the first replan, and there is no before."
+    body = [
+        [
+            _short(row["quantity"], 40),
+            ("x " if row["quantity"] == RATIO else "") + format_number(row["change"]),
+            _interval(row),
+            str(row["num_episodes"]),
+        ]
+        for row in courses.change.iter_rows(named=True)
+    ]
+    note = (
+        f"change: mean over the {settings.window + 1} replans from the closing on, against the {settings.window} before it, within "
+        "each episode; a factor for the ratio, a difference of fractions for groups. No causal claim: much else changes then."
+    )
+    if not courses.change["num_episodes"].max():
+        return "\n".join([heading, *_wrapped(f"{rule} No episode shows both sides of a closing.")])
+    table = text_table(["quantity", "change", "interval", "episodes"], body, left=(0,))
+    return "\n".join([heading, *_wrapped(rule), table, *_wrapped(note)])
+
+
+def outcomes_section(outcomes: pl.DataFrame) -> str:
+    """Success against failure as text, from `TimeCourses.outcomes`."""
+    heading = _title("SUCCESS AGAINST FAILURE  means of the episodes' means over replans")
+    notes = [f"{row['quantity']}: {row['note']}." for row in outcomes.iter_rows(named=True) if row["note"]]
+    if outcomes["difference"].null_count() == outcomes.height:
+        counts = outcomes.row(0, named=True)
+        numbers = f"{counts[f'num_{SUCCESS}']} solved and {counts[f'num_{FAILURE}']} failed"
+        said = f"Not compared: of the episodes, {numbers}; at least 2 of either are needed."
+        return "\n".join([heading, *_wrapped(said)])
+    header = ["quantity", "n", "difference", "interval", "in tasks", "interval", "g", "delta"]
+    body = [
+        [
+            _short(row["quantity"], 24),
+            f"{row[f'num_{SUCCESS}']}/{row[f'num_{FAILURE}']}",
+            _signed(row["difference"]),
+            _interval(row, "difference"),
+            _signed(row["within_tasks"]),
+            _interval(row, "within_tasks"),
+            _signed(row["hedges_g"]),
+            _signed(row["cliffs_delta"]),
+        ]
+        for row in outcomes.iter_rows(named=True)
+    ]
+    both = max(outcomes["num_tasks_with_both"])
+    note = (
+        "n: solved / failed episodes. difference: solved minus failed (for log2_ratio, 1 is a factor of 2). in tasks: the same inside "
+        f"tasks ({both} hold both outcomes), free of differences between tasks. g: Hedges' g, in standard deviations. delta: Cliff's "
+        "delta, P(solved > failed) - P(solved < failed). Their intervals are in the table."
+    )
+    return "\n".join(
+        [heading, text_table(header, body, left=(0,)), *_wrapped(note), *(w for n in notes for w in _wrapped(n))]
+    )
+
+
+def _counts_section(courses: TimeCourses) -> str:
+    table = courses.autocorrelation
+    known = table.drop_nulls("effective_replans")
+    heading = _title("INDEPENDENT REPLANS  how many an episode is worth")
+    if known.is_empty():
+        why = f"Cannot be estimated in any of the {table.height} episodes: too few replans, no change, or ratios that are not finite."
+        return "\n".join([heading, *_wrapped(why)])
+    series = known["series"][0]
+    text = (
+        f"{int(known['num_replans'].sum())} replans of {known.height} episodes are worth "
+        f"{format_number(float(known['effective_replans'].sum()))} independent ones for {series} (integrated autocorrelation time "
+        f"{format_number(_median(known['autocorrelation_time']))} replans in the median; initial positive sequence, Geyer 1992). "
+        "In series this short that is an upper bound. No interval counts replans: the episode is the unit."
+    )
+    if known.height < table.height:
+        text += f" {table.height - known.height} of {table.height} episodes are left out: too few replans, no change, or gaps."
+    return "\n".join([heading, *_wrapped(text)])
+
+
+def _median(column: pl.Series) -> float | None:
+    value = column.median()
+    return value if isinstance(value, float) else None
+
+
+def _interval(row: Mapping[str, Any], name: str = "") -> str:
+    prefix = f"{name}_" if name else ""
+    return format_interval(row[f"{prefix}low"], row[f"{prefix}high"])
+
+
+def _short(name: str, width: int) -> str:
+    return name if len(name) <= width else f"{name[: width - 1]}…"
+
+
+def _signed(value: float | None) -> str:
+    return format_number(value) if value is None or value <= 0 else f"+{format_number(value)}"
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.1f}%"
+
+
+def _title(text: str) -> str:
+    return "\n".join([*textwrap.wrap(text, WIDTH), "-" * WIDTH])
+
+
+def _wrapped(text: str) -> list[str]:
+    return textwrap.wrap(text, WIDTH, break_on_hyphens=False)

@@ -1,0 +1,310 @@
+"""Time courses: means over episodes on the episode's own time and around the first gripper closing, with pointwise intervals.
+
+Quantities are the ratio (its geometric mean: the course of a mean of ratios is that of its largest episode) and the
+fractions of all groups that take any mass, for the layer that speaks for the whole ("layers_avg" unless one layer is chosen).
+Intervals are pointwise two-level bootstraps: each point's own, not a band for the whole curve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from vla_attention.analyze.measures.aggregate import EPISODE_KEYS, add_layers_avg, overall_layer, per_replan
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.steps import SelectedEpisode, steps_table
+from vla_attention.analyze.show.progress import progress_bar
+from vla_attention.analyze.statistics.autocorrelation import autocorrelation_table
+from vla_attention.analyze.statistics.bootstrap import (
+    SHARE,
+    EpisodeStatistic,
+    Interval,
+    Resamples,
+    bootstrap_intervals,
+    geometric_mean_over_episodes,
+    mean_over_episodes,
+    resample_episodes,
+)
+from vla_attention.analyze.statistics.effect_sizes import contrast, contrast_row
+from vla_attention.analyze.time.phases import (
+    around_event,
+    change_at_event,
+    closing_replan,
+    on_episode_time,
+    replan_starts,
+)
+from vla_attention.schemas.errors import BadArgument
+
+RATIO = "ratio"
+#: The two alignments of a time course.
+EPISODE_TIME, GRIPPER_CLOSING = "episode", "gripper"
+#: Which episodes a curve is of.
+ALL, SUCCESS, FAILURE = "all", "success", "failure"
+
+
+@dataclass(frozen=True)
+class TimeSettings:
+    """`num_bins` parts of the episode's time; `window` replans shown on either side of the gripper's closing."""
+
+    num_bins: int = 20
+    window: int = 8
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.num_bins <= 1000:
+            raise BadArgument(f"Cannot use --bins {self.num_bins}; expected 2 to 1000 parts of an episode.")
+        if not 1 <= self.window <= 1000:
+            raise BadArgument(f"Cannot use --window {self.window}; expected 1 to 1000 replans on either side.")
+
+
+@dataclass(frozen=True)
+class TimeCourses:
+    """What `time_courses` finds; all tables are about one layer.
+
+    Attributes:
+        layer: which one.
+        quantities: "ratio" (when the grouping has one) and the groups whose fractions are followed.
+        course: one row per (alignment, outcome, quantity, position): `position_low`, `position`, `position_high` (episode time 0 to
+            1, or replans from the closing), `value`, `low`, `high`, `num_episodes`, `num_tasks`, `uniform` (of the ratio).
+        closing: one row per episode: its identity, `closing_replan` (null when the gripper never closes) and `closing_time`
+            (0 to 1); empty when the stores hold no actions.
+        change: one row per quantity: mean change from before to after the closing (a factor for the ratio, a difference for
+            fractions) with `low` and `high`, and how many episodes show both sides.
+        outcomes: success against failure, one row per quantity, columns of `effect_sizes.contrast_row`; the ratio as log2.
+        autocorrelation: one row per episode, see `autocorrelation.autocorrelation_table`.
+        num_nonfinite: (episode, replan) pairs without a finite log ratio, which take no part in the ratio's course.
+    """
+
+    layer: str
+    quantities: tuple[str, ...]
+    course: pl.DataFrame
+    closing: pl.DataFrame
+    change: pl.DataFrame
+    outcomes: pl.DataFrame
+    autocorrelation: pl.DataFrame
+    num_nonfinite: int
+
+
+@dataclass(frozen=True)
+class _Episode:
+    """One episode's values (replan, quantity) with the ratio as its natural logarithm, and where its replans are."""
+
+    identity: tuple[object, ...]
+    task: tuple[str, int]
+    success: bool
+    values: NDArray[np.float64]
+    uniform: float
+    starts: NDArray[np.int64]
+    num_steps: int
+    closing: int | None
+
+
+def replans_of(question: Question) -> pl.DataFrame:
+    """The replans of a question, with "layers_avg" (see `aggregate`)."""
+    with progress_bar(len(question.selected), "episodes") as advance:
+        steps = steps_table(question.selected, question.grouping, question.selection, question.site, advance)
+    return add_layers_avg(per_replan(steps, question.grouping), question.grouping)
+
+
+def time_course_table(question: Question, settings: TimeSettings | None = None) -> pl.DataFrame:
+    """The table `TimeCourses.course` of a question."""
+    return time_courses(question, settings).course
+
+
+def time_courses(
+    question: Question, settings: TimeSettings | None = None, replans: pl.DataFrame | None = None
+) -> TimeCourses:
+    """Everything about the course of episodes.
+
+    Args:
+        question: stores, selection and grouping.
+        settings: bins and window.
+        replans: the question's replans when they are known already (`replans_of`).
+    """
+    settings = settings or TimeSettings()
+    replans = replans_of(question) if replans is None else replans
+    grouping = question.grouping
+    layer = overall_layer(replans)
+    rows = replans.filter(pl.col("layer") == layer)
+    groups = [name for name in grouping.names if (rows[f"{name}_mass"] > 0).any()]
+    quantities = ((RATIO,) if grouping.ratio else ()) + tuple(groups)
+    has_actions = all("actions" in item.episode.attributes.arrays for item in question.selected)
+    by_name = {
+        (i.store.suite, i.episode.attributes.task_id, i.episode.attributes.episode_index): i for i in question.selected
+    }
+    episodes = []
+    for part in rows.partition_by("suite", "task_id", "episode_index", maintain_order=True):
+        item = by_name[part["suite"][0], part["task_id"][0], part["episode_index"][0]]
+        episodes.append(_episode(item, part.sort("replan"), quantities, has_actions))
+    seed = question.settings.seed
+    classes = {ALL: episodes}
+    solved = [episode for episode in episodes if episode.success]
+    if 0 < len(solved) < len(episodes):
+        classes |= {SUCCESS: solved, FAILURE: [episode for episode in episodes if not episode.success]}
+    course = [
+        _course(members, outcome, alignment, quantities, settings, seed)
+        for outcome, members in classes.items()
+        for alignment in ((EPISODE_TIME, GRIPPER_CLOSING) if has_actions else (EPISODE_TIME,))
+    ]
+    ratios = [episode.values[:, 0] for episode in episodes] if grouping.ratio else []
+    return TimeCourses(
+        layer=layer,
+        quantities=quantities,
+        course=pl.concat(course),
+        closing=_closing_table(episodes if has_actions else [], rows),
+        change=_change_table(episodes, quantities, settings.window, seed),
+        outcomes=_outcomes_table(episodes, quantities, seed),
+        autocorrelation=autocorrelation_table(rows, grouping),
+        num_nonfinite=int(sum((~np.isfinite(values)).sum() for values in ratios)),
+    )
+
+
+def _episode(item: SelectedEpisode, part: pl.DataFrame, quantities: Sequence[str], has_actions: bool) -> _Episode:
+    attributes = item.episode.attributes
+    wait_steps = item.store.attributes.protocol.wait_steps
+    starts = replan_starts(part["env_step"].to_numpy(), wait_steps, attributes.num_steps, item.episode.name)
+    columns = [
+        part["log2_ratio"] * np.log(2.0) if quantity == RATIO else part[f"{quantity}_fraction"]
+        for quantity in quantities
+    ]
+    uniform = part["uniform_ratio"].cast(pl.Float64).mean() if RATIO in quantities else None
+    actions = item.episode.read("actions") if has_actions else None
+    return _Episode(
+        identity=part.select(EPISODE_KEYS).row(0),
+        task=(item.store.suite, attributes.task_id),
+        success=attributes.success,
+        values=np.stack([column.fill_null(float("nan")).to_numpy() for column in columns], axis=1),
+        uniform=uniform if isinstance(uniform, float) else float("nan"),
+        starts=starts,
+        num_steps=attributes.num_steps,
+        closing=None if actions is None else closing_replan(actions, starts, attributes.num_steps),
+    )
+
+
+def _statistics(values: NDArray[np.float64], quantities: Sequence[str]) -> list[EpisodeStatistic]:
+    """Statistics over episodes of values (episode, position, quantity), quantity by quantity, position by position."""
+    return [
+        geometric_mean_over_episodes(values[:, position, i])
+        if quantity == RATIO
+        else mean_over_episodes(values[:, position, i], SHARE)
+        for i, quantity in enumerate(quantities)
+        for position in range(values.shape[1])
+    ]
+
+
+def _course(
+    episodes: Sequence[_Episode],
+    outcome: str,
+    alignment: str,
+    quantities: Sequence[str],
+    settings: TimeSettings,
+    seed: int,
+) -> pl.DataFrame:
+    if alignment == EPISODE_TIME:
+        aligned = [on_episode_time(e.values, e.starts, e.num_steps, settings.num_bins) for e in episodes]
+        edges = np.linspace(0.0, 1.0, settings.num_bins + 1)
+        places = np.stack([edges[:-1], (edges[:-1] + edges[1:]) / 2, edges[1:]], axis=1)
+    else:
+        episodes = [episode for episode in episodes if episode.closing is not None]
+        aligned = [around_event(e.values, e.closing, settings.window) for e in episodes if e.closing is not None]
+        offsets = np.arange(-settings.window, settings.window + 1, dtype=np.float64)
+        places = np.stack([offsets, offsets, offsets], axis=1)
+    rows: list[tuple[object, ...]] = []
+    if episodes:
+        resamples = _resamples(episodes, seed)
+        statistics = _statistics(np.stack(aligned), quantities)
+        intervals = bootstrap_intervals(statistics, resamples)
+        known = np.array([episode.uniform for episode in episodes])
+        for number, (statistic, interval) in enumerate(zip(statistics, intervals, strict=True)):
+            quantity, position = quantities[number // len(places)], number % len(places)
+            # The baseline is known where no ratio is finite, too.
+            of = statistic.used if statistic.used.any() else np.isfinite(known)
+            uniform = mean_over_episodes(known[of]).value if quantity == RATIO else None
+            num_tasks = len(np.unique(resamples.task_of[statistic.used]))
+            rows.append(
+                (
+                    *(alignment, outcome, quantity, *(float(place) for place in places[position])),
+                    *(statistic.value, *_ends(interval), int(statistic.used.sum()), num_tasks, uniform),
+                )
+            )
+    text = dict.fromkeys(("alignment", "outcome", "quantity"), pl.String)
+    numbers = ("position_low", "position", "position_high", "value", "low", "high")
+    counts = dict.fromkeys(("num_episodes", "num_tasks"), pl.Int64)
+    schema = {**text, **dict.fromkeys(numbers, pl.Float64), **counts, "uniform": pl.Float64}
+    return pl.DataFrame(rows, schema=schema, orient="row")
+
+
+def _resamples(episodes: Sequence[_Episode], seed: int) -> Resamples:
+    tasks = sorted({episode.task for episode in episodes})
+    return resample_episodes([tasks.index(episode.task) for episode in episodes], seed=seed)
+
+
+def _closing_table(episodes: Sequence[_Episode], rows: pl.DataFrame) -> pl.DataFrame:
+    found = [
+        (*e.identity, e.closing, None if e.closing is None else float(e.starts[e.closing] / e.num_steps))
+        for e in episodes
+    ]
+    kinds = {key: rows.schema[key] for key in EPISODE_KEYS}
+    return pl.DataFrame(found, schema={**kinds, "closing_replan": pl.Int64, "closing_time": pl.Float64}, orient="row")
+
+
+def _change_table(episodes: Sequence[_Episode], quantities: Sequence[str], window: int, seed: int) -> pl.DataFrame:
+    schema = {
+        "quantity": pl.String,
+        "change": pl.Float64,
+        "low": pl.Float64,
+        "high": pl.Float64,
+        "num_episodes": pl.Int64,
+        "num_tasks": pl.Int64,
+    }
+    closers = [
+        (e, change_at_event(around_event(e.values, e.closing, window), window))
+        for e in episodes
+        if e.closing is not None
+    ]
+    if not closers:
+        return pl.DataFrame(schema=schema)
+    resamples = _resamples([episode for episode, _ in closers], seed)
+    changes = np.stack([change for _, change in closers])
+    statistics = [
+        geometric_mean_over_episodes(changes[:, i]) if quantity == RATIO else mean_over_episodes(changes[:, i])
+        for i, quantity in enumerate(quantities)
+    ]
+    rows = [
+        (
+            *(quantity, statistic.value, *_ends(interval)),
+            *(int(statistic.used.sum()), len(np.unique(resamples.task_of[statistic.used]))),
+        )
+        for quantity, statistic, interval in zip(
+            quantities, statistics, bootstrap_intervals(statistics, resamples), strict=True
+        )
+    ]
+    return pl.DataFrame(rows, schema=schema, orient="row")
+
+
+def _outcomes_table(episodes: Sequence[_Episode], quantities: Sequence[str], seed: int) -> pl.DataFrame:
+    """Success against failure on the episodes' means over replans: log2 of the ratio, and fractions."""
+    resamples = _resamples(episodes, seed)
+    solved = np.array([episode.success for episode in episodes])
+    rows = []
+    for i, quantity in enumerate(quantities):
+        means = np.array([_finite_mean(episode.values[:, i]) for episode in episodes])
+        values = means / np.log(2.0) if quantity == RATIO else means
+        name = "log2_ratio" if quantity == RATIO else f"{quantity}_fraction"
+        rows.append({"quantity": name, **contrast_row(contrast(values, solved, resamples), SUCCESS, FAILURE)})
+    texts = {"quantity": pl.String, "note": pl.String}
+    return pl.DataFrame(rows, schema_overrides=texts, infer_schema_length=None).with_columns(
+        pl.col(pl.Null).cast(pl.Float64)
+    )
+
+
+def _finite_mean(values: NDArray[np.float64]) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if finite.size else float("nan")
+
+
+def _ends(interval: Interval | None) -> tuple[float | None, float | None]:
+    return (None, None) if interval is None else (interval.low, interval.high)

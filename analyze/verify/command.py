@@ -1,0 +1,36 @@
+"""`vla-analyze verify`: read everything back and check it."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from vla_attention.schemas.command_line import OneSentenceParser
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of `vla-analyze verify STORE ...`."""
+    parser = OneSentenceParser(
+        prog="vla-analyze verify",
+        description="Read everything back and check counts, missing chunks, digests and row sums. Exit code 1 if anything is wrong.",
+    )
+    parser.add_argument("stores", nargs="+", type=Path, metavar="STORE", help="one or several NAME.zarr")
+    return parser
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Verify every store; 1 if anything is wrong."""
+    from vla_attention.analyze.show.progress import progress_bar
+    from vla_attention.schemas.stores.reader import open_store
+    from vla_attention.schemas.stores.verify import verify_store
+
+    faulty = False
+    for path in arguments.stores:
+        store = open_store(path)
+        with progress_bar(len(store.episodes), "episodes") as advance:
+            faults = verify_store(store, advance)
+        for fault in faults:
+            print(f"{path}: {fault.episode}: {fault.problem}")
+        print(f"{path}: {len(store.episodes)} episodes, {'all whole' if not faults else f'{len(faults)} faults'}.")
+        faulty = faulty or bool(faults)
+    return 1 if faulty else 0

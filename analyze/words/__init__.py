@@ -1,0 +1,1 @@
+"""`vla-analyze words`: which words of the instruction are read."""

@@ -1,0 +1,190 @@
+"""`vla-capture status`: what a store holds, what is missing, who writes and who wrote. Reads only."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from vla_attention.capture.environments.suites import SUITES
+from vla_attention.capture.jobs.claims import Holder, holders
+from vla_attention.capture.jobs.run_records import planned_tasks, read_records
+from vla_attention.capture.store.disk_estimate import format_bytes
+from vla_attention.capture.store.store_root import episode_folders, read_root
+from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
+from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
+from vla_attention.schemas.stores.store_format import EpisodeAttributes, StoreNotFound, parse_episode_name
+
+
+@dataclass(frozen=True)
+class EpisodeStatus:
+    """One committed episode. `success` is None when its attributes cannot be read. `by` is empty when no run left a note."""
+
+    task_id: int
+    episode: int
+    success: bool | None
+    bytes: int
+    at: str
+    by: str
+
+
+@dataclass(frozen=True)
+class TaskStatus:
+    """One task. `expected` is None when nobody said how many episodes are wanted; `missing` are indices of episodes."""
+
+    task_id: int
+    instruction: str
+    committed: int
+    expected: int | None
+    success: int
+    unreadable: int
+    bytes: int
+    last_at: str
+    last_by: str
+    missing: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class StoreStatus:
+    """A store. `writing`: episodes that are claimed now."""
+
+    store: str
+    suite: str
+    policy: str
+    tasks: tuple[TaskStatus, ...]
+    writing: tuple[Holder, ...]
+
+    @property
+    def complete(self) -> bool | None:
+        """Whether everything expected is there; None when that is not known of every task."""
+        if any(task.missing for task in self.tasks):
+            return False
+        return None if any(task.expected is None for task in self.tasks) or not self.tasks else True
+
+    def missing_lines(self) -> list[str]:
+        """A line per task with missing episodes."""
+        return [
+            f"task {task.task_id} lacks {len(task.missing)} of {task.expected} episodes: {listing(task.missing, 20)}"
+            for task in self.tasks
+            if task.missing
+        ]
+
+
+def store_status(path: Path, expected: int | None = None) -> StoreStatus:
+    """Look at a store. `expected`: episodes per task, instead of what the runs planned.
+
+    Raises:
+        StoreNotFound: nothing is at `path`.
+        StoreError: something else is.
+    """
+    if expected is not None and expected < 1:
+        raise BadArgument(f"Cannot use --expected {expected}; expected at least 1.")
+    if not path.exists():
+        nearby = sorted(str(found) for found in path.parent.glob("*.zarr")) if path.parent.is_dir() else []
+        raise StoreNotFound(
+            f"There is no store at {path}.{did_you_mean(str(path), nearby)} Stores in {path.parent}: {listing(nearby)}."
+        )
+    root = read_root(path)
+    records = read_records(path)
+    plan = planned_tasks(records)
+    writers = {commit.episode: (commit.at, record.worker) for record in records for commit in record.committed}
+    episodes: dict[int, list[EpisodeStatus]] = {}
+    instructions: dict[int, str] = {task.task_id: task.instruction for task in plan.values()}
+    for folder in sorted(episode_folders(path)):
+        task_id, index = parse_episode_name(folder.name)
+        at, worker = writers.get(folder.name, ("", None))
+        attributes = _attributes(folder)
+        if attributes is not None:
+            instructions[task_id] = attributes.instruction
+        episodes.setdefault(task_id, []).append(
+            EpisodeStatus(
+                task_id=task_id,
+                episode=index,
+                success=None if attributes is None else attributes.success,
+                bytes=sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()),
+                at=at or _time_of(folder),
+                by=worker.described() if worker else "",
+            )
+        )
+    ids = set(plan) | set(episodes)
+    if expected is not None and not plan:
+        ids |= set(range(next((suite.num_tasks for suite in SUITES if suite.name == root.protocol.suite), 0)))
+    tasks = []
+    for task_id in sorted(ids):
+        found = episodes.get(task_id, [])
+        wanted = expected if expected is not None else plan[task_id].episodes if task_id in plan else None
+        last = max(found, key=lambda episode: episode.at, default=None)
+        tasks.append(
+            TaskStatus(
+                task_id=task_id,
+                instruction=instructions.get(task_id, ""),
+                committed=len(found),
+                expected=wanted,
+                success=sum(episode.success is True for episode in found),
+                unreadable=sum(episode.success is None for episode in found),
+                bytes=sum(episode.bytes for episode in found),
+                last_at=last.at if last else "",
+                last_by=last.by if last else "",
+                missing=tuple(sorted(set(range(wanted or 0)) - {episode.episode for episode in found})),
+            )
+        )
+    return StoreStatus(str(path), root.protocol.suite, root.policy.name, tuple(tasks), tuple(holders(path)))
+
+
+def run_status(stores: Sequence[Path], expected: int | None, as_json: bool, check: bool) -> int:
+    """Print the status of stores; the exit code is 1 with `check` when an expected episode is missing, else 0."""
+    found = [store_status(store, expected) for store in stores]
+    if as_json:
+        print(json.dumps([to_json(status) | {"complete": status.complete} for status in found], indent=1))
+    else:
+        print("\n\n".join(_text(status) for status in found))
+    return 1 if check and any(status.complete is False for status in found) else 0
+
+
+def _attributes(folder: Path) -> EpisodeAttributes | None:
+    try:
+        return from_json(EpisodeAttributes, json.loads((folder / "zarr.json").read_text())["attributes"])
+    except (OSError, ValueError, KeyError, TypeError, MalformedDocument):
+        return None
+
+
+def _time_of(folder: Path) -> str:
+    return datetime.fromtimestamp(folder.stat().st_mtime, UTC).isoformat(timespec="seconds")
+
+
+def _cells(task: TaskStatus) -> tuple[str, ...]:
+    return (
+        str(task.task_id),
+        f"{task.committed} of {'?' if task.expected is None else task.expected}",
+        str(task.success) if task.committed else "-",
+        format_bytes(task.bytes) if task.committed else "-",
+        task.last_at.removesuffix("+00:00").replace("T", " ") or "-",
+        task.last_by or ("unknown" if task.committed else "-"),
+        task.instruction,
+    )
+
+
+def _text(status: StoreStatus) -> str:
+    tasks = status.tasks
+    committed = sum(task.committed for task in tasks)
+    lines = [
+        f"{status.store}: {status.suite}, policy {status.policy}, {committed} episodes of {sum(t.committed > 0 for t in tasks)} "
+        f"tasks, {format_bytes(sum(task.bytes for task in tasks))}"
+    ]
+    rows = [("task", "episodes", "solved", "size", "last written (UTC)", "by", "instruction"), *map(_cells, tasks)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines += ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    unreadable = [task for task in tasks if task.unreadable]
+    lines += [
+        f"task {task.task_id}: the attributes of {task.unreadable} episodes cannot be read; see vla-analyze verify."
+        for task in unreadable
+    ]
+    lines += [f"missing: {line}" for line in status.missing_lines()]
+    if status.complete is None:
+        lines.append("How many episodes are expected is not known here; say it with --expected N.")
+    elif status.complete:
+        lines.append("complete: everything that was planned is there.")
+    lines += [f"being written: {holder.described()}" for holder in status.writing]
+    return "\n".join(lines)

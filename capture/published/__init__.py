@@ -1,0 +1,1 @@
+"""The published scripts' command lines and the variables of their batch scripts."""

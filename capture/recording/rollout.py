@@ -1,0 +1,178 @@
+"""Running a policy in an environment, episode by episode, and handing every replan to the store."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.capture.environments.base import Environment, Observation, Task
+from vla_attention.capture.environments.coverage import patch_coverage
+from vla_attention.capture.policies.base import Policy
+from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan
+from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
+from vla_attention.capture.store.store_writer import RunStore
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.layout import SiteLayout
+from vla_attention.schemas.segments import segment_members, segments_of
+from vla_attention.schemas.stores.store_format import Protocol, Recording
+
+#: Called after each replan's actions with (environment steps done, replans done).
+StepReport = Callable[[int, int], None]
+#: Called before every environment step and policy call; raises to drop the episode.
+StopCheck = Callable[[], None]
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """How an episode ended and where it was stored."""
+
+    task_id: int
+    episode_index: int
+    success: bool
+    num_steps: int
+    num_replans: int
+    folder: Path
+
+
+def max_replans(protocol: Protocol) -> int:
+    """Largest number of policy calls that one episode can have."""
+    return math.ceil(protocol.max_steps / protocol.replan_steps)
+
+
+def check_protocol(protocol: Protocol, policy: Policy) -> None:
+    """Raise `BadArgument` when the policy cannot follow the protocol."""
+    if protocol.max_steps < 1:
+        raise BadArgument(f"Cannot use --max-steps {protocol.max_steps}; expected at least 1.")
+    if not 1 <= protocol.replan_steps <= policy.action_horizon:
+        raise BadArgument(
+            f"Cannot use --replan-steps {protocol.replan_steps}: the policy gives {policy.action_horizon} actions a call; "
+            f"expected 1 to {policy.action_horizon}."
+        )
+
+
+def run_episode(
+    environment: Environment,
+    policy: Policy,
+    store: RunStore,
+    task: Task,
+    episode_index: int,
+    provenance: dict[str, str],
+    report: StepReport | None = None,
+    check: StopCheck = lambda: None,
+) -> EpisodeResult:
+    """Run one episode from the stored initial state of the same index, and commit it.
+
+    The protocol of the published evaluations: waiting steps, then a policy call every `replan_steps` executed actions until
+    the task is solved or `max_steps` actions have been executed. What `check` raises drops the episode without a trace.
+    """
+    protocol = store.attributes.protocol
+    environment.reset(episode_index, protocol.seed)
+    start = EpisodeStart(
+        task_id=task.task_id,
+        task_name=task.name,
+        instruction=task.instruction,
+        episode_index=episode_index,
+        initial_state_index=episode_index,
+        initial_state_digest=environment.initial_state_digest,
+        objects=tuple(environment.objects),
+        provenance=provenance,
+    )
+    denoise_times = policy.denoise_times()[list(store.attributes.recording.denoise_steps)]
+    with store.episode(start, denoise_times, max_replans(protocol)) as writer:
+        observation = _wait(environment, protocol.wait_steps, check)
+        success, step, replans = False, 0, 0
+        while step < protocol.max_steps and not success:
+            check()
+            actions = _replan(environment, policy, store, writer, task, episode_index, observation, step)
+            replans += 1
+            chunk = min(protocol.replan_steps, protocol.max_steps - step)
+            for i in range(chunk):
+                # Pictures are drawn only where the policy will look: before the next replan.
+                check()
+                look = i == chunk - 1 and step + 1 < protocol.max_steps
+                result = environment.step(actions[i], observe=look)
+                step += 1
+                success = result.success
+                if success:
+                    break
+                if result.observation is not None:
+                    observation = result.observation
+            if report is not None:
+                report(step, replans)
+        folder = writer.commit(success, step)
+    return EpisodeResult(task.task_id, episode_index, success, step, replans, folder)
+
+
+def make_recorders(
+    recording: Recording,
+    sites: Sequence[SiteLayout],
+    key_role: Mapping[str, NDArray[np.uint8]],
+    pools: NDArray[np.float64] | None = None,
+) -> dict[str, AttentionRecorder]:
+    """Fresh recorders for one replan, one per site; contributions are those of the replan's own segments."""
+    recorders: dict[str, AttentionRecorder] = {}
+    for site in sites:
+        plan = RecordingPlan(recording.layers, recording.denoise_steps, recording.heads, recording.queries, site.name)
+        roles = key_role[site.name]
+        parts = segment_members(site, roles[None], segments_of(site, roles))[0] if recording.contributions else None
+        recorders[site.name] = AttentionRecorder(plan, site.num_keys, parts, pools)
+    return recorders
+
+
+def _wait(environment: Environment, steps: int, check: StopCheck) -> Observation:
+    observation = None
+    for i in range(steps):
+        check()
+        observation = environment.step(environment.wait_action, observe=i == steps - 1).observation
+    if observation is None:
+        raise ValueError("an episode needs at least one waiting step: the first picture is the one after it")
+    return observation
+
+
+def _replan(
+    environment: Environment,
+    policy: Policy,
+    store: RunStore,
+    writer: EpisodeWriter,
+    task: Task,
+    episode_index: int,
+    observation: Observation,
+    step: int,
+) -> NDArray[np.float64]:
+    protocol, recording = store.attributes.protocol, store.attributes.recording
+    policy_input = policy.prepare(observation, task.instruction)
+    seed = policy.replan_noise_seed(protocol.seed, task.task_id, episode_index, len(writer.records))
+    pools = policy.query_pools() if recording.queries == "steps" else None
+    recorders = make_recorders(recording, policy.sites, policy_input.key_role, pools)
+    actions = policy.act(policy_input, seed, recorders)
+    coverage = {
+        camera.slot: patch_coverage(
+            environment.segmentation(camera.environment_camera),
+            len(environment.objects),
+            camera.grid.rows,
+            camera.grid.columns,
+            flip_rows=camera.flip_rows,
+            flip_columns=camera.flip_columns,
+            visible=camera.visible,
+        )
+        for camera in policy.cameras
+    }
+    writer.append(
+        ReplanRecord(
+            env_step=protocol.wait_steps + step,
+            noise_seed=seed,
+            rows={site: recorder.finish() for site, recorder in recorders.items()},
+            key_role=policy_input.key_role,
+            prompt=policy_input.prompt,
+            state=policy_input.state,
+            actions=actions,
+            frames=policy_input.frames if recording.frames else {},
+            coverage=coverage,
+        )
+    )
+    return actions

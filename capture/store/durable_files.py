@@ -1,0 +1,109 @@
+"""Files that survive a crash: partial folders beside a store, flushing to disk, and failures in one sentence."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import shutil
+import socket
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.stores.store_format import PARTIAL_SUFFIX, StoreError
+
+
+class StoreWriteFailed(StoreError, OSError):
+    """The operating system refused a write: the disk is full, a permission is missing, a device failed."""
+
+
+def partial_folder(store: Path) -> Path:
+    """Where things are while they are written: beside the store, on the same file system, never in it."""
+    return store.with_name(store.name + PARTIAL_SUFFIX)
+
+
+def process_tag() -> str:
+    """A name that no other process uses, and from which this machine can tell whether its process still lives."""
+    return f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
+
+
+def remove_dead_partials(store: Path) -> None:
+    """Remove what killed processes of this machine left beside the store. Other machines' processes cannot be judged from here."""
+    partial = partial_folder(store)
+    for folder in partial.glob("*"):
+        host, _, process = folder.name.partition("-")[2].rpartition("-")[0].rpartition("-")
+        if host == socket.gethostname() and process.isdigit() and not _is_running(int(process)):
+            shutil.rmtree(folder, ignore_errors=True)
+    remove_if_empty(partial)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)  # signal 0 asks, and does nothing
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+@contextmanager
+def naming_the_failure(what: str) -> Iterator[None]:
+    """Turn an error of the operating system into one sentence that says what was being written."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, UserError):
+            raise
+        raise StoreWriteFailed(
+            f"Cannot write {what}: {error.strerror or error}. Nothing of this episode was kept, and the episodes before it are "
+            "unharmed; remove the cause and go on with --resume."
+        ) from error
+
+
+def make_partial(folder: Path) -> None:
+    """Create a folder for what is being written; another process may be removing the (empty) parent at this moment."""
+    while True:
+        folder.parent.mkdir(exist_ok=True)
+        try:
+            folder.mkdir()
+        except FileNotFoundError:
+            continue
+        return
+
+
+def remove_if_empty(folder: Path) -> None:
+    """Remove a folder unless somebody uses it."""
+    try:
+        folder.rmdir()
+    except OSError:
+        return  # another writer's episode is in it, or it is gone
+
+
+def flush_folder(folder: Path) -> None:
+    """Force every file and directory below `folder` to disk: a rename must not become durable before its content."""
+    for parent, _, files in os.walk(folder):
+        for file in files:
+            flush_entry(Path(parent) / file)
+        flush_entry(Path(parent))
+
+
+def flush_entry(path: Path) -> None:
+    """Force one file or directory to disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        # Some network file systems cannot flush directories; they have nothing to offer instead.
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
+    finally:
+        os.close(handle)
+
+
+def file_digest(file: Path) -> str:
+    """sha256 (hex) of a file's bytes."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()

@@ -1,0 +1,219 @@
+"""Writing one episode: it is collected in a folder beside the store, read back, sealed, and renamed into place when whole."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from vla_attention.capture.recording.attention import RecordedRows
+from vla_attention.capture.store.arrays import write_whole
+from vla_attention.capture.store.durable_files import file_digest, flush_entry, flush_folder, naming_the_failure
+from vla_attention.capture.store.site_writer import SiteWriter
+from vla_attention.capture.store.store_root import check_same_run, read_root
+from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.layout import Prompt
+from vla_attention.schemas.stores.digest import ArrayDigest
+from vla_attention.schemas.stores.store_format import (
+    EPISODES_GROUP,
+    SEAL_GROUP,
+    ArrayRecord,
+    CorruptEpisode,
+    EpisodeAttributes,
+    EpisodeSeal,
+    RootAttributes,
+    StoreExists,
+    episode_name,
+)
+
+
+@dataclass(frozen=True)
+class ReplanRecord:
+    """Everything stored about one replan.
+
+    `rows` and `key_role` are per site. `state` is (state_dim,), `actions` (horizon, action_dim) as given to the environment,
+    `frames` per policy camera (row, column, channel) uint8, `coverage` per policy camera (patch, object) float32.
+    """
+
+    env_step: int
+    noise_seed: int
+    rows: Mapping[str, RecordedRows]
+    key_role: Mapping[str, NDArray[np.uint8]]
+    prompt: Prompt
+    state: NDArray[np.float64]
+    actions: NDArray[np.float64]
+    frames: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    coverage: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class EpisodeStart:
+    """What is known of an episode before its first replan."""
+
+    task_id: int
+    task_name: str
+    instruction: str
+    episode_index: int
+    initial_state_index: int
+    initial_state_digest: str
+    objects: tuple[SceneObject, ...]
+    provenance: Mapping[str, str]
+
+
+class EpisodeWriter:
+    """Collects replans; keeps at most one block of rows in memory and writes whole shards only."""
+
+    def __init__(
+        self,
+        store: Path,
+        run: RootAttributes,
+        folder: Path,
+        start: EpisodeStart,
+        denoise_times: NDArray[np.float64],
+        max_replans: int,
+    ) -> None:
+        self.store = store
+        self.run = run
+        self.folder = folder
+        self.start = start
+        self.denoise_times = denoise_times
+        self.name = episode_name(start.task_id, start.episode_index)
+        self.what = f"episode {self.name} of {store}"
+        self.group = zarr.create_group(folder, zarr_format=3)
+        self.digests: dict[str, ArrayRecord] = {}
+        self.sites = {
+            site.name: SiteWriter(self.group, self.write, site, run.recording, max_replans) for site in run.sites
+        }
+        self.prompts: dict[Prompt, int] = {}
+        self.records: list[ReplanRecord] = []
+
+    def append(self, record: ReplanRecord) -> None:
+        """Add the next replan.
+
+        Raises:
+            ValueError: the record does not fit the run or the replans before it, or holds numbers that are not finite.
+            StoreWriteFailed: the disk is full, or refuses in another way.
+        """
+        self._check(record)
+        with naming_the_failure(self.what):
+            for name, site in self.sites.items():
+                site.append(record.rows[name], record.key_role[name])
+        self.prompts.setdefault(record.prompt, len(self.prompts))
+        # Rows are on their way to disk; the rest is small and waits for the end.
+        self.records.append(replace(record, rows={}))
+
+    def _check(self, record: ReplanRecord) -> None:
+        first = self.records[0] if self.records else record
+        for what in ("frames", "coverage"):
+            given, expected = list(getattr(record, what)), list(getattr(first, what))
+            if given != expected:
+                raise ValueError(f"a replan has {what} of the cameras {given}, the first one of {expected}")
+        numbers: dict[str, NDArray[Any]] = {"state": record.state, "actions": record.actions, **record.coverage}
+        for what, values in numbers.items():
+            if not np.isfinite(values).all():
+                raise ValueError(f"the {what} of a replan are not all finite numbers")
+
+    def commit(self, success: bool, num_steps: int) -> Path:
+        """Finish, verify and publish the episode; returns its folder in the store.
+
+        Raises:
+            StoreExists: another writer has published the same episode meanwhile.
+            RunMismatch: the store has been replaced by one of another run meanwhile.
+            StoreWriteFailed: the disk is full, or refuses in another way.
+        """
+        with naming_the_failure(self.what):
+            self._check_store()
+            for name, site in self.sites.items():
+                self.digests[f"{name}/rows"] = site.finish()
+            self._write_side_arrays()
+            self.group.update_attributes(to_json(self._attributes(success, num_steps)))
+            self._write_seal()
+            self._read_back()
+            flush_folder(self.folder)
+            return self._publish()
+
+    def _attributes(self, success: bool, num_steps: int) -> EpisodeAttributes:
+        return EpisodeAttributes(
+            task_id=self.start.task_id,
+            task_name=self.start.task_name,
+            instruction=self.start.instruction,
+            episode_index=self.start.episode_index,
+            initial_state_index=self.start.initial_state_index,
+            initial_state_digest=self.start.initial_state_digest,
+            success=success,
+            num_steps=num_steps,
+            num_replans=len(self.records),
+            prompts=tuple(self.prompts),
+            segments={name: site.segments for name, site in self.sites.items()},
+            objects=self.start.objects,
+            provenance=dict(self.start.provenance),
+            arrays=dict(sorted(self.digests.items())),
+        )
+
+    def _check_store(self) -> None:
+        # Somebody may have overwritten the store with another run while this episode was rolled out.
+        check_same_run(self.store, read_root(self.store), self.run)
+
+    def _publish(self) -> Path:
+        self._check_store()
+        target = self.store / EPISODES_GROUP / self.name
+        try:
+            self.folder.rename(target)
+        except OSError:
+            if not target.exists():
+                raise
+            raise StoreExists(f"Episode {target.name} of {self.store} was committed by another process.") from None
+        flush_entry(target.parent)
+        return target
+
+    def write(self, name: str, values: NDArray[np.generic], axes: tuple[str, ...]) -> None:
+        """Write one complete array of the episode and note its digest."""
+        write_whole(self.group, name, values, axes)
+        digest = ArrayDigest()
+        digest.update(values)
+        self.digests[name] = ArrayRecord(values.shape, digest.hexdigest())
+
+    def _write_side_arrays(self) -> None:
+        records = self.records
+        self.write("env_step", np.array([record.env_step for record in records], dtype=np.int32), ("replan",))
+        self.write("noise_seed", np.array([record.noise_seed for record in records], dtype=np.int64), ("replan",))
+        index = np.array([self.prompts[record.prompt] for record in records], dtype=np.int32)
+        self.write("prompt_index", index, ("replan",))
+        self.write("denoise_time", np.asarray(self.denoise_times, dtype=np.float32), ("denoise",))
+        self.write("state", np.stack([record.state for record in records]), ("replan", "state_dim"))
+        self.write("actions", np.stack([record.actions for record in records]), ("replan", "horizon", "action_dim"))
+        for camera in records[0].frames:
+            frames = np.stack([record.frames[camera] for record in records])
+            self.write(f"frames/{camera}", frames, ("replan", "row", "column", "channel"))
+        for camera in records[0].coverage:
+            coverage = np.stack([record.coverage[camera] for record in records])
+            self.write(f"objects/{camera}", coverage, ("replan", "patch", "object"))
+
+    def _write_seal(self) -> None:
+        """Note the digest of every piece of metadata: chunks have checksums, and JSON has none of its own."""
+        files = sorted(self.folder.rglob("zarr.json"))
+        digests = {file.relative_to(self.folder).as_posix(): file_digest(file) for file in files}
+        seal = EpisodeSeal(run=file_digest(self.store / "zarr.json"), files=digests)
+        self.group.create_group(SEAL_GROUP, attributes=to_json(seal))
+
+    def _read_back(self) -> None:
+        """Read every array from disk and hold it against what was written, block by block."""
+        written = zarr.open_group(self.folder, mode="r", use_consolidated=False)
+        for name, record in self.digests.items():
+            array = written[name]
+            assert isinstance(array, zarr.Array)
+            digest = ArrayDigest()
+            step = (array.shards or array.chunks)[0] if array.ndim else 1
+            for first in range(0, array.shape[0], max(1, step)):
+                try:
+                    digest.update(np.asarray(array[first : first + step]))
+                except ValueError as error:
+                    raise CorruptEpisode(f"Array {name} cannot be read back from {self.folder}: {error}.") from None
+            if tuple(array.shape) != record.shape or digest.hexdigest() != record.sha256:
+                raise CorruptEpisode(f"Array {name} read back from {self.folder} differs from what was written.")

@@ -1,0 +1,130 @@
+"""Rows, row sums, atoms and contributions of one site of one episode, written in whole shards as they come."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from vla_attention.capture.recording.attention import RecordedRows
+from vla_attention.capture.store.arrays import create_blocked, replans_per_block
+from vla_attention.schemas.layout import SiteLayout
+from vla_attention.schemas.precision import round_mantissa
+from vla_attention.schemas.segments import Segment, merge_segments, segment_masses, segment_members, segments_of
+from vla_attention.schemas.stores.digest import ArrayDigest
+from vla_attention.schemas.stores.store_format import ATOM_AXES, CONTRIBUTION_AXES, ROW_AXES, ArrayRecord, Recording
+
+#: Writes one complete array of the episode: name, values, axes.
+WriteArray = Callable[[str, NDArray[np.generic], tuple[str, ...]], None]
+
+
+class SiteWriter:
+    """Collects one site's replans; keeps at most one block of rows in memory."""
+
+    def __init__(
+        self, group: zarr.Group, write: WriteArray, layout: SiteLayout, recording: Recording, max_replans: int
+    ) -> None:
+        self.group = group
+        self.write = write
+        self.layout = layout
+        self.recording = recording
+        self.bits = recording.mantissa_bits
+        self.shape = (len(recording.layers), len(recording.denoise_steps), len(recording.heads), recording.num_queries)
+        self.bytes_per_replan = 4 * self.shape[2] * self.shape[3] * layout.num_keys
+        self.block = replans_per_block(self.bytes_per_replan, max_replans)
+        self.rows_array: zarr.Array | None = None
+        self.rows_digest = ArrayDigest()
+        self.pending: list[NDArray[np.float32]] = []
+        self.num_written = 0
+        self.row_sums: list[NDArray[np.float32]] = []
+        self.roles: list[NDArray[np.uint8]] = []
+        self.masses: list[tuple[tuple[Segment, ...], NDArray[np.float32]]] = []
+        self.contributions: list[NDArray[np.float32]] = []
+        self.segments: tuple[Segment, ...] = ()
+        group.create_group(layout.name)
+
+    def append(self, recorded: RecordedRows, key_role: NDArray[np.uint8]) -> None:
+        """Add the next replan's rows (layer, denoise, head, query, key) and roles (key,)."""
+        expected = (*self.shape, self.layout.num_keys)
+        shapes = (recorded.rows.shape, recorded.row_sum.shape, key_role.shape)
+        if shapes != (expected, self.shape, expected[-1:]):
+            raise ValueError(
+                f"site '{self.layout.name}' recorded rows, row sums and key roles of shapes {shapes}, expected {expected} and so on"
+            )
+        if not np.isfinite(recorded.rows).all() or (recorded.rows < 0).any():
+            raise ValueError(
+                f"site '{self.layout.name}' recorded rows that are not probabilities: negative or not finite"
+            )
+        segments = segments_of(self.layout, key_role)
+        members = segment_members(self.layout, key_role[None], segments)[0]
+        self._take_contribution(recorded.contribution, len(segments))
+        # Atoms and sums come from the rows as computed, before rounding: what storage takes away stays known.
+        self.masses.append((segments, segment_masses(recorded.rows, members)))
+        self.row_sums.append(recorded.row_sum)
+        self.roles.append(key_role)
+        self.pending.append(round_mantissa(recorded.rows, self.bits))
+        if len(self.pending) == self.block:
+            self._flush()
+
+    def _take_contribution(self, gram: NDArray[np.float32] | None, num_segments: int) -> None:
+        wanted = self.recording.contributions
+        expected = (*self.shape[:2], num_segments + 1, num_segments + 1) if wanted else None
+        if (None if gram is None else gram.shape) != expected:
+            raise ValueError(
+                f"site '{self.layout.name}' gave contributions {None if gram is None else gram.shape}, expected {expected}"
+            )
+        if gram is not None:
+            if not np.isfinite(gram).all():
+                raise ValueError(f"site '{self.layout.name}' gave contributions that are not all finite")
+            self.contributions.append(gram)
+
+    def _flush(self) -> None:
+        rows = np.stack(self.pending)
+        self.pending.clear()
+        total = self.num_written + len(rows)
+        if self.rows_array is None:
+            block = replans_per_block(self.bytes_per_replan, min(len(rows), self.block))
+            shape = (total, *rows.shape[1:])
+            self.rows_array = create_blocked(self.group, f"{self.layout.name}/rows", shape, block, ROW_AXES)
+        else:
+            self.rows_array.resize((total, *rows.shape[1:]))
+        self.rows_array[self.num_written : total] = rows
+        self.rows_digest.update(rows)
+        self.num_written = total
+
+    def finish(self) -> ArrayRecord:
+        """Write what is left and everything that waited for the end; returns what is to be known of the rows."""
+        if self.pending:
+            self._flush()
+        if self.rows_array is None:
+            raise ValueError("an episode without replans cannot be committed")
+        name = self.layout.name
+        self.segments = merge_segments(self.layout, (segments for segments, _ in self.masses))
+        column = {segment: i for i, segment in enumerate(self.segments)}
+        atoms = np.zeros((self.num_written, *self.shape, len(self.segments)), dtype=np.float32)
+        for replan, (segments, masses) in enumerate(self.masses):
+            atoms[replan][..., [column[segment] for segment in segments]] = masses
+        self.write(f"{name}/atoms", atoms, ATOM_AXES)
+        if self.contributions:
+            self._write_contributions(column)
+        self.write(f"{name}/row_sum", np.stack(self.row_sums), ROW_AXES[:-1])
+        self.write(f"{name}/key_role", np.stack(self.roles), ("replan", "key"))
+        recording = self.recording
+        for axis, numbers in (
+            ("layer", recording.layers),
+            ("denoise", recording.denoise_steps),
+            ("head", recording.heads),
+        ):
+            self.write(f"{name}/{axis}", np.array(numbers, dtype=np.int32), (axis,))
+        return ArrayRecord(tuple(self.rows_array.shape), self.rows_digest.hexdigest())
+
+    def _write_contributions(self, column: dict[Segment, int]) -> None:
+        size = len(column) + 1
+        grams = np.zeros((self.num_written, *self.shape[:2], size, size), dtype=np.float32)
+        for replan, ((segments, _), gram) in enumerate(zip(self.masses, self.contributions, strict=True)):
+            # A segment that a replan does not have contributes nothing there; the update is the last part.
+            at = [*(column[segment] for segment in segments), size - 1]
+            grams[replan][..., np.ix_(at, at)[0], np.ix_(at, at)[1]] = gram
+        self.write(f"{self.layout.name}/contribution", grams, CONTRIBUTION_AXES)

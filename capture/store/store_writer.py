@@ -1,0 +1,111 @@
+"""A store opened for adding episodes.
+
+An episode is written into a folder beside the store, read back, flushed to disk and then renamed into place. Whatever
+kills the process in between leaves the store as it was.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.capture.store.durable_files import (
+    make_partial,
+    naming_the_failure,
+    partial_folder,
+    process_tag,
+    remove_dead_partials,
+    remove_if_empty,
+)
+from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter
+from vla_attention.capture.store.store_root import check_same_run, create_root, delete_store, episode_folders, read_root
+from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.stores.store_format import (
+    EPISODES_GROUP,
+    STORE_SUFFIX,
+    RootAttributes,
+    StoreExists,
+    episode_name,
+    parse_episode_name,
+)
+
+WriteMode = Literal["new", "resume", "overwrite"]
+
+
+class RunStore:
+    """A store opened for adding episodes. Any number of processes may hold one; each episode has one writer."""
+
+    def __init__(self, path: Path, attributes: RootAttributes) -> None:
+        self.path = path
+        self.attributes = attributes
+
+    def committed(self) -> set[tuple[int, int]]:
+        """(task id, episode index) of every complete episode."""
+        return {parse_episode_name(folder.name) for folder in episode_folders(self.path)}
+
+    def has(self, task_id: int, episode_index: int) -> bool:
+        """Whether an episode is complete; asks the file system, as other processes may have added it."""
+        return (self.path / EPISODES_GROUP / episode_name(task_id, episode_index)).is_dir()
+
+    @contextmanager
+    def episode(
+        self, start: EpisodeStart, denoise_times: NDArray[np.float64], max_replans: int
+    ) -> Iterator[EpisodeWriter]:
+        """Write one episode; leaving the block without `commit` drops it."""
+        name = episode_name(start.task_id, start.episode_index)
+        folder = partial_folder(self.path) / f"{name}-{process_tag()}"
+        try:
+            with naming_the_failure(f"episode {name} of {self.path}"):
+                make_partial(folder)
+                writer = EpisodeWriter(self.path, self.attributes, folder, start, denoise_times, max_replans)
+            yield writer
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+            remove_if_empty(folder.parent)
+
+
+def open_run(path: Path, attributes: RootAttributes, mode: WriteMode) -> RunStore:
+    """Create a store, continue one, or replace one.
+
+    Raises:
+        StoreExists: something is at `path` and the mode is `new`.
+        RunMismatch: the mode is `resume` and the existing run differs; the first differing field is named.
+    """
+    if path.suffix != STORE_SUFFIX:
+        raise BadArgument(f"Cannot write a store at {path}: expected a name that ends with '{STORE_SUFFIX}'.")
+    # Episodes are written beside the store itself: beside a link to it may be another file system.
+    path = path.resolve() if path.is_symlink() else path
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists():
+            if mode == "new":
+                refuse_existing(path)
+            existing = read_root(path)
+            if mode == "overwrite":
+                delete_store(path)
+                existing = create_root(path, attributes)
+        else:
+            existing = create_root(path, attributes)
+        check_same_run(path, existing, attributes)
+        remove_dead_partials(path)
+    except OSError as error:
+        if isinstance(error, UserError):
+            raise
+        raise BadArgument(f"Cannot write a store at {path}: {error.strerror or error}; give another --store.") from None
+    return RunStore(path, existing)
+
+
+def refuse_existing(path: Path) -> NoReturn:
+    """Raise `StoreExists` for a store that is in the way (or `StoreError` when what is there is no store)."""
+    read_root(path)
+    count = len(episode_folders(path))
+    raise StoreExists(
+        f"Store {path} exists already and holds {count} episodes; add --resume to continue it, "
+        "--overwrite to delete it and begin again, or give another --store."
+    )

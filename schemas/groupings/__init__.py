@@ -1,0 +1,1 @@
+"""The grouping language: selectors, groupings, the built-in ones, and the weights they give every key."""

@@ -1,0 +1,157 @@
+"""The groupings that come with the tool. Each is a function of what the stores hold, because cameras and objects differ."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from vla_attention.schemas.errors import did_you_mean, listing
+from vla_attention.schemas.groupings.grouping import (
+    Grouping,
+    GroupingError,
+    GroupingNotFound,
+    Ratio,
+    read_grouping_file,
+)
+from vla_attention.schemas.groupings.resolve import NO_COVERAGE, NO_WORDS
+from vla_attention.schemas.groupings.vocabulary import Vocabulary
+
+_TEXT = "role:bos | role:template | role:instruction | role:text"
+
+
+def _others(vocabulary: Vocabulary) -> dict[str, tuple[str, ...]]:
+    """Groups that stand beside the visual and the linguistic ones so that the masses of a grouping sum to the row sum."""
+    # Cosmos's padded text: attended to, and without effect.
+    null = {"null": ("role:null",)} if "null" in vocabulary.roles else {}
+    return {
+        "state": ("role:state | role:proprio",),
+        "action": ("role:action",),
+        **null,
+        "padding": ("role:padding",),
+        "masked": ("role:masked_image",),
+        "other": ("*",),
+    }
+
+
+_TEXT_ROLES = {"bos", "template", "instruction", "text"}
+
+
+def _over_linguistic(vocabulary: Vocabulary, *numerator: str) -> Ratio | None:
+    """The ratio to the linguistic group, where a site has both kinds of keys: Cosmos's self-attention has no text."""
+    both = "image" in vocabulary.roles and _TEXT_ROLES & set(vocabulary.roles)
+    return Ratio(numerator, ("linguistic",)) if numerator and both else None
+
+
+def default(vocabulary: Vocabulary) -> Grouping:
+    """Visual: every valid image key; linguistic: every valid text key that is not a state digit."""
+    others = _others(vocabulary)
+    return Grouping(
+        name="default",
+        groups={"visual": ("role:image",), "linguistic": (_TEXT,), **others},
+        ratio=_over_linguistic(vocabulary, "visual"),
+        allow_empty=("visual", "linguistic", *others),
+        description="visual = every valid image key; linguistic = every valid text key that is not a state digit",
+    )
+
+
+def instruction(vocabulary: Vocabulary) -> Grouping:
+    """Linguistic is the words of the instruction only; bos and template text are a group of their own."""
+    if "text" in vocabulary.roles and "instruction" not in vocabulary.roles:
+        raise GroupingError(f"Grouping 'instruction': {NO_WORDS}.")
+    others = _others(vocabulary)
+    return Grouping(
+        name="instruction",
+        groups={
+            "visual": ("role:image",),
+            "linguistic": ("role:instruction",),
+            "template": ("role:bos | role:template | role:text",),
+            **others,
+        },
+        ratio=_over_linguistic(vocabulary, "visual"),
+        allow_empty=("visual", "linguistic", "template", *others),
+        description="visual = every valid image key; linguistic = the words of the instruction only",
+    )
+
+
+def cameras(vocabulary: Vocabulary) -> Grouping:
+    """One group per camera that the policy really sees."""
+    others = _others(vocabulary)
+    views = {camera: (f"camera:{camera} & role:image",) for camera in vocabulary.cameras}
+    return Grouping(
+        name="cameras",
+        groups={**views, "linguistic": (_TEXT,), **others},
+        ratio=_over_linguistic(vocabulary, *views),
+        allow_empty=(*views, "linguistic", *others),
+        description="one group per camera; linguistic as in 'default'",
+    )
+
+
+def objects(vocabulary: Vocabulary) -> Grouping:
+    """One group per object of the scene, by the area of each patch that it covers."""
+    others = _others(vocabulary)
+    if not vocabulary.objects:
+        raise GroupingError(f"Grouping 'objects': {NO_COVERAGE}.")
+    things = {name: (f"object:{name}",) for name in vocabulary.objects}
+    return Grouping(
+        name="objects",
+        groups={**things, "linguistic": (_TEXT,), **others},
+        ratio=_over_linguistic(vocabulary, *things),
+        allow_empty=(*things, "linguistic", *others),
+        description="one group per scene object, weighted by the area of each patch that it covers; linguistic as in 'default'",
+    )
+
+
+def reference(vocabulary: Vocabulary) -> Grouping:
+    """The published scripts' arithmetic on our rows, to compare with old numbers; its labels do not say what its keys are.
+
+    pi: "visual" is the first camera, "linguistic" as many keys after it as the prompt has slots (in truth the next camera's
+    patches), "action" all the rest. Cosmos: frame `curr_last` over frame `frame0`, a blank picture. The scripts' query rows
+    differ too: theirs is one token of the prefix pass for pi, and for Cosmos a sum over the queries where ours is their mean.
+    """
+    spans = vocabulary.layout.spans if vocabulary.layout is not None else ()
+    if any(span.kind == "latent" for span in spans):
+        groups = {"visual": ("frame:curr_last",), "linguistic": ("frame:frame0",)}
+        return Grouping(
+            name="reference",
+            groups=groups,
+            ratio=Ratio(("visual",), ("linguistic",)),
+            description="the published Cosmos scripts' frames: 'linguistic' is a blank picture, and holds no language",
+            proxy=True,
+        )
+    images = [span.num_keys for span in spans if span.kind == "image"]
+    texts = [span.num_keys for span in spans if span.kind == "text"]
+    if not images or not texts:
+        raise GroupingError(
+            "The grouping 'reference' is defined for the sites 'joint' (pi) and 'self' (Cosmos) only; choose with --site."
+        )
+    first, last = images[0], images[0] + texts[0] - 1
+    return Grouping(
+        name="reference",
+        groups={"visual": (f"keys:0-{first - 1}",), "linguistic": (f"keys:{first}-{last}",), "action": ("*",)},
+        ratio=Ratio(("visual",), ("linguistic",)),
+        allow_empty=("action",),
+        description=f"the published pi scripts' key ranges: 'linguistic' is keys {first} to {last}, wherever the prompt really is",
+        proxy=True,
+    )
+
+
+BUILTIN_GROUPINGS: dict[str, Callable[[Vocabulary], Grouping]] = {
+    "default": default,
+    "instruction": instruction,
+    "cameras": cameras,
+    "objects": objects,
+    "reference": reference,
+}
+
+
+def find_grouping(name_or_file: str, vocabulary: Vocabulary) -> Grouping:
+    """Find a built-in grouping by name, or read a TOML file."""
+    if name_or_file in BUILTIN_GROUPINGS:
+        return BUILTIN_GROUPINGS[name_or_file](vocabulary)
+    path = Path(name_or_file)
+    if path.suffix == ".toml" or path.exists():
+        return read_grouping_file(path)
+    raise GroupingNotFound(
+        f"Unknown grouping '{name_or_file}'.{did_you_mean(name_or_file, BUILTIN_GROUPINGS)} "
+        f"Built in: {listing(BUILTIN_GROUPINGS)}; anything else is taken as a TOML file, and there is none of that name."
+    )

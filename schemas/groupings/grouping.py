@@ -1,0 +1,185 @@
+"""Groupings: named sets of groups, each a selector over keys, as data (TOML file, command line, or built in)."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from vla_attention.schemas.errors import UserError, did_you_mean, listing
+from vla_attention.schemas.groupings.selectors import SelectorError, atoms_of, parse_selector
+from vla_attention.schemas.jsonable import MalformedDocument, from_json
+
+#: The selector that, alone, means: whatever no other group of the grouping takes.
+REST = "*"
+
+
+#: Column names of tables begin with group names; these are taken by the ratio.
+_RESERVED_NAMES = ("numerator", "denominator", "ratio")
+_GROUP_NAME = re.compile(r"[A-Za-z0-9_][\w.@-]*$")
+
+
+class GroupingError(UserError, ValueError):
+    """A grouping that contradicts itself or that does not fit what is stored."""
+
+
+class GroupingNotFound(GroupingError, FileNotFoundError):
+    """Neither a built-in grouping nor a readable TOML file."""
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """Which groups' masses make the numerator and the denominator of the ratio."""
+
+    numerator: tuple[str, ...]
+    denominator: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class GroupingFile:
+    """A grouping as written in a TOML file: group name to one selector or a list of selectors (their union)."""
+
+    groups: dict[str, str | list[str]]
+    name: str | None = None
+    description: str = ""
+    ratio: Ratio | None = None
+    overlap: bool = False
+    allow_empty: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Grouping:
+    """A named set of groups. Order matters only for display and for the rest group.
+
+    `groups`: group name to selectors (their union). `overlap`: a key may belong to more than one group. `allow_empty`:
+    groups that may have no keys at all in what is analysed; for any other group that is an error. `proxy`: its groups are called
+    visual and linguistic as in published scripts, and are not.
+    """
+
+    name: str
+    groups: Mapping[str, tuple[str, ...]]
+    ratio: Ratio | None = None
+    overlap: bool = False
+    allow_empty: tuple[str, ...] = ()
+    description: str = ""
+    proxy: bool = False
+
+    def __post_init__(self) -> None:
+        """Check everything that can be checked without a layout."""
+        if not self.groups:
+            raise GroupingError(f"Grouping '{self.name}' has no groups; expected at least one NAME = SELECTOR.")
+        for group, selectors in self.groups.items():
+            if group in _RESERVED_NAMES or not _GROUP_NAME.match(group):
+                raise GroupingError(
+                    f"'{group}' cannot name a group: expected letters, digits, '_', '.', '-', and none of "
+                    f"{listing(_RESERVED_NAMES)}."
+                )
+            if not selectors:
+                raise GroupingError(f"Group '{group}' of grouping '{self.name}' has no selector.")
+            for selector in selectors:
+                if selector.strip() == REST and len(selectors) > 1:
+                    raise GroupingError(f"Group '{group}': '*' (the rest) cannot be joined with other selectors.")
+                try:
+                    parse_selector(selector)
+                except SelectorError as error:
+                    raise SelectorError(f"Group '{group}': {error}") from None
+        rest = [group for group, selectors in self.groups.items() if selectors[0].strip() == REST]
+        if len(rest) > 1:
+            raise GroupingError(f"Groups {listing(rest)} are all '*'; only one group can take the rest.")
+        for part in (*(self.ratio.numerator + self.ratio.denominator if self.ratio else ()), *self.allow_empty):
+            if part not in self.groups:
+                raise GroupingError(
+                    f"Grouping '{self.name}' refers to group '{part}', which it does not define."
+                    f"{did_you_mean(part, self.groups)} Defined: {listing(self.groups)}."
+                )
+        if self.ratio and not (self.ratio.numerator and self.ratio.denominator):
+            raise GroupingError(f"The ratio of grouping '{self.name}' needs a numerator and a denominator.")
+
+    @property
+    def compares_modalities(self) -> bool:
+        """Whether the ratio is one of seeing over reading, so that the published thresholds can be applied to it.
+
+        It is not, whatever the groups are called, for a proxy and when the denominator is made of latent frames: those are
+        pictures, numbers and noise.
+        """
+        if self.proxy or self.ratio is None or self.ratio.denominator != ("linguistic",):
+            return False
+        atoms = [atom for text in self.groups["linguistic"] for atom in atoms_of(parse_selector(text))]
+        return not any(atom.kind == "frame" for atom in atoms)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Group names in order."""
+        return tuple(self.groups)
+
+
+def read_grouping_file(path: Path) -> Grouping:
+    """Read a TOML grouping; every error names the file."""
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise GroupingNotFound(f"Cannot read grouping file {path}: {error}.") from None
+    except tomllib.TOMLDecodeError as error:
+        raise GroupingError(f"Grouping file {path} is not valid TOML: {error}.") from None
+    try:
+        content = from_json(GroupingFile, document)
+        groups = {
+            name: (selectors,) if isinstance(selectors, str) else tuple(selectors)
+            for name, selectors in content.groups.items()
+        }
+        return Grouping(
+            name=content.name or path.stem,
+            groups=groups,
+            ratio=content.ratio or conventional_ratio(groups),
+            overlap=content.overlap,
+            allow_empty=tuple(content.allow_empty),
+            description=content.description,
+        )
+    except (MalformedDocument, GroupingError, SelectorError) as error:
+        raise type(error)(f"Grouping file {path}: {error}") from None
+
+
+def conventional_ratio(groups: Iterable[str]) -> Ratio | None:
+    """visual / linguistic when a grouping has groups of these names and says nothing else."""
+    names = set(groups)
+    return Ratio(("visual",), ("linguistic",)) if {"visual", "linguistic"} <= names else None
+
+
+def parse_group_argument(text: str) -> tuple[str, str]:
+    """Split a command-line `NAME=SELECTOR`."""
+    name, separator, selector = text.partition("=")
+    if not separator or not name.strip() or not selector.strip():
+        raise GroupingError(f"Cannot read --group '{text}'; expected NAME=SELECTOR, for instance nouns='word:bowl'.")
+    return name.strip(), selector.strip()
+
+
+def parse_ratio_argument(text: str) -> Ratio:
+    """Read a command-line `A,B/C`: groups of the numerator and of the denominator."""
+    numerator, separator, denominator = text.partition("/")
+    parts = [tuple(name.strip() for name in side.split(",") if name.strip()) for side in (numerator, denominator)]
+    if not separator or not all(parts):
+        raise GroupingError(f"Cannot read --ratio '{text}'; expected GROUP[,GROUP]/GROUP[,GROUP].")
+    return Ratio(parts[0], parts[1])
+
+
+def with_groups(base: Grouping | None, added: Iterable[tuple[str, str]]) -> Grouping:
+    """Add command-line groups to a grouping, or make one of them alone (then the rest is a group of its own).
+
+    A name given twice is a union of its selectors; a name that the base grouping has is replaced.
+    """
+    selectors: dict[str, tuple[str, ...]] = {}
+    for name, selector in added:
+        selectors[name] = (*selectors.get(name, ()), selector)
+    if base is not None:
+        kept = {name: value for name, value in base.groups.items() if name not in selectors}
+        return replace(base, name=f"{base.name}+{'+'.join(selectors)}", groups={**selectors, **kept})
+    if not any(value == (REST,) for value in selectors.values()) and "rest" not in selectors:
+        return Grouping(
+            name="+".join(selectors),
+            groups={**selectors, "rest": (REST,)},
+            ratio=conventional_ratio(selectors),
+            allow_empty=("rest",),
+        )
+    return Grouping(name="+".join(selectors), groups=selectors, ratio=conventional_ratio(selectors))

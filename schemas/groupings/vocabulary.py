@@ -1,0 +1,115 @@
+"""What selectors can name: the tokens of one episode, and the union of names over a selection of episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.schemas.groupings.words import Word, words_of
+from vla_attention.schemas.layout import INVALID_ROLES, Prompt, Role, SiteLayout
+
+ObjectKind = Literal["object", "fixture", "robot", "background"]
+
+
+@dataclass(frozen=True)
+class SceneObject:
+    """One thing a pixel can belong to, named as in the task files (`akita_black_bowl_1`).
+
+    `of_interest`: whether the task itself names it as its subject.
+    """
+
+    name: str
+    kind: ObjectKind
+    of_interest: bool
+
+
+@dataclass(frozen=True)
+class EpisodeTokens:
+    """Everything about one episode's keys at one site that a selector may ask for.
+
+    Attributes:
+        layout: the site's spans.
+        key_role: role codes, shape (replan, key) uint8.
+        prompts: the different prompts of the episode.
+        prompt_index: which prompt each replan had, shape (replan,).
+        objects: the scene's objects, in the order of the coverage's last axis.
+        coverage: per camera the area of each patch that each object covers, shape (replan, patch, object), 0..1.
+    """
+
+    layout: SiteLayout
+    key_role: NDArray[np.uint8]
+    prompts: tuple[Prompt, ...] = ()
+    prompt_index: NDArray[np.integer] | None = None
+    objects: tuple[SceneObject, ...] = ()
+    coverage: Mapping[str, NDArray[np.float32]] | None = None
+
+    @property
+    def num_replans(self) -> int:
+        """Number of replans."""
+        return int(self.key_role.shape[0])
+
+    @cached_property
+    def static_roles(self) -> NDArray[np.uint8]:
+        """`key_role` as (1, key) when it never changes in the episode, else as stored."""
+        return self.key_role[:1] if (self.key_role == self.key_role[:1]).all() else self.key_role
+
+    @cached_property
+    def words(self) -> tuple[tuple[Word, ...], ...]:
+        """The instruction's words for each of `prompts`."""
+        return tuple(words_of(prompt) for prompt in self.prompts)
+
+    @cached_property
+    def valid(self) -> NDArray[np.bool_]:
+        """Keys that can hold information, shape (replan or 1, key)."""
+        return ~np.isin(self.static_roles, [int(role) for role in INVALID_ROLES])
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """The names that selectors may use over a selection of episodes, for validation and for "did you mean".
+
+    `words` are case-folded, and `sentences` are the instructions as such words; `layout` is the site's, which all episodes of a
+    selection share.
+    """
+
+    cameras: tuple[str, ...]
+    spans: tuple[str, ...]
+    roles: tuple[str, ...]
+    words: tuple[str, ...]
+    objects: tuple[str, ...]
+    layout: SiteLayout | None = None
+    sentences: tuple[tuple[str, ...], ...] = ()
+
+
+def collect_vocabulary(episodes: Iterable[EpisodeTokens]) -> Vocabulary:
+    """Union of the names in the given episodes, in order of first appearance. Cameras that are always masked are left out."""
+    cameras: dict[str, None] = {}
+    spans: dict[str, None] = {}
+    roles: dict[str, None] = {}
+    words: dict[str, None] = {}
+    objects: dict[str, None] = {}
+    sentences: dict[tuple[str, ...], None] = {}
+    layout: SiteLayout | None = None
+    for tokens in episodes:
+        layout = tokens.layout
+        for span in tokens.layout.spans:
+            spans[span.name] = None
+            if span.camera is not None and (tokens.static_roles[:, span.start : span.stop] != Role.MASKED_IMAGE).any():
+                cameras[span.camera] = None
+        roles.update({Role(code).label: None for code in np.unique(tokens.static_roles)})
+        for line in tokens.words:
+            if not any(word.keys for word in line):
+                continue  # a text whose positions are known, and not which word each of them is
+            sentence = tuple(word.text.casefold() for word in line)
+            sentences[sentence] = None
+            words.update(dict.fromkeys(sentence))
+        if tokens.coverage:
+            objects.update({thing.name: None for thing in tokens.objects})
+    return Vocabulary(
+        tuple(cameras), tuple(spans), tuple(roles), tuple(words), tuple(objects), layout, tuple(sentences)
+    )

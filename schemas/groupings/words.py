@@ -1,0 +1,83 @@
+"""Words of an instruction and the keys (token pieces) that spell them."""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Literal
+
+from vla_attention.schemas.layout import Piece, Prompt
+
+WordClass = Literal["content", "stop"]
+
+_WORD = re.compile(r"\w+(?:['\u2019-]\w+)*")
+
+
+@dataclass(frozen=True)
+class Word:
+    """One word of the instruction: its text, its characters in the prompt, and the keys of all its pieces."""
+
+    text: str
+    start: int
+    stop: int
+    keys: tuple[int, ...]
+
+
+def split_words(text: str) -> list[tuple[int, int]]:
+    """Character ranges [start, stop) of the words of a text; underscores separate words as they do for the policies."""
+    return [match.span() for match in _WORD.finditer(text.replace("_", " "))]
+
+
+def words_of(prompt: Prompt) -> tuple[Word, ...]:
+    """The words of the prompt's instruction, in order. A piece that touches a word's characters belongs to it."""
+    first, last = prompt.instruction
+    words = []
+    for start, stop in split_words(prompt.text[first:last]):
+        begin, end = first + start, first + stop
+        words.append(Word(prompt.text[begin:end], begin, end, _keys_between(prompt.pieces, begin, end)))
+    return tuple(words)
+
+
+def find_phrase(words: Sequence[Word], phrase: str) -> tuple[Word, ...]:
+    """Every word that takes part in an occurrence of the phrase (case-insensitive, whole words, in sequence)."""
+    wanted = [phrase[start:stop].casefold() for start, stop in split_words(phrase)]
+    given = [word.text.casefold() for word in words]
+    taken = {i for first in _occurrences(given, wanted) for i in range(first, first + len(wanted))}
+    return tuple(words[i] for i in sorted(taken))
+
+
+@functools.cache
+def stop_words() -> frozenset[str]:
+    """The shipped stop list (`word_lists/english_stop_words.txt`, which says what is in it and why), in lower case."""
+    text = (
+        files("vla_attention.schemas.groupings")
+        .joinpath("word_lists", "english_stop_words.txt")
+        .read_text(encoding="utf-8")
+    )
+    return frozenset(word for line in text.splitlines() for word in line.partition("#")[0].split())
+
+
+def word_class(word: str) -> WordClass:
+    """`stop` for a word of the stop list, else `content`. Needs no model: the same word has the same class everywhere."""
+    return "stop" if word.casefold().replace("\u2019", "'") in stop_words() else "content"
+
+
+def has_phrase(sentence: Sequence[str], phrase: str) -> bool:
+    """Whether the words of a phrase follow each other in a sentence, both case-folded."""
+    wanted = [phrase[start:stop].casefold() for start, stop in split_words(phrase)]
+    return any(True for _ in _occurrences(sentence, wanted))
+
+
+def _occurrences(given: Sequence[str], wanted: Sequence[str]) -> Iterator[int]:
+    """Where the wanted words begin, one after the other, among the given ones."""
+    if wanted:
+        for first in range(len(given) - len(wanted) + 1):
+            if list(given[first : first + len(wanted)]) == list(wanted):
+                yield first
+
+
+def _keys_between(pieces: Sequence[Piece], begin: int, end: int) -> tuple[int, ...]:
+    return tuple(piece.key for piece in pieces if piece.start < end and piece.stop > begin)

@@ -1,0 +1,222 @@
+"""The store contract, format version 1: names, axes and attributes of `NAME.zarr`. No I/O here.
+
+NAME.zarr/                            attributes: `RootAttributes`
+  episodes/task003_episode007/        attributes: `EpisodeAttributes`; listed = complete
+    joint/rows                        (replan, layer, denoise, head, query, key) float32
+    joint/row_sum                     (replan, layer, denoise, head, query) float32
+    joint/atoms                       (replan, layer, denoise, head, query, segment) float32
+    joint/key_role                    (replan, key) uint8
+    joint/layer, denoise, head        the numbers of the recorded layers, denoise steps and heads (coordinates)
+    env_step, noise_seed, prompt_index  (replan,)
+    denoise_time                      (denoise,)
+    state                             (replan, state_dim)
+    actions                           (replan, horizon, action_dim), as given to the environment
+    frames/<camera>                   (replan, row, column, channel) uint8
+    objects/<camera>                  (replan, patch, object) float32
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.layout import Prompt, SiteLayout
+from vla_attention.schemas.segments import Segment
+
+FORMAT_NAME = "vla-attention"
+FORMAT_VERSION = 1
+STORE_SUFFIX = ".zarr"
+EPISODES_GROUP = "episodes"
+#: Beside the store, not in it: episodes being written. A reader of the store never meets them.
+PARTIAL_SUFFIX = ".partial"
+
+ROW_AXES = ("replan", "layer", "denoise", "head", "query", "key")
+ATOM_AXES = (*ROW_AXES[:-1], "segment")
+#: Parts are the episode's segments in order, then the block's whole attention update.
+CONTRIBUTION_AXES = ("replan", "layer", "denoise", "part", "other_part")
+
+#: The group of an episode whose attributes are an `EpisodeSeal`.
+SEAL_GROUP = "seal"
+
+_EPISODE_NAME = re.compile(r"task(\d{3,})_episode(\d{3,})$")
+
+
+class StoreError(UserError, ValueError):
+    """Something that calls itself a store and cannot be used as one."""
+
+
+class StoreNotFound(StoreError, FileNotFoundError):
+    """No store at the given path."""
+
+
+class StoreExists(StoreError, FileExistsError):
+    """A store is there already, and neither resuming nor overwriting was asked for."""
+
+
+class FormatTooNew(StoreError):
+    """The store was written by a later format version."""
+
+
+class RunMismatch(StoreError):
+    """A store cannot be continued because its run was configured differently."""
+
+
+class CorruptEpisode(StoreError):
+    """An episode whose content does not agree with what its attributes promise."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What of the attention is recorded.
+
+    `layers` are block indices; `layer_labels` are the numbers that the user typed for them (the same unless the
+    reference's recorded-call numbers were used; a block named both ways has two). `queries` is `mean` (over the action
+    queries), `steps` (weighted means of them, `num_pools` many, one per action step or per step and dimension) or `all`.
+    `mantissa_bits` is the precision of the rows (23 = exact). `contributions`: the Gram matrix of value-weighted contributions,
+    mean over the action queries, is recorded too.
+    """
+
+    layers: tuple[int, ...]
+    layer_labels: tuple[int, ...]
+    denoise_steps: tuple[int, ...]
+    heads: tuple[int, ...]
+    queries: Literal["mean", "steps", "all"]
+    num_action_queries: int
+    mantissa_bits: int
+    frames: bool = True
+    contributions: bool = False
+    num_pools: int = 0
+
+    @property
+    def num_queries(self) -> int:
+        """Length of the query axis."""
+        return {"mean": 1, "steps": self.num_pools, "all": self.num_action_queries}[self.queries]
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How episodes are run: what must be equal for episodes to belong to one run."""
+
+    suite: str
+    seed: int
+    wait_steps: int
+    replan_steps: int
+    max_steps: int
+
+
+@dataclass(frozen=True)
+class PolicyCameraView:
+    """How a policy camera's picture came from the simulator's.
+
+    The simulators deliver the bottom row first. `upright`: rows were reversed, so that row 0 of the stored frame is the top of
+    the scene. `mirrored`: columns were reversed, so that column 0 is the scene's right edge. `visible`: the model sees the
+    middle of the picture, this share of its side.
+    """
+
+    name: str
+    source: str
+    upright: bool
+    mirrored: bool
+    visible: float = 1.0
+
+
+@dataclass(frozen=True)
+class PolicyIdentity:
+    """Which policy ran. `digest` is over the weights; `config` is whatever the policy's family needs to be told apart."""
+
+    name: str
+    family: str
+    checkpoint: str
+    checkpoint_format: str
+    digest: str
+    untrained: bool
+    num_layers: int
+    num_heads: int
+    num_denoise_steps: int
+    action_horizon: int
+    cameras: tuple[PolicyCameraView, ...]
+    config: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class RootAttributes:
+    """Attributes of the store's root group: the run's identity. The same for every process that adds episodes."""
+
+    format: str
+    format_version: int
+    policy: PolicyIdentity
+    protocol: Protocol
+    recording: Recording
+    sites: tuple[SiteLayout, ...]
+    provenance: dict[str, str]
+
+
+@dataclass(frozen=True)
+class ArrayRecord:
+    """What `verify` holds an array against: its shape and the sha256 of its values (C order, little endian)."""
+
+    shape: tuple[int, ...]
+    sha256: str
+
+
+@dataclass(frozen=True)
+class EpisodeSeal:
+    """sha256 of every `zarr.json` of an episode by its path, and of the store's own: chunks have checksums, and JSON has none."""
+
+    run: str
+    files: dict[str, str]
+
+
+@dataclass(frozen=True)
+class EpisodeAttributes:
+    """Attributes of one episode's group. `num_steps` counts environment steps after waiting."""
+
+    task_id: int
+    task_name: str
+    instruction: str
+    episode_index: int
+    initial_state_index: int
+    initial_state_digest: str
+    success: bool
+    num_steps: int
+    num_replans: int
+    prompts: tuple[Prompt, ...]
+    segments: dict[str, tuple[Segment, ...]]
+    objects: tuple[SceneObject, ...]
+    provenance: dict[str, str]
+    arrays: dict[str, ArrayRecord]
+
+
+def episode_name(task_id: int, episode_index: int) -> str:
+    """Name of an episode's group, for instance `task003_episode007`."""
+    return f"task{task_id:03d}_episode{episode_index:03d}"
+
+
+def parse_episode_name(name: str) -> tuple[int, int]:
+    """Task id and episode index of an episode's group name."""
+    match = _EPISODE_NAME.fullmatch(name)
+    if match is None:
+        raise BadArgument(f"'{name}' is no episode name; expected for instance {episode_name(3, 7)}.")
+    return int(match[1]), int(match[2])
+
+
+def check_format(attributes: object, path: object) -> None:
+    """Raise unless root attributes belong to a store that this version can read."""
+    given = attributes if isinstance(attributes, dict) else {}
+    if given.get("format") != FORMAT_NAME:
+        raise StoreError(
+            f"{path} is a Zarr group, but not a store of this tool: its attribute 'format' is not '{FORMAT_NAME}'."
+        )
+    version = given.get("format_version")
+    if not isinstance(version, int) or version < 1:
+        raise StoreError(
+            f"{path} has the format version {version!r}; expected a whole number from 1 to {FORMAT_VERSION}."
+        )
+    if version > FORMAT_VERSION:
+        raise FormatTooNew(
+            f"{path} has format version {version}, and this program reads up to version {FORMAT_VERSION}; "
+            "install a newer version of it."
+        )

@@ -1,0 +1,138 @@
+"""Verification: read everything back and hold it against what the episodes promise of themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.schemas.precision import mass_error_bound
+from vla_attention.schemas.stores.digest import ArrayDigest
+from vla_attention.schemas.stores.reader import Store, StoredEpisode
+from vla_attention.schemas.stores.store_format import (
+    CorruptEpisode,
+    EpisodeAttributes,
+    RootAttributes,
+    episode_name,
+    parse_episode_name,
+)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something wrong with one episode."""
+
+    episode: str
+    problem: str
+
+
+def verify_store(store: Store, progress: Callable[[int], object] | None = None) -> list[Fault]:
+    """Check every episode; `progress` is called with 1 after each. An empty list means the store is whole."""
+    faults = []
+    for episode in store.episodes:
+        faults += episode_faults(store, episode)
+        if progress is not None:
+            progress(1)
+    return faults
+
+
+def episode_faults(store: Store, episode: StoredEpisode) -> list[Fault]:
+    """Everything that is wrong with one episode of a store; reads all of it."""
+    problems = dict.fromkeys(_problems(store.attributes, episode))  # several checks may stumble over one fault
+    return [Fault(episode.name, problem) for problem in problems]
+
+
+def _problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
+    try:
+        attributes = episode.attributes
+        if not episode.is_of_this_run:
+            yield "it was recorded under other attributes than the store has now: one of them has been changed"
+    except CorruptEpisode as error:
+        yield str(error)
+        return
+    if parse_episode_name(episode.name) != (attributes.task_id, attributes.episode_index):
+        yield f"its attributes are those of {episode_name(attributes.task_id, attributes.episode_index)}"
+    for file in episode.seal.files:
+        yield from _guarded(_metadata_problems(episode, file))
+    shapes = _expected_shapes(root, attributes)
+    for name in sorted(set(shapes) - set(attributes.arrays)):
+        yield f"the array {name} is not in the episode"
+    for name, record in attributes.arrays.items():
+        expected = shapes.get(name, (attributes.num_replans,))
+        if record.shape[: len(expected)] != expected:
+            yield f"the array {name} has the shape {record.shape}; expected {expected}"
+            continue
+        yield from _guarded(_array_problems(episode, name, record.sha256, root.recording.mantissa_bits))
+    yield from _guarded(_prompt_problems(episode))
+
+
+def _guarded(check: Iterator[str]) -> Iterator[str]:
+    try:
+        yield from check
+    except CorruptEpisode as error:
+        yield str(error)
+
+
+def _expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dict[str, tuple[int, ...]]:
+    """First axes of every array that must be there; arrays that are not named here begin with the replans."""
+    recording, replans = root.recording, attributes.num_replans
+    cells = (replans, len(recording.layers), len(recording.denoise_steps), len(recording.heads), recording.num_queries)
+    shapes: dict[str, tuple[int, ...]] = {"denoise_time": (len(recording.denoise_steps),)}
+    shapes |= dict.fromkeys(("env_step", "noise_seed", "prompt_index", "state", "actions"), (replans,))
+    for site in root.sites:
+        shapes[f"{site.name}/rows"] = (*cells, site.num_keys)
+        shapes[f"{site.name}/row_sum"] = cells
+        shapes[f"{site.name}/atoms"] = (*cells, len(attributes.segments.get(site.name, ())))
+        shapes[f"{site.name}/key_role"] = (replans, site.num_keys)
+        if recording.contributions:
+            parts = len(attributes.segments.get(site.name, ())) + 1
+            shapes[f"{site.name}/contribution"] = (*cells[:3], parts, parts)
+        shapes[f"{site.name}/layer"] = (len(recording.layers),)
+        shapes[f"{site.name}/denoise"] = (len(recording.denoise_steps),)
+        shapes[f"{site.name}/head"] = (len(recording.heads),)
+    return shapes
+
+
+def _metadata_problems(episode: StoredEpisode, file: str) -> Iterator[str]:
+    episode.sealed(file)
+    yield from ()
+
+
+def _array_problems(episode: StoredEpisode, name: str, sha256: str, mantissa_bits: int) -> Iterator[str]:
+    """One pass over an array: its digest and, of rows and of segments' masses, that they add up to the row sums."""
+    array = episode.array(name)
+    sums, bound = None, 1e-5 + (mass_error_bound(mantissa_bits) if name.endswith("/rows") else 0.0)
+    if name.endswith(("/rows", "/atoms")):
+        sums = _row_sums(episode, name, array.shape[:-1])
+    digest, negative, worst = ArrayDigest(), False, 0.0
+    step = max(1, (array.shards or array.chunks)[0])
+    for first in range(0, array.shape[0], step):
+        values = episode.read(name, slice(first, first + step))
+        digest.update(values)
+        if sums is not None:
+            expected = sums[first : first + step]
+            error = np.abs(values.sum(axis=-1, dtype=np.float64) - expected) / np.maximum(expected, 1e-30)
+            negative, worst = negative or bool((values < 0).any()), max(worst, float(error.max(initial=0.0)))
+    if digest.hexdigest() != sha256:
+        yield f"the values of {name} are not those that were written (digest differs)"
+    if negative:
+        yield f"{name} holds negative numbers"
+    if worst > bound:
+        yield f"{name} does not add up to the row sums: they differ by up to {worst:.2g} of them, allowed is {bound:.2g}"
+
+
+def _row_sums(episode: StoredEpisode, name: str, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
+    """The exact sums that belong to rows or atoms; None when they are damaged, which is a fault of their own."""
+    try:
+        sums: NDArray[np.float64] = episode.read(f"{name.rpartition('/')[0]}/row_sum").astype(np.float64)
+    except CorruptEpisode:
+        return None
+    return sums if sums.shape == shape else None
+
+
+def _prompt_problems(episode: StoredEpisode) -> Iterator[str]:
+    index = episode.read("prompt_index")
+    if not np.isin(index, np.arange(len(episode.attributes.prompts))).all():
+        yield "prompt_index names prompts that the attributes do not have"

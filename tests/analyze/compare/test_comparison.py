@@ -1,0 +1,325 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy import stats
+
+from tests.kit.store_kit import StoreSpec, write_store
+from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.compare import runs as runs_module
+from vla_attention.analyze.compare.comparison import compare
+from vla_attention.analyze.compare.runs import (
+    FIELDS,
+    MixedPolicies,
+    RunsDiffer,
+    check_comparable,
+    open_runs,
+    parse_runs,
+)
+from vla_attention.analyze.compare.text import comparison_text
+from vla_attention.analyze.measures.question import AnalysisSettings
+from vla_attention.schemas.errors import BadArgument, UnknownName
+from vla_attention.schemas.layout import Role
+
+TASKS, EPISODES = (0, 1, 2, 5), 4
+
+
+def log_ratio(run, task, episode):
+    """Planted: scenes differ a lot and alike in all runs; run 1 is 0.25 higher, run 2 is 0.4 lower."""
+    scene = np.random.default_rng([task, episode]).normal(0.5 * task, 0.6)
+    own = np.random.default_rng([run, task, episode]).normal(0, 0.04)
+    return scene + own + (0.0, 0.25, -0.4)[run]
+
+
+def planting(run):
+    def plant(task, episode, tokens, rows):
+        visual = tokens.key_role == Role.IMAGE
+        read = np.isin(tokens.key_role, [int(Role.INSTRUCTION), int(Role.BOS)])
+        share = 1 / (1 + np.exp(-log_ratio(run, task, episode)))
+        weight = share * visual / visual.sum(axis=1, keepdims=True) + (1 - share) * read / read.sum(
+            axis=1, keepdims=True
+        )
+        return np.broadcast_to(weight[:, None, None, None, None, :], rows.shape)
+
+    return plant
+
+
+PLAIN = StoreSpec(
+    tasks=TASKS, episodes=EPISODES, replans=2, layers=(0, 1), heads=(0,), denoise_steps=(9,), frames=False, coverage=False,
+    mantissa_bits=23,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    specs = {
+        "base": replace(PLAIN, plant_rows=planting(0)),
+        "higher": replace(PLAIN, plant_rows=planting(1), policy="tuned"),
+        "lower": replace(PLAIN, plant_rows=planting(2), tasks=(1, 2, 5), episodes=5),
+        "reseeded": replace(PLAIN, plant_rows=planting(1), seed=8, tasks=(0, 1), episodes=2),
+        "goal": replace(PLAIN, plant_rows=planting(1), suite="goal"),
+        "goal_base": replace(PLAIN, plant_rows=planting(0), suite="goal"),
+        "one_layer": replace(PLAIN, plant_rows=planting(1), layers=(1,), tasks=(0, 1), episodes=2),
+    }
+    return {name: write_store(folder / f"{name}.zarr", spec=spec) for name, spec in specs.items()}
+
+
+def opened(stores, *names, allowed=(), **settings):
+    return open_runs(parse_runs([str(stores[name]) for name in names]), AnalysisSettings(**settings), allowed)
+
+
+def one(table, **values):
+    rows = table.filter(*(pl.col(name) == value for name, value in values.items()))
+    assert rows.height == 1
+    return rows.row(0, named=True)
+
+
+def test_paired_differences_are_those_of_the_planted_pairs(stores):
+    found = compare(opened(stores, "base", "higher"))
+    expected = {
+        (task, episode): (log_ratio(1, task, episode) - log_ratio(0, task, episode)) / np.log(2)
+        for task in TASKS
+        for episode in range(EPISODES)
+    }
+    row = one(found.differences, scope="all", layer="layers_avg", quantity="log2_ratio")
+    values = np.array(list(expected.values()))
+    assert row["difference"] == pytest.approx(values.mean(), rel=1e-4)
+    assert row["effect"] == pytest.approx(values.mean() / values.std(ddof=1), rel=1e-3)
+    assert (row["paired"], row["num_pairs"], row["num_tasks"]) == (True, 16, 4)
+    assert row["low"] < 0.25 / np.log(2) < row["high"]
+    assert row["low"] > 0.2
+    for task in TASKS:
+        own = np.array([value for (of, _), value in expected.items() if of == task])
+        row = one(found.differences, scope="task", task_id=task, layer="1", quantity="log2_ratio")
+        assert row["difference"] == pytest.approx(own.mean(), rel=1e-3)
+        # One task is a plain bootstrap over its pairs, widened for their number.
+        theirs = stats.bootstrap((own,), np.mean, n_resamples=20000, method="percentile", rng=np.random.default_rng(0))
+        factor = stats.t.ppf(0.975, 3) / stats.norm.ppf(0.975) * np.sqrt(4 / 3)
+        ends = [own.mean() + factor * (end - own.mean()) for end in theirs.confidence_interval]
+        assert (row["low"], row["high"]) == pytest.approx(ends, abs=0.012)
+    pair = one(found.pairs, task_id=5, episode_first=3, layer="layers_avg")
+    assert pair["log2_ratio_difference"] == pytest.approx(expected[5, 3], rel=1e-3)
+    assert found.unpaired.is_empty()
+
+
+def test_pairing_is_far_sharper_than_comparing_means(stores):
+    widths = []
+    for other, allowed in (("higher", ()), ("goal", ("suite",))):
+        found = compare(opened(stores, "base", other, allowed=allowed), allowed)
+        row = one(found.differences, scope="all", layer="layers_avg", quantity="log2_ratio")
+        widths.append(row["high"] - row["low"])
+    # The same planted difference; scenes differ fifteen times as much as runs of one scene do.
+    assert widths[1] > 8 * widths[0]
+
+
+def test_with_another_seed_allowed_the_initial_state_alone_makes_a_pair(stores):
+    found = compare(opened(stores, "base", "reseeded", allowed=("seed",)), ("seed",))
+    row = one(found.differences, scope="all", layer="layers_avg", quantity="log2_ratio")
+    assert (row["paired"], row["num_pairs"]) == (True, 4)
+    assert found.pairs.height == 4 * 3
+    assert [note for note in found.notes if "seed" in note]
+
+
+def test_episodes_without_a_partner_are_counted_and_named(stores):
+    runs = opened(stores, "base", "lower")
+    found = compare(runs)
+    alone = found.unpaired.group_by("run").len().sort("run").rows()
+    assert alone == [("base", 4), ("lower", 3)]
+    assert one(found.differences, scope="all", layer="layers_avg", quantity="log2_ratio")["num_pairs"] == 12
+    text = comparison_text(found, runs)
+    assert "task000_episode000" in text
+    assert "task001_episode004" in text
+    assert max(map(len, text.splitlines())) <= 101
+
+
+def test_three_runs_are_each_compared_with_the_first(stores):
+    runs = opened(stores, "base", "higher", "lower")
+    found = compare(runs)
+    assert found.differences["run"].unique(maintain_order=True).to_list() == ["higher", "lower"]
+    lower = one(found.differences, run="lower", scope="all", layer="layers_avg", quantity="log2_ratio")
+    assert lower["high"] < 0 < -lower["low"]
+    # Each run's own estimate is the plain geometric mean over its episodes.
+    row = one(found.estimates, run="lower", layer="layers_avg")
+    logs = [log_ratio(2, task, episode) for task in (1, 2, 5) for episode in range(5)]
+    assert row["ratio"] == pytest.approx(np.exp(np.mean(logs)), rel=1e-4)
+    assert row["num_episodes"] == 15
+
+
+def test_nothing_that_pairs_is_compared_unpaired_and_said(stores):
+    runs = opened(stores, "base", "goal", allowed=("suite",))
+    found = compare(runs, ("suite",))
+    row = one(found.differences, scope="all", layer="layers_avg", quantity="log2_ratio")
+    first, other = ([log_ratio(run, t, e) / np.log(2) for t in TASKS for e in range(EPISODES)] for run in (0, 1))
+    assert row["paired"] is False
+    assert row["difference"] == pytest.approx(np.mean(other) - np.mean(first), rel=1e-4)
+    assert row["low"] < row["difference"] < row["high"]
+    assert row["high"] - row["low"] > 1.0  # scenes are in it
+    assert found.pairs.is_empty()
+    assert found.unpaired.height == 32
+    assert "NOT PAIRED" in comparison_text(found, runs)
+    assert found.runs_with_common_tasks == ()
+
+
+def test_a_run_of_several_stores_is_compared_suite_by_suite(stores):
+    words = [f"old={stores['base']},{stores['goal_base']}", f"new={stores['higher']},{stores['goal']}"]
+    found = compare(open_runs(parse_runs(words), AnalysisSettings()))
+    assert found.names == ("old", "new")
+    of_ratio = found.differences.filter(layer="layers_avg", quantity="log2_ratio")
+    assert of_ratio["scope"].to_list() == ["task"] * 8 + ["suite"] * 2 + ["all"]
+    assert of_ratio.filter(scope="all")["num_pairs"].to_list() == [32]
+    assert of_ratio.filter(scope="all")["num_tasks"].to_list() == [8]
+
+
+def test_layers_named_in_two_ways_are_one_block(tmp_path):
+    small = replace(PLAIN, tasks=(0,), episodes=2, num_layers=18)
+    path = write_store(tmp_path / "labelled.zarr", spec=replace(small, plant_rows=planting(1), layer_labels=(18, 19)))
+    plain = write_store(tmp_path / "plain.zarr", spec=replace(small, plant_rows=planting(0)))
+    found = compare(open_runs(parse_runs([str(plain), str(path)]), AnalysisSettings()))
+    assert found.differences["layer"].unique().sort().to_list() == ["0", "1", "layers_avg"]
+    assert found.differences["paired"].all()
+
+
+CHANGES = {
+    "suite": lambda root: replace(root, protocol=replace(root.protocol, suite="other")),
+    "seed": lambda root: replace(root, protocol=replace(root.protocol, seed=9)),
+    "wait_steps": lambda root: replace(root, protocol=replace(root.protocol, wait_steps=11)),
+    "replan_steps": lambda root: replace(root, protocol=replace(root.protocol, replan_steps=4)),
+    "max_steps": lambda root: replace(root, protocol=replace(root.protocol, max_steps=77)),
+    "family": lambda root: replace(root, policy=replace(root.policy, family="another")),
+    "depth": lambda root: replace(root, policy=replace(root.policy, num_heads=5)),
+    "queries": lambda root: replace(root, recording=replace(root.recording, num_action_queries=4)),
+    "processing": lambda root: replace(root, policy=replace(root.policy, config={"normalisation": "other"})),
+    "cameras": lambda root: replace(root, policy=replace(root.policy, cameras=root.policy.cameras[:1])),
+    "simulator": lambda root: replace(root, provenance={**root.provenance, "mujoco": "1.2"}),
+}
+
+
+@pytest.fixture
+def changed(stores, monkeypatch):
+    """Two runs, the attributes of the second one changed."""
+
+    def change_second(change, allowed=()):
+        plain = runs_module.open_store
+
+        def changed_store(path):
+            store = plain(path)
+            return replace(store, attributes=change(store.attributes)) if path == stores["higher"] else store
+
+        with monkeypatch.context() as patch:
+            patch.setattr(runs_module, "open_store", changed_store)
+            return opened(stores, "base", "higher", allowed=allowed)
+
+    return change_second
+
+
+@pytest.mark.parametrize("field", CHANGES)
+def test_every_field_that_must_agree_is_named_and_can_be_allowed(changed, field):
+    with pytest.raises((RunsDiffer, MixedPolicies), match=rf"--allow-mismatch {field}\b") as caught:
+        check_comparable(changed(CHANGES[field]), ())
+    assert str(caught.value).count("\n") == 0
+    notes = check_comparable(changed(CHANGES[field], (field,)), (field,))
+    assert len(notes) == 1
+    assert field in notes[0]
+
+
+def test_weights_and_their_names_may_differ(changed):
+    policy = {"name": "b", "checkpoint": "gs://b", "checkpoint_format": "x", "digest": "1" * 64, "untrained": False}
+    assert check_comparable(changed(lambda root: replace(root, policy=replace(root.policy, **policy))), ()) == []
+
+
+def test_other_software_is_noted_and_not_refused(changed):
+    found = compare(changed(lambda root: replace(root, provenance={"numpy": "0.1"})))
+    assert [note for note in found.notes if "numpy" in note and "0.1" in note]
+
+
+def test_mixed_policies_without_a_common_site_cannot_be_allowed(changed):
+    def as_cosmos(root):
+        sites = (replace(root.sites[0], name="self"), replace(root.sites[0], name="cross"))
+        return replace(root, policy=replace(root.policy, family="cosmos"), sites=sites)
+
+    for allowed in ((), ("family",)):
+        with pytest.raises(
+            MixedPolicies, match=r"made-up and cosmos, which have no site in common \(joint; self, cross\)"
+        ):
+            changed(as_cosmos, allowed)
+
+
+def test_layers_that_only_one_run_recorded_are_refused_until_chosen(stores):
+    with pytest.raises(RunsDiffer, match=r"layers: 0, 1 and 1.*--layers"):
+        compare(opened(stores, "base", "one_layer"))
+    found = compare(opened(stores, "base", "one_layer", layers=(1,)))
+    assert one(found.differences, scope="all", layer="1", quantity="log2_ratio")["num_pairs"] == 4
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["{base}"], "needs two runs or more"),
+        (["{base}", "{base}"], "is given twice"),
+        (["a={base},{goal}", "b={goal}"], "is given twice"),
+        (["a={base}", "a={goal}"], "Two runs are named 'a'"),
+        (["{base},{goal}", "{higher}"], "no name; write NAME="),
+        (["={base}", "{goal}"], "Cannot read the run"),
+        (["a=", "{goal}"], "Cannot read the run"),
+        (["{base}", "{goal}"], "suite: made_up and goal"),
+        (["{base}", "{goal}", "--allow-mismatch", "sute"], "Did you mean 'suite'?"),
+        (["{base}", "{reseeded}"], "seed: 0 and 8"),
+        (["{base}", "nowhere.zarr"], "There is no store at nowhere.zarr"),
+    ],
+)
+def test_mistakes_are_one_sentence(stores, words, said, capsys):
+    filled = [word.format(**stores) for word in words]
+    assert main(["compare", *filled]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert len(error.strip().splitlines()) == 1
+
+
+def test_an_unknown_field_names_all_fields(stores):
+    with pytest.raises(UnknownName) as caught:
+        opened(stores, "base", "higher", allowed=("colour",))
+    assert all(field in str(caught.value) for field in FIELDS)
+
+
+def test_stores_of_one_file_name_are_named_with_their_folders(tmp_path):
+    paths = [tmp_path / folder / "libero_10.zarr" for folder in ("base", "tuned")] + [
+        tmp_path / "tuned" / "libero_goal.zarr"
+    ]
+    assert [run.name for run in parse_runs([str(path) for path in paths])] == [
+        "base/libero_10",
+        "tuned/libero_10",
+        "libero_goal",
+    ]
+
+
+def test_a_path_that_holds_an_equals_sign_is_a_path(stores, tmp_path):
+    path = tmp_path / "seed=8.zarr"
+    path.mkdir()
+    assert [run.name for run in parse_runs([str(stores["base"]), str(path)])] == ["base", "seed=8"]
+    with pytest.raises(BadArgument):
+        parse_runs([str(path)])
+
+
+def test_the_command_writes_tables_and_pictures(stores, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert (
+        main(["compare", str(stores["base"]), f"new={stores['higher']}", str(stores["lower"]), "--output", str(out)])
+        == 0
+    )
+    assert "new AGAINST base" in capsys.readouterr().out
+    assert pl.read_parquet(out / "comparison.parquet")["run"].unique().sort().to_list() == ["lower", "new"]
+    assert pl.read_parquet(out / "pairs.parquet").height == (16 + 12) * 3
+    for stem in ("forest", "paired_differences_new", "paired_differences_lower"):
+        for kind in ("png", "pdf", "csv"):
+            assert (out / f"{stem}.{kind}").stat().st_size > 300
+
+
+def test_without_a_ratio_fractions_are_compared(stores, tmp_path):
+    words = ["--group", "base=camera:base_0_rgb", "--group", "rest=*", "--output", str(tmp_path)]
+    assert main(["compare", str(stores["base"]), str(stores["higher"]), *words]) == 0
+    table = pl.read_parquet(tmp_path / "comparison.parquet")
+    assert table["quantity"].unique(maintain_order=True).to_list() == ["base_fraction", "rest_fraction", "success"]

@@ -1,0 +1,127 @@
+"""Entropy, effective keys and top-k mass of random stores and groupings against scipy and sorting, and of rows that are known."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import entropy as entropy_of_scipy
+
+from tests.kit.raw_rows import FEW, leaky, question_about, raw_episodes, weights_of
+from tests.kit.store_kit import StoreSpec, write_store
+from tests.kit.strategies import episode_tokens, groupings
+from vla_attention.analyze.heads.entropy import effective_keys, entropies, top_mass
+from vla_attention.analyze.heads.row_metrics import RowOptions, groups_with_valid_keys, row_metrics_table
+from vla_attention.analyze.measures.steps import resolve_all
+from vla_attention.schemas.groupings.grouping import Grouping
+
+
+def by_hand(row: np.ndarray, weights: np.ndarray) -> float:
+    """Minus the relative entropy of the attention inside a group to its weights; with whole keys, Shannon's entropy."""
+    inside = row * weights
+    if inside.sum() <= 0:
+        return float("nan")
+    # scipy takes 0 x ln(0 / 0) for 0, and wants no weight of 0 below a probability above 0: there is none. It renormalises both.
+    return float(np.log(weights.sum()) - entropy_of_scipy(inside, weights))
+
+
+def test_known_rows_have_known_entropies():
+    rows = np.array(
+        [[[0.25, 0.25, 0.25, 0.25, 0.0]], [[1.0, 0.0, 0.0, 0.0, 0.0]], [[0.5, 0.5, 0.0, 0.0, 0.0]]], np.float32
+    )
+    every = np.ones((1, 5, 1), np.float32)
+    found = entropies(rows, every)[:, 0, 0]
+    np.testing.assert_allclose(found, np.log([4, 1, 2]), atol=1e-6)
+    np.testing.assert_allclose(effective_keys(found), [4, 1, 2], rtol=1e-6)
+
+
+def test_a_group_of_fractions_reaches_its_number_of_keys_and_no_more():
+    weights = np.array([0.5, 0.25, 0.0, 1.0], np.float32)
+    rows = np.array([[[0.1, 0.1, 0.7, 0.1]], [[0.0, 0.3, 0.7, 0.0]]], np.float32)
+    found = effective_keys(entropies(rows, weights[None, :, None]))[:, 0, 0]
+    # Attention that is even over the covered area: 1.75 keys. All of it on the quarter of a key: a quarter of a key.
+    np.testing.assert_allclose(found, [1.75, 0.25], rtol=1e-5)
+
+
+def test_the_smallest_masses_still_have_an_entropy():
+    rows = np.full((1, 1, 6), 1e-12, np.float32)
+    rows[0, 0, 0] = 1.0
+    weights = np.ones((1, 6, 2), np.float32)
+    weights[0, 0, 1] = 0.0
+    np.testing.assert_allclose(entropies(rows, weights)[0, 0], [0.0, np.log(5)], atol=1e-4)
+
+
+def test_top_masses_do_not_depend_on_the_order_of_their_numbers():
+    rows = np.random.default_rng(0).dirichlet(np.full(20, 0.2), (2, 3)).astype(np.float32)
+    valid = np.ones((1, 20), bool)
+    np.testing.assert_array_equal(top_mass(rows, valid, (5, 1)), top_mass(rows, valid, (1, 5))[..., ::-1])
+
+
+@FEW
+@given(data=st.data())
+def test_the_table_of_rows_holds_what_scipy_and_sorting_say_of_the_raw_rows(data):
+    tokens = data.draw(episode_tokens())
+    grouping = data.draw(groupings(tokens))
+    spec = StoreSpec(
+        tokens=tokens,
+        plant_rows=leaky,
+        tasks=(0,),
+        episodes=1,
+        queries=data.draw(st.sampled_from(["mean", "all"])),
+        layer_labels=(0, 2, 4),
+    )
+    options = RowOptions(top=(2, 1, 7))
+    with tempfile.TemporaryDirectory() as folder:
+        path = write_store(Path(folder) / "a.zarr", spec=spec)
+        question = question_about(path, grouping)
+        shown = groups_with_valid_keys(question.selected, resolve_all(grouping, question.selected))
+        table = row_metrics_table(question, options)
+        (raw,) = raw_episodes(path, spec)
+    rows, valid = raw.held()
+    weights = weights_of(grouping, tokens) * valid[:, :, None]
+    assert table.height == rows[..., 0].size
+    assert table["layer"].unique().sort().to_list() == [0, 2, 4]
+    assert set(table.filter(pl.col("layer") == 4)["block"]) == {0}
+    having = {name for i, name in enumerate(grouping.names) if weights[:, :, i].any()}
+    assert set(shown) == having
+    for row, (replan, layer, denoise, head) in zip(
+        table.iter_rows(named=True), np.ndindex(rows.shape[:4]), strict=True
+    ):
+        where = (row["replan"], row["layer"], row["denoise_step"], row["head"])
+        assert where == (replan, (0, 2, 4)[layer], spec.denoise_steps[denoise], spec.heads[head])
+        seen = rows[replan, layer, denoise, head]
+        everything = entropy_of_scipy(seen)
+        assert row["entropy"] == pytest.approx(everything, abs=2e-5)
+        assert row["effective_keys"] == pytest.approx(np.exp(everything), rel=1e-4)
+        largest = np.sort(seen)[::-1] / seen.sum()
+        for k in options.top:
+            assert row[f"top{k}_mass"] == pytest.approx(largest[:k].sum(), rel=1e-5)
+        for name in shown:
+            expected = by_hand(seen, weights[replan, :, grouping.names.index(name)])
+            if np.isnan(expected):
+                assert row[f"{name}_entropy"] is None
+                assert row[f"{name}_effective_keys"] is None
+            else:
+                assert row[f"{name}_entropy"] == pytest.approx(expected, abs=5e-5)
+                assert row[f"{name}_effective_keys"] == pytest.approx(np.exp(expected), rel=2e-4)
+
+
+def test_keys_that_are_padding_at_some_replans_are_in_no_entropy_of_a_group_there(tmp_path):
+    """A third state digit is there at some replans; at the others its key is padding, and takes mass nonetheless."""
+    spec = StoreSpec(tasks=(0,), episodes=2, replans=4, plant_rows=leaky, mantissa_bits=23)
+    path = write_store(tmp_path / "a.zarr", spec=spec)
+    grouping = Grouping("g", {"text": ("span:prompt",), "rest": ("*",)})
+    table = row_metrics_table(question_about(path, grouping))
+    text = np.zeros(spec.layout.num_keys)
+    text[spec.layout.span("prompt").start : spec.layout.span("prompt").stop] = 1.0
+    for raw in raw_episodes(path, spec):
+        assert (raw.valid != raw.valid[0]).any()
+        found = table.filter(episode_index=raw.order[1])["text_entropy"].to_numpy()
+        cells = np.ndindex(raw.rows.shape[:4])
+        expected = [by_hand(raw.rows[cell], text * raw.valid[cell[0]]) for cell in cells]
+        np.testing.assert_allclose(found, expected, atol=5e-5)

@@ -1,0 +1,362 @@
+"""Heads, layers, denoise steps, rows and sinks of random stores against independent arithmetic on the raw Zarr arrays."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+import zarr
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from polars.testing import assert_frame_equal
+from scipy import stats
+
+from tests.kit.store_kit import StoreSpec, valid_keys, write_store
+from tests.kit.strategies import episode_tokens
+from vla_attention.analyze.heads import command as heads_command
+from vla_attention.analyze.heads.head_measures import ranked_heads
+from vla_attention.analyze.heads.head_study import study_heads
+from vla_attention.analyze.heads.row_metrics import RowOptions, row_metrics_table
+from vla_attention.analyze.heads.text import heads_text
+from vla_attention.analyze.measures.question import AnalysisSettings, Question, ask
+from vla_attention.analyze.measures.sinks import SinkRule, sinks_table, without_sinks
+from vla_attention.analyze.ratios.analysis import analyse
+from vla_attention.schemas.groupings.resolve import resolve
+from vla_attention.schemas.precision import mass_error_bound
+from vla_attention.schemas.stores.reader import open_store
+
+QUICK = settings(
+    max_examples=12,
+    phases=[Phase.explicit, Phase.generate],
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+BOUND = mass_error_bound(10) + 1e-4
+
+
+def question_of(path: Path, **wanted) -> Question:
+    return ask([open_store(path)], AnalysisSettings(**wanted))
+
+
+def raw_rows(path: Path, episode: str) -> np.ndarray:
+    """Rows (replan, layer, denoise, head, key), mean over the stored queries."""
+    return zarr.open_group(path / "episodes" / episode, mode="r")["joint/rows"][:].astype(np.float64).mean(axis=4)
+
+
+@QUICK
+@given(data=st.data())
+def test_row_metrics_equal_scipy_on_raw_rows(data):
+    tokens = data.draw(episode_tokens())
+    queries = data.draw(st.sampled_from(["mean", "all"]))
+    grouping = data.draw(st.sampled_from(["default", "objects"]))
+    with tempfile.TemporaryDirectory() as folder:
+        path = write_store(Path(folder) / "a.zarr", tokens=tokens, tasks=(0,), episodes=1, queries=queries)
+        question = question_of(path, grouping=grouping)
+        table = row_metrics_table(question, RowOptions(top=(1, 3)))
+        rows = raw_rows(path, "task000_episode000")
+    resolved = resolve(question.grouping, tokens)
+    valid = np.broadcast_to(valid_keys(tokens.key_role), (len(rows), rows.shape[-1]))
+    weights = np.broadcast_to(resolved.weights, (len(rows), rows.shape[-1], len(resolved.names)))
+    assert table.height == np.prod(rows.shape[:4])
+    for row, (replan, layer, denoise, head) in zip(
+        table.iter_rows(named=True), np.ndindex(rows.shape[:4]), strict=True
+    ):
+        seen = rows[replan, layer, denoise, head] * valid[replan]
+        assert row["block"] == question.selection.blocks[layer]
+        assert row["denoise_step"] == question.selection.denoise_steps[denoise]
+        assert (row["replan"], row["head"]) == (replan, head)
+        assert row["entropy"] == pytest.approx(stats.entropy(seen), abs=1e-3)
+        assert row["effective_keys"] == pytest.approx(np.exp(stats.entropy(seen)), rel=1e-3)
+        for k in (1, 3):
+            assert row[f"top{k}_mass"] == pytest.approx(np.sort(seen)[::-1][:k].sum() / seen.sum(), rel=1e-4)
+        for i, name in enumerate(resolved.names):
+            part = weights[replan, :, i] * valid[replan]
+            if (seen * part).sum() == 0:
+                assert row.get(f"{name}_entropy") is None
+            else:
+                expected = np.log(part.sum()) - stats.entropy(seen * part, part)
+                assert row[f"{name}_entropy"] == pytest.approx(expected, abs=2e-3)
+
+
+@QUICK
+@given(data=st.data())
+def test_heads_equal_sums_over_raw_rows(data):
+    tokens = data.draw(episode_tokens())
+    with_rows = data.draw(st.booleans())
+    wanted = data.draw(st.sampled_from([{}, {"grouping": "objects"}]))
+    with tempfile.TemporaryDirectory() as folder:
+        path = write_store(Path(folder) / "a.zarr", tokens=tokens, tasks=(0,), episodes=2)
+        question = question_of(path, **wanted)
+        study = study_heads(question, RowOptions() if with_rows else None)
+        rows = [raw_rows(path, f"task000_episode{i:03d}") for i in range(2)]
+    grouping, names = question.grouping, question.grouping.names
+    resolved = resolve(grouping, tokens)
+    weights = np.broadcast_to(resolved.weights, (len(rows[0]), rows[0].shape[-1], len(names))).astype(np.float64)
+    assert grouping.ratio is not None
+    top = [names.index(name) for name in grouping.ratio.numerator]
+    bottom = [names.index(name) for name in grouping.ratio.denominator]
+    masses = [
+        np.einsum("rldhk,rkg->rldhg", part, weights).mean(axis=2) for part in rows
+    ]  # (replan, layer, head, group)
+    for row in study.heads.iter_rows(named=True):
+        layer, head = question.selection.blocks.index(row["block"]), row["head"]
+        own = [mass[:, layer, head] for mass in masses]
+        for i, name in enumerate(names):
+            expected = np.mean([(mass[:, i] / mass.sum(axis=1)).mean() for mass in own])
+            assert row[f"{name}_fraction"] == pytest.approx(expected, rel=2 * BOUND, abs=1e-9)
+        logs = [np.log2(mass[:, top].sum(axis=1) / mass[:, bottom].sum(axis=1)).mean() for mass in own]
+        assert row["log2_ratio"] == pytest.approx(np.mean(logs), abs=5 * BOUND)
+        quotient = np.mean([mass[:, top].sum(axis=1).mean() for mass in own])
+        quotient /= np.mean([mass[:, bottom].sum(axis=1).mean() for mass in own])
+        assert row["ratio_of_means"] == pytest.approx(quotient, rel=4 * BOUND)
+        uniform = np.log2(weights[:, :, top].sum(axis=(1, 2)) / weights[:, :, bottom].sum(axis=(1, 2)))
+        lifts = [(np.log2(mass[:, top].sum(axis=1) / mass[:, bottom].sum(axis=1)) - uniform).mean() for mass in own]
+        assert row["log2_lift"] == pytest.approx(np.mean(lifts), abs=5 * BOUND)
+    for row in study.dispersion.iter_rows(named=True):
+        layer = question.selection.blocks.index(row["block"])
+        shares = [(mass[:, layer][..., top].sum(axis=-1) / mass[:, layer].sum(axis=-1)).mean(axis=0) for mass in masses]
+        assert row["fraction_std"] == pytest.approx(np.mean([np.std(share) for share in shares]), abs=5 * BOUND)
+    for row in study.depth.filter(of="mass").iter_rows(named=True):
+        i = names.index(row["group"])
+        centres = [np.average(question.selection.blocks, weights=mass[..., i].mean(axis=(0, 2))) for mass in masses]
+        assert row["centre"] == pytest.approx(np.mean(centres), abs=10 * BOUND)
+
+
+def test_a_head_of_the_grid_is_what_the_whole_analysis_says_of_that_head_alone(tmp_path):
+    path = write_store(tmp_path / "a.zarr", tasks=(0, 1), episodes=3)
+    study = study_heads(question_of(path))
+    alone = analyse(question_of(path, heads=(1,), layers=(2,)))
+    expected = alone.tasks.filter(scope="all", layer="2").row(0, named=True)
+    row = study.heads.filter(block=2, head=1).row(0, named=True)
+    assert 2 ** row["log2_ratio"] == pytest.approx(expected["geometric_mean"])
+    assert 2 ** row["log2_ratio_low"] == pytest.approx(expected["geometric_mean_low"])
+    assert row["visual_fraction_high"] == pytest.approx(expected["visual_fraction_high"])
+    assert row["ratio_of_means"] == pytest.approx(expected["ratio_of_means"])
+    step = analyse(question_of(path, denoise=("9",))).tasks.filter(scope="all", layer="layers_avg").row(0, named=True)
+    found = study.denoise.filter(denoise_step=9).row(0, named=True)
+    assert found["denoise_time"] == pytest.approx(0.1)
+    for name in ("ratio_mean", "ratio_mean_low", "visual_fraction", "uniform_ratio"):
+        assert found[name] == pytest.approx(step[name])
+
+
+def test_contribution_depth_is_there_where_gram_matrices_are(tmp_path):
+    path = write_store(tmp_path / "a.zarr", contributions=True)
+    depth = study_heads(question_of(path)).depth
+    assert set(depth["of"]) == {"mass", "contribution"}
+    assert depth["centre"].is_between(0, 2).all()
+    assert set(study_heads(question_of(write_store(tmp_path / "b.zarr"))).depth["of"]) == {"mass"}
+
+
+# --- planted truths ---------------------------------------------------------------------------------------------------
+
+
+def plant_specialists(task, episode, tokens, rows):
+    """Layer 2, head 1 looks; layer 0, head 0 reads; all others are alike."""
+    valid = np.broadcast_to(tokens.valid, tokens.key_role.shape)
+    planted = np.broadcast_to(valid[:, None, None, None, None, :], rows.shape).astype(np.float64).copy()
+    planted[:, 1, :, 1, :, :16] *= 30.0
+    span = tokens.layout.span("prompt")
+    planted[:, 0, :, 0, :, span.start : span.stop] *= 30.0
+    noise = np.random.default_rng([task, episode]).normal(0, 0.1, planted.shape)
+    planted *= np.exp(noise)
+    return planted / planted.sum(axis=-1, keepdims=True)
+
+
+def test_planted_specialist_heads_are_found_and_named(tmp_path):
+    path = write_store(tmp_path / "a.zarr", spec=StoreSpec(plant_rows=plant_specialists, tasks=(0, 1, 2), episodes=3))
+    study = study_heads(question_of(path), RowOptions())
+    ranked = ranked_heads(study.heads, study.question.grouping)
+    first, last = ranked.row(0, named=True), ranked.row(-1, named=True)
+    assert (first["block"], first["head"]) == (2, 1)
+    assert (last["block"], last["head"]) == (0, 0)
+    assert first["log2_lift_low"] > 0 > last["log2_lift_high"]
+    text = heads_text(study, top=1)
+    lines = text.splitlines()
+    looking, reading = lines.index("MOST VISUAL HEADS"), lines.index("MOST LINGUISTIC HEADS")
+    assert lines[looking + 4].split()[:2] == ["2", "1"]
+    assert lines[reading + 4].split()[:2] == ["0", "0"]
+    assert max(map(len, lines)) <= 100
+
+
+def plant_sinks(task, episode, tokens, rows):
+    """Key 5 takes half of every row of task 1 and the bos key a third of three quarters of the rows of all tasks."""
+    planted = rows.astype(np.float64).copy()
+    if task == 1:
+        planted *= 0.5 / (planted.sum(axis=-1, keepdims=True) - planted[..., 5:6])
+        planted[..., 5] = 0.5
+    bos = tokens.layout.span("prompt").start
+    flat = planted.reshape(-1, planted.shape[-1])
+    for i, row in enumerate(flat):
+        if i % 4:
+            row *= (2 / 3) / (row.sum() - row[bos])
+            row[bos] = 1 / 3
+    return flat.reshape(planted.shape) / flat.reshape(planted.shape).sum(axis=-1, keepdims=True)
+
+
+@pytest.fixture(scope="module")
+def sunken(tmp_path_factory) -> Path:
+    return write_store(
+        tmp_path_factory.mktemp("sinks") / "a.zarr", spec=StoreSpec(plant_rows=plant_sinks, tasks=(0, 1), episodes=2)
+    )
+
+
+RULE = SinkRule(factor=5.0, share=0.7)
+
+
+def test_planted_sinks_are_found_named_and_told_apart_by_task(sunken):
+    question = question_of(sunken)
+    sinks = sinks_table(question, RULE)
+    bos = question.selected[0].tokens.layout.span("prompt").start
+    assert sinks.select("task_id", "key").rows() == [(0, bos), (1, 5), (1, bos)]
+    patch = sinks.filter(key=5).row(0, named=True)
+    assert (patch["span"], patch["role"], patch["patch_row"], patch["patch_column"]) == ("base_0_rgb", "image", 1, 1)
+    assert "patch (1, 1)" in patch["description"]
+    assert sinks.filter(key=bos)["role"].unique().to_list() == ["bos"]
+    of_study = study_heads(question, RowOptions(rule=RULE)).sinks
+    assert of_study is not None
+    assert_frame_equal(of_study, sinks, rel_tol=1e-5)
+    # The numbers, by hand.
+    for row in sinks.iter_rows(named=True):
+        above, held = [], []
+        for episode in range(2):
+            rows = raw_rows(sunken, f"task{row['task_id']:03d}_episode{episode:03d}")
+            item = question.selected[2 * row["task_id"] + episode]
+            valid = np.broadcast_to(valid_keys(item.tokens.key_role), (len(rows), rows.shape[-1]))[:, None, None, None]
+            share = rows * valid / (rows * valid).sum(axis=-1, keepdims=True)
+            above.append((share > 5.0 / valid.sum(axis=-1, keepdims=True))[..., row["key"]].mean())
+            held.append(share[..., row["key"]].mean())
+        assert row["share_of_rows"] == pytest.approx(np.mean(above))
+        assert row["mean_mass"] == pytest.approx(np.mean(held), rel=1e-3)
+
+
+def test_masses_without_sinks_are_those_of_the_remaining_keys(sunken):
+    question = question_of(sunken)
+    sinks = sinks_table(question, RULE)
+    corrected = without_sinks(question, sinks, RULE)
+    assert corrected.grouping.name == "default-without-sinks"
+    analysis = analyse(corrected)
+    steps = analysis.steps
+    bos = question.selected[0].tokens.layout.span("prompt").start
+    for index, item in enumerate(question.selected):
+        task, episode = divmod(index, 2)
+        out = [bos, 5] if task == 1 else [bos]
+        rows = raw_rows(sunken, f"task{task:03d}_episode{episode:03d}").mean(axis=3)  # (replan, layer, denoise, key)
+        resolved = resolve(question.grouping, item.tokens)
+        weights = np.broadcast_to(resolved.weights, (len(rows), rows.shape[-1], len(resolved.names))).copy()
+        weights[:, out] = 0.0
+        valid = np.broadcast_to(valid_keys(item.tokens.key_role), (len(rows), rows.shape[-1])).copy()
+        valid[:, out] = False
+        mass = np.einsum("rldk,rkg->rldg", rows, weights)
+        part = steps.filter(task_id=task, episode_index=episode)
+        visual, linguistic = (resolved.names.index(name) for name in ("visual", "linguistic"))
+        given = part["visual_mass"].to_numpy().reshape(mass.shape[:3])
+        np.testing.assert_allclose(given, mass[..., visual], rtol=BOUND)
+        np.testing.assert_allclose(
+            part["ratio"].to_numpy().reshape(mass.shape[:3]), mass[..., visual] / mass[..., linguistic], rtol=2 * BOUND
+        )
+        np.testing.assert_allclose(
+            part["visual_fraction"].to_numpy().reshape(mass.shape[:3]),
+            mass[..., visual] / mass.sum(axis=-1),
+            rtol=2 * BOUND,
+        )
+        held = np.einsum("rldk,rk->rld", rows, valid)
+        lift = (mass[..., visual] / weights[:, :, visual].sum(axis=1)[:, None, None]) / (
+            held / valid.sum(axis=1)[:, None, None]
+        )
+        np.testing.assert_allclose(part["visual_lift"].to_numpy().reshape(lift.shape), lift, rtol=3 * BOUND)
+        uniform = weights[:, :, visual].sum(axis=1) / weights[:, :, linguistic].sum(axis=1)
+        np.testing.assert_allclose(part["uniform_ratio"].to_numpy().reshape(lift.shape)[:, 0, 0], uniform, rtol=1e-6)
+        # And so it stays when denoise steps are averaged over: the baseline is that of the remaining keys, too.
+        whole = analysis.replans.filter(task_id=task, episode_index=episode, layer="2").sort("replan")
+        averaged = mass[:, 1, :, visual].mean(axis=1) / weights[:, :, visual].sum(axis=1)
+        baseline = held[:, 1].mean(axis=1) / valid.sum(axis=1)
+        np.testing.assert_allclose(whole["visual_lift"].to_numpy(), averaged / baseline, rtol=3 * BOUND)
+
+
+def test_the_summary_without_sinks_names_the_keys_and_takes_a_folder_of_its_own(sunken, tmp_path, monkeypatch, capsys):
+    from vla_attention.analyze.__main__ import main
+
+    monkeypatch.chdir(tmp_path)
+    rule = ["--sink-factor", "5", "--sink-share", "0.7"]
+    assert main([str(sunken), "--without-sinks", *rule, "--no-plots"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "patch (1, 1) (image; in 1 of 2 tasks" in said
+    assert "(bos; in 2 of 2 tasks" in said
+    folder = tmp_path / "results" / "a" / "default-without-sinks"
+    assert pl.read_parquet(folder / "sinks.parquet").height == 3
+    assert main([str(sunken), "--without-sinks", "--sink-factor", "1000", "--no-plots"]) == 0
+    assert "nothing was taken out" in " ".join(capsys.readouterr().out.split())
+    assert main([str(sunken), "--sink-factor", "5", "--no-plots"]) == 2
+    assert "give that too" in capsys.readouterr().err
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_writes_tables_and_pictures_and_names_the_nearest_key(tmp_path, capsys):
+    from vla_attention.analyze.__main__ import main
+
+    path = write_store(tmp_path / "a.zarr")
+    assert main(["heads", str(path), "--output", str(tmp_path / "out"), "--sink-factor", "1000", "--top", "2"]) == 0
+    said = capsys.readouterr().out
+    assert "None. The key that comes nearest, key " in said
+    tables = ("heads", "dispersion", "depth", "denoise", "row_metrics", "sinks")
+    pictures = ("head_grid", "layer_profile", "layer_time", "denoise_profile")
+    written = {file.name for file in (tmp_path / "out").iterdir()}
+    assert written == {f"{name}.parquet" for name in tables} | {
+        f"{name}.{kind}" for name in pictures for kind in ("png", "pdf", "csv")
+    }
+    assert pl.read_parquet(tmp_path / "out" / "row_metrics.parquet").height == 4 * 3 * 2 * 2 * 2
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--layers", "2", "--heads", "1", "--denoise", "9"],
+        ["--group", "base=camera:base_0_rgb", "--no-rows"],
+        ["--grouping", "objects"],
+        ["--group", "seen=role:image", "--group", "blind=span:right_wrist_0_rgb", "--ratio", "seen/blind"],
+        ["--group", "seen=role:image", "--group", "blind=span:right_wrist_0_rgb", "--ratio", "blind/blind"],
+    ],
+)
+def test_unusual_questions_are_answered(arguments, tmp_path, capsys):
+    from vla_attention.analyze.__main__ import main
+
+    path = write_store(tmp_path / "a.zarr", tasks=(0,), episodes=1, replans=1)
+    assert main(["heads", str(path), "--output", str(tmp_path / "out"), *arguments]) == 0
+    said = capsys.readouterr().out
+    assert max(map(len, said.splitlines())) <= 100 + len(str(tmp_path))
+    assert "nan" not in said.lower().split()
+    if "seen/blind" in arguments:
+        assert said.count(" inf ") >= 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--top", "0"], "expected at least 1"),
+        (["--top-k", "0"], "whole numbers from 1"),
+        (["--sink-share", "2"], "no share of rows"),
+        (["--heads", "7"], "was not recorded"),
+    ],
+)
+def test_bad_arguments_end_in_one_sentence(arguments, said, tmp_path, capsys):
+    from vla_attention.analyze.__main__ import main
+
+    path = write_store(tmp_path / "a.zarr", tasks=(0,), episodes=1)
+    assert main(["heads", str(path), *arguments]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+
+
+def test_the_help_has_examples_and_needs_no_library():
+    code = "import sys; from vla_attention.analyze.heads import command; command.build_parser().format_help(); print('numpy' in sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "False"
+    assert "vla-analyze heads runs/" in heads_command.build_parser().format_help()

@@ -1,0 +1,87 @@
+"""Questions: what is selected, and what becomes of episodes that cannot be used."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from tests.kit.store_kit import write_store
+from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.measures.question import AnalysisSettings, ask
+from vla_attention.analyze.ratios.analysis import analyse
+from vla_attention.schemas.stores.reader import Store, open_store
+from vla_attention.schemas.stores.store_format import StoreError
+
+
+def damage_rows(store: Path, episode: str) -> None:
+    """Flip bits in the middle of an episode's rows."""
+    (file,) = (path for path in (store / "episodes" / episode / "joint/rows/c").rglob("*") if path.is_file())
+    content = bytearray(file.read_bytes())
+    content[len(content) // 3] ^= 0xFF
+    file.write_bytes(bytes(content))
+
+
+def without_replans(store: Store, position: int) -> Store:
+    """The opened store, one of whose episodes says that it holds no replan. The writer makes no such episode; others might."""
+    episode = store.episodes[position]
+    episode.__dict__["attributes"] = replace(episode.attributes, num_replans=0)
+    return store
+
+
+def test_a_damaged_episode_ends_the_analysis_with_its_name_and_a_way_out(tmp_path, capsys):
+    path = write_store(tmp_path / "a.zarr")
+    damage_rows(path, "task000_episode001")
+    words = [str(path), "--group", "a=word:the", "--no-plots", "--output", str(tmp_path / "out")]
+    assert main(words) == 2
+    said = capsys.readouterr().err.strip()
+    assert "task000_episode001" in said
+    assert "--skip-corrupt" in said
+    assert "vla-analyze verify" in said
+    assert "\n" not in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_damaged_episode_is_left_out_by_name_when_asked(tmp_path, capsys):
+    path = write_store(tmp_path / "a.zarr")
+    whole = analyse(ask([open_store(path)], AnalysisSettings())).episodes
+    damage_rows(path, "task000_episode001")
+    words = [str(path), "--no-plots", "--output", str(tmp_path / "out"), "--skip-corrupt"]
+    assert main(words) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "task000_episode001 of" in printed
+    assert "is left out" in printed
+    kept = pl.read_parquet(tmp_path / "out" / "episodes.parquet")
+    expected = whole.filter(~((pl.col("task_id") == 0) & (pl.col("episode_index") == 1)))
+    assert kept.equals(expected)
+
+
+def test_when_every_episode_is_damaged_nothing_is_left_to_analyse(tmp_path, capsys):
+    path = write_store(tmp_path / "a.zarr", tasks=(0,), episodes=2)
+    for episode in ("task000_episode000", "task000_episode001"):
+        damage_rows(path, episode)
+    assert main([str(path), "--skip-corrupt", "--no-plots"]) == 2
+    assert "None of the 2 selected episodes can be used" in capsys.readouterr().err
+
+
+def test_an_episode_without_replans_is_named_and_left_out_only_when_asked(tmp_path):
+    path = write_store(tmp_path / "a.zarr")
+    with pytest.raises(StoreError, match=r"task000_episode001 of .* holds no replan.*--skip-corrupt"):
+        ask([without_replans(open_store(path), 1)], AnalysisSettings())
+    question = ask([without_replans(open_store(path), 1)], AnalysisSettings(skip_corrupt=True))
+    assert [item.episode.name for item in question.selected] == [
+        "task000_episode000",
+        "task001_episode000",
+        "task001_episode001",
+    ]
+    (line,) = question.skipped
+    assert "task000_episode001" in line
+
+
+def test_a_misspelt_command_is_no_store(capsys):
+    assert main(["haeds", "a.zarr"]) == 2
+    said = capsys.readouterr().err
+    assert "Did you mean 'heads'" in said
+    assert "compare" in said

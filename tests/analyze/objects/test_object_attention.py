@@ -1,0 +1,303 @@
+"""Objects against loops over raw Zarr arrays, a planted follower, chance levels, and the command."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+import scipy.stats
+import zarr
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from polars.testing import assert_frame_equal
+
+from tests.kit.group_stores import CAMERAS, coverage_of, episode_tokens, random_rows, write
+from tests.kit.store_kit import OBJECTS, StoreSpec, root_attributes, write_store
+from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.measures.question import AnalysisSettings, ask
+from vla_attention.analyze.objects.object_attention import ObjectTables, object_tables
+from vla_attention.analyze.objects.object_summary import best_finders, iou_summary, objects_summary, strongest_followers
+from vla_attention.analyze.objects.objects_in_view import ObjectSettings, site_of_pictures
+from vla_attention.analyze.words.word_reading import site_of_words, words_table
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
+from vla_attention.schemas.layout import SiteLayout, Span
+from vla_attention.schemas.stores.reader import open_store
+
+QUICK = settings(
+    max_examples=6, phases=[Phase.explicit, Phase.generate], deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+)  # fmt: skip
+CLASS_OF = {"akita_black_bowl_1": "of interest", "plate_1": "of interest", "wooden_cabinet_1": "other objects"}
+
+
+def measured(path: Path, wanted: ObjectSettings | None = None, keep_steps: bool = False, **selected) -> ObjectTables:
+    return object_tables(ask([open_store(path)], AnalysisSettings(**selected)), wanted, keep_steps)
+
+
+def follow_bowl(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
+    """Head 1 of the middle layer gives the bowl's patches thirty times their weight, wherever the bowl is."""
+    rows = random_rows(tokens, rows.shape[1:-1], seed=10 * task + episode)
+    assert tokens.coverage is not None
+    for camera in CAMERAS:
+        span = tokens.layout.camera_span(camera)
+        rows[:, 1, :, 1][..., span.start : span.stop] *= 1 + 29 * tokens.coverage[camera][:, None, None, :, 0]
+    return rows / rows.sum(axis=-1, keepdims=True)
+
+
+def attend_uniformly(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
+    rows = random_rows(tokens, rows.shape[1:-1], seed=0, spread=0.0)
+    return rows / rows.sum(axis=-1, keepdims=True)
+
+
+@pytest.fixture(scope="module")
+def follower_store(tmp_path_factory) -> Path:
+    return write(tmp_path_factory.mktemp("objects") / "follower.zarr", plant_rows=follow_bowl)
+
+
+def members_of(kind: str, name: str) -> list[int]:
+    names = [thing.name for thing in OBJECTS]
+    if kind == "object":
+        return [names.index(name)]
+    return [i for i, thing in enumerate(names) if CLASS_OF.get(thing, thing) == name]
+
+
+def raw_episode(path: Path, name: str) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, slice]]:
+    """Rows (replan, layer, denoise, head, key), coverage by camera, and where each camera's keys are."""
+    root = zarr.open_group(path, mode="r")
+    episode = root[f"episodes/{name}"]
+    spans = {
+        span["camera"]: slice(span["start"], span["stop"]) for span in root.attrs["sites"][0]["spans"] if span["camera"]
+    }
+    coverage = {
+        camera: episode[f"objects/{camera}"][:].astype(float) for camera in spans if f"objects/{camera}" in episode
+    }
+    return episode["joint/rows"][:].astype(np.float64).mean(axis=4), coverage, spans
+
+
+def test_shares_and_lifts_equal_sums_over_raw_rows(follower_store):
+    objects = measured(follower_store, ObjectSettings(spatial=False)).objects
+    rows, coverage, spans = raw_episode(follower_store, "task001_episode000")
+    own = objects.filter((pl.col("task_id") == 1) & (pl.col("episode_index") == 0) & (pl.col("layer") == "2"))
+    assert own.height == 3 * (4 + 5)
+    mean = rows[:, 1].mean(axis=(1, 2))  # (replan, key)
+    for row in own.iter_rows(named=True):
+        cameras = CAMERAS if row["camera"] == "all" else (row["camera"],)
+        masses, areas, seen, images = [], [], [], []
+        for replan in range(len(mean)):
+            area = {c: coverage[c][replan][:, members_of(row["kind"], row["item"])].sum(axis=1) for c in cameras}
+            masses.append(sum(float((mean[replan, spans[c]] * area[c]).sum()) for c in cameras))
+            areas.append(sum(area[c].sum() for c in cameras) / sum(len(area[c]) for c in cameras))
+            seen.append(sum(mean[replan, spans[c]].sum() for c in cameras))
+            images.append(sum(mean[replan, spans[c]].sum() for c in CAMERAS))
+        masses, seen = np.array(masses), np.array(seen)
+        assert row["mass"] == pytest.approx(masses.mean(), rel=1e-5)
+        assert row["share"] == pytest.approx((masses / np.array(images)).mean(), rel=1e-5)
+        assert row["area_share"] == pytest.approx(np.mean(areas), rel=1e-5)
+        assert row["lift"] == pytest.approx((masses / seen).mean() / np.mean(areas), rel=1e-5)
+
+
+@QUICK
+@given(data=st.data())
+def test_spatial_metrics_equal_loops_over_raw_maps(data):
+    """On random rows and coverage, per replan, layer, denoise step and head."""
+    size, seed = data.draw(st.integers(7, 9)), data.draw(st.integers(0, 2**16))
+    tokens = episode_tokens(replans=2, size=size)
+    percentile = data.draw(st.sampled_from([75.0, 90.0]))
+    least, tolerance = data.draw(st.sampled_from([0.3, 0.7])), data.draw(st.sampled_from([0.0, 1.0, 1.5]))
+
+    def plant(task, episode, tokens, rows):
+        rows = random_rows(tokens, rows.shape[1:-1], seed, spread=1.0)
+        return rows / rows.sum(axis=-1, keepdims=True)
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = write(Path(folder) / "a.zarr", tokens=tokens, tasks=(0,), episodes=1, layers=(0, 1), plant_rows=plant)
+        chosen = ObjectSettings(percentiles=(percentile,), mask_coverage=least, tolerance=tolerance)
+        tables = measured(path, chosen, keep_steps=True, per_head=True)
+        rows, coverage, spans = raw_episode(path, "task000_episode000")
+    steps, iou = tables.steps, tables.iou
+    assert steps is not None
+    assert iou is not None
+    centres = np.array([(r + 0.5, c + 0.5) for r in range(size) for c in range(size)])
+    for row in steps.sample(80, seed=seed).iter_rows(named=True):
+        layer, denoise = row["layer"], {0: 0, 9: 1}[row["denoise_step"]]
+        values = rows[row["replan"], layer, denoise, row["head"], spans[row["camera"]]]
+        area = coverage[row["camera"]][row["replan"]][:, members_of(row["kind"], row["item"])].sum(axis=1)
+        mask = set(np.flatnonzero(area >= least).tolist())
+        centre = np.average(centres, axis=0, weights=values)
+        np.testing.assert_allclose([row["centre_row"], row["centre_column"]], centre, rtol=1e-5)
+        assert row["mass"] == pytest.approx((values * area).sum(), rel=1e-5)
+        if not mask:
+            assert row["pointing"] is None
+            assert row["iou_otsu"] is None
+            continue
+        region = set(np.flatnonzero(values >= scipy.stats.scoreatpercentile(values, percentile)).tolist())
+        assert row[f"iou_p{percentile:g}"] == pytest.approx(len(region & mask) / len(region | mask))
+        common = scipy.stats.hypergeom(size**2, len(mask), len(region))
+        chance = common.expect(lambda x: x / (len(region) + len(mask) - x))  # noqa: B023 - used at once
+        assert row[f"iou_p{percentile:g}_chance"] == pytest.approx(chance)
+        # Stored rows are rounded, so two patches can be equally high.
+        highest = centres[values == values.max()]
+        near = [any(math.dist(place, centres[patch]) <= tolerance for patch in mask) for place in highest]
+        assert row["pointing"] == pytest.approx(np.mean(near))
+        of_object = np.average(centres, axis=0, weights=area)
+        assert row["distance"] == pytest.approx(np.hypot(*(centre - of_object)) / size, rel=1e-5)
+    # The episode's table holds the means of these steps over replans with a mask and denoise steps.
+    keys = ["layer", "head", "camera", "kind", "item"]
+    names = [f"iou_p{percentile:g}", "iou_otsu", "pointing", "distance"]
+    means = steps.with_columns(pl.col("layer").cast(pl.String)).group_by(keys).agg(pl.col(names).mean())
+    joined = iou.filter(pl.col("layer") != "layers_avg").join(means, on=keys, suffix="_mean")
+    assert joined.height == 2 * 2 * 2 * 9
+    for name in names:
+        np.testing.assert_allclose(joined[name].to_numpy(), joined[f"{name}_mean"].to_numpy(), rtol=1e-9)
+
+
+def test_uniform_attention_scores_exactly_what_chance_does(tmp_path):
+    path = write(tmp_path / "uniform.zarr", plant_rows=attend_uniformly, tasks=(0,), episodes=1)
+    tables = measured(path)
+    assert tables.iou is not None
+    np.testing.assert_allclose(tables.objects["lift"].drop_nulls(), 1.0, rtol=1e-5)
+    np.testing.assert_allclose(
+        tables.objects["share"], tables.objects["area_share"] * _of_all(tables.objects), rtol=1e-5
+    )
+    seen = tables.iou.filter(pl.col("mask_replans") > 0)
+    np.testing.assert_allclose(seen["pointing"], seen["pointing_chance"], rtol=1e-6)
+    np.testing.assert_allclose(seen["iou_p90"], seen["iou_p90_chance"], rtol=1e-6)
+    np.testing.assert_allclose(seen["centre_row"], 8.0, rtol=1e-5)
+    np.testing.assert_allclose(seen["distance"], seen["distance_uniform"], rtol=1e-4)
+
+
+def _of_all(objects: pl.DataFrame) -> np.ndarray:
+    """The part of all cameras' pictures that the row's cameras are."""
+    return np.where(objects["camera"].to_numpy() == "all", 1.0, 0.5)
+
+
+def test_a_planted_follower_is_found_and_named(follower_store):
+    tables = measured(follower_store, per_head=True)
+    assert tables.iou is not None
+    best = strongest_followers(tables.objects).row(0, named=True)
+    assert (best["item"], best["object_class"]) == ("akita_black_bowl_1", "of interest")
+    assert (best["layer"], best["head"], best["num_episodes"]) == ("2", 1, 4)
+    assert best["lift"] > 10
+    finder = best_finders(tables.iou, "p90").row(0, named=True)
+    assert (finder["layer"], finder["head"]) == ("2", 1)
+    assert finder["iou"] > 2 * finder["chance"]
+    assert finder["pointing"] > 0.9 > finder["pointing_chance"] + 0.5
+    summary = objects_summary(tables.objects)
+    bowl = summary.filter((pl.col("camera") == "all") & (pl.col("item") == "akita_black_bowl_1")).row(0, named=True)
+    assert bowl["lift_low"] > 1.5
+    cabinet = summary.filter((pl.col("camera") == "all") & (pl.col("item") == "wooden_cabinet_1")).row(0, named=True)
+    assert cabinet["lift_high"] < 1.1
+    found = iou_summary(tables.iou, ObjectSettings())
+    assert found.filter(pl.col("item") == "akita_black_bowl_1")["num_episodes"].to_list() == [4, 4]
+
+
+def test_classes_follow_the_task_and_add_up(follower_store):
+    tables = measured(follower_store, ObjectSettings(spatial=False))
+    times = tables.times.filter(pl.col("camera") == "all")
+    whole = (
+        times.filter(pl.col("kind") == "class")
+        .group_by("task_id", "episode_index", "replan")
+        .agg(pl.col("share").sum())
+    )
+    np.testing.assert_allclose(whole["share"], 1.0, rtol=1e-5)
+    classes = dict(times.filter(pl.col("kind") == "object").select("item", "object_class").unique().rows())
+    assert classes == {**CLASS_OF, "robot": "robot", "background": "background"}
+
+
+def test_an_object_out_of_sight_has_no_lift_and_no_mask(tmp_path):
+    tokens = episode_tokens(replans=2)
+    coverage = coverage_of(2, 16)
+    coverage[CAMERAS[1]][:, :, 4] += coverage[CAMERAS[1]][:, :, 1]
+    coverage[CAMERAS[1]][:, :, 1] = 0.0
+    hidden = EpisodeTokens(tokens.layout, tokens.key_role, tokens.prompts, tokens.prompt_index, OBJECTS, coverage)
+    tables = measured(write(tmp_path / "hidden.zarr", tokens=hidden, tasks=(0,), episodes=1))
+    plate = (pl.col("item") == "plate_1") & (pl.col("camera") == CAMERAS[1])
+    assert tables.objects.filter(plate)["lift"].is_null().all()
+    assert tables.iou is not None
+    unseen = tables.iou.filter(plate)
+    assert (unseen["mask_replans"] == 0).all()
+    assert (
+        unseen.select("pointing", "iou_p90", "distance", "pointing_chance").null_count().row(0) == (unseen.height,) * 4
+    )
+    assert (
+        tables.objects.filter((pl.col("item") == "plate_1") & (pl.col("camera") == "all"))["lift"].is_not_null().all()
+    )
+
+
+def test_a_block_that_has_two_numbers_counts_once_in_the_average(follower_store):
+    question = ask([open_store(follower_store)], AnalysisSettings(tasks=(0,)))
+    chosen = question.selection
+    twice = replace(
+        chosen,
+        layers=(*chosen.layers, chosen.layers[1]),
+        layer_labels=(*chosen.layer_labels, 20),
+        blocks=(*chosen.blocks, chosen.blocks[1]),
+    )
+    once, doubled = object_tables(question), object_tables(replace(question, selection=twice))
+    for name in ("objects", "iou"):
+        averages = [getattr(tables, name).filter(pl.col("layer") == "layers_avg") for tables in (once, doubled)]
+        assert_frame_equal(*averages)
+    words = [words_table(part) for part in (question, replace(question, selection=twice))]
+    assert_frame_equal(*(table.filter(pl.col("layer") == "layers_avg") for table in words))
+
+
+def test_sites_are_chosen_by_what_they_hold():
+    cross = SiteLayout("cross", (Span("text", "text", 0, 2),))
+    latent = SiteLayout("self", (Span("primary", "latent", 0, 1, camera="primary"), Span("blank", "latent", 1, 2)))
+    root = replace(root_attributes(StoreSpec()), sites=(latent, cross))
+    assert site_of_pictures(root, None) == "self"
+    assert site_of_words(root, None) == "cross"
+    assert site_of_words(replace(root, sites=(cross, latent)), None) == "cross"
+    with pytest.raises(BadArgument, match="Site 'cross' has no pictures; choose one with --site: self"):
+        site_of_pictures(root, "cross")
+    with pytest.raises(BadArgument, match="Site 'self': the keys of this site spell no words"):
+        site_of_words(root, "self")
+
+
+def test_the_command_prints_writes_and_draws(follower_store, tmp_path, capsys):
+    arguments = ["objects", str(follower_store), "--output", str(tmp_path), "--per-head", "--save-steps", "--task", "1"]
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert "Followed most, by layer: 'akita_black_bowl_1' (of interest) in layer 2 head 1" in printed
+    assert "Objects of interest are found best by layer 2 head 1" in printed
+    assert {path.name for path in tmp_path.iterdir()} == {
+        *(f"{name}.parquet" for name in ("objects", "object_times", "object_steps", "objects_summary", "iou", "iou_summary")),
+        *(f"{name}.{kind}" for name in ("object_shares", "object_iou") for kind in ("png", "pdf", "csv")),
+    }  # fmt: skip
+    assert main(["objects", str(follower_store), "--output", str(tmp_path / "less"), "--no-iou"]) == 0
+    assert not (tmp_path / "less" / "object_iou.png").exists()
+    assert "IoU" not in capsys.readouterr().out
+
+
+def test_mistakes_are_said_in_one_sentence(follower_store, tmp_path, capsys):
+    for arguments, said in (
+        (["--task", "9"], "There is no task 9 among the 4 selected episodes"),
+        (["--percentiles", "100"], "Percentile 100 was given"),
+        (["--mask-coverage", "0"], "Mask coverage 0 was given"),
+        (["--tolerance", "-1"], "Tolerance -1 was given"),
+    ):
+        assert main(["objects", str(follower_store), "--output", str(tmp_path), *arguments]) == 2
+        error = capsys.readouterr().err
+        assert said in error
+        assert "Traceback" not in error
+
+
+def test_a_store_without_coverage_says_so_and_what_to_do(tmp_path, capsys):
+    path = write_store(tmp_path / "bare.zarr", coverage=False, tasks=(0,), episodes=1)
+    for command in (
+        ["objects", str(path)],
+        ["groups", str(path), "--group", "x=object:@interest"],
+        ["groups", str(path), "--grouping", "objects"],
+    ):
+        assert main([*command, "--output", str(tmp_path / "out")]) == 2
+        error = capsys.readouterr().err
+        assert "no selected episode has object coverage" in error
+        assert "vla-capture" in error
+    with pytest.raises(BadArgument, match="no selected episode has object coverage"):
+        measured(path)

@@ -1,0 +1,156 @@
+"""Spatial metrics against independent code: sets, loops, scipy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import scipy.ndimage
+import scipy.stats
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vla_attention.analyze.objects.spatial import (
+    centre_of_mass,
+    distance_in_pictures,
+    grown,
+    intersection_over_union,
+    near_patches,
+    object_masks,
+    otsu_regions,
+    otsu_thresholds,
+    patch_centres,
+    percentile_regions,
+    pointing_hits,
+    random_iou,
+)
+
+SIZES = st.tuples(st.integers(1, 6), st.integers(1, 6))
+QUICK = settings(max_examples=60, deadline=None)
+
+
+@st.composite
+def maps_and_masks(draw: st.DrawFn) -> tuple[int, int, np.ndarray, np.ndarray]:
+    """Maps (replan, head, patch) with ties and zeros, masks (replan, patch, item) that may be empty."""
+    rows, columns = draw(SIZES)
+    generator = np.random.default_rng(draw(st.integers(0, 2**16)))
+    levels = draw(st.sampled_from([2, 5, 1000]))
+    shape = (draw(st.integers(1, 3)), draw(st.integers(1, 2)), rows * columns)
+    maps = (generator.integers(0, levels, shape) / levels).astype(np.float32)
+    masks = generator.random((shape[0], rows * columns, 3)) < draw(st.sampled_from([0.0, 0.2, 0.7]))
+    return rows, columns, maps, masks
+
+
+@QUICK
+@given(maps_and_masks())
+def test_centre_of_mass_is_that_of_scipy_moved_to_the_middle_of_patches(case):
+    rows, columns, maps, _ = case
+    found = centre_of_mass(maps, patch_centres(rows, columns))
+    for replan in range(maps.shape[0]):
+        for head in range(maps.shape[1]):
+            values = maps[replan, head].astype(float)
+            if values.sum() == 0:
+                assert np.isnan(found[replan, head]).all()
+                continue
+            wanted = np.array(scipy.ndimage.center_of_mass(values.reshape(rows, columns))) + 0.5
+            np.testing.assert_allclose(found[replan, head], wanted, rtol=1e-9)
+
+
+def test_a_uniform_map_has_its_centre_in_the_middle_and_distances_are_parts_of_the_picture():
+    centres = patch_centres(4, 8)
+    middle = centre_of_mass(np.full(32, 0.25), centres)
+    assert middle.tolist() == [2.0, 4.0]
+    corner = centre_of_mass(np.eye(32)[31], centres)
+    assert corner.tolist() == [3.5, 7.5]
+    assert distance_in_pictures(middle, corner, 4, 8) == pytest.approx(math.hypot(1.5 / 4, 3.5 / 8))
+
+
+@QUICK
+@given(maps_and_masks(), st.sampled_from([0.0, 1.0, 1.5, 2.0]))
+def test_pointing_game_counts_highest_patches_near_the_mask(case, tolerance):
+    rows, columns, maps, masks = case
+    hits = pointing_hits(maps, grown(masks, near_patches(rows, columns, tolerance)))
+    for replan in range(maps.shape[0]):
+        for head in range(maps.shape[1]):
+            values = maps[replan, head].reshape(rows, columns)
+            highest = list(zip(*np.nonzero(values == values.max()), strict=True))
+            for item in range(masks.shape[2]):
+                members = list(zip(*np.nonzero(masks[replan, :, item].reshape(rows, columns)), strict=True))
+                if not members:
+                    assert np.isnan(hits[replan, head, item])
+                    continue
+                near = [any(math.dist(place, member) <= tolerance for member in members) for place in highest]
+                assert hits[replan, head, item] == pytest.approx(sum(near) / len(near))
+
+
+@QUICK
+@given(maps_and_masks(), st.sampled_from([5.0, 50.0, 80.0, 95.0]))
+def test_iou_is_that_of_python_sets(case, percentile):
+    _, _, maps, masks = case
+    regions = percentile_regions(maps, percentile)
+    found = intersection_over_union(regions, masks)
+    for replan in range(maps.shape[0]):
+        for head in range(maps.shape[1]):
+            values = [float(value) for value in maps[replan, head]]
+            limit = scipy.stats.scoreatpercentile(values, percentile)
+            region = {i for i, value in enumerate(values) if value >= limit or math.isclose(value, limit, rel_tol=1e-6)}
+            assert set(np.flatnonzero(regions[replan, head])) <= region
+            region = set(np.flatnonzero(regions[replan, head]).tolist())
+            for item in range(masks.shape[2]):
+                mask = set(np.flatnonzero(masks[replan, :, item]).tolist())
+                if mask:
+                    assert found[replan, head, item] == pytest.approx(len(region & mask) / len(region | mask))
+                else:
+                    assert np.isnan(found[replan, head, item])
+
+
+def test_percentile_regions_have_the_stated_sizes():
+    values = np.random.default_rng(0).permutation(256).astype(np.float32)
+    assert [int(percentile_regions(values, p).sum()) for p in (80, 90, 95)] == [52, 26, 13]
+    assert percentile_regions(np.ones(9), 90).all()
+
+
+def between_class_variance(values: np.ndarray, threshold: float) -> float:
+    low, high = values[values <= threshold], values[values > threshold]
+    if not low.size or not high.size:
+        return 0.0
+    return low.size * high.size / values.size**2 * (low.mean() - high.mean()) ** 2
+
+
+@QUICK
+@given(st.lists(st.integers(0, 50), min_size=2, max_size=40), st.sampled_from([1.0, 1e-4]))
+def test_otsu_is_the_best_threshold_of_a_brute_force_search(values, scale):
+    values = np.array(values) * scale
+    threshold = float(otsu_thresholds(values))
+    if len(set(values)) == 1:
+        assert np.isnan(threshold)
+        assert not otsu_regions(values).any()
+        return
+    best = max(between_class_variance(values, candidate) for candidate in values)
+    assert between_class_variance(values, threshold) == pytest.approx(best, rel=1e-9)
+    assert np.array_equal(otsu_regions(values), values > threshold)
+
+
+def test_otsu_separates_two_clusters_whatever_else_the_axes_hold():
+    generator = np.random.default_rng(1)
+    maps = np.concatenate([generator.normal(1, 0.05, (3, 2, 20)), generator.normal(2, 0.05, (3, 2, 6))], axis=-1)
+    assert np.array_equal(otsu_regions(maps), np.broadcast_to(np.arange(26) >= 20, maps.shape))
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 9), st.data())
+def test_chance_iou_is_the_mean_over_all_regions_of_that_size(total, data):
+    from itertools import combinations
+
+    drawn, wanted = data.draw(st.integers(0, total)), data.draw(st.integers(1, total))
+    mask = set(range(wanted))
+    all_regions = [set(region) for region in combinations(range(total), drawn)]
+    wanted_mean = np.mean([len(region & mask) / len(region | mask) for region in all_regions])
+    found = random_iou(np.array([[drawn]]), np.array([[wanted, 0]]), total)
+    assert found[0, 0] == pytest.approx(wanted_mean)
+    assert np.isnan(found[0, 1])
+
+
+def test_masks_take_patches_from_the_stated_coverage_on():
+    assert object_masks(np.array([0.49, 0.5, 1.0]), 0.5).tolist() == [False, True, True]

@@ -1,0 +1,178 @@
+"""`vla-analyze overlay` on stores made by the real writer: numbers from raw arrays, pictures, a planted follower, bad input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+import zarr
+
+import tests.kit.store_kit as kit
+from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.measures.question import AnalysisSettings, ask
+from vla_attention.analyze.overlay.overlay_data import camera_names, draw, episode_overlay, ratios_of
+from vla_attention.capture.store.store_writer import open_run
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
+from vla_attention.schemas.layout import Role, SiteLayout, Span
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import PolicyCameraView
+
+CAMERA = "base_0_rgb"
+
+
+def place_of(replan: int) -> tuple[int, int]:
+    """Where the followed thing is in the stored picture of `base_0_rgb`, which has 3 x 4 patches."""
+    return (replan * 2 + 1) % 3, (replan + 2) % 4
+
+
+def follow(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
+    span = tokens.layout.camera_span(CAMERA)
+    for replan in range(len(rows)):
+        row, column = place_of(replan)
+        rows[replan][..., span.start + 4 * row + column] = 3.0
+    return rows / rows.sum(axis=-1, keepdims=True)
+
+
+def write_turned_store(path: Path, upright: bool, mirrored: bool) -> Path:
+    """One episode whose frames are black but for a white patch that attention follows."""
+    spec = kit.StoreSpec(tasks=(0,), episodes=1, plant_rows=follow)
+    root = kit.root_attributes(spec)
+    views = tuple(replace(view, upright=upright, mirrored=mirrored) for view in root.policy.cameras)
+    store = open_run(path, replace(root, policy=replace(root.policy, cameras=views)), "new")
+    start, records = kit.episode_records(spec, 0, 0)
+    for replan, record in enumerate(records):
+        row, column = place_of(replan)
+        frame = record.frames[CAMERA]
+        frame[:] = 0
+        frame[row * 4 : row * 4 + 4, column * 4 : column * 4 + 4] = 255
+    with store.episode(start, kit.denoise_times(spec), len(records)) as writer:
+        for record in records:
+            writer.append(record)
+        kit.commit(writer, spec, 0, 0)
+    return path
+
+
+@pytest.mark.parametrize("upright", [True, False])
+@pytest.mark.parametrize("mirrored", [True, False])
+def test_the_follower_s_attention_is_drawn_on_what_it_follows(tmp_path: Path, upright: bool, mirrored: bool) -> None:
+    store = open_store(write_turned_store(tmp_path / "a.zarr", upright, mirrored))
+    question = ask([store], AnalysisSettings())
+    item = question.selected[0]
+    overlay = episode_overlay(question, item, camera_names(question, None), ratios_of(question, item))
+    scale, values = overlay.scale("lift", range(3)), overlay.values("lift")
+    view = PolicyCameraView(CAMERA, "", upright, mirrored)
+    assert overlay.views[CAMERA].mirrored == mirrored
+    for replan in range(3):
+        frame = zarr.open_array(store.path / f"episodes/{item.episode.name}/frames/{CAMERA}", mode="r")[replan]
+        seen = frame[:, :, 0] == 255
+        seen = seen if view.upright else seen[::-1]
+        seen = seen[:, ::-1] if view.mirrored else seen
+        drawn = draw(overlay, CAMERA, replan, scale, values).astype(float)
+        # Black stays dark under weak attention; the followed patch alone has the scale's last, pale yellow.
+        bright = drawn[..., 0] + drawn[..., 1] > 330
+        np.testing.assert_array_equal(bright, seen)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("overlay") / "made.zarr"
+    return kit.write_store(path, episodes=2, replans=4, plant_rows=follow)
+
+
+def test_the_csv_has_the_raw_rows_numbers(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = [
+        "overlay",
+        str(made),
+        "--task",
+        "1",
+        "--episode",
+        "1",
+        "--replans",
+        "3",
+        "1",
+        "--layers",
+        "2",
+        "--heads",
+        "1",
+    ]
+    assert (
+        main([*arguments, "--denoise", "last", "--output", str(tmp_path), "--group", f"spot=patch:{CAMERA}[0:1,0:2]"])
+        == 0
+    )
+    stem = tmp_path / "overlay_task001_episode001"
+    assert {path.suffix for path in tmp_path.iterdir()} == {".png", ".pdf", ".csv"}
+    table = pl.read_csv(stem.with_suffix(".csv"))
+    group = zarr.open_group(made / "episodes/task001_episode001", mode="r")
+    rows = np.asarray(group["joint/rows"])[:, 1, 1, 1, 0].astype(np.float64)  # layer 2, last denoise step, head 1
+    roles = np.asarray(group["joint/key_role"])
+    valid = ~np.isin(roles, [int(Role.MASKED_IMAGE), int(Role.PADDING), int(Role.NULL)])
+    image = roles == int(Role.IMAGE)
+    assert table["camera"].unique(maintain_order=True).to_list() == [CAMERA, "left_wrist_0_rgb"]
+    for replan in (3, 1):
+        own = table.filter((pl.col("camera") == CAMERA) & (pl.col("replan") == replan)).sort("row", "column")
+        mass = rows[replan, :12]
+        np.testing.assert_allclose(own["mass"], mass, rtol=1e-6)
+        np.testing.assert_allclose(own["share_percent"], 100 * mass / rows[replan, image[replan]].sum(), rtol=1e-6)
+        mean_key = rows[replan, valid[replan]].sum() / valid[replan].sum()
+        np.testing.assert_allclose(own["lift"], mass / mean_key, rtol=1e-6)
+    printed = capsys.readouterr().out
+    assert "task001_episode001: open the top drawer" in printed
+
+
+def test_without_frames_the_map_alone_is_drawn_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    store = kit.write_store(tmp_path / "bare.zarr", tasks=(0,), episodes=1, frames=False)
+    assert main(["overlay", str(store), "--output", str(tmp_path / "out"), "--video", "gif", "--smooth"]) == 0
+    assert "No pictures were stored" in capsys.readouterr().out
+    from PIL import Image
+
+    with Image.open(tmp_path / "out/overlay_task000_episode000.gif") as gif:
+        assert gif.n_frames == 3
+    every = pl.read_csv(tmp_path / "out/overlay_task000_episode000_all.csv")
+    assert every["replan"].n_unique() == 3
+
+
+def test_turned_pictures_keep_the_selectors_coordinates(tmp_path: Path) -> None:
+    store = write_turned_store(tmp_path / "a.zarr", upright=False, mirrored=True)
+    assert main(["overlay", str(store), "--no-plots", "--output", str(tmp_path / "out")]) == 0
+    table = pl.read_csv(tmp_path / "out/overlay_task000_episode000_all.csv").filter(pl.col("camera") == CAMERA)
+    for replan in range(3):
+        top = table.filter(pl.col("replan") == replan).sort("mass").row(-1, named=True)
+        row, column = place_of(replan)
+        assert (top["row"], top["column"]) == (row, column)
+        assert (top["shown_row"], top["shown_column"]) == (2 - row, 3 - column)
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (["--camera", "base"], "Did you mean 'base_0_rgb'"),
+        (["--replans", "9"], "replans 0 to 3"),
+        (["--task", "7"], "no task 7"),
+        (["--group", "x=word:kettle"], "no instruction has the word 'kettle'"),
+        (["--group", "x"], "NAME=SELECTOR"),
+        (["--video", "gif", "--fps", "0"], "0.1 to 50"),
+        (["--video", "gif", "--no-plots"], "contradict"),
+    ],
+)
+def test_bad_input_is_one_sentence(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], extra: list[str], message: str
+) -> None:
+    assert main(["overlay", str(made), "--output", str(tmp_path / "out"), *extra]) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert "Traceback" not in captured.err
+
+
+def test_a_site_without_pictures_is_refused(tmp_path: Path) -> None:
+    layout = SiteLayout("joint", (Span("prompt", "text", 0, 14), Span("actions", "action", 14, 19)))
+    prompt, roles = kit.make_prompt(layout, kit.INSTRUCTIONS[0], "1 2")
+    key_role = np.tile(np.concatenate([roles, np.full(5, Role.ACTION, dtype=np.uint8)]), (2, 1))
+    tokens = EpisodeTokens(layout, key_role, (prompt,), np.zeros(2, dtype=np.int64), kit.OBJECTS, {})
+    store = kit.write_store(tmp_path / "blind.zarr", tasks=(0,), episodes=1, tokens=tokens)
+    question = ask([open_store(store)], AnalysisSettings())
+    with pytest.raises(BadArgument, match="no patches of pictures"):
+        camera_names(question, None)

@@ -1,0 +1,165 @@
+"""Overlays: the right patch on the right pixels, whichever way a camera's picture was turned; values and scales by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+
+from vla_attention.analyze.show.patch_pictures import (
+    COLOR_KEPT,
+    NO_PICTURE,
+    OPACITY,
+    Scale,
+    color_bar,
+    enlarge,
+    outline,
+    overlay_image,
+    patch_values,
+    scale_for,
+    upright,
+)
+from vla_attention.capture.environments.coverage import patch_coverage
+from vla_attention.capture.policies.cosmos.preprocess import crop_and_enlarge, visible_area
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.stores.store_format import PolicyCameraView
+
+ROWS, COLUMNS, SIDE = 8, 4, 5  # patches of 5 x 5 pixels
+OBJECT = (230, 20, 10)
+SCALE = Scale(10.0, "lift")
+
+
+def scene(row: int, column: int) -> np.ndarray:
+    """A picture as a person sees the scene: grey, with one patch-sized object."""
+    picture = np.full((ROWS * SIDE, COLUMNS * SIDE, 3), 90, dtype=np.uint8)
+    picture[row * SIDE : (row + 1) * SIDE, column * SIDE : (column + 1) * SIDE] = OBJECT
+    return picture
+
+
+def as_stored(picture: np.ndarray, view: PolicyCameraView) -> np.ndarray:
+    """From what a person sees to the stored frame, as capture does it: the simulator delivers the bottom row first."""
+    raw = np.flipud(picture)
+    stored = np.flipud(raw) if view.upright else raw
+    return np.fliplr(stored) if view.mirrored else stored
+
+
+@pytest.mark.parametrize("upright_frame", [True, False])
+@pytest.mark.parametrize("mirrored", [True, False])
+@pytest.mark.parametrize(("row", "column"), [(0, 0), (1, 3), (6, 0), (7, 2)])
+def test_a_bright_patch_lies_on_the_object_that_the_person_sees(
+    upright_frame: bool, mirrored: bool, row: int, column: int
+) -> None:
+    view = PolicyCameraView("cam", "agentview", upright_frame, mirrored)
+    frame = as_stored(scene(row, column), view)
+    # The follower attends to whatever patch of the stored frame shows the object.
+    red = (frame == OBJECT).all(axis=-1).reshape(ROWS, SIDE, COLUMNS, SIDE).all(axis=(1, 3))
+    assert red.sum() == 1
+    attention = np.where(red, SCALE.high, 0.0)
+    shown = upright(overlay_image(frame, attention, SCALE), view)
+    np.testing.assert_array_equal(upright(frame, view), scene(row, column))
+    plain = overlay_image(scene(row, column), np.zeros((ROWS, COLUMNS)), SCALE)
+    changed = (shown != plain).any(axis=-1)
+    expected = (scene(row, column) == OBJECT).all(axis=-1)
+    np.testing.assert_array_equal(changed, expected)
+
+
+@pytest.mark.parametrize("flip_columns", [True, False])
+def test_patches_line_up_with_what_a_cropping_policy_stores(flip_columns: bool) -> None:
+    """Coverage is computed from the whole picture and `visible`; the stored frame is the crop. Both must mean the same pixels."""
+    size, patches = 224, 16
+    segmentation = np.zeros((size, size), dtype=np.int64)
+    segmentation[40:124, 150:190] = 1  # in the simulator's order
+    turned = segmentation[::-1, :: -1 if flip_columns else 1]
+    picture = np.where(turned[..., None] == 1, 255, 0).astype(np.uint8).repeat(3, axis=-1)
+    frame = crop_and_enlarge(picture)
+    share = patch_coverage(
+        segmentation, 2, patches, patches, flip_rows=True, flip_columns=flip_columns, visible=visible_area()
+    )[:, 1]
+    seen = (frame[..., 0] / 255.0).reshape(patches, size // patches, patches, size // patches).mean(axis=(1, 3))
+    assert 0.05 < seen.mean() < 0.5
+    # The crop begins at a whole pixel: a border may be off by one pixel of fourteen, a shifted patch would be off by one.
+    np.testing.assert_allclose(share.reshape(patches, patches), seen, atol=0.1)
+
+
+@given(
+    npst.arrays(np.float64, st.tuples(st.integers(1, 6), st.integers(1, 6)), elements=st.floats(0, 9)),
+    st.integers(1, 40),
+    st.integers(1, 40),
+)
+def test_every_pixel_has_the_value_of_the_patch_around_its_centre(grid: np.ndarray, height: int, width: int) -> None:
+    large = enlarge(grid, height, width)
+    assert large.shape == (height, width)
+    for row in {0, height // 2, height - 1}:
+        for column in {0, width // 3, width - 1}:
+            r = int((2 * row + 1) * grid.shape[0] // (2 * height))
+            c = int((2 * column + 1) * grid.shape[1] // (2 * width))
+            assert large[row, column] == grid[r, c]
+    smooth = enlarge(grid, height, width, smooth=True)
+    assert smooth.min() >= grid.min() - 1e-9
+    assert smooth.max() <= grid.max() + 1e-9
+
+
+def test_smooth_enlargement_is_linear_between_centres_and_true_at_them() -> None:
+    grid = np.array([[0.0, 6.0], [3.0, 9.0]])
+    large = enlarge(grid, 6, 6, smooth=True)
+    np.testing.assert_allclose(large[1, [1, 4]], [0.0, 6.0])
+    np.testing.assert_allclose(large[1, 1:5], [0.0, 2.0, 4.0, 6.0])
+    np.testing.assert_allclose(large[[0, 5], 0], [0.0, 3.0])
+
+
+def test_values_are_shares_of_image_attention_and_lifts_over_the_mean_valid_key() -> None:
+    mass = np.array([[[0.1, 0.3]], [[0.2, 0.0]]])
+    image, mean_key = np.array([0.5, 0.0]), np.array([0.05, 0.1])
+    np.testing.assert_allclose(patch_values(mass, image, mean_key, "lift"), [[[2, 6]], [[2, 0]]])
+    share = patch_values(mass, image, mean_key, "share")
+    np.testing.assert_allclose(share[0], [[20, 60]])
+    assert np.isinf(share[1, 0, 0])
+    assert np.isnan(share[1, 0, 1])
+
+
+@given(st.lists(st.floats(0, 500), min_size=1, max_size=60))
+def test_a_scale_ends_at_a_high_quantile_and_never_makes_uniform_attention_look_like_more(values: list[float]) -> None:
+    array = np.array(values)
+    for measure, uniform in (("lift", 1.0), ("share", 100.0 / 512)):
+        scale = scale_for(array, measure, 512)
+        assert scale.high >= 4 * uniform * (1 - 1e-12)
+        assert scale.high >= np.quantile(array, 0.995) * (1 - 1e-9)
+        assert scale.high <= 1.11 * max(np.quantile(array, 0.995), 4 * uniform)
+        assert scale.colors(np.array(uniform))[3] <= OPACITY / 4 + 1e-9
+
+
+def test_undefined_and_missing_values() -> None:
+    frame = np.full((4, 4, 3), (200, 100, 0), dtype=np.uint8)
+    untouched = overlay_image(frame, np.full((2, 2), np.nan), SCALE)
+    grey = 0.299 * 200 + 0.587 * 100
+    expected = np.round(COLOR_KEPT * np.array([200, 100, 0]) + (1 - COLOR_KEPT) * grey)
+    np.testing.assert_array_equal(untouched, np.broadcast_to(expected.astype(np.uint8), frame.shape))
+    alone = overlay_image(None, np.zeros((2, 2)), SCALE, size=(6, 8))
+    assert alone.shape == (6, 8, 3)
+    assert (alone == NO_PICTURE).all()
+    with pytest.raises(BadArgument, match="size"):
+        overlay_image(None, np.zeros((2, 2)), SCALE)
+    with pytest.raises(BadArgument, match="two axes"):
+        overlay_image(frame, np.zeros((2, 2, 2)), SCALE)
+
+
+def test_colours_get_lighter_and_more_opaque_with_the_value() -> None:
+    colors = SCALE.colors(np.linspace(0, 10, 21))
+    lightness = colors[:, :3] @ np.array([0.2126, 0.7152, 0.0722])
+    assert (np.diff(lightness) > 0).all()
+    np.testing.assert_allclose(colors[:, 3], OPACITY * np.linspace(0, 1, 21))
+    assert color_bar(SCALE, 100, 4).shape == (4, 100, 3)
+
+
+def test_an_outline_is_the_inner_border_of_the_members() -> None:
+    image = np.zeros((12, 12, 3), dtype=np.uint8)
+    member = np.zeros((3, 3), dtype=bool)
+    member[0:2, 1] = True
+    drawn = (outline(image, member, (255, 255, 255), width=1) == 255).all(axis=-1)
+    expected = np.zeros((12, 12), dtype=bool)
+    expected[0:8, 4:8] = True
+    expected[1:7, 5:7] = False
+    np.testing.assert_array_equal(drawn, expected)
+    assert not image.any()

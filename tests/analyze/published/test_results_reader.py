@@ -1,0 +1,317 @@
+"""Results files of anybody: ours, and those of the published scripts as the test writes them."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.kit.published_results import (
+    cosmos_episodes,
+    pi_episodes,
+    pi_step,
+    published_average,
+    published_episode,
+    write_published,
+)
+from tests.kit.synthetic import default_grouping, make_steps
+from vla_attention.analyze.measures.aggregate import add_layers_avg, per_replan
+from vla_attention.analyze.published.results_file import write_results_of_suites
+from vla_attention.analyze.published.results_reader import find_results, read_results_file
+from vla_attention.analyze.published.results_tables import (
+    NO_FINITE_AS_ZERO,
+    ZEROS_COUNTED,
+    disagreements,
+    labels_of,
+    results_tables,
+    spread_of,
+)
+from vla_attention.schemas.results import ResultsError, ResultsNotFound
+
+GROUPING = default_grouping()
+
+
+def ours(folder, **changes):
+    replans = add_layers_avg(per_replan(make_steps(**changes), GROUPING), GROUPING)
+    (path,) = write_results_of_suites(folder, replans, GROUPING)
+    return path, replans
+
+
+def test_our_own_files_read_back_as_the_table_they_were_written_from(tmp_path):
+    path, replans = ours(tmp_path, no_denominator=0.2)
+    file = read_results_file(path)
+    assert file.suite == "libero_10"
+    assert file.kind.frames is None
+    assert file.kind.has_action
+    assert file.unused == ()
+    assert file.zeros == 0
+    back = file.steps.join(file.episodes.select("episode", "task_id", "episode_index"), on="episode").sort(
+        "task_id", "episode_index", "replan", "layer_number", nulls_last=True
+    )
+    expected = replans.sort("task_id", "episode_index", "replan", "layer_number", nulls_last=True)
+    for column in ("layer", "env_step", "visual_mass", "linguistic_mass", "action_mass", "visual_fraction"):
+        assert back[column].to_list() == expected[column].to_list(), column
+    # Infinities come back, although the file has only null for them.
+    assert back["ratio"].to_list() == expected["ratio"].to_list()
+    assert expected["ratio"].is_infinite().any()
+    assert disagreements(file) == []
+
+
+def test_files_of_the_published_pi_script(tmp_path):
+    episodes = pi_episodes(dark=0.3)
+    file = read_results_file(write_published(tmp_path, "libero_10", episodes))
+    assert file.unused == ("visual_perturbation",)
+    assert file.episodes["num_steps"].to_list() == [episode["num_steps"] for episode in episodes]
+    for number, episode in enumerate(episodes):
+        for name, steps in episode["per_step_ratios"].items():
+            layer = name.removeprefix("layer_") if name != "layers_avg" else name
+            rows = file.steps.filter(episode=number, layer=layer).sort("replan")
+            assert rows["env_step"].to_list() == [step["step"] for step in steps]
+            if layer != "layers_avg":
+                assert rows["ratio"].to_list() == [step["visual_linguistic_ratio"] for step in steps]
+    assert np.isinf(file.steps["ratio"].to_numpy()).any()
+
+
+def test_a_zero_that_stands_for_no_ratio_is_undefined_and_counted(tmp_path):
+    file = read_results_file(write_published(tmp_path, "s", pi_episodes(tasks=1, episodes=1, dark=1.0)))
+    assert file.steps.filter(layer="layers_avg")["ratio"].is_null().all()
+    assert file.steps.filter(layer="25")["ratio"].is_infinite().all()
+    assert file.zeros == 8
+    assert {item.reason for item in disagreements(file)} == {NO_FINITE_AS_ZERO}
+    # A step at which only some layers are infinite has a ratio; zeros among ratios change the file's own means.
+    episodes = pi_episodes(tasks=1, episodes=1, layers=(25, 26), steps=4)
+    for name in ("layer_25", "layer_26", "layers_avg"):
+        step = episodes[0]["per_step_ratios"][name][0]
+        step["visual_linguistic_ratio"] = 0.0 if name == "layers_avg" else float("inf")
+    steps = episodes[0]["per_step_ratios"]["layers_avg"]
+    claimed = episodes[0]["summary"]["layers_avg"]["visual_linguistic_ratio"]
+    claimed["mean"] = float(np.mean([step["visual_linguistic_ratio"] for step in steps]))
+    file = read_results_file(write_published(tmp_path, "t", episodes))
+    mean = next(d for d in disagreements(file) if d.claim.layer == "layers_avg" and d.claim.statistic == "mean")
+    assert mean.reason == ZEROS_COUNTED
+    assert mean.computed == pytest.approx(np.mean([step["visual_linguistic_ratio"] for step in steps[1:]]))
+
+
+def test_a_true_zero_stays_a_ratio(tmp_path):
+    layers = {"layer_3": [pi_step(10, 0.0, 0.5, 0.5), pi_step(15, 0.25, 0.5, 0.25)]}
+    file = read_results_file(write_published(tmp_path, "s", [published_episode(0, 0, layers)]))
+    assert file.steps["ratio"].to_list() == [0.0, 0.5]
+    assert file.zeros == 0
+
+
+def test_files_of_the_published_cosmos_script(tmp_path):
+    file = read_results_file(write_published(tmp_path, "libero_goal", cosmos_episodes()))
+    assert file.kind.frames == ("action", "curr_last", "frame0")
+    assert not file.kind.has_action
+    assert file.steps["layer"].unique().sort().to_list() == ["25", "26"]
+    assert (file.steps["visual_mass"] > 1).any()
+    tables = results_tables([file], ["libero_goal"])
+    assert tables.grouping.names == ("visual", "linguistic")
+
+
+def test_what_no_named_fraction_holds_is_the_rest(tmp_path):
+    path, replans = ours(tmp_path)
+    tables = results_tables([read_results_file(path)], ["x"])
+    assert tables.grouping.names == ("visual", "linguistic", "action", "rest")
+    others = [name for name in GROUPING.names if name not in ("visual", "linguistic", "action")]
+    expected = replans.select(pl.sum_horizontal(f"{name}_fraction" for name in others)).to_series()
+    np.testing.assert_allclose(tables.replans["rest_fraction"].to_numpy(), expected.to_numpy(), atol=1e-9)
+    mass = replans.select(pl.sum_horizontal(f"{name}_mass" for name in others)).to_series()
+    np.testing.assert_allclose(tables.replans["rest_mass"].to_numpy(), mass.to_numpy(), atol=1e-9)
+
+
+def test_tables_are_those_of_numpy(tmp_path):
+    episodes = pi_episodes(dark=0.2, seed=4)
+    tables = results_tables([read_results_file(write_published(tmp_path, "s", episodes))], ["s"])
+    means = {}
+    for episode in episodes:
+        for name, steps in episode["per_step_ratios"].items():
+            ratios = np.array([step["visual_linguistic_ratio"] for step in steps])
+            finite = ratios[np.isfinite(ratios)]
+            if name == "layers_avg":
+                finite = finite[finite > 0]
+            key = (episode["task_id"], episode["episode_idx"], name.removeprefix("layer_"))
+            means[key] = finite.mean() if finite.size else None
+    for row in tables.episodes.iter_rows(named=True):
+        assert row["ratio_mean"] == pytest.approx(means[row["task_id"], row["episode_index"], row["layer"]])
+    for row in tables.tasks.filter(scope="task").iter_rows(named=True):
+        own = [v for (task, _, layer), v in means.items() if (task, layer) == (row["task_id"], row["layer"]) and v]
+        assert row["ratio_mean"] == pytest.approx(np.mean(own))
+        assert row["num_episodes"] == 4
+
+
+def test_spread_counts_what_it_leaves_out():
+    values = [1.0, 2.0, 4.0, float("inf"), None, 8.0]
+    spread = spread_of(pl.Series(values))
+    finite = np.array([1.0, 2.0, 4.0, 8.0])
+    assert (spread.num_replans, spread.num_infinite, spread.num_undefined) == (6, 1, 1)
+    assert (spread.mean, spread.std, spread.median) == (finite.mean(), finite.std(), np.median(finite))
+    assert [spread.q25, spread.q75] == np.quantile(finite, [0.25, 0.75]).tolist()
+
+
+def test_a_summary_that_its_steps_do_not_bear_out_is_noticed(tmp_path):
+    episodes = pi_episodes(tasks=1, episodes=2)
+    episodes[1]["summary"]["layer_26"]["visual_mass"]["std"] += 0.1
+    episodes[0]["summary"]["layer_99"] = episodes[0]["summary"]["layer_26"]
+    found = disagreements(read_results_file(write_published(tmp_path, "s", episodes)))
+    (changed,) = [item for item in found if item.claim.episode == 1]
+    assert (changed.claim.layer, changed.claim.measure, changed.claim.statistic) == ("26", "visual_mass", "std")
+    assert changed.claim.value - changed.computed == pytest.approx(0.1)
+    assert {item.claim.layer for item in found if item.claim.episode == 0} == {"99"}
+
+
+def test_layers_that_an_episode_lacks_and_episodes_without_steps_are_kept(tmp_path):
+    episodes = pi_episodes(tasks=2, episodes=1)
+    episodes[1]["per_step_ratios"], episodes[1]["summary"] = {}, {}
+    file = read_results_file(write_published(tmp_path, "s", episodes))
+    assert file.episodes["num_replans"].to_list() == [8, 0]
+
+
+def test_files_folders_and_patterns_are_found_once(tmp_path):
+    goal = write_published(tmp_path / "run_a", "goal", cosmos_episodes())
+    ten = write_published(tmp_path / "run_b", "ten", cosmos_episodes())
+    (tmp_path / "run_a" / "config.json").write_text("{}")
+    plain = tmp_path / "plain"
+    plain.mkdir()
+    (plain / "renamed.json").write_text(json.dumps(cosmos_episodes()))
+    assert find_results([str(tmp_path / "run_a")]) == [goal]
+    assert find_results([str(tmp_path / "run_*/attention_ratio_results_*.json"), str(goal)]) == [goal, ten]
+    assert find_results([str(tmp_path / "run_*")]) == [goal, ten]
+    assert find_results([str(plain)]) == [plain / "renamed.json"]
+    with pytest.raises(ResultsNotFound, match=r"Nothing matches .*run_x.*run_a/attention_ratio_results_goal"):
+        find_results([str(tmp_path / "run_x*/a.json")])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FileNotFoundError, match="no results file in"):
+        find_results([str(tmp_path / "empty")])
+
+
+def test_labels_are_suites_and_folders_only_where_they_are_needed(tmp_path):
+    paths = [
+        write_published(tmp_path / "x" / "one", "goal", cosmos_episodes()),
+        write_published(tmp_path / "x" / "two", "goal", cosmos_episodes()),
+        write_published(tmp_path / "y" / "two", "goal", cosmos_episodes()),
+        write_published(tmp_path / "x" / "one", "ten", cosmos_episodes()),
+    ]
+    same = tmp_path / "x" / "one" / "ten.json"
+    same.write_text(paths[3].read_text())
+    files = [read_results_file(path) for path in [*paths, same]]
+    assert labels_of(files) == [
+        *("one/goal", "x/two/goal", "y/two/goal"),
+        *("attention_ratio_results_ten", "ten"),
+    ]
+    assert labels_of(files[:1]) == ["goal"]
+
+
+def one_episode(**changes: Any) -> dict[str, Any]:
+    return {**pi_episodes(tasks=1, episodes=1)[0], **changes}
+
+
+def with_step(**changes: Any) -> list[dict[str, Any]]:
+    episode = one_episode()
+    episode["per_step_ratios"]["layer_26"][3].update(changes)
+    return [one_episode(episode_idx=7), episode]
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        ({"a": 1}, r"not a results file: expected a list of episodes, found an object"),
+        ("text", r"expected a list of episodes, found a text"),
+        ([], r"holds no episode"),
+        ([{"a": 1}], r"not a results file: episode 0 lacks 'task_id'"),
+        ([3], r"episode 0 is the number 3; expected an object"),
+        ([one_episode(success="yes")], r"episode 0, success is a text; expected true or false"),
+        ([one_episode(task_id=-1)], r"episode 0, task_id is the number -1; expected a whole number"),
+        ([one_episode(), one_episode()], r"episodes 0 and 1 are both task 0, episode 0"),
+        ([one_episode(per_step_ratios={}, summary={})], r"none of its 1 episodes has a single step"),
+        ([one_episode(per_step_ratios={"level_3": []})], r"has 'level_3'; expected layer_N or layers_avg"),
+        (
+            [one_episode(summary={"layer_25": {"visual_mass": {"mean": "x"}}})],
+            r"summary\.layer_25\.visual_mass\.mean is a text",
+        ),
+        (with_step(visual_mass=-0.1), r"episode 1 \(task 0, episode 0\), layer_26\[3\]\.visual_mass is -0\.1"),
+        (with_step(visual_mass=float("nan")), r"layer_26\[3\]\.visual_mass is nan; expected a finite mass"),
+        (
+            with_step(linguistic_fraction=1.5),
+            r"layer_26\[3\]\.linguistic_fraction is 1\.5; expected a number from 0 to 1",
+        ),
+        (with_step(visual_linguistic_ratio=float("-inf")), r"visual_linguistic_ratio is -inf"),
+        (with_step(visual_linguistic_ratio="high"), r"visual_linguistic_ratio is a text; expected a number"),
+        (with_step(step=10), r"layer_26\[3\]\.step is 10, after 20: steps must rise"),
+        (with_step(step=True), r"layer_26\[3\]\.step is true; expected a whole number"),
+        (with_step(query_frame="action"), r"layer_26\[3\] lacks 'visual_frame', 'text_frame'"),
+        (
+            with_step(query_frame="action", visual_frame="curr_last", text_frame="frame0"),
+            r"layer_26\[3\] holds masses of another kind \(latent frames.*than episode 0",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_said_with_file_episode_and_field(tmp_path, document, message):
+    path = tmp_path / "broken.json"
+    path.write_text(json.dumps(document))
+    with pytest.raises(ResultsError, match=rf"broken\.json: .*{message}") as caught:
+        read_results_file(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_fields_of_a_step_are_named(tmp_path):
+    episode = one_episode()
+    del episode["per_step_ratios"]["layer_25"][0]["linguistic_mass"]
+    path = write_published(tmp_path, "s", [episode])
+    with pytest.raises(ResultsError, match=r"layer_25\[0\] lacks 'linguistic_mass'"):
+        read_results_file(path)
+
+
+@pytest.mark.parametrize("content", [b"[{]", b"\xff\xfe", b"[" * 100_000])
+def test_what_is_no_json_is_no_results_file(tmp_path, content):
+    path = tmp_path / "broken.json"
+    path.write_bytes(content)
+    with pytest.raises(ResultsError, match=r"broken\.json"):
+        read_results_file(path)
+
+
+def test_a_single_episode_need_not_be_in_a_list(tmp_path):
+    assert read_results_file(write_published(tmp_path, "s", one_episode())).episodes.height == 1
+
+
+MASSES = st.tuples(*[st.one_of(st.just(0.0), st.just(1e-9), st.floats(1e-6, 1.0))] * 3)
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_any_masses_give_the_numbers_of_numpy(data):
+    layers, replans = data.draw(st.integers(2, 3)), data.draw(st.integers(1, 5))
+    by_layer = {
+        f"layer_{layer}": [pi_step(10 + 5 * i, *data.draw(MASSES)) for i in range(replans)] for layer in range(layers)
+    }
+    by_layer["layers_avg"] = [published_average(list(at)) for at in zip(*by_layer.values(), strict=True)]
+    with tempfile.TemporaryDirectory() as folder:
+        file = read_results_file(write_published(Path(folder), "s", [published_episode(0, 0, by_layer)]))
+    averages = np.zeros((layers, replans))
+    for layer in range(layers):
+        steps = by_layer[f"layer_{layer}"]
+        # Nothing on either side is no ratio; the published scripts write 0 for it.
+        nothing = [step["visual_mass"] <= 1e-8 and step["linguistic_mass"] <= 1e-8 for step in steps]
+        ratios = np.where(nothing, np.nan, [step["visual_linguistic_ratio"] for step in steps])
+        averages[layer] = ratios
+        spread = spread_of(file.steps.filter(layer=str(layer)).sort("replan")["ratio"])
+        finite = ratios[np.isfinite(ratios)]
+        assert spread.num_finite == finite.size
+        assert spread.num_infinite == np.isinf(ratios).sum()
+        assert spread.mean == (pytest.approx(finite.mean()) if finite.size else None)
+    overall = file.steps.filter(layer="layers_avg").sort("replan")["ratio"]
+    for column, ratio in zip(averages.T, overall, strict=True):
+        finite = column[np.isfinite(column)]
+        if not finite.size:
+            assert ratio is None
+        elif not np.isnan(column).any():
+            assert ratio == pytest.approx(finite.mean())
+    # What differs from the file's summaries always has a known reason.
+    assert all(item.reason for item in disagreements(file))

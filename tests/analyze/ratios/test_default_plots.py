@@ -1,0 +1,160 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from tests.kit.synthetic import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups
+from vla_attention.analyze.measures.aggregate import LAYERS_AVG, add_layers_avg, episodes_table, per_replan, tasks_table
+from vla_attention.analyze.ratios.plot_attention_fractions import plot_attention_fractions
+from vla_attention.analyze.ratios.plot_ratio_distribution import plot_ratio_distribution
+from vla_attention.analyze.ratios.plot_ratio_evolution import evolution_stem, plot_all_evolutions, plot_ratio_evolution
+from vla_attention.analyze.ratios.plot_ratio_per_task import plot_ratio_per_task
+from vla_attention.analyze.show.plot_style import FIXED_COLORS, group_styles, new_figure, ratio_axis
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def only_zero_ratios():
+    zero = [pl.lit(0.0).alias(name) for name in ("visual_mass", "numerator_mass")]
+    return make_steps().with_columns(zero)
+
+
+def mixed_layers():
+    """One layer is infinite throughout, the others are not."""
+    hit = pl.col("layer") == 25
+    names = ("linguistic_mass", "denominator_mass")
+    return make_steps().with_columns(pl.when(hit).then(0.0).otherwise(pl.col(name)).alias(name) for name in names)
+
+
+CASES = {
+    "one of everything": lambda: (
+        make_steps(num_tasks=1, num_episodes=1, layers=(25,), num_replans=1),
+        default_grouping(),
+    ),
+    "some infinite": lambda: (make_steps(layers=tuple(range(6)), no_denominator=0.2), default_grouping()),
+    "all infinite": lambda: (make_steps(no_denominator=1.0), default_grouping()),
+    "all zero": lambda: (only_zero_ratios(), default_grouping()),
+    "a layer infinite": lambda: (mixed_layers(), default_grouping()),
+    "custom": lambda: (make_steps(custom_grouping(), CUSTOM_KEYS), custom_grouping()),
+    "no ratio": lambda: (make_steps(custom_grouping(False), CUSTOM_KEYS), custom_grouping(False)),
+    "many groups": lambda: (make_steps(*many_groups(22), num_tasks=1, layers=(3,)), many_groups(22)[0]),
+    "two suites": lambda: (pl.concat([make_steps(), make_steps(suite="libero_goal")]), default_grouping()),
+    "ninety tasks": lambda: (
+        make_steps(num_tasks=90, num_episodes=2, layers=(3,), num_replans=2),
+        default_grouping(),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_picture_of_every_case_is_drawn_without_a_warning(case, tmp_path):
+    steps, grouping = CASES[case]()
+    replans = add_layers_avg(per_replan(steps, grouping), grouping)
+    episodes = episodes_table(replans, grouping)
+    tasks = tasks_table(episodes, grouping, num_resamples=50)
+    with warnings.catch_warnings():
+        # Layout that does not fit, missing glyphs and empty limits are warnings of matplotlib.
+        warnings.simplefilter("error")
+        paths = plot_ratio_distribution(replans, grouping, tmp_path)
+        paths += plot_ratio_per_task(episodes, tasks, grouping, tmp_path)
+        paths += plot_attention_fractions(tasks, grouping, tmp_path)
+        first = replans.row(0, named=True)
+        one = replans.filter(*(pl.col(name) == first[name] for name in ("suite", "task_id", "episode_index", "layer")))
+        paths += plot_ratio_evolution(one, grouping, tmp_path)
+    stems = ["ratio_distribution", "ratio_per_task", "attention_fractions"]
+    stems.append(evolution_stem(0, first["instruction"], 0, first["layer"]))
+    assert [path.name for path in paths] == [f"{stem}.{kind}" for stem in stems for kind in ("png", "pdf", "csv")]
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in paths)
+    for path in paths:
+        start = path.read_bytes()[:5]
+        assert {".png": start == b"\x89PNG\r", ".pdf": start == b"%PDF-", ".csv": True}[path.suffix]
+        if path.suffix == ".csv":
+            assert pl.read_csv(path).height > 0
+
+
+def test_data_beside_the_picture_are_those_of_the_picture(tmp_path):
+    grouping = default_grouping()
+    replans = add_layers_avg(per_replan(make_steps(), grouping), grouping)
+    plot_ratio_distribution(replans, grouping, tmp_path)
+    data = pl.read_csv(tmp_path / "ratio_distribution.csv")
+    assert data.height == replans.height
+    assert data["ratio"].to_list() == pytest.approx(replans["ratio"].to_list())
+
+
+def test_same_data_give_the_same_file(tmp_path):
+    grouping = default_grouping()
+    tasks = tasks_table(
+        episodes_table(add_layers_avg(per_replan(make_steps(), grouping), grouping), grouping), grouping
+    )
+    for folder in ("a", "b"):
+        plot_attention_fractions(tasks, grouping, tmp_path / folder)
+    for kind in ("png", "pdf", "csv"):
+        name = f"attention_fractions.{kind}"
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_all_evolutions_keep_suites_apart(tmp_path):
+    grouping = default_grouping()
+    small = {"num_tasks": 1, "num_episodes": 1, "layers": (3, 4), "num_replans": 2}
+    steps = pl.concat([make_steps(**small), make_steps(**small, suite="libero_goal")])
+    replans = add_layers_avg(per_replan(steps, grouping), grouping)
+    done = []
+    paths = plot_all_evolutions(replans, grouping, tmp_path, formats=("png",), progress=done.append)
+    assert len(done) == 2 * 3
+    assert len(set(paths)) == len(paths) == 2 * 3 * 2
+    assert {path.parent.name for path in paths} == {"libero_10", "libero_goal"}
+
+
+def test_names_of_evolution_files():
+    stem = evolution_stem(3, "Put the $5 mug_1 on the plate, then stop!", 2, "25")
+    assert stem == "task3_put_the_5_mug_1_on_the_plate_then_stop_ep2_layer25_ratio_evolution"
+    assert evolution_stem(0, "", 0, LAYERS_AVG) == "task0_task_ep0_layers_avg_ratio_evolution"
+    assert len(evolution_stem(0, "word " * 100, 0, "1")) < 120
+
+
+def test_groups_keep_their_colours_and_no_two_look_alike():
+    grouping, _ = many_groups(30)
+    styles = group_styles(grouping.names)
+    assert styles["linguistic"]["color"] == FIXED_COLORS["linguistic"]
+    looks = [(style["color"], style["hatch"]) for style in styles.values()]
+    assert len(set(looks)) == len(looks)
+    assert group_styles(("visual", "mine"))["visual"] == group_styles(("visual",))["visual"]
+
+
+def test_axis_of_nearly_equal_ratios_is_not_blown_up():
+    axes = new_figure(4, 3).subplots()
+    ratio_axis(axes.xaxis, [10.0, 10.001])
+    low, high = axes.get_xlim()
+    assert high / low > 1.9
+
+
+def test_importing_analyze_and_its_plots_does_not_import_matplotlib():
+    modules = [
+        "measures.aggregate",
+        "ratios.summary",
+        "published.results_file",
+        "statistics.bootstrap",
+        "show.plot_style",
+    ]
+    modules += [f"ratios.plot_{name}" for name in ("ratio_distribution", "ratio_per_task", "ratio_evolution")]
+    modules += ["ratios.plot_attention_fractions"]
+    code = f"import sys, {', '.join(f'vla_attention.analyze.{name}' for name in modules)}; print('matplotlib' in sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "False"
+
+
+def test_drawing_leaves_the_settings_of_the_caller_alone(tmp_path):
+    import matplotlib as mpl
+
+    before = mpl.rcParams.copy()
+    grouping = default_grouping()
+    tasks = tasks_table(
+        episodes_table(add_layers_avg(per_replan(make_steps(), grouping), grouping), grouping), grouping
+    )
+    plot_attention_fractions(tasks, grouping, tmp_path)
+    assert mpl.rcParams.copy() == before

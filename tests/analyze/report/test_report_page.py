@@ -1,0 +1,256 @@
+"""The report without a browser: well-formed, self-contained, escaped, small, and with the numbers of the tables."""
+
+from __future__ import annotations
+
+import base64
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tests.kit.store_kit as kit
+from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.measures.question import AnalysisSettings, ask
+from vla_attention.analyze.ratios.analysis import Analysis, analyse
+from vla_attention.analyze.report.caveats import caveats, role_shares, verdict_sentence
+from vla_attention.analyze.report.markup import Cell, interval_cell, number_cell, table
+from vla_attention.analyze.report.overlay_section import choose_episodes
+from vla_attention.analyze.report.page import report_html
+from vla_attention.analyze.show.text_table import format_number
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
+from vla_attention.schemas.layout import Role
+from vla_attention.schemas.stores.reader import open_store
+
+_VOID = {"meta", "link", "img", "input", "br", "hr"}
+_HOSTILE = "<script>alert('task')</script> & \"bowl\""
+
+
+class Page(HTMLParser):
+    """What is on a page; fails on a closing tag that does not fit, like a strict reader."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self.feed(page)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        assert len({name for name, _ in attrs}) == len(attrs), f"<{tag}> has an attribute twice"
+        self.tags.append((tag, dict(attrs)))
+        if tag not in _VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open, f"</{tag}> closes nothing"
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] not in ("script", "style"):
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+    def of(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+@pytest.fixture(scope="module")
+def analysis(tmp_path_factory: pytest.TempPathFactory) -> Analysis:
+    """Two tasks with two episodes; names and instructions full of markup."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kit, "INSTRUCTIONS", (_HOSTILE, "open <b>the</b> drawer", "turn on the stove"))
+        path = tmp_path_factory.mktemp("report") / "made.zarr"
+        kit.write_store(path, contributions=True, policy="<i>made & up</i>", suite="suite<1>")
+    return analyse(ask([open_store(path)], AnalysisSettings()))
+
+
+@pytest.fixture(scope="module")
+def html(analysis: Analysis) -> str:
+    return report_html(analysis)
+
+
+def test_the_page_is_well_formed_and_its_links_lead_somewhere(html: str) -> None:
+    page = Page(html)
+    ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
+    assert len(set(ids)) == len(ids)
+    inside = [link["href"] for link in page.of("a") if str(link["href"]).startswith("#")]
+    assert len(inside) > 8
+    assert {str(address)[1:] for address in inside} <= set(ids)
+    labels = [str(attributes.get("aria-labelledby")) for _, attributes in page.tags if "aria-labelledby" in attributes]
+    assert set(labels) <= set(ids)
+    assert {str(label["for"]) for label in page.of("label") if "for" in label} <= set(ids)
+    assert all(image.get("alt") for image in page.of("img"))
+
+
+def test_nothing_on_the_page_comes_from_elsewhere(html: str) -> None:
+    page = Page(html)
+    for _, attributes in page.tags:
+        for name in ("src", "href", "srcset", "action", "data", "poster"):
+            address = attributes.get(name)
+            assert address is None or re.match(r"data:|#", address), address
+    assert "http:" not in html
+    assert "https:" not in html
+    assert "@import" not in html
+    assert "url(" not in html
+
+
+def test_what_a_store_says_is_text_and_never_markup(html: str) -> None:
+    page = Page(html)
+    assert len(page.of("script")) == 1
+    assert page.of("b") == []
+    assert page.of("i") == []
+    assert _HOSTILE in page.text
+    assert "Attention of <i>made & up</i> on suite<1>" in page.text
+    assert html.count("<script>") == 1
+
+
+def test_the_page_is_small_and_the_same_twice(analysis: Analysis, html: str) -> None:
+    assert len(html.encode()) < 3_000_000
+    assert report_html(analysis) == html
+
+
+def test_the_headline_and_the_tables_have_the_analysis_s_numbers(analysis: Analysis, html: str) -> None:
+    page = Page(html)
+    row = analysis.tasks.filter(layer="layers_avg", scope="all").row(0, named=True)
+    for column in ("ratio_mean", "ratio_mean_low", "ratio_mean_high", "uniform_ratio", "ratio_lift", "geometric_mean"):
+        assert format_number(row[column]) in page.text
+    keys = [float(cell["data-key"]) for tag, cell in page.tags if tag == "td" and cell.get("data-key", "x") not in ("", "x")
+            and re.fullmatch(r"[\d.e+-]+", str(cell["data-key"]))]  # fmt: skip
+    for value in analysis.tasks.filter(layer="layers_avg", scope="task")["ratio_mean"]:
+        assert value in keys
+    store = analysis.question.stores[0].attributes
+    assert store.policy.digest in page.text
+    assert "0.049 %" in page.text  # of ten mantissa bits
+
+
+def test_episodes_have_a_slider_over_their_replans(analysis: Analysis, html: str) -> None:
+    page = Page(html)
+    sliders = [box for box in page.of("input") if box.get("type") == "range"]
+    assert [box["max"] for box in sliders] == ["2"] * 4
+    replans = [figure for figure in page.of("figure") if figure.get("class") == "replan"]
+    assert len(replans) == 4 * 3
+    heat = [image for image in page.of("img") if image.get("class") == "heat"]
+    plain = [image for image in page.of("img") if image.get("class") == "plain"]
+    assert len(heat) == len(plain) == 4 * 3 * 2
+    for image in (*heat, *plain):
+        kind, _, content = str(image["src"]).partition(";base64,")
+        assert kind == "data:image/webp"
+        assert base64.b64decode(content)[8:12] == b"WEBP"
+
+
+def test_a_slider_over_some_of_the_replans_says_so(analysis: Analysis) -> None:
+    page = Page(report_html(analysis, episodes=1, replans=2, rows=False))
+    assert "2 of 3 replans, from the first to the last." in page.text
+    labels = [str(figure["data-label"]) for figure in page.of("figure") if figure.get("class") == "replan"]
+    assert [label.split(",")[0] for label in labels] == ["replan 0", "replan 2"]
+
+
+def test_untrained_weights_and_compute_types_are_caveats(analysis: Analysis) -> None:
+    found = {note.topic: note for note in caveats(analysis, role_shares(analysis.question))}
+    assert found["Untrained weights"].grave
+    assert "does not say" in found["Compute type"].sentence
+    assert "2 episodes each" in found["Few episodes"].sentence
+    assert "3 action queries" in found["Mean over queries"].sentence
+    store = analysis.question.stores[0]
+    for dtype, topic in (("bfloat16", "bfloat16"), ("float32", "Compute type")):
+        policy = replace(store.attributes.policy, config={"dtype": dtype}, untrained=False)
+        other = replace(store, attributes=replace(store.attributes, policy=policy))
+        notes = caveats(replace(analysis, question=replace(analysis.question, stores=(other,))), {})
+        topics = [note.topic for note in notes]
+        assert topic in topics
+        assert "Untrained weights" not in topics
+
+
+def test_shares_of_roles_are_those_of_the_raw_rows(analysis: Analysis) -> None:
+    expected: dict[str, list[float]] = {}
+    for item in analysis.question.selected:
+        rows = item.episode.read("joint/rows").astype(np.float64)
+        for role in Role:
+            mask = (item.tokens.key_role == role)[:, None, None, None, None]
+            expected.setdefault(role.label, []).append(float((rows * mask).sum(axis=-1).mean()))
+    shares = role_shares(analysis.question)
+    for role, values in expected.items():
+        assert shares.get(role, 0.0) == pytest.approx(np.mean(values), rel=1e-3, abs=1e-9)
+
+
+def test_the_verdict_stands_beside_that_of_uniform_attention(analysis: Analysis) -> None:
+    assert "just the same" in verdict_sentence(analysis.grouping, 30.0, 40.0)
+    other = verdict_sentence(analysis.grouping, 0.5, 40.0)
+    assert "'linguistic-dominant'" in other
+    assert "'visual-dominant'" in other
+    assert verdict_sentence(analysis.grouping, None, 40.0) == ""
+    assert verdict_sentence(replace(analysis.grouping, ratio=None), 3.0, 40.0) == ""
+
+
+def no_words(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
+    read = np.isin(tokens.key_role, [Role.BOS, Role.TEMPLATE, Role.INSTRUCTION])
+    rows = np.where(read[:, None, None, None, None, :], 0.0, rows)
+    return rows / rows.sum(axis=-1, keepdims=True)
+
+
+def test_a_store_of_infinite_ratios_still_gives_a_page_that_says_so(tmp_path: Path) -> None:
+    store = kit.write_store(tmp_path / "a.zarr", plant_rows=no_words, frames=False, coverage=False)
+    assert main(["report", str(store), "--output", str(tmp_path / "a.html")]) == 0
+    page = Page((tmp_path / "a.html").read_text(encoding="utf-8"))
+    assert "Infinite ratios." in page.text
+    assert "12 of 12 replans" in page.text
+    assert "No replan of this episode has a finite ratio." in page.text
+    assert "attention alone, on grey" in page.text
+
+
+def test_a_single_episode_of_a_single_layer_and_a_grouping_without_ratio(tmp_path: Path) -> None:
+    store = kit.write_store(tmp_path / "a.zarr", tasks=(0,), episodes=1, replans=1, layers=(1,), heads=(0,))
+    path = tmp_path / "deep" / "b.html"
+    given = ["--group", "bowl=word:bowl", "--quick", "--episodes", "1", "--output", str(path)]
+    assert main(["report", str(store), *given]) == 0
+    page = Page(path.read_text(encoding="utf-8"))
+    assert "fraction of bowl" in page.text
+    assert "One episode." in page.text
+    assert "were not looked for" in page.text
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (["--output", "folder"], "FILE.html"),
+        (["--episodes", "-1"], "--episodes from 0"),
+        (["--replans", "0"], "--replans from 1"),
+        (["--grouping", "defalt"], "Did you mean 'default'"),
+    ],
+)
+def test_bad_input_is_one_sentence(
+    analysis: Analysis, capsys: pytest.CaptureFixture[str], extra: list[str], message: str
+) -> None:
+    assert main(["report", str(analysis.question.stores[0].path), *extra]) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert "Traceback" not in captured.err
+
+
+def test_episodes_are_chosen_over_tasks_and_outcomes(tmp_path: Path) -> None:
+    path = kit.write_store(tmp_path / "a.zarr", tasks=(0, 1, 2, 3), episodes=3, replans=1, layers=(0,))
+    selected = ask([open_store(path)], AnalysisSettings()).selected
+    chosen = [item.episode.attributes for item in choose_episodes(selected, 4)]
+    assert [item.task_id for item in chosen] == [0, 1, 2, 3]
+    assert [item.success for item in chosen] == [True, False, True, False]
+    assert [item.episode.attributes.task_id for item in choose_episodes(selected, 2)] == [0, 3]
+    assert len(choose_episodes(selected, 100)) == 12
+    assert choose_episodes(selected, 0) == []
+
+
+def test_tables_escape_and_keep_their_sort_keys() -> None:
+    built = table(
+        "a <caption>", ["x & y", "n"], [[Cell("<1>", 1.0), number_cell(None)], [Cell("b", 2.0), interval_cell(1, 3.5)]]
+    )
+    page = Page(built)
+    assert "a <caption>" in page.text
+    assert [cell["data-key"] for cell in page.of("td")] == ["", "2.5"]
+    assert [cell["data-key"] for cell in page.of("th") if "data-key" in cell] == ["1.0", "2.0"]

@@ -1,0 +1,119 @@
+"""What `vla-capture status` says of a store: counts, what is missing, who wrote and who writes."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.kit.store_kit import INSTRUCTIONS, StoreSpec, write_store
+from vla_attention.capture.__main__ import main
+from vla_attention.capture.jobs.claims import Claims, jobs_folder
+from vla_attention.capture.jobs.job import Worker
+from vla_attention.capture.jobs.run_records import PlannedTask, RecordKeeper, forget_runs, planned_tasks, read_records
+from vla_attention.capture.jobs.status import store_status
+
+SPEC = StoreSpec(tasks=(0, 2), episodes=2, replans=1, layers=(0,), heads=(0,), frames=False)
+NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2", 0)
+
+
+def planned(task: int, episodes: int) -> PlannedTask:
+    return PlannedTask(task, f"task_{task}", INSTRUCTIONS[task], episodes)
+
+
+@pytest.fixture
+def store(tmp_path) -> Path:
+    return write_store(tmp_path / "a.zarr", spec=SPEC)
+
+
+def test_without_notes_it_says_what_it_cannot_know(store, capsys):
+    status = store_status(store)
+    assert [(task.task_id, task.committed, task.success, task.expected) for task in status.tasks] == [
+        (0, 2, 1, None),
+        (2, 2, 1, None),
+    ]
+    assert status.complete is None
+    for task in status.tasks:
+        folders = store.glob(f"episodes/task{task.task_id:03d}_*")
+        assert task.bytes == sum(
+            file.stat().st_size for folder in folders for file in folder.rglob("*") if file.is_file()
+        )
+    assert main(["status", str(store), "--check"]) == 0
+    said = capsys.readouterr().out
+    assert "2 of ?" in said
+    assert "say it with --expected N" in said
+
+
+def test_expected_may_be_given(store, capsys):
+    status = store_status(store, expected=3)
+    assert [task.missing for task in status.tasks] == [(2,), (2,)]
+    assert main(["status", str(store), "--expected", "3", "--check"]) == 1
+    assert "task 0 lacks 1 of 3 episodes: 2" in capsys.readouterr().out
+    assert main(["status", str(store), "--expected", "3"]) == 0
+    assert main(["status", str(store), "--expected", "2", "--check"]) == 0
+    assert "complete" in capsys.readouterr().out
+
+
+def test_plans_of_several_processes_add_up(store, capsys):
+    first = RecordKeeper(store, NODE, (planned(0, 2), planned(1, 2)))
+    first.committed("task000_episode001")
+    first.ended("stopped")
+    RecordKeeper(store, replace(NODE, tag="node8-5-cd", host="node8", job_name="98_0"), (planned(0, 4),))
+    assert {task: plan.episodes for task, plan in planned_tasks(read_records(store)).items()} == {0: 4, 1: 2}
+    status = store_status(store)
+    by_id = {task.task_id: task for task in status.tasks}
+    assert by_id[0].missing == (2, 3)
+    assert by_id[1].missing == (0, 1)
+    assert (by_id[1].instruction, by_id[1].committed, by_id[1].last_by) == (INSTRUCTIONS[1], 0, "")
+    assert by_id[2].expected is None  # nobody planned it, and it is there
+    os.utime(store / "episodes/task000_episode000", (0, 0))
+    assert store_status(store).tasks[0].last_by == "node7 (job 98_2)"
+    assert main(["status", str(store)]) == 0
+    assert "node7 (job 98_2)" in capsys.readouterr().out
+
+
+def test_episodes_in_flight_and_json(store, capsys):
+    claims = Claims(store, NODE)
+    assert claims.acquire("task000_episode002") is None
+    assert main(["status", str(store), "--json", "--expected", "3"]) == 0
+    (status,) = json.loads(capsys.readouterr().out)
+    assert status["complete"] is False
+    assert [task["missing"] for task in status["tasks"]] == [[2], [2]]
+    (writing,) = status["writing"]
+    assert (writing["episode"], writing["worker"]["job_name"]) == ("task000_episode002", "98_2")
+    assert 0 <= writing["silent_s"] < 60
+    assert main(["status", str(store)]) == 0
+    assert "being written: task000_episode002 by node7 (job 98_2)" in capsys.readouterr().out
+
+
+def test_notes_of_an_earlier_store_of_the_same_name_do_not_count(store):
+    RecordKeeper(store, NODE, (planned(0, 50),))
+    assert store_status(store).complete is False
+    os.utime(store / "zarr.json", (1, 1))
+    assert read_records(store) == []
+    assert store_status(store).complete is None
+    forget_runs(store)
+    assert not jobs_folder(store).exists()
+
+
+def test_damaged_episodes_and_notes_are_said_or_passed_over(store, capsys):
+    RecordKeeper(store, NODE, (planned(0, 2), planned(2, 2)))
+    (jobs_folder(store) / "runs" / "x.json").write_text("{")
+    (store / "episodes/task002_episode000/zarr.json").write_text("{")
+    assert main(["status", str(store)]) == 0
+    assert "task 2: the attributes of 1 episodes cannot be read" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [(["none.zarr"], "There is no store at"), (["a.zarr", "--expected", "0"], "expected at least 1")],
+)
+def test_mistakes(store, monkeypatch, capsys, words, expected):
+    monkeypatch.chdir(store.parent)
+    assert main(["status", *words]) == 2
+    said = capsys.readouterr().err
+    assert expected in said
+    assert said.count("\n") == 1

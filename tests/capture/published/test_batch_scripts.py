@@ -1,0 +1,180 @@
+"""The batch scripts without SLURM: what their variables mean, and that a mistake is one sentence and leaves nothing behind."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from vla_attention.capture.published.environment_variables import arguments_from_environment, describe_job
+from vla_attention.capture.published.evaluate import main_cosmos, main_pi
+from vla_attention.schemas.errors import BadArgument
+
+SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
+
+
+def run(script: str, folder: Path, *words: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run a script in an empty folder with nothing but these variables."""
+    environment = {"PATH": f"{Path(sys.executable).parent}:/usr/bin:/bin", "HOME": str(folder), **variables}
+    return subprocess.run(
+        ["bash", SCRIPTS / script, *words],
+        env=environment,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize(
+    ("script", "variables", "expected"),
+    [
+        ("run_attention_ratio.sh", {"LAYERS": "25 late"}, "LAYERS is '25 late'; expected layer numbers"),
+        ("run_attention_ratio_cosmos.sh", {"TASK_SUITE": "libero_spacial"}, "Did you mean 'libero_spatial'?"),
+        (
+            "run_attention_ratio.sh",
+            {"SLURM_JOB_ID": "1", "SLURM_ARRAY_TASK_ID": "10"},
+            "Array index 10 is beyond the tasks of libero_10, which has 10; submit with --array=0-9.",
+        ),
+        ("run_attention_ratio.sh", {"OUTPUT_DIR": "file/results"}, "file is a file; give another --output-dir"),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_leaves_nothing(tmp_path, script, variables, expected):
+    (tmp_path / "file").write_text("")
+    done = run(script, tmp_path, CHECKPOINT="dummy", **variables)
+    assert done.returncode == 2, done.stderr
+    assert expected in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_missing_installation_is_said(tmp_path):
+    done = run("run_attention_ratio.sh", tmp_path, PATH="/usr/bin:/bin")
+    assert done.returncode == 2
+    assert "activate an environment in SETUP" in done.stderr
+
+
+def test_setup_runs_first(tmp_path):
+    done = run("run_attention_ratio.sh", tmp_path, SETUP="echo ready; export LAYERS=x")
+    assert done.stdout == "ready\n"
+    assert "LAYERS is 'x'" in done.stderr
+
+
+def test_the_helper_prints_what_it_would_submit(tmp_path):
+    done = run("submit_attention_ratio.sh", tmp_path, "--dry-run", "cosmos", "--gpus=1", TASK_SUITE="all")
+    assert done.returncode == 0, done.stderr
+    array, analysis = done.stdout.splitlines()
+    assert "STAGE=capture sbatch --parsable --array=0-39 --gpus=1" in array
+    assert "STAGE=analyze sbatch" in analysis
+    assert "--dependency=afterok:JOB" in analysis
+    assert "--gpus" not in analysis
+    assert all(line.strip().endswith("run_attention_ratio_cosmos.sh") for line in (array, analysis))
+
+
+@pytest.mark.parametrize(
+    ("words", "variables", "expected"),
+    [
+        (["cosmo"], {}, "unknown word 'cosmo'"),
+        (["--array=0-2"], {"TASK_ID": "2"}, "give --array=2 instead"),
+        (["--dry-run"], {"TASK_SUITE": "libero_11"}, "Unknown task suite 'libero_11'"),
+        (["--array=0-2"], {}, "there is no sbatch here"),
+    ],
+)
+def test_mistakes_of_the_helper(tmp_path, words, variables, expected):
+    # Without the folders in which an sbatch may be.
+    (tmp_path / "bin").mkdir()
+    for tool in ("bash", "dirname", "env"):
+        (tmp_path / "bin" / tool).symlink_to(f"/usr/bin/{tool}")
+    path = f"{tmp_path / 'bin'}:{Path(sys.executable).parent}"
+    done = run("submit_attention_ratio.sh", tmp_path, *words, **variables, PATH=path)
+    assert done.returncode == 2, done.stderr
+    assert expected in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_every_variable_is_documented_in_the_heads():
+    names = (
+        "CHECKPOINT CKPT_PATH CONFIG_NAME TASK_SUITE TASK_ID NUM_EPISODES LAYERS SEED SAVE_VIZ OUTPUT_DIR QUERY_FRAME"
+    )
+    names += " VISUAL_FRAME TEXT_FRAME REPLAN_STEPS STORE SETUP STAGE DEVICE MAX_REQUEUES MUJOCO_GL ARGS"
+    for script in ("run_attention_ratio.sh", "run_attention_ratio_cosmos.sh"):
+        head = [line for line in (SCRIPTS / script).read_text().splitlines() if line.startswith("#")]
+        for name in names.split():
+            assert any(name in line.replace(",", " ").split()[1:4] for line in head), (script, name)
+
+
+def arguments(family: str = "pi", **variables: str) -> list[str]:
+    return arguments_from_environment(variables, family, "~/default")
+
+
+def test_variables_become_the_options_that_they_name():
+    assert arguments() == []
+    assert arguments(TASK_SUITE="", LAYERS=" ", SAVE_VIZ="0", TASK_ID="") == []
+    assert arguments(LAYERS="0 8 25", SAVE_VIZ="1", ARGS="--max-steps 10") == [
+        *("--layers", "0", "8", "25"),
+        "--save-viz",
+        *("--max-steps", "10"),
+    ]
+    assert arguments(CKPT_PATH="a b") == ["--checkpoint", "a b"]
+    assert arguments("cosmos", TEXT_FRAME="frame0") == ["--text-frame", "frame0"]
+
+
+def test_a_job_with_a_real_checkpoint_wants_a_gpu():
+    assert arguments(SLURM_JOB_ID="1") == ["--device", "cuda"]
+    assert arguments(SLURM_JOB_ID="1", CHECKPOINT="dummy") == ["--checkpoint", "dummy"]
+    assert arguments(SLURM_JOB_ID="1", DEVICE="cpu") == ["--device", "cpu"]
+    assert arguments(SLURM_JOB_ID="1", STAGE="analyze", SLURM_ARRAY_TASK_ID="3") == ["--stage", "analyze"]
+    assert arguments(SLURM_ARRAY_TASK_ID="3") == ["--array-index", "3"]
+
+
+@pytest.mark.parametrize(
+    "variables",
+    [
+        {"SAVE_VIZ": "maybe"},
+        {"TASK_ID": "-1"},
+        {"NUM_EPISODES": "five"},
+        {"QUERY_FRAME": "action"},
+        {"CHECKPOINT": "a", "CKPT_PATH": "b"},
+        {"ARGS": "'open"},
+    ],
+)
+def test_values_that_cannot_be(variables):
+    with pytest.raises(BadArgument, match=next(iter(variables))):
+        arguments(**variables)
+
+
+def test_the_log_begins_with_the_job():
+    assert describe_job({}, "n1") == ""
+    assert describe_job({"SLURM_JOB_ID": "7"}, "n1") == "Job 7 on n1."
+    array = {"SLURM_JOB_ID": "9", "SLURM_ARRAY_JOB_ID": "7", "SLURM_ARRAY_TASK_ID": "2", "SLURM_RESTART_COUNT": "1"}
+    assert describe_job(array, "n1") == "Job 7_2 on n1, requeued 1 times."
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--task-suite", "all", "--store", "a.zarr"], "a store holds one suite"),
+        (["--task-suite", "all", "--array-index", "40"], "--array=0-39"),
+        (["--array-index", "1", "--task-id", "1"], "in an array the index is the task"),
+        (["--task-id", "11"], "its tasks are 0 to 9"),
+        (["--layers", "3.5"], "invalid int value"),
+        (["--stage", "analyze"], "There is no store at"),
+        (["--stage", "plot"], "invalid choice"),
+    ],
+)
+@pytest.mark.parametrize("main", [main_pi, main_cosmos])
+def test_mistakes_in_the_commands(tmp_path, monkeypatch, capsys, main, words, expected):
+    monkeypatch.chdir(tmp_path)
+    try:
+        code = main(words)
+    except SystemExit as stopped:
+        code = stopped.code
+    said = capsys.readouterr().err
+    assert code == 2
+    assert expected in said
+    assert said.count("\n") == 1
+    assert os.listdir(tmp_path) == []

@@ -1,0 +1,138 @@
+"""Contributions of key parts: against a direct computation, and against what the block really added."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from vla_attention.capture.policies.pi.config import GemmaConfig
+from vla_attention.capture.policies.pi.gemma import GemmaBlock, Rotation
+from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan, SiteNotRecorded, attend
+from vla_attention.capture.recording.contributions import gram_matrix, keys_of_parts, part_contributions
+from vla_attention.capture.recording.rollout import make_recorders
+from vla_attention.schemas.segments import segments_of
+from vla_attention.schemas.stores.store_format import Recording
+
+HEADS, KV_HEADS, QUERIES, KEYS, DIM, WIDTH = 4, 2, 3, 11, 5, 7
+
+
+def random_tensors(seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    rows = torch.softmax(torch.randn(HEADS, QUERIES, KEYS, generator=generator) * 3, dim=-1)
+    values = torch.randn(KV_HEADS, KEYS, DIM, generator=generator)
+    weight = torch.randn(WIDTH, HEADS * DIM, generator=generator)
+    gate = torch.randn(1, WIDTH, generator=generator)
+    return rows, values, weight, gate
+
+
+def parts_of(members: torch.Tensor) -> list[slice | torch.Tensor]:
+    return keys_of_parts(members.numpy(), torch.device("cpu"))
+
+
+def test_parts_equal_a_direct_computation_and_add_up_to_the_update():
+    rows, values, weight, gate = random_tensors(0)
+    members = torch.zeros(KEYS, 3, dtype=torch.bool)
+    members[[0, 4, 5], 0] = True
+    members[[1, 2, 3, 6], 1] = True
+    members[[7, 8, 9, 10], 2] = True
+    each = part_contributions(rows, values, parts_of(members), lambda mixed: mixed @ weight.T * gate)
+    assert each.shape == (QUERIES, 3, WIDTH)
+    for query in range(QUERIES):
+        for part in range(3):
+            direct = torch.zeros(WIDTH, dtype=torch.float64)
+            for head in range(HEADS):
+                for key in range(KEYS):
+                    if members[key, part]:
+                        block = weight[:, head * DIM : (head + 1) * DIM].double()
+                        direct += rows[head, query, key].double() * (block @ values[head // 2, key].double())
+            torch.testing.assert_close(each[query, part].double(), direct * gate[0].double(), rtol=1e-4, atol=1e-5)
+    update = (rows @ values.repeat_interleave(2, dim=0)).transpose(0, 1).flatten(1) @ weight.T * gate
+    torch.testing.assert_close(each.sum(dim=1), update, rtol=1e-4, atol=1e-5)
+    gram = gram_matrix(each, update)
+    torch.testing.assert_close(gram[:3, :3].sum(), update.square().sum(dim=1).mean(), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(gram[3, 3], gram[:3, :3].sum(), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(gram[:3].sum(dim=0), gram[3], rtol=1e-4, atol=1e-4)
+
+
+def test_norms_of_unions_of_parts_follow_from_the_gram_matrix():
+    rows, values, weight, gate = random_tensors(1)
+    members = torch.eye(KEYS, dtype=torch.bool)
+
+    def project(mixed: torch.Tensor) -> torch.Tensor:
+        return mixed @ weight.T * gate
+
+    each = part_contributions(rows, values, parts_of(members), project)
+    gram = gram_matrix(each, each.sum(dim=1))
+    chosen = torch.zeros(KEYS + 1)
+    chosen[[2, 3, 9]] = 1
+    union = members[:, [2, 3, 9]].any(dim=1, keepdim=True)
+    together = part_contributions(rows, values, parts_of(union), project)
+    torch.testing.assert_close(chosen @ gram @ chosen, together.square().sum(dim=2).mean(), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("condition_width", [None, 6])
+def test_a_block_tells_the_recorder_what_it_really_added(condition_width):
+    torch.manual_seed(0)
+    config = GemmaConfig(width=8, depth=1, mlp_dim=16, num_heads=4, num_kv_heads=1, head_dim=4)
+    block = GemmaBlock(config, condition_width)
+    x = torch.randn(1, 6, 8)
+    condition = None if condition_width is None else torch.randn(1, condition_width)
+    rotation = Rotation.at(torch.arange(6)[None], 4)
+    members = np.zeros((6, 2), dtype=bool)
+    members[:2, 0], members[2:, 1] = True, True
+    plan = RecordingPlan(layers=(0,), denoise_steps=(0,), heads=(1,), queries="mean", site="joint")
+    recorder = AttentionRecorder(plan, 6, members)
+    actions = slice(3, 6)
+    seen: list[torch.Tensor] = []
+    take_update = recorder.update_sink(0, 0, actions)
+    assert take_update is not None
+    with torch.no_grad():
+        block(
+            x,
+            None,
+            rotation,
+            condition=condition,
+            rows_to=recorder.sink(0, 0, actions),
+            update_to=lambda values, project, update: (seen.append(update), take_update(values, project, update)),
+        )
+    gram = recorder.finish().contribution
+    assert gram is not None
+    assert gram.shape == (1, 1, 3, 3)
+    norm = seen[0][0, actions].square().sum(dim=1).mean().item()
+    assert gram[0, 0, 2, 2] == pytest.approx(norm, rel=1e-5)
+    assert gram[0, 0, :2, :2].sum() == pytest.approx(norm, rel=1e-4)
+
+
+def test_masked_keys_contribute_nothing():
+    query, key, value = (torch.randn(1, 2, 5, 4) for _ in range(3))
+    mask = torch.ones(1, 5, 5, dtype=torch.bool)
+    mask[:, :, 3:] = False
+    rows: list[torch.Tensor] = []
+    attend(query, key, value, mask, 0.5, rows_to=rows.append)
+    members = torch.zeros(5, 2, dtype=torch.bool)
+    members[:3, 0], members[3:, 1] = True, True
+    each = part_contributions(rows[0][0], value[0], parts_of(members), lambda mixed: mixed)
+    assert not each[:, 1].any()
+
+
+def test_an_update_that_never_came_is_an_error():
+    plan = RecordingPlan(layers=(0,), denoise_steps=(0,), heads=(0,), queries="mean", site="joint")
+    recorder = AttentionRecorder(plan, 4, np.ones((4, 1), dtype=bool))
+    take = recorder.sink(0, 0, slice(0, 2))
+    assert take is not None
+    take(torch.full((1, 1, 2, 4), 0.25))
+    with pytest.raises(SiteNotRecorded, match="given updates once"):
+        recorder.finish()
+
+
+def test_recorders_of_a_rollout_take_the_segments_of_the_replan():
+    from tests.kit.store_kit import make_tokens
+
+    tokens = make_tokens(2, 0, [0], changing=True)
+    recording = Recording((0,), (0,), (0,), (0,), "mean", 3, 10, contributions=True)
+    recorders = make_recorders(recording, (tokens.layout,), {"joint": tokens.key_role[1]})
+    parts = recorders["joint"].parts
+    assert parts is not None
+    assert parts.shape == (tokens.layout.num_keys, len(segments_of(tokens.layout, tokens.key_role[1])))
+    assert (parts.sum(axis=1) == 1).all()

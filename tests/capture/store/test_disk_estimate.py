@@ -1,0 +1,139 @@
+"""The estimate printed before a run is never less than what the run then takes."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tests.kit.store_kit import StoreSpec, make_prompt, root_attributes, write_store
+from vla_attention.capture.store.disk_estimate import (
+    EPISODE_OVERHEAD,
+    DiskEstimate,
+    bytes_per_number,
+    describe,
+    estimate_disk,
+    format_bytes,
+)
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
+from vla_attention.schemas.layout import PatchGrid, SiteLayout, Span
+
+
+def large_tokens(replans: int, pixels: int = 56) -> EpisodeTokens:
+    """800 keys, none of them masked; every replan with a prompt of its own."""
+    grid = PatchGrid(17, 20, pixels, pixels)
+    layout = SiteLayout(
+        "joint",
+        (
+            Span("base", "image", 0, 340, camera="base", grid=grid),
+            Span("wrist", "image", 340, 680, camera="wrist", grid=grid),
+            Span("prompt", "text", 680, 750),
+            Span("actions", "action", 750, 800),
+        ),
+    )
+    roles = np.full((replans, 800), 1, dtype=np.uint8)
+    roles[:, 750:] = 8
+    prompts = []
+    for replan in range(replans):
+        digits = " ".join(str(1000 * replan + i) for i in range(60))
+        prompt, roles[replan, 680:750] = make_prompt(layout, "put the bowl on the plate", digits)
+        prompts.append(prompt)
+    edges = np.zeros((replans, 340, 5), dtype=np.float32)
+    edges[:, np.arange(340), np.arange(340) // 70] = 1
+    return EpisodeTokens(layout, roles, tuple(prompts), np.arange(replans), (), {"base": edges, "wrist": edges})
+
+
+def size_of(path: Path) -> int:
+    return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+
+
+@pytest.mark.parametrize("bits", [1, 4, 7, 10, 16, 23])
+def test_a_store_of_random_rows_and_pictures_stays_below_the_estimate(tmp_path, bits):
+    """Softmaxed normal logits of a standard deviation of 3, and noise for pictures: nothing that a codec could find."""
+    tokens = large_tokens(12)
+    layers, heads = tuple(range(8)), tuple(range(8))
+    spec = StoreSpec(
+        tokens=tokens, mantissa_bits=bits, tasks=(0,), episodes=1, layers=layers, num_layers=8, heads=heads
+    )
+    size = size_of(write_store(tmp_path / "a.zarr", spec=spec) / "episodes")
+    recording = root_attributes(spec).recording
+    pictures = [span.grid.image_height * span.grid.image_width * 3 for span in tokens.layout.spans if span.grid]
+    estimate = estimate_disk(recording, (tokens.layout,), pictures, 12, 1)
+    assert size <= estimate.total_bytes
+    assert size >= 0.5 * estimate.total_bytes, "the estimate has become useless"
+
+
+@pytest.mark.parametrize(("queries", "frames", "replans"), [("mean", True, 1), ("all", False, 2), ("mean", False, 9)])
+def test_small_stores_stay_below_the_estimate(tmp_path, queries, frames, replans):
+    spec = StoreSpec(queries=queries, frames=frames, replans=replans, tasks=(0,))
+    path = write_store(tmp_path / "a.zarr", spec=spec)
+    pictures = [12 * 16 * 3, 8 * 8 * 3]
+    estimate = estimate_disk(root_attributes(spec).recording, (spec.layout,), pictures, replans, 2)
+    assert size_of(path / "episodes") <= estimate.total_bytes
+
+
+def test_bytes_per_number_are_above_what_was_measured():
+    measured = {4: 1.0, 7: 1.43, 10: 1.79, 12: 2.04, 23: 3.40}  # rows of a trained transformer
+    for bits, size in measured.items():
+        assert size < bytes_per_number(bits) < 1.5 * size
+    sizes = [bytes_per_number(bits) for bits in range(1, 24)]
+    assert sizes == sorted(sizes)
+    assert bytes_per_number(23) < 4
+
+
+def test_what_is_asked_for_is_what_is_counted():
+    spec = StoreSpec(tokens=large_tokens(1), heads=tuple(range(8)))
+    layout = spec.layout
+
+    def size(pictures: list[int], **changes: object) -> int:
+        recording = root_attributes(StoreSpec(tokens=spec.tokens, **changes)).recording  # type: ignore[arg-type]
+        return estimate_disk(recording, (layout,), pictures, 1, 1).bytes_per_replan
+
+    heads = {"heads": tuple(range(8))}
+    assert size([10_000], frames=False, **heads) == size([], **heads)
+    assert 10_000 <= size([10_000], **heads) - size([], **heads) <= 10_200
+    one, two = size([], layers=(0,), **heads), size([], layers=(0, 1), **heads)
+    assert size([], layers=(0, 1, 2), **heads) - two == pytest.approx(two - one, abs=2)
+    assert size([], queries="all", num_action_queries=10, **heads) > 9 * (two - one)
+
+
+def test_episodes_and_replans_multiply():
+    estimate = DiskEstimate(bytes_per_replan=1000, max_replans=10, num_episodes=3)
+    assert estimate.total_bytes == 3 * (10_000 + EPISODE_OVERHEAD)
+    assert DiskEstimate(1000, 10, 0).total_bytes == 0
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [
+        (0, "0 B"),
+        (1, "1 B"),
+        (999, "999 B"),
+        (1000, "1 kB"),
+        (1234, "1.23 kB"),
+        (999_400, "999 kB"),
+        (999_900, "1 MB"),
+        (12_340_000, "12.3 MB"),
+        (13.2e9, "13.2 GB"),
+        (4.56e12, "4.56 TB"),
+    ],
+)
+def test_format_bytes(count, text):
+    assert format_bytes(count) == text
+
+
+def test_the_line_before_a_run(tmp_path, monkeypatch):
+    estimate = DiskEstimate(1_000_000, 50, 20)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=2e9))
+    line = describe(estimate, tmp_path / "not" / "yet" / "a.zarr")
+    assert line == "Disk: at most 1.01 GB (20 episodes x up to 50 replans x 1 MB); 2 GB free."
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=5e8))
+    assert "500 MB free. WARNING: that is more than the disk has room for" in describe(estimate, tmp_path)
+
+
+def test_a_relative_path_that_does_not_exist(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "free" in describe(DiskEstimate(1, 1, 1), Path("runs/a.zarr"))

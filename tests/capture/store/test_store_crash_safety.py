@@ -1,0 +1,556 @@
+"""Whatever happens to a writing process, the store holds whole episodes only, and resuming completes it.
+
+Failures are injected from here, into the calls that reach the disk: the product knows nothing of them.
+"""
+
+from __future__ import annotations
+
+import errno
+import multiprocessing
+import os
+import shutil
+import signal
+import subprocess
+from collections.abc import Callable
+from contextlib import contextmanager
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Barrier
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from zarr.storage import LocalStore
+
+from tests.kit.store_kit import (
+    StoreSpec,
+    commit,
+    denoise_times,
+    episode_records,
+    root_attributes,
+    write_episode,
+    write_store,
+)
+from vla_attention.capture.store.durable_files import StoreWriteFailed
+from vla_attention.capture.store.store_writer import open_run
+from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import FormatTooNew, RunMismatch, StoreError, StoreExists, episode_name
+from vla_attention.schemas.stores.verify import verify_store
+
+SPEC = StoreSpec(tasks=(0,), episodes=2, replans=9, layers=(0,), heads=(0,), frames=False)
+#: Processes that have imported everything and started no thread yet, so that a child is there at once.
+PROCESSES = multiprocessing.get_context("forkserver")
+PROCESSES.set_forkserver_preload(["tests.kit.store_kit"])
+
+
+def store_bytes(path: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
+
+
+def names(path: Path) -> list[str]:
+    return [episode.name for episode in open_store(path).episodes]
+
+
+def leftovers(path: Path) -> list[Path]:
+    return list(path.with_name(path.name + ".partial").glob("*"))
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory) -> dict[str, bytes]:
+    return store_bytes(write_store(tmp_path_factory.mktemp("reference") / "a.zarr", spec=SPEC))
+
+
+@contextmanager
+def before_call(kind: str, number: int, action: Callable[[], None]):
+    """Do something right before the number-th (from 0) call of a kind: `set` (a file), `fsync`, `rename`; "renamed" is after it."""
+    owner: Any = {"set": LocalStore, "fsync": os, "rename": Path, "renamed": Path}[kind]
+    name = kind.removesuffix("d")
+    original = getattr(owner, name)
+    calls = 0
+
+    def note() -> None:
+        nonlocal calls
+        calls += 1
+        if calls == number + 1:
+            action()
+
+    async def noted_set(self, *arguments, **keywords):
+        note()
+        return await original(self, *arguments, **keywords)
+
+    def noted(*arguments, **keywords):
+        if kind != "renamed":
+            note()
+        result = original(*arguments, **keywords)
+        if kind == "renamed":
+            note()
+        return result
+
+    setattr(owner, name, noted_set if kind == "set" else noted)
+    try:
+        yield lambda: calls
+    finally:
+        setattr(owner, name, original)
+
+
+def die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def write_and_die(path: Path, kind: str, number: int) -> None:
+    with before_call(kind, number, die):
+        write_store(path, mode="resume", spec=SPEC)
+
+
+def run_child(target: Callable[..., None], *arguments: Any) -> int | None:
+    child = PROCESSES.Process(target=target, args=arguments)
+    child.start()
+    child.join(60)
+    assert child.exitcode is not None, "the child hangs"
+    return child.exitcode
+
+
+def count_calls(kind: str, path: Path) -> int:
+    with before_call(kind, -1, die) as calls:
+        write_store(path, spec=SPEC)
+    return calls()
+
+
+@pytest.mark.parametrize(("kind", "moments"), [("set", 6), ("fsync", 4), ("rename", 3), ("renamed", 3)])
+def test_a_killed_process_leaves_whole_episodes_and_is_resumed(tmp_path, uninterrupted, kind, moments):
+    total = count_calls(kind, tmp_path / "counted.zarr")
+    assert total >= moments
+    for i in range(moments):
+        path = tmp_path / f"{i}.zarr"
+        number = i * (total - 1) // (moments - 1)
+        assert run_child(write_and_die, path, kind, number) == -signal.SIGKILL
+        if path.exists():
+            store = open_store(path)
+            assert verify_store(store) == []
+            assert [episode.name for episode in store.episodes] in (
+                [],
+                ["task000_episode000"],
+                ["task000_episode000", "task000_episode001"],
+            )
+        write_store(path, mode="resume", spec=SPEC)
+        assert store_bytes(path) == uninterrupted
+        assert not leftovers(path)
+
+
+def test_an_exception_in_the_block_leaves_no_trace(tmp_path, uninterrupted):
+    path = write_store(tmp_path / "a.zarr", spec=SPEC)
+    store = open_run(path, root_attributes(SPEC), "resume")
+    start, records = episode_records(SPEC, 7, 0)
+    for stop in (0, 1, len(records)):
+        for exception in (RuntimeError, KeyboardInterrupt):
+            with pytest.raises(exception), store.episode(start, denoise_times(SPEC), 9) as writer:  # noqa: PT012
+                for record in records[:stop]:
+                    writer.append(record)
+                raise exception
+    with store.episode(start, denoise_times(SPEC), 9) as writer:
+        writer.append(records[0])  # and never committed
+    assert store_bytes(path) == uninterrupted
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("kind", ["set", "fsync", "rename"])
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
+def test_a_full_or_failing_disk_is_an_error_and_harms_nothing(tmp_path, uninterrupted, kind, code):
+    path = write_store(tmp_path / "a.zarr", spec=SPEC)
+    store = open_run(path, root_attributes(SPEC), "resume")
+
+    def fail() -> None:
+        raise OSError(code, os.strerror(code))
+
+    with before_call(kind, -1, fail) as calls:
+        write_episode(store, SPEC, 6, 0)
+    total = calls()
+    shutil.rmtree(path / "episodes/task006_episode000")
+    for number in sorted({0, total // 2, total - 1 if kind != "fsync" else total - 2}):
+        with before_call(kind, number, fail), pytest.raises(StoreWriteFailed, match=os.strerror(code)) as caught:
+            write_episode(store, SPEC, 6, 0)
+        assert "task006_episode000" in str(caught.value)
+        assert isinstance(caught.value, OSError)
+        assert store_bytes(path) == uninterrupted
+        assert not leftovers(path)
+
+
+def test_a_disk_that_is_full_when_the_store_is_made(tmp_path):
+    def fail() -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    for kind in ("set", "fsync", "rename"):
+        with before_call(kind, 0, fail), pytest.raises(BadArgument, match="No space left"):
+            open_run(tmp_path / "a.zarr", root_attributes(SPEC), "new")
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_file_systems_that_cannot_flush_folders_are_accepted(tmp_path, monkeypatch, uninterrupted):
+    def refuse(handle: int) -> None:
+        raise OSError(errno.EINVAL, "Invalid argument")
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    assert store_bytes(write_store(tmp_path / "a.zarr", spec=SPEC)) == uninterrupted
+
+
+def test_bytes_that_come_back_changed_are_never_published(tmp_path, monkeypatch):
+    store = open_run(tmp_path / "a.zarr", root_attributes(SPEC), "new")
+    original = LocalStore.set
+
+    async def spoiled(self, key, value, **keywords):
+        await original(self, key, value, **keywords)
+        if "rows/c/" in key:
+            file = Path(self.root) / key
+            file.write_bytes(file.read_bytes()[:20] + b"\x55" + file.read_bytes()[21:])
+
+    monkeypatch.setattr(LocalStore, "set", spoiled)
+    with pytest.raises(StoreError, match="joint/rows"):
+        write_episode(store, SPEC, 0, 0)
+    assert names(store.path) == []
+
+
+def write_same(path: Path, barrier: Barrier, report: Connection) -> None:
+    store = open_run(path, root_attributes(SPEC), "resume")
+    start, records = episode_records(SPEC, 0, 0)
+    try:
+        with store.episode(start, denoise_times(SPEC), 9) as writer:
+            for record in records:
+                writer.append(record)
+            barrier.wait(60)
+            commit(writer, SPEC, 0, 0)
+        report.send("committed")
+    except StoreExists as error:
+        report.send(str(error))
+
+
+def create_and_fill(path: Path, task: int, barrier: Barrier) -> None:
+    spec = replace(SPEC, tasks=(task,))
+    barrier.wait(60)
+    write_store(path, mode="resume", spec=spec)
+
+
+def test_one_of_two_writers_of_an_episode_wins(tmp_path, uninterrupted):
+    path = tmp_path / "a.zarr"
+    barrier = PROCESSES.Barrier(2)
+    receivers, children = [], []
+    for _ in range(2):
+        receiver, sender = PROCESSES.Pipe(duplex=False)
+        receivers.append(receiver)
+        children.append(PROCESSES.Process(target=write_same, args=(path, barrier, sender)))
+        children[-1].start()
+    results = [receiver.recv() for receiver in receivers if receiver.poll(60)]
+    for child in children:
+        child.join(60)
+        assert child.exitcode == 0
+    assert results.count("committed") == 1
+    assert sum("committed by another process" in result for result in results) == 1
+    assert verify_store(open_store(path)) == []
+    assert not leftovers(path)
+    write_store(path, mode="resume", spec=SPEC)
+    assert store_bytes(path) == uninterrupted
+
+
+def test_many_processes_create_and_fill_one_store(tmp_path):
+    path = tmp_path / "a.zarr"
+    barrier = PROCESSES.Barrier(4)
+    children = [PROCESSES.Process(target=create_and_fill, args=(path, task, barrier)) for task in range(4)]
+    for child in children:
+        child.start()
+    for child in children:
+        child.join(60)
+        assert child.exitcode == 0
+    assert names(path) == [episode_name(task, episode) for task in range(4) for episode in range(2)]
+    assert verify_store(open_store(path)) == []
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"seed": 1}, "protocol.seed is 0"),
+        ({"suite": "libero_10"}, "protocol.suite"),
+        ({"mantissa_bits": 7}, "recording.mantissa_bits is 10, this run's is 7"),
+        ({"layers": (0, 1)}, "recording.layers"),
+        ({"queries": "all"}, "recording.queries"),
+        ({"frames": True}, "recording.frames"),
+        ({"policy": "other"}, "policy.name"),
+        ({"num_layers": 5}, "policy.num_layers"),
+    ],
+)
+def test_a_different_run_cannot_be_resumed(tmp_path, uninterrupted, change, field):
+    path = write_store(tmp_path / "a.zarr", spec=SPEC)
+    with pytest.raises(RunMismatch, match=field) as caught:
+        write_store(path, mode="resume", spec=SPEC, **change)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 300 + len(str(path))
+    assert store_bytes(path) == uninterrupted
+
+
+def test_a_different_layout_names_the_span(tmp_path):
+    path = write_store(tmp_path / "a.zarr", spec=SPEC)
+    attributes = root_attributes(SPEC)
+    (site,) = attributes.sites
+    other = replace(site, spans=(*site.spans[:-1], replace(site.spans[-1], stop=site.spans[-1].stop + 1)))
+    with pytest.raises(RunMismatch, match=r"sites\[0\]\.spans\[4\]\.stop is 39, this run's is 40"):
+        open_run(path, replace(attributes, sites=(other,)), "resume")
+
+
+def test_other_provenance_and_another_checkpoint_path_may_resume(tmp_path, uninterrupted):
+    path = write_store(tmp_path / "a.zarr", spec=replace(SPEC, episodes=1))
+    attributes = root_attributes(SPEC)
+    moved = replace(attributes, provenance={"numpy": "9"}, policy=replace(attributes.policy, checkpoint="elsewhere"))
+    store = open_run(path, moved, "resume")
+    assert store.attributes == attributes  # what the store says, not what this process is
+    write_episode(store, SPEC, 0, 1)
+    assert store_bytes(path) == uninterrupted
+
+
+def test_an_existing_store_is_refused_resumed_or_overwritten(tmp_path, uninterrupted):
+    path = write_store(tmp_path / "a.zarr", spec=replace(SPEC, seed=5))
+    with pytest.raises(StoreExists, match=r"holds 2 episodes.*--resume.*--overwrite"):
+        write_store(path, spec=SPEC)
+    write_store(path, mode="overwrite", spec=SPEC)
+    assert store_bytes(path) == uninterrupted
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_crash_while_overwriting_leaves_no_half_store(tmp_path, monkeypatch, uninterrupted):
+    path = write_store(tmp_path / "a.zarr", spec=replace(SPEC, seed=5))
+
+    def die_in_the_middle(folder: Path, **_: object) -> None:
+        next(file for file in Path(folder).rglob("0") if file.is_file()).unlink()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", die_in_the_middle)
+        with pytest.raises(KeyboardInterrupt):
+            open_run(path, root_attributes(SPEC), "overwrite")
+    assert not path.exists()
+    assert store_bytes(write_store(path, mode="overwrite", spec=SPEC)) == uninterrupted
+
+
+def test_overwriting_where_nothing_is(tmp_path, uninterrupted):
+    assert store_bytes(write_store(tmp_path / "new/folder/a.zarr", mode="overwrite", spec=SPEC)) == uninterrupted
+
+
+def test_an_episode_is_not_added_to_another_run_that_took_the_place(tmp_path):
+    path = tmp_path / "a.zarr"
+    store = open_run(path, root_attributes(SPEC), "new")
+    start, records = episode_records(SPEC, 0, 0)
+    with store.episode(start, denoise_times(SPEC), 9) as writer:
+        writer.append(records[0])
+        open_run(path, root_attributes(replace(SPEC, seed=3)), "overwrite")
+        with pytest.raises(RunMismatch, match=r"protocol\.seed"):
+            writer.commit(False, 5)
+        shutil.rmtree(path)
+    with store.episode(start, denoise_times(SPEC), 9) as writer:
+        writer.append(records[0])
+        with pytest.raises(StoreError, match="has been removed"):
+            writer.commit(False, 5)
+
+
+def make_foreign(path: Path, kind: str) -> None:
+    if kind == "file":
+        path.write_text("mine")
+        return
+    path.mkdir()
+    if kind == "folder with files":
+        (path / "thesis.txt").write_text("mine")
+    elif kind == "other Zarr group":
+        (path / "zarr.json").write_text('{"zarr_format": 3, "node_type": "group", "attributes": {"mine": 1}}')
+    elif kind == "Zarr array":
+        (path / "zarr.json").write_text('{"zarr_format": 3, "node_type": "array", "attributes": {}}')
+    elif kind == "unreadable zarr.json":
+        (path / "zarr.json").write_bytes(b"\xff{")
+
+
+@pytest.mark.parametrize("mode", ["new", "resume", "overwrite"])
+@pytest.mark.parametrize(
+    "kind",
+    ["file", "empty folder", "folder with files", "other Zarr group", "Zarr array", "unreadable zarr.json"],
+)
+def test_what_is_not_a_store_is_never_touched(tmp_path, kind, mode):
+    path = tmp_path / "a.zarr"
+    make_foreign(path, kind)
+    before = store_bytes(tmp_path)
+    with pytest.raises(StoreError):
+        write_store(path, mode=mode, spec=SPEC)
+    assert store_bytes(tmp_path) == before
+    assert path.exists()
+
+
+@pytest.mark.parametrize("mode", ["new", "resume", "overwrite"])
+def test_a_store_of_a_later_format_is_never_touched(tmp_path, mode):
+    path = write_store(tmp_path / "a.zarr", spec=SPEC)
+    root = path / "zarr.json"
+    root.write_text(root.read_text().replace('"format_version": 1', '"format_version": 2'))
+    before = store_bytes(path)
+    with pytest.raises(FormatTooNew):
+        write_store(path, mode=mode, spec=SPEC)
+    assert store_bytes(path) == before
+
+
+@pytest.mark.parametrize("name", ["a", "a.zarr.zip", "a.zar", ".zarr.d"])
+def test_a_path_without_the_suffix_is_refused(tmp_path, name):
+    with pytest.raises(BadArgument, match=r"ends with '\.zarr'"):
+        write_store(tmp_path / name, spec=SPEC)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_written(tmp_path):
+    if os.geteuid() == 0:
+        pytest.skip("root may write everywhere")
+    tmp_path.chmod(0o500)
+    try:
+        with pytest.raises(BadArgument, match="Permission denied"):
+            write_store(tmp_path / "a.zarr", spec=SPEC)
+    finally:
+        tmp_path.chmod(0o700)
+
+
+@pytest.mark.parametrize("parent", ["file/a.zarr", "file/b/a.zarr"])
+def test_a_parent_that_is_a_file(tmp_path, parent):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(BadArgument, match="Cannot write a store"):
+        write_store(tmp_path / parent, spec=SPEC)
+
+
+def test_permission_denied_is_one_sentence(tmp_path, monkeypatch):
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    with pytest.raises(BadArgument, match="Permission denied; give another --store"):
+        open_run(tmp_path / "a.zarr", root_attributes(SPEC), "new")
+
+
+def test_a_link_to_a_store_is_followed(tmp_path, uninterrupted):
+    (tmp_path / "elsewhere").mkdir()
+    link = tmp_path / "a.zarr"
+    link.symlink_to(tmp_path / "elsewhere/real.zarr")
+    for mode in ("new", "resume", "overwrite"):
+        write_store(link, mode=mode, spec=SPEC)
+        assert store_bytes(tmp_path / "elsewhere/real.zarr") == uninterrupted
+        assert link.is_symlink()
+
+
+def test_only_dead_processes_of_this_machine_lose_their_partials(tmp_path):
+    path = write_store(tmp_path / "a.zarr", spec=SPEC)
+    folder = path.with_name("a.zarr.partial")
+    host = os.uname().nodename
+    keep = [
+        f"task000_episode003-{host}-{os.getpid()}-aaaa",
+        f"task000_episode003-{host}x-{dead_process()}-aaaa",
+        "notes",
+    ]
+    for name in (*keep, f"task000_episode003-{host}-{dead_process()}-aaaa", f"root-{host}-{dead_process()}-aaaa"):
+        (folder / name / "deep").mkdir(parents=True)
+    open_run(path, root_attributes(SPEC), "resume")
+    assert sorted(entry.name for entry in folder.iterdir()) == sorted(keep)
+
+
+def dead_process() -> int:
+    process = subprocess.Popen(["true"])
+    process.wait()
+    return process.pid
+
+
+class Crash(BaseException):
+    """Stands for the end of a process: nothing behind it is cleaned up."""
+
+
+class WritersAndCrashes(RuleBasedStateMachine):
+    """Writing, crashing anywhere, resuming and overwriting, against a set of episode names."""
+
+    episodes = st.sampled_from([0, 1, 2])
+
+    @initialize()
+    def begin(self) -> None:
+        self.folder = Path(os.environ["PYTEST_STATE_FOLDER"]) / os.urandom(6).hex()
+        self.path = self.folder / "a.zarr"
+        self.spec = replace(SPEC, replans=2)
+        self.model: set[int] = set()
+        self.exists = False
+
+    def process_ends(self, kind: str, number: int, action: Callable[[], object]) -> None:
+        """Run something in what looks like another process, which ends at the number-th write, if it comes to that."""
+
+        def crash() -> None:
+            raise Crash
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(os, "getpid", dead_process)
+            try:
+                with before_call(kind, number, crash):
+                    # Cleaning up is not for the dead.
+                    patch.setattr(shutil, "rmtree", lambda *_, **__: None)
+                    action()
+            except (Crash, UserError):
+                return
+
+    @rule(kind=st.sampled_from(["set", "fsync", "rename", "renamed"]), number=st.integers(0, 60), episode=episodes)
+    def crash(self, kind: str, number: int, episode: int) -> None:
+        def work() -> None:
+            store = open_run(self.path, root_attributes(self.spec), "resume")
+            if (0, episode) not in store.committed():
+                write_episode(store, self.spec, 0, episode)
+
+        self.process_ends(kind, number, work)
+        # Either of the two, but nothing in between: what is listed is believed, and `whole` checks it.
+        self.exists = self.path.exists()
+        listed = self.listed()
+        assert self.model <= listed <= self.model | {episode}
+        self.model = listed
+
+    @rule(episode=episodes)
+    def write(self, episode: int) -> None:
+        store = open_run(self.path, root_attributes(self.spec), "resume")
+        self.exists = True
+        if episode in self.model:
+            with pytest.raises(StoreExists):
+                write_episode(store, self.spec, 0, episode)
+        else:
+            write_episode(store, self.spec, 0, episode)
+            self.model.add(episode)
+        assert not leftovers(self.path)
+
+    @precondition(lambda self: self.exists)
+    @rule()
+    def another_run(self) -> None:
+        with pytest.raises(RunMismatch):
+            open_run(self.path, root_attributes(replace(self.spec, seed=99)), "resume")
+        with pytest.raises(StoreExists):
+            open_run(self.path, root_attributes(self.spec), "new")
+
+    @rule()
+    def overwrite(self) -> None:
+        open_run(self.path, root_attributes(self.spec), "overwrite")
+        self.exists = True
+        self.model = set()
+
+    def listed(self) -> set[int]:
+        return (
+            {episode.attributes.episode_index for episode in open_store(self.path).episodes} if self.exists else set()
+        )
+
+    @invariant()
+    def whole(self) -> None:
+        if getattr(self, "exists", False):
+            assert self.listed() == self.model
+            assert verify_store(open_store(self.path)) == []
+
+
+def test_writers_and_crashes(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTEST_STATE_FOLDER", str(tmp_path))
+    from hypothesis.stateful import run_state_machine_as_test
+
+    run_state_machine_as_test(
+        WritersAndCrashes,
+        settings=settings(
+            max_examples=8, stateful_step_count=8, deadline=None, suppress_health_check=list(HealthCheck)
+        ),
+    )

@@ -1,0 +1,359 @@
+"""What is written is what is read, by our reader and by readers that know nothing of us."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+import tensorstore
+import xarray
+import zarr
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.kit.store_kit import StoreSpec, denoise_times, episode_records, root_attributes, write_episode, write_store
+from tests.kit.strategies import episode_tokens
+from vla_attention.capture.recording.attention import RecordedRows
+from vla_attention.capture.store import arrays as store_arrays
+from vla_attention.capture.store.arrays import replans_per_block, write_whole
+from vla_attention.capture.store.store_writer import open_run
+from vla_attention.schemas.json_files import FOLDER
+from vla_attention.schemas.layout import Role
+from vla_attention.schemas.precision import mass_error_bound
+from vla_attention.schemas.segments import segment_members
+from vla_attention.schemas.stores import store_format as contract
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.verify import verify_store
+
+CORE_CODECS = {"bytes", "blosc", "crc32c", "sharding_indexed"}
+
+
+def check_equals_spec(path: Path, spec: StoreSpec) -> None:
+    """Every array and attribute of every episode against what the spec says."""
+    store = open_store(path)
+    assert verify_store(store) == []
+    assert [(e.attributes.task_id, e.attributes.episode_index) for e in store.episodes] == spec.names
+    assert store.attributes == root_attributes(spec)
+    for stored, (task, episode) in zip(store.episodes, spec.names, strict=True):
+        start, records = episode_records(spec, task, episode)
+        attributes = stored.attributes
+        for name in (
+            "task_name",
+            "instruction",
+            "initial_state_index",
+            "initial_state_digest",
+            "objects",
+            "provenance",
+        ):
+            assert getattr(attributes, name) == getattr(start, name)
+        assert attributes.success == (episode % 2 == 1)
+        assert attributes.num_steps == 5 * spec.num_replans - episode % 2
+        assert attributes.num_replans == len(records)
+        index = stored.read("prompt_index")
+        assert [attributes.prompts[i] for i in index] == [record.prompt for record in records]
+        assert len(set(attributes.prompts)) == len(attributes.prompts)
+
+        rows = np.stack([record.rows["joint"].rows for record in records])
+        read = stored.read("joint/rows")
+        assert read.dtype == np.float32
+        assert (np.abs(read - rows) <= mass_error_bound(spec.mantissa_bits) * rows).all()
+        assert (read[rows == 0] == 0).all()
+        assert (stored.read("joint/row_sum") == np.stack([record.rows["joint"].row_sum for record in records])).all()
+        roles = np.stack([record.key_role["joint"] for record in records])
+        assert (stored.read("joint/key_role") == roles).all()
+        members = segment_members(spec.layout, roles, attributes.segments["joint"])
+        atoms = np.einsum("rldhqk,rks->rldhqs", rows.astype(np.float64), members.astype(np.float64))
+        np.testing.assert_allclose(stored.read("joint/atoms"), atoms, rtol=1e-7, atol=0)
+        np.testing.assert_allclose(stored.read("joint/atoms").sum(-1), stored.read("joint/row_sum"), rtol=1e-6)
+
+        for name in ("state", "actions", "env_step", "noise_seed"):
+            assert (stored.read(name) == np.stack([getattr(record, name) for record in records])).all(), name
+        assert (stored.read("denoise_time") == denoise_times(spec).astype(np.float32)).all()
+        assert stored.read("joint/layer").tolist() == list(spec.layers)
+        assert stored.read("joint/denoise").tolist() == list(spec.denoise_steps)
+        assert stored.read("joint/head").tolist() == list(spec.heads)
+        for group, field in (("frames", "frames"), ("objects", "coverage")):
+            cameras = {name.split("/")[1] for name in attributes.arrays if name.startswith(f"{group}/")}
+            assert cameras == set(getattr(records[0], field))
+            for camera in cameras:
+                written = np.stack([getattr(record, field)[camera] for record in records])
+                assert (stored.read(f"{group}/{camera}") == written).all()
+                assert stored.read(f"{group}/{camera}").dtype == written.dtype
+
+
+@pytest.mark.parametrize("bits", [1, 7, 10, 23])
+@pytest.mark.parametrize("queries", ["mean", "all"])
+def test_everything_written_is_read_back(tmp_path, bits, queries):
+    spec = StoreSpec(tasks=(0, 3), episodes=1, mantissa_bits=bits, queries=queries)
+    check_equals_spec(write_store(tmp_path / "a.zarr", spec=spec), spec)
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        StoreSpec(frames=False, tasks=(12,), episodes=1),
+        StoreSpec(coverage=False, prompts="same", tasks=(0,), episodes=1),
+        StoreSpec(
+            layers=(3,), layer_labels=(21,), denoise_steps=(4,), heads=(1,), tasks=(1234,), episodes=1, replans=1
+        ),
+    ],
+)
+def test_unusual_recordings(tmp_path, spec):
+    check_equals_spec(write_store(tmp_path / "a.zarr", spec=spec), spec)
+
+
+@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(tokens=episode_tokens(), bits=st.sampled_from([4, 10, 23]))
+def test_random_layouts_are_read_back(tmp_path_factory, tokens, bits):
+    spec = StoreSpec(tokens=tokens, mantissa_bits=bits, tasks=(0,), episodes=1)
+    check_equals_spec(write_store(tmp_path_factory.mktemp("stores") / "a.zarr", spec=spec), spec)
+
+
+@pytest.mark.parametrize("replans", [7, 8, 9, 15, 16, 17, 24, 30])
+def test_episodes_around_the_size_of_a_block(tmp_path, monkeypatch, replans):
+    monkeypatch.setattr(store_arrays, "TARGET_CHUNK_BYTES", 1)
+    spec = StoreSpec(replans=replans, tasks=(0,), episodes=1, heads=(0,), layers=(0, 1))
+    path = write_store(tmp_path / "a.zarr", spec=spec)
+    array = open_store(path).episodes[0].array("joint/rows")
+    assert array.shards is not None
+    assert array.shards[0] == 8  # 39 keys: only eight replans make the chunk a multiple of 8 numbers
+    assert math.prod(array.chunks) % 8 == 0
+    folder = path / "episodes/task000_episode000"
+    assert len(list((folder / "joint/rows/c").iterdir())) == math.ceil(replans / 8)
+    check_equals_spec(path, spec)
+
+
+def test_an_episode_shorter_than_a_block_has_a_small_block(tmp_path):
+    spec = StoreSpec(replans=9, heads=(0,))
+    store = open_run(tmp_path / "a.zarr", root_attributes(spec), "new")
+    start, records = episode_records(spec, 0, 0)
+    with store.episode(start, denoise_times(spec), max_replans=200) as writer:
+        for record in records:
+            writer.append(record)
+        writer.commit(False, 45)
+    array = open_store(store.path).episodes[0].array("joint/rows")
+    assert array.shards is not None
+    assert array.shards[0] == 16
+
+
+@given(numbers=st.integers(1, 10**7), replans=st.integers(1, 500))
+def test_replans_per_block(numbers, replans):
+    block = replans_per_block(4 * numbers, replans)
+    assert block * numbers % 8 == 0
+    assert 1 <= block <= 8 * math.ceil(replans / 8)
+    chunk = 4 * numbers * block
+    assert chunk <= max(store_arrays.TARGET_CHUNK_BYTES + 8 * 4 * numbers, 8 * 4 * numbers)
+    if 8 * math.ceil(replans / 8) * 4 * numbers <= store_arrays.TARGET_CHUNK_BYTES:
+        assert block >= replans  # what fits into one chunk is one chunk
+
+
+def test_long_side_arrays_are_cut_into_chunks_of_one_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(store_arrays, "TARGET_CHUNK_BYTES", 500)
+    spec = StoreSpec(replans=7, tasks=(0,), episodes=1)
+    path = write_store(tmp_path / "a.zarr", spec=spec)
+    episode = open_store(path).episodes[0]
+    assert episode.array("frames/base_0_rgb").chunks[0] == 1
+    assert episode.array("joint/key_role").chunks[0] == 7
+    for name in ("frames/base_0_rgb", "joint/atoms", "actions"):
+        assert len([file for file in (episode.folder / name / "c").rglob("*") if file.is_file()]) == 1
+    check_equals_spec(path, spec)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory) -> tuple[Path, StoreSpec]:
+    spec = StoreSpec(replans=9)
+    return write_store(tmp_path_factory.mktemp("written") / "a.zarr", spec=spec), spec
+
+
+def array_documents(path: Path) -> dict[str, dict]:
+    documents = {str(file.parent): json.loads(file.read_text()) for file in path.rglob("zarr.json")}
+    return {name: document for name, document in documents.items() if document["node_type"] == "array"}
+
+
+def codec_chains(codecs: list[dict]) -> list[list[dict]]:
+    """The codec chain of chunks and, inside a shard, those of the inner chunks and of the index."""
+    if codecs[0]["name"] != "sharding_indexed":
+        return [codecs]
+    inner = codecs[0]["configuration"]
+    return [*codec_chains(inner["codecs"]), inner["index_codecs"]]
+
+
+def test_core_codecs_only_and_a_checksum_on_every_chunk(written):
+    documents = array_documents(written[0])
+    assert len(documents) == 4 * 17
+    for name, document in documents.items():
+        assert document["zarr_format"] == 3
+        assert document["storage_transformers"] == []
+        names = {codec["name"] for codec in document["codecs"]}
+        for chain in codec_chains(document["codecs"]):
+            names |= {codec["name"] for codec in chain}
+            assert chain[-1]["name"] == "crc32c", name
+        assert names <= CORE_CODECS, name
+        assert document["fill_value"] == (
+            "NaN" if document["data_type"].startswith("float") else document["fill_value"]
+        )
+        assert document["fill_value"] == -1 or not document["data_type"].startswith("int")
+        assert len(document["dimension_names"]) == len(document["shape"])
+
+
+def test_one_layer_and_denoise_step_to_a_chunk_of_rows(written):
+    array = open_store(written[0]).episodes[0].array("joint/rows")
+    assert array.chunks == (12, 1, 1, 2, 1, 39)  # 9 replans; 78 numbers each, so that 4 make a multiple of 8
+    assert math.prod(array.chunks) % 8 == 0
+    chain = codec_chains(array.metadata.to_dict()["codecs"])[0]  # type: ignore[arg-type]
+    blosc = next(codec["configuration"] for codec in chain if codec["name"] == "blosc")
+    assert (blosc["cname"], blosc["shuffle"], blosc["typesize"]) == ("lz4", "bitshuffle", 4)
+
+
+def test_chunks_that_hold_only_the_fill_value_are_written(tmp_path):
+    group = zarr.create_group(tmp_path / "g", zarr_format=3)
+    for name, values in {
+        "black": np.zeros((20, 30, 30, 3), dtype=np.uint8),
+        "minus": np.full((4,), -1, dtype=np.int32),
+        "nan": np.full((4, 2), np.nan, dtype=np.float32),
+    }.items():
+        write_whole(group, name, values, [f"axis{i}" for i in range(values.ndim)])
+        assert [file for file in (tmp_path / "g" / name / "c").rglob("*") if file.is_file()], name
+    many = np.zeros((20, 300, 300, 3), dtype=np.uint8)
+    array = write_whole(group, "many", many, ("replan", "row", "column", "channel"))
+    assert array.shards is not None
+    (file,) = [file for file in (tmp_path / "g/many/c").rglob("*") if file.is_file()]
+    count = array.shards[0] // array.chunks[0]
+    index = np.frombuffer(file.read_bytes()[-16 * count - 4 : -4], dtype="<u8")
+    assert count > 1
+    assert (index != 2**64 - 1).all()  # what the index of a shard says of a chunk that was left out
+
+
+def test_attributes_fit_the_json_schemas(written):
+    path, _ = written
+    root = json.loads((path / "zarr.json").read_text())["attributes"]
+    schema = json.loads((FOLDER / "root_attributes.schema.json").read_text())
+    jsonschema.validate(root, schema)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({**root, "surprise": 1}, schema)
+    schema = json.loads((FOLDER / "episode_attributes.schema.json").read_text())
+    for folder in (path / "episodes").glob("task*"):
+        jsonschema.validate(json.loads((folder / "zarr.json").read_text())["attributes"], schema)
+
+
+def test_xarray_reads_it(written):
+    path, _ = written
+    episode = open_store(path).episodes[-1]
+    group = f"episodes/{episode.name}"
+    joint = xarray.open_zarr(path, group=f"{group}/joint", consolidated=False)
+    assert joint["rows"].dims == contract.ROW_AXES
+    assert joint["atoms"].dims == contract.ATOM_AXES
+    assert joint["row_sum"].dims == contract.ROW_AXES[:-1]
+    assert set(joint.coords) == {"layer", "denoise", "head"}
+    assert joint["rows"].sel(layer=2, denoise=9, head=1).equals(joint["rows"].isel(layer=1, denoise=1, head=1))
+    for name in ("rows", "atoms", "row_sum", "key_role", "layer", "denoise", "head"):
+        stored = episode.read(f"joint/{name}")
+        assert joint[name].dtype == stored.dtype  # a fill value must not turn integers into floats
+        assert (joint[name].to_numpy() == stored).all()
+    side = xarray.open_zarr(path, group=group, consolidated=False)
+    assert side.attrs["instruction"] == episode.attributes.instruction
+    assert dict(side.sizes) == {"replan": 9, "denoise": 2, "state_dim": 8, "horizon": 5, "action_dim": 7}
+    for name in side.variables:
+        assert (side[name].to_numpy() == episode.read(str(name))).all()
+    # Cameras of different sizes share the names of their axes: open one at a time.
+    frames = xarray.open_zarr(path, group=f"{group}/frames", consolidated=False, drop_variables="left_wrist_0_rgb")
+    assert frames["base_0_rgb"].dims == ("replan", "row", "column", "channel")
+    assert frames["base_0_rgb"].dtype == np.uint8
+
+
+def test_tensorstore_reads_it(written):
+    path, _ = written
+    episode = open_store(path).episodes[0]
+    for name in episode.attributes.arrays:
+        file_store = {"driver": "file", "path": str(episode.folder / name)}
+        array = tensorstore.open({"driver": "zarr3", "kvstore": file_store}, read=True).result()
+        assert tuple(array.domain.labels) == tuple(episode.array(name).metadata.dimension_names), name  # type: ignore[union-attr]
+        assert (array.read().result() == episode.read(name)).all(), name
+
+
+DOCUMENT = Path(__file__).parents[3] / "docs" / "store.md"
+
+
+@pytest.mark.parametrize("example", re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL))
+def test_the_examples_of_the_documentation_run(written, tmp_path, monkeypatch, capsys, example):
+    (tmp_path / "run.zarr").symlink_to(written[0])
+    monkeypatch.chdir(tmp_path)
+    exec(compile(example, str(DOCUMENT), "exec"), {})
+    assert len(capsys.readouterr().out) > 10
+
+
+def test_the_documentation_lists_every_array_and_role(written):
+    text = DOCUMENT.read_text(encoding="utf-8")
+    for name in open_store(written[0]).episodes[0].attributes.arrays:
+        assert name.rpartition("/")[2] in text or "frames" in name or "objects" in name, name
+    for role in Role:
+        assert f"{role.value} {role.label}" in text
+
+
+def test_a_store_has_no_code_and_no_objects(written):
+    files = {file.name for file in written[0].rglob("*") if file.is_file()}
+    assert "zarr.json" in files
+    assert all(name == "zarr.json" or name.isdigit() for name in files)
+
+
+def wrong(spec: StoreSpec, **changes: object):
+    start, (first, second, *_) = episode_records(spec, 0, 0)
+    return start, first, replace(second, **changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"state": np.array([np.nan] * 8)}, "state"),
+        ({"actions": np.full((5, 7), np.inf)}, "actions"),
+        ({"frames": {}}, "frames of the cameras"),
+        ({"coverage": {"base_0_rgb": np.zeros((12, 5), dtype=np.float32)}}, "coverage of the cameras"),
+        ({"key_role": {"joint": np.zeros(40, dtype=np.uint8)}}, "shapes"),
+        ({"key_role": {"joint": np.zeros(39, dtype=np.uint8)}}, "Role"),
+    ],
+)
+def test_a_replan_that_does_not_fit_is_refused_at_once(tmp_path, changes, message):
+    spec = StoreSpec()
+    store = open_run(tmp_path / "a.zarr", root_attributes(spec), "new")
+    start, first, second = wrong(spec, **changes)
+    with store.episode(start, denoise_times(spec), 3) as writer:
+        writer.append(first)
+        with pytest.raises(ValueError, match=message):
+            writer.append(second)
+    assert store.committed() == set()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -0.1])
+def test_rows_that_are_no_probabilities_are_refused(tmp_path, value):
+    spec = StoreSpec()
+    store = open_run(tmp_path / "a.zarr", root_attributes(spec), "new")
+    start, (first, *_) = episode_records(spec, 0, 0)
+    rows = first.rows["joint"].rows.copy()
+    rows[1, 1, 0, 0, 7] = value
+    with store.episode(start, denoise_times(spec), 3) as writer, pytest.raises(ValueError, match="not probabilities"):
+        writer.append(replace(first, rows={"joint": RecordedRows(rows, first.rows["joint"].row_sum)}))
+
+
+def test_an_episode_without_replans_is_refused(tmp_path):
+    spec = StoreSpec()
+    store = open_run(tmp_path / "a.zarr", root_attributes(spec), "new")
+    start, _ = episode_records(spec, 0, 0)
+    with store.episode(start, denoise_times(spec), 3) as writer, pytest.raises(ValueError, match="without replans"):
+        writer.commit(False, 0)
+    assert not list(tmp_path.glob("*.partial"))
+
+
+def test_writing_twice_gives_the_same_bytes(tmp_path, written):
+    path, spec = written
+    store = open_run(tmp_path / "b.zarr", root_attributes(spec), "new")
+    for task, episode in reversed(spec.names):
+        write_episode(store, spec, task, episode)
+    first = {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
+    again = {str(file.relative_to(store.path)): file.read_bytes() for file in store.path.rglob("*") if file.is_file()}
+    assert first == again

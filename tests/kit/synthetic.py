@@ -1,0 +1,143 @@
+"""A made-up table of steps in the form that `vla_attention.analyze.measures.steps` gives, with its metrics computed in numpy, not with our code."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import polars as pl
+
+from vla_attention.schemas.groupings.grouping import Grouping, Ratio
+
+#: Keys per group of the default grouping in something like pi0.5 with two cameras.
+DEFAULT_KEYS = {
+    "visual": 512.0,
+    "linguistic": 14.0,
+    "state": 24.0,
+    "action": 50.0,
+    "padding": 162.0,
+    "masked": 256.0,
+    "other": 0.0,
+}
+#: Groups whose keys are masked out: no mass, not valid.
+INVALID = ("padding", "masked")
+CUSTOM_KEYS = {
+    "base": 256.0,
+    "wrist": 256.0,
+    "nouns": 3.0,
+    "target": 7.25,
+    "verbs": 2.0,
+    "rest": 74.0,
+}
+INSTRUCTIONS = (
+    "put both the alphabet soup and the tomato sauce in the basket",
+    "turn on the stove and put the moka pot on it",
+    "pick up the book and place it in the back compartment of the caddy",
+    "put the $5 mug_1 on the left $plate_2 and the other mug on the right plate, then close the bottom drawer of the cabinet",
+)
+
+
+def default_grouping() -> Grouping:
+    groups = {
+        "visual": ("role:image",),
+        "linguistic": ("role:instruction | role:bos",),
+        "state": ("role:state",),
+        "action": ("role:action",),
+        "padding": ("role:padding",),
+        "masked": ("role:masked_image",),
+        "other": ("*",),
+    }
+    return Grouping(
+        "default", groups, Ratio(("visual",), ("linguistic",)), description="visual = every valid image key"
+    )
+
+
+def custom_grouping(with_ratio: bool = True) -> Grouping:
+    groups = {name: ("*",) if name == "rest" else (f"span:{name}",) for name in CUSTOM_KEYS}
+    return Grouping("cameras-and-words", groups, Ratio(("base", "wrist"), ("nouns",)) if with_ratio else None)
+
+
+def many_groups(count: int = 14) -> tuple[Grouping, dict[str, float]]:
+    keys = {f"akita_black_bowl_{i}": 5.0 + i for i in range(count - 2)} | {"linguistic": 12.0, "other": 500.0}
+    groups = {name: (f"span:{name}",) for name in keys}
+    return Grouping("objects", groups, Ratio(tuple(keys)[: count - 2], ("linguistic",))), keys
+
+
+def make_steps(
+    grouping: Grouping | None = None,
+    keys: Mapping[str, float] | None = None,
+    *,
+    num_tasks: int = 2,
+    num_episodes: int = 3,
+    layers: tuple[int, ...] = (18, 25, 35),
+    num_replans: int = 6,
+    denoise_steps: tuple[int, ...] = (0, 9),
+    heads: tuple[int, ...] | None = None,
+    no_denominator: float = 0.0,
+    suite: str = "libero_10",
+    seed: int = 0,
+) -> pl.DataFrame:
+    """Steps with smooth changes over time, and differences between layers, tasks and episodes.
+
+    `no_denominator`: share of (episode, replan) pairs whose denominator groups get no mass at all, so that their ratio is +inf.
+    """
+    grouping = grouping or default_grouping()
+    keys = dict(keys or DEFAULT_KEYS)
+    generator = np.random.default_rng(seed)
+    axes = (num_tasks, num_episodes, num_replans, len(layers), len(denoise_steps), len(heads or (0,)))
+    task, episode, replan, layer, denoise, head = (part.ravel() for part in np.indices(axes))
+    number = {name: i for i, name in enumerate(keys)}
+    logits = np.zeros((len(task), len(keys)))
+    for name, i in number.items():
+        logits[:, i] = np.log(max(keys[name], 1e-9))
+        logits[:, i] += generator.normal(0, 0.5, len(layers))[layer] + generator.normal(0, 0.3, num_tasks)[task]
+        logits[:, i] += generator.normal(0, 0.25, (num_tasks, num_episodes))[task, episode]
+        drift = generator.normal(0, 0.15, (num_tasks, num_episodes, num_replans)).cumsum(axis=2)
+        logits[:, i] += drift[task, episode, replan] + generator.normal(0, 0.05, len(task))
+        if name in INVALID or keys[name] == 0:
+            logits[:, i] = -np.inf
+    if grouping.ratio and no_denominator:
+        hit = generator.random((num_tasks, num_episodes, num_replans)) < no_denominator
+        for name in grouping.ratio.denominator:
+            logits[hit[task, episode, replan], number[name]] = -np.inf
+    weights = np.exp(logits - logits.max(axis=1, keepdims=True))
+    masses = weights / weights.sum(axis=1, keepdims=True)
+    num_valid = sum(count for name, count in keys.items() if name not in INVALID)
+    steps_of = generator.integers(num_replans * 5 - 4, num_replans * 5 + 1, (num_tasks, num_episodes))
+    success = generator.random((num_tasks, num_episodes)) < 0.7
+    columns: dict[str, object] = {
+        "suite": [suite] * len(task),
+        "task_id": task,
+        "instruction": [INSTRUCTIONS[i % len(INSTRUCTIONS)] for i in task],
+        "episode_index": episode,
+        "success": success[task, episode],
+        "num_steps": steps_of[task, episode],
+        "replan": replan,
+        "env_step": 10 + 5 * replan,
+        "layer": np.array(layers)[layer],
+        "block": np.array(layers)[layer] % 18,
+        "denoise_step": np.array(denoise_steps)[denoise],
+        "denoise_time": 1.0 - np.array(denoise_steps)[denoise] / 10.0,
+        "head": pl.Series([None] * len(task), dtype=pl.Int64) if heads is None else np.array(heads)[head],
+        "row_sum": np.ones(len(task)),
+        "valid_mass": np.ones(len(task)),
+        "num_valid": np.full(len(task), round(num_valid)),
+    }
+    for name, i in number.items():
+        columns[f"{name}_mass"] = masses[:, i]
+        columns[f"{name}_fraction"] = masses[:, i] / masses.sum(axis=1)
+        columns[f"{name}_keys"] = np.full(len(task), keys[name])
+        density = masses[:, i] / keys[name] if keys[name] else None
+        columns[f"{name}_density"] = pl.Series([None] * len(task), dtype=pl.Float64) if density is None else density
+        lift = masses[:, i] / keys[name] * round(num_valid) if keys[name] else None
+        columns[f"{name}_lift"] = pl.Series([None] * len(task), dtype=pl.Float64) if lift is None else lift
+    if grouping.ratio:
+        above = sum(masses[:, number[name]] for name in grouping.ratio.numerator)
+        below = sum(masses[:, number[name]] for name in grouping.ratio.denominator)
+        with np.errstate(divide="ignore"):
+            ratio = above / below
+        uniform = sum(keys[n] for n in grouping.ratio.numerator) / sum(keys[n] for n in grouping.ratio.denominator)
+        columns |= {"numerator_mass": above, "denominator_mass": below, "ratio": ratio}
+        columns |= {"uniform_ratio": np.full(len(task), uniform), "ratio_lift": ratio / uniform}
+        columns["log2_ratio"] = np.log2(ratio)
+    return pl.DataFrame(columns)

@@ -1,0 +1,63 @@
+from __future__ import annotations
+
+import pytest
+
+from vla_attention.schemas.groupings.selectors import (
+    Atom,
+    Everything,
+    Operation,
+    SelectorError,
+    atoms_of,
+    parse_selector,
+)
+
+
+def test_and_binds_tighter_than_or_and_minus():
+    tree = parse_selector("camera:a | role:image & object:bowl_1 - keys:3-9")
+    assert tree == Operation(
+        "-",
+        Operation("|", Atom("camera", "a"), Operation("&", Atom("role", "image"), Atom("object", "bowl_1"))),
+        Atom("keys", "3-9"),
+    )
+
+
+def test_minus_and_or_associate_to_the_left():
+    assert parse_selector("* - role:bos - role:padding") == Operation(
+        "-", Operation("-", Everything(), Atom("role", "bos")), Atom("role", "padding")
+    )
+
+
+def test_parentheses_quotes_and_hyphens_in_names():
+    assert parse_selector('(word:"black bowl")&object:salad-dressing') == Operation(
+        "&", Atom("word", "black bowl"), Atom("object", "salad-dressing")
+    )
+
+
+def test_patch_region_may_contain_spaces():
+    assert parse_selector("patch:cam[0:4, 2:16]") == Atom("patch", "cam[0:4, 2:16]")
+
+
+def test_atoms_are_listed_left_to_right():
+    assert [atom.kind for atom in atoms_of(parse_selector("(role:bos | word:x) - span:y"))] == ["role", "word", "span"]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "expected a selector"),
+        ("camera:", "expected a name after 'camera:'"),
+        ('word:""', "expected a name after 'word:'"),
+        ("camra:base", "did you mean 'camera'"),
+        ("base", "expected KIND:NAME"),
+        ("(role:bos", "expected ')'"),
+        ("role:bos role:image", "expected '&', '|' or ' - '"),
+        ("role:bos &", "expected a selector"),
+        ("| role:bos", "expected a selector"),
+        ("role:bos)", "expected '&', '|' or ' - '"),
+    ],
+)
+def test_errors_quote_the_selector_and_say_what_was_expected(text, said):
+    with pytest.raises(SelectorError) as caught:
+        parse_selector(text)
+    assert said in str(caught.value)
+    assert f"'{text}'" in str(caught.value)

@@ -1,0 +1,174 @@
+"""Opening stores that are there, that are not, and that are something else."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.kit.store_kit import StoreSpec, episode_records, root_attributes, write_store
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import CorruptEpisode, FormatTooNew, StoreError, StoreNotFound
+
+SPEC = StoreSpec(tasks=(1, 12), episodes=2, replans=2)
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory) -> Path:
+    return write_store(tmp_path_factory.mktemp("original") / "libero_10.zarr", spec=SPEC)
+
+
+@pytest.fixture
+def path(original, tmp_path) -> Path:
+    copy = tmp_path / "libero_10.zarr"
+    shutil.copytree(original, copy)
+    return copy
+
+
+def test_a_store_lists_its_run_and_its_episodes_in_order(original):
+    store = open_store(original)
+    assert store.attributes == root_attributes(SPEC)
+    assert store.suite == "made_up"
+    assert store.task_ids == (1, 12)
+    assert [episode.name for episode in store.episodes] == [
+        "task001_episode000",
+        "task001_episode001",
+        "task012_episode000",
+        "task012_episode001",
+    ]
+
+
+def test_order_is_by_number_and_not_by_letter(tmp_path):
+    path = write_store(tmp_path / "a.zarr", tasks=(1000, 999), episodes=1, replans=1)
+    assert [episode.name for episode in open_store(path).episodes] == ["task999_episode000", "task1000_episode000"]
+
+
+def test_tokens_are_those_of_the_records(original):
+    store = open_store(original)
+    for stored, (task, episode) in zip(store.episodes, SPEC.names, strict=True):
+        tokens = stored.tokens(store.attributes, "joint")
+        _, records = episode_records(SPEC, task, episode)
+        assert (tokens.key_role == np.stack([record.key_role["joint"] for record in records])).all()
+        assert tokens.prompt_index is not None
+        assert [tokens.prompts[i] for i in tokens.prompt_index] == [record.prompt for record in records]
+        assert tokens.coverage is not None
+        assert list(tokens.coverage) == ["base_0_rgb", "left_wrist_0_rgb"]
+        for camera, coverage in tokens.coverage.items():
+            assert (coverage == np.stack([record.coverage[camera] for record in records])).all()
+
+
+def test_one_layer_does_not_need_the_others(path):
+    """The chunk of one layer is damaged; the other layer is read, and this one is an error."""
+    file = next(file for file in (path / "episodes/task001_episode000/joint/rows/c").rglob("0") if file.is_file())
+    content = bytearray(file.read_bytes())
+    content[20] ^= 1  # the first chunk: layer 0, first denoise step
+    file.write_bytes(content)
+    episode = open_store(path).episodes[0]
+    _, records = episode_records(SPEC, 1, 0)
+    rows = np.stack([record.rows["joint"].rows for record in records])
+    np.testing.assert_allclose(episode.read("joint/rows", (slice(None), 1)), rows[:, 1], rtol=2**-11)
+    with pytest.raises(CorruptEpisode, match="joint/rows of episode task001_episode000"):
+        episode.read("joint/rows", (slice(None), 0, 0))
+
+
+def test_an_index_that_does_not_exist_is_the_callers_mistake(original):
+    with pytest.raises(IndexError):
+        open_store(original).episodes[0].read("joint/rows", (0, 99))
+
+
+def test_an_array_that_does_not_exist(original):
+    with pytest.raises(CorruptEpisode, match="task001_episode000 lacks the array joint/colour"):
+        open_store(original).episodes[0].array("joint/colour")
+
+
+def test_a_missing_store_names_its_neighbours(path):
+    with pytest.raises(StoreNotFound, match=r"Did you mean '.*libero_10\.zarr'") as caught:
+        open_store(path.with_name("libero10.zarr"))
+    assert isinstance(caught.value, FileNotFoundError)
+    with pytest.raises(StoreNotFound, match=r"Stores in .*: none"):
+        open_store(path.parent / "nowhere" / "a.zarr")
+
+
+def test_a_folder_or_file_that_is_no_store(tmp_path):
+    with pytest.raises(StoreError, match=r"is not a store: it has no zarr\.json"):
+        open_store(tmp_path)
+    file = tmp_path / "a.zarr"
+    file.write_text("mine")
+    with pytest.raises(StoreError, match="is not a store"):
+        open_store(file)
+
+
+def change_root(path: Path, **changes: object) -> None:
+    document = json.loads((path / "zarr.json").read_text())
+    document["attributes"].update(changes)
+    (path / "zarr.json").write_text(json.dumps(document))
+
+
+def test_a_later_format(path):
+    change_root(path, format_version=2, something_new={"a": 1})
+    with pytest.raises(FormatTooNew, match="format version 2, and this program reads up to version 1; install"):
+        open_store(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"format": "something else"}, "not a store of this tool"),
+        ({"format": None}, "not a store of this tool"),
+        ({"format_version": 0}, "expected a whole number from 1"),
+        ({"format_version": "1"}, "expected a whole number from 1"),
+        ({"policy": "pi0.5"}, r"\$\.policy is str; expected dict"),
+        ({"protocol": {}}, r"\$\.protocol lacks the field 'suite'"),
+        (
+            {"sites": [{"name": "joint", "spans": [{"name": "a", "kind": "image", "start": 3, "stop": 5}]}]},
+            "gap or overlap",
+        ),
+        ({"sites": [{"name": "sideways", "spans": []}]}, r"\$\.sites\[0\]\.name is 'sideways'"),
+        ({"surprise": 1}, "unknown field 'surprise'"),
+    ],
+)
+def test_root_attributes_of_the_wrong_kind(path, changes, message):
+    change_root(path, **changes)
+    with pytest.raises(StoreError, match=message) as caught:
+        open_store(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"{", b"\xff\xfe\xfd", b"[]", b"null", b"3", b'{"node_type": "array", "zarr_format": 3}', b"\x00" * 50],
+)
+def test_an_unreadable_root(path, content):
+    (path / "zarr.json").write_bytes(content)
+    with pytest.raises(StoreError, match="cannot be read") as caught:
+        open_store(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
+def test_a_truncated_root(path, share):
+    content = (path / "zarr.json").read_bytes().rstrip()
+    (path / "zarr.json").write_bytes(content[: int(share * len(content))])
+    with pytest.raises(StoreError, match="cannot be read"):
+        open_store(path)
+
+
+def test_a_folder_that_is_no_episode(path):
+    (path / "episodes" / "my notes").mkdir()
+    with pytest.raises(StoreError, match="'my notes' is no episode name"):
+        open_store(path)
+
+
+def test_a_store_without_its_episodes_group(path):
+    shutil.rmtree(path / "episodes")
+    with pytest.raises(StoreError, match="cannot be read"):
+        open_store(path)
+
+
+def test_files_beside_the_episodes_are_of_no_interest(path):
+    (path / "episodes" / "README").write_text("mine")
+    assert len(open_store(path).episodes) == 4

@@ -1,0 +1,295 @@
+"""Every kind of damage is reported with the episode's and the file's or array's name, and never becomes a number."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.kit.store_kit import StoreSpec, denoise_times, episode_records, root_attributes, write_store
+from vla_attention.analyze.__main__ import main
+from vla_attention.capture.store.store_writer import open_run
+from vla_attention.schemas.stores.reader import StoredEpisode, open_store
+from vla_attention.schemas.stores.store_format import CorruptEpisode
+from vla_attention.schemas.stores.verify import Fault, verify_store
+
+SPEC = StoreSpec(tasks=(0, 1), episodes=1, replans=3, heads=(0,))
+EPISODE = "task000_episode000"
+ARRAYS = (
+    "joint/rows",
+    "joint/atoms",
+    "joint/row_sum",
+    "joint/key_role",
+    "joint/layer",
+    "frames/base_0_rgb",
+    "objects/left_wrist_0_rgb",
+    "env_step",
+    "noise_seed",
+    "prompt_index",
+    "denoise_time",
+    "state",
+    "actions",
+)
+METADATA = (
+    "zarr.json",
+    "joint/zarr.json",
+    "frames/zarr.json",
+    "seal/zarr.json",
+    *(f"{name}/zarr.json" for name in ARRAYS),
+)
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory) -> Path:
+    return write_store(tmp_path_factory.mktemp("original") / "a.zarr", spec=SPEC)
+
+
+@pytest.fixture
+def path(original, tmp_path) -> Path:
+    copy = tmp_path / "a.zarr"
+    shutil.copytree(original, copy)
+    return copy
+
+
+def faults(path: Path) -> list[Fault]:
+    found = verify_store(open_store(path))
+    assert all("\n" not in fault.problem for fault in found)
+    return found
+
+
+def only_fault_of(path: Path) -> str:
+    """All problems of the damaged episode, in one text; the other episode must be whole."""
+    found = faults(path)
+    assert found, "the damage was not noticed"
+    assert {fault.episode for fault in found} == {EPISODE}
+    return " | ".join(fault.problem for fault in found)
+
+
+def chunk_file(path: Path, array: str, episode: str = EPISODE) -> Path:
+    (file,) = [file for file in (path / "episodes" / episode / array / "c").rglob("*") if file.is_file()]
+    return file
+
+
+def flip(file: Path, position: int, bits: int = 1) -> None:
+    content = bytearray(file.read_bytes())
+    content[position % len(content)] ^= bits
+    file.write_bytes(content)
+
+
+def check_unreadable(path: Path, array: str) -> None:
+    with pytest.raises(CorruptEpisode, match=EPISODE):
+        open_store(path).episodes[0].read(array)
+
+
+def test_a_whole_store_has_no_faults(original):
+    assert faults(original) == []
+    counted: list[int] = []
+    verify_store(open_store(original), counted.append)
+    assert counted == [1, 1]
+
+
+@pytest.mark.parametrize("array", ARRAYS)
+def test_a_flipped_byte_in_a_chunk(path, array):
+    file = chunk_file(path, array)
+    content = file.read_bytes()
+    for position in (17, -1):
+        file.write_bytes(content)
+        flip(file, position)
+        assert array in only_fault_of(path)
+        check_unreadable(path, array)
+
+
+@pytest.mark.parametrize("array", ARRAYS)
+def test_a_truncated_chunk(path, array):
+    file = chunk_file(path, array)
+    content = file.read_bytes()
+    for keep in (0, 10, len(content) - 1):
+        file.write_bytes(content[:keep])
+        assert array in only_fault_of(path)
+        check_unreadable(path, array)
+
+
+@pytest.mark.parametrize("array", ARRAYS)
+def test_a_deleted_chunk(path, array):
+    chunk_file(path, array).unlink()
+    assert f"{array} of episode {EPISODE} has lost its file c/0" in only_fault_of(path)
+    check_unreadable(path, array)
+
+
+@pytest.mark.parametrize("array", ARRAYS)
+def test_a_deleted_array(path, array):
+    shutil.rmtree(path / "episodes" / EPISODE / array)
+    assert array in only_fault_of(path)
+    check_unreadable(path, array)
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        "joint/rows",
+        "joint/atoms",
+        "joint/key_role",
+        "frames/base_0_rgb",
+        "objects/base_0_rgb",
+        "noise_seed",
+        "state",
+        "actions",
+    ],
+)
+def test_arrays_of_two_episodes_changed_places(path, array):
+    first, second = (path / "episodes" / name / array for name in (EPISODE, "task001_episode000"))
+    first.rename(path / "aside")
+    second.rename(first)
+    (path / "aside").rename(second)
+    found = faults(path)
+    assert {fault.episode for fault in found} == {EPISODE, "task001_episode000"}
+    for name in (EPISODE, "task001_episode000"):
+        assert array in " | ".join(fault.problem for fault in found if fault.episode == name)
+
+
+def test_episodes_changed_places(path):
+    first, second = path / "episodes" / EPISODE, path / "episodes" / "task001_episode000"
+    first.rename(path / "aside")
+    second.rename(first)
+    (path / "aside").rename(second)
+    assert [fault.problem for fault in faults(path)] == [
+        "its attributes are those of task001_episode000",
+        "its attributes are those of task000_episode000",
+    ]
+
+
+def test_an_episode_of_another_run(path, tmp_path):
+    other = write_store(tmp_path / "other.zarr", spec=SPEC, policy="another")
+    shutil.rmtree(path / "episodes" / EPISODE)
+    shutil.copytree(other / "episodes" / EPISODE, path / "episodes" / EPISODE)
+    assert "recorded under other attributes" in only_fault_of(path)
+
+
+@pytest.mark.parametrize("file", METADATA)
+def test_every_changed_byte_of_metadata_is_noticed(path, file):
+    target = path / "episodes" / EPISODE / file
+    content = target.read_bytes()
+    generator = np.random.default_rng(len(content))
+    for position in generator.integers(0, len(content), 2):
+        changed = bytearray(content)
+        changed[position] ^= 1 << generator.integers(7)
+        target.write_bytes(changed)
+        if file.startswith("seal/") and same_json(content, bytes(changed)):
+            continue  # white space of the seal itself: nothing says anything else than before
+        assert Path(file).parent.name in only_fault_of(path)
+
+
+def same_json(one: bytes, other: bytes) -> bool:
+    try:
+        return json.loads(one) == json.loads(other)
+    except ValueError:
+        return False
+
+
+@pytest.mark.parametrize("file", METADATA)
+def test_deleted_metadata(path, file):
+    (path / "episodes" / EPISODE / file).unlink()
+    assert Path(file).parent.name in only_fault_of(path)
+
+
+def test_a_changed_run(path):
+    root = path / "zarr.json"
+    root.write_text(root.read_text().replace('"made-up"', '"made up"'))
+    found = faults(path)
+    assert [fault.episode for fault in found] == [EPISODE, "task001_episode000"]
+    assert all("other attributes than the store has now" in fault.problem for fault in found)
+
+
+def test_damaged_attributes_are_not_read(path):
+    file = path / "episodes" / EPISODE / "zarr.json"
+    file.write_text(file.read_text().replace("bowl", "bowk"))
+    episode = open_store(path).episodes[0]
+    with pytest.raises(CorruptEpisode, match=f"{EPISODE} is damaged: its zarr.json"):
+        _ = episode.attributes
+    with pytest.raises(CorruptEpisode):
+        episode.read("joint/rows")
+
+
+def test_rows_that_do_not_add_up_to_their_sums(tmp_path):
+    """A writer that lies consistently: checksums, digests and seal are all in order."""
+    store = open_run(tmp_path / "a.zarr", root_attributes(SPEC), "new")
+    start, records = episode_records(SPEC, 0, 0)
+    with store.episode(start, denoise_times(SPEC), 3) as writer:
+        for record in records:
+            rows = record.rows["joint"]
+            writer.append(replace(record, rows={"joint": replace(rows, row_sum=rows.row_sum * np.float32(1.01))}))
+        writer.commit(False, 5)
+    problems = [fault.problem for fault in faults(store.path)]
+    assert len(problems) == 2
+    for name, problem in zip(("joint/atoms", "joint/rows"), problems, strict=True):
+        assert problem.startswith(f"{name} does not add up to the row sums: they differ by up to 0.0")
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda attributes: attributes.update(num_replans=4), "has the shape (3, 2, 2, 1, 1, 39); expected (4, "),
+        (lambda attributes: attributes["arrays"].pop("joint/rows"), "the array joint/rows is not in the episode"),
+        (lambda attributes: attributes["prompts"].pop(), "prompt_index names prompts"),
+        (lambda attributes: attributes["arrays"].update({"../../a": {"shape": [1], "sha256": ""}}), "../../a"),
+    ],
+)
+def test_attributes_that_contradict_the_arrays(path, change, problem):
+    """Changed and sealed anew, as somebody might who knows the format."""
+    folder = path / "episodes" / EPISODE
+    document = json.loads((folder / "zarr.json").read_text())
+    change(document["attributes"])
+    (folder / "zarr.json").write_text(json.dumps(document))
+    seal = json.loads((folder / "seal/zarr.json").read_text())
+    seal["attributes"]["files"]["zarr.json"] = hashlib.sha256((folder / "zarr.json").read_bytes()).hexdigest()
+    (folder / "seal/zarr.json").write_text(json.dumps(seal))
+    assert problem in only_fault_of(path)
+
+
+def test_an_empty_episode_folder(path):
+    (path / "episodes" / "task007_episode000").mkdir()
+    assert [fault.episode for fault in faults(path)] == ["task007_episode000"]
+
+
+@pytest.fixture(scope="module")
+def victim(original, tmp_path_factory) -> tuple[StoredEpisode, Path, dict[str, np.ndarray]]:
+    """A copy to damage and repair, and what it holds."""
+    copy = tmp_path_factory.mktemp("victim") / "a.zarr"
+    shutil.copytree(original, copy)
+    episode = open_store(copy).episodes[0]
+    return episode, copy, {name: episode.read(name) for name in episode.attributes.arrays}
+
+
+@settings(max_examples=30, deadline=None)
+@given(data=st.data())
+def test_a_random_bit_flip_is_noticed_or_changes_nothing(victim, data):
+    _, path, values = victim
+    array = data.draw(st.sampled_from(sorted(values)))
+    file = chunk_file(path, array)
+    content = file.read_bytes()
+    bit = data.draw(st.integers(0, 8 * len(content) - 1))
+    try:
+        flip(file, bit // 8, 1 << bit % 8)
+        if EPISODE not in {fault.episode for fault in faults(path)}:
+            assert (open_store(path).episodes[0].read(array) == values[array]).all()
+    finally:
+        file.write_bytes(content)
+
+
+def test_the_command_line_says_it_and_fails(path, capsys):
+    assert main(["verify", str(path)]) == 0
+    assert "2 episodes, all whole" in capsys.readouterr().out
+    flip(chunk_file(path, "joint/rows"), 30)
+    assert main(["verify", str(path)]) == 1
+    output = capsys.readouterr().out
+    assert f"{EPISODE}: Array joint/rows" in output
+    assert "Traceback" not in output
+    assert main(["verify", str(path.with_name("b.zarr"))]) == 2
+    assert "Did you mean" in capsys.readouterr().err

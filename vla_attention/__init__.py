@@ -1,0 +1,52 @@
+"""Does a vision-language-action policy look, or does it read? Record its attention once, regroup it for months.
+
+    import vla_attention as va
+
+    run = va.open("runs/libero_10.zarr")    # a store, or several that are analysed as one
+    run.ratios()                            # a polars frame; docs/python.md lists the other methods
+
+Public names: `open` and `OpenStores` (stage two), `UserError` (the base of every error that a user can cause) and `__version__`.
+`vla_attention.testing` makes small stores with known content. This import loads neither torch nor zarr, polars or numpy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vla_attention.schemas.errors import UserError
+
+if TYPE_CHECKING:
+    from vla_attention.analyze.api import OpenStores
+
+__all__ = ["OpenStores", "UserError", "__version__", "open"]
+
+
+def open(stores: str | Path | Sequence[str | Path]) -> OpenStores:
+    """Open one store, or several that are analysed as one; returns what answers questions about them.
+
+    >>> import vla_attention as va
+    >>> run = va.open(store)
+    >>> run.ratios().filter(layer="layers_avg")["scope"].to_list()
+    ['task', 'task', 'all']
+
+    Raises:
+        StoreNotFound, StoreError: no store is there, or it cannot be read.
+    """
+    # Imported here: `import vla_attention` loads neither polars nor zarr.
+    from vla_attention.analyze.api import open_stores
+
+    return open_stores(stores)
+
+
+def __getattr__(name: str) -> Any:
+    if name == "OpenStores":
+        from vla_attention.analyze.api import OpenStores
+
+        return OpenStores
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("vla-attention")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
