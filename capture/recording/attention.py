@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from vla_attention.capture.recording.contributions import Projection, gram_matrix, keys_of_parts, part_contributions
+from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.schemas.errors import BadArgument
 
 #: What the reference puts in place of the logits of masked keys: so low that their probability is exactly 0.
@@ -106,20 +107,6 @@ class RecordingPlan:
             raise BadArgument(
                 f"The queries of site '{self.site}' must be 'mean', 'steps' or 'all', not '{self.queries}'."
             )
-
-
-@dataclass(frozen=True)
-class RecordedRows:
-    """The rows of one site at one replan.
-
-    rows: (layer, denoise, head, query, key) float32, the axes in the order of the plan.
-    row_sum: (layer, denoise, head, query) float32, summed over keys in float64 from the rows as computed.
-    contribution: (layer, denoise, part, part) float32, see `vla_attention.capture.recording.contributions`; None when not asked for.
-    """
-
-    rows: np.ndarray
-    row_sum: np.ndarray
-    contribution: np.ndarray | None = None
 
 
 @dataclass

@@ -11,9 +11,9 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from vla_attention.capture.recording.attention import RecordedRows
 from vla_attention.capture.store.arrays import write_whole
 from vla_attention.capture.store.durable_files import file_digest, flush_entry, flush_folder, naming_the_failure
+from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.site_writer import SiteWriter
 from vla_attention.capture.store.store_root import check_same_run, read_root
 from vla_attention.schemas.groupings.vocabulary import SceneObject

@@ -8,8 +8,8 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from vla_attention.capture.recording.attention import RecordedRows
 from vla_attention.capture.store.arrays import create_blocked, replans_per_block
+from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.precision import round_mantissa
 from vla_attention.schemas.segments import Segment, merge_segments, segment_masses, segment_members, segments_of

@@ -13,8 +13,8 @@ from typing import Any, Literal
 import numpy as np
 
 from tests.kit.strategies import random_rows
-from vla_attention.capture.recording.attention import RecordedRows
 from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
+from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, SceneObject
 from vla_attention.schemas.layout import INVALID_ROLES, PatchGrid, Piece, Prompt, Role, SiteLayout, Span

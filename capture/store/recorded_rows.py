@@ -1,0 +1,24 @@
+"""What the recorder hands to the store. This module needs numpy only, so that a store can be written without torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class RecordedRows:
+    """The rows of one site at one replan.
+
+    rows: (layer, denoise, head, query, key) float32, the axes in the order of the plan.
+    row_sum: (layer, denoise, head, query) float32, summed over keys in float64 from the rows as computed.
+    contribution: (layer, denoise, part, part) float32, or None when contributions are not recorded. Entry (i, j) is the
+        inner product of what parts i and j of the keys add to the residual stream, averaged over the action queries;
+        the last part is the block's whole attention update.
+    """
+
+    rows: NDArray[np.float32]
+    row_sum: NDArray[np.float32]
+    contribution: NDArray[np.float32] | None = None
