@@ -11,7 +11,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.patch_maps import seen_cameras
-from vla_attention.analyze.measures.steps import SelectedEpisode
+from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.show.patch_pictures import NO_PICTURE, upright
 from vla_attention.analyze.show.plot_style import (
     NOTE_COLOR,

@@ -8,8 +8,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.masses import ratio
-from vla_attention.analyze.measures.steps import SelectedEpisode
+from vla_attention.analyze.measures.masses import finite_mean, ratio
+from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_SEED, NO_LIMITS, POSITIVE, SHARE
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
 from vla_attention.analyze.stores.selection import Selection
@@ -56,14 +56,6 @@ def head_values(
             values["numerator_mass"], values["denominator_mass"] = above.mean(axis=0), below.mean(axis=0)
             values["num_nonfinite"] = (~np.isfinite(log2)).sum(axis=0)
     return values
-
-
-def finite_mean(values: NDArray[np.float64], axis: int = 0) -> NDArray[np.float64]:
-    """Mean over the finite values along an axis; NaN where there is none."""
-    finite = np.isfinite(values)
-    count = finite.sum(axis=axis)
-    with np.errstate(invalid="ignore"):
-        return np.where(finite, values, 0.0).sum(axis=axis) / np.where(count > 0, count, np.nan)
 
 
 def dispersion(values: NDArray[np.float64], axis: int = -1) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -15,16 +15,9 @@ from vla_attention.analyze.heads.head_measures import dispersion_table, head_fra
 from vla_attention.analyze.heads.row_metrics import RowOptions, groups_with_valid_keys, measure_all_rows, row_table
 from vla_attention.analyze.measures.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
 from vla_attention.analyze.measures.sinks import key_shares_table, sinks_of
-from vla_attention.analyze.measures.steps import (
-    SelectedEpisode,
-    episode_masses,
-    episode_steps,
-    resolve_all,
-    row_sums,
-    segment_weights,
-    with_valid,
-)
+from vla_attention.analyze.measures.steps import episode_masses, episode_steps, row_sums, segment_weights, with_valid
 from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from vla_attention.analyze.heads.entropy import effective_keys, entropies, top_mass
 from vla_attention.analyze.measures.masses import masses
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
 from vla_attention.analyze.measures.sinks import KeyShares, SinkRule, is_first, key_sums
-from vla_attention.analyze.measures.steps import SelectedEpisode, resolve_all, with_valid
+from vla_attention.analyze.measures.steps import with_valid
 from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.analyze.stores.rows import layer_rows

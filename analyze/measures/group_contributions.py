@@ -17,7 +17,7 @@ from vla_attention.analyze.measures.aggregate import LAYERS_AVG
 from vla_attention.analyze.measures.contributions import joint_norm, selected_gram
 from vla_attention.analyze.measures.masses import ratio
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.steps import SelectedEpisode
+from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.ratios.summary import WIDTH
 from vla_attention.analyze.show.text_table import format_interval, format_number, text_table
 from vla_attention.analyze.statistics.bootstrap import POSITIVE

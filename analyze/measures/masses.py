@@ -70,3 +70,12 @@ def ratio(numerator: NDArray[np.float64], denominator: NDArray[np.float64]) -> N
     """numerator / denominator: infinite where only the denominator is 0, NaN (undefined) where both are."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return numerator / denominator
+
+
+def finite_mean(values: NDArray[np.float64], axis: int | tuple[int, ...] = 0) -> NDArray[np.float64]:
+    """Mean over the finite values along one axis or several; NaN where there is none."""
+    finite = np.isfinite(values)
+    count = finite.sum(axis=axis)
+    with np.errstate(invalid="ignore"):
+        mean: NDArray[np.float64] = np.where(finite, values, 0.0).sum(axis=axis) / np.where(count > 0, count, np.nan)
+    return mean

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from vla_attention.analyze.measures.steps import SelectedEpisode, load_tokens, vocabulary_of
+from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
 from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.selection import Selection, check_combinable, choose_site, select, select_episodes
 from vla_attention.schemas.errors import listing

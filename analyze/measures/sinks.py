@@ -23,7 +23,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.steps import SelectedEpisode
+from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.analyze.stores.rows import layer_rows

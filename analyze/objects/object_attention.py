@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.aggregate import EPISODE_KEYS, LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.steps import SelectedEpisode
+from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.objects.objects_in_view import (
     ALL_CAMERAS,
     ObjectSettings,

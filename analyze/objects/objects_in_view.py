@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.patch_maps import seen_cameras
-from vla_attention.analyze.measures.steps import SelectedEpisode
+from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.objects.spatial import (
     centre_of_mass,
     distance_in_pictures,

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.steps import SelectedEpisode
+from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.objects.objects_in_view import ALL_CAMERAS, CLASSES
 from vla_attention.analyze.show.plot_style import (
     BASELINE_COLOR,

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from vla_attention.analyze.measures.aggregate import add_layers_avg, overall_layer, per_replan
 from vla_attention.analyze.measures.patch_maps import mean_rows, seen_cameras
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.steps import SelectedEpisode, steps_table
+from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.measures.steps import steps_table
 from vla_attention.analyze.show.patch_pictures import (
     Measure,
     Scale,

@@ -13,7 +13,8 @@ from vla_attention.analyze.measures.aggregate import add_layers_avg, episodes_ta
 from vla_attention.analyze.measures.contributions import contribution_table, summarise_contributions
 from vla_attention.analyze.measures.group_contributions import group_contribution_table, summarise_group_contributions
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.steps import resolve_all, steps_table
+from vla_attention.analyze.measures.selected import resolve_all
+from vla_attention.analyze.measures.steps import steps_table
 from vla_attention.analyze.published.frame_proxy import frame_proxy
 from vla_attention.analyze.published.results_file import write_results_of_suites
 from vla_attention.analyze.ratios.summary import AnalysedRun, summary_text, write_summary

@@ -9,7 +9,7 @@ import polars as pl
 
 from vla_attention.analyze.measures.patch_maps import seen_cameras
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.steps import SelectedEpisode
+from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.overlay.overlay_data import (
     EpisodeOverlay,
     camera_names,

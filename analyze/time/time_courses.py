@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.aggregate import EPISODE_KEYS, add_layers_avg, overall_layer, per_replan
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.steps import SelectedEpisode, steps_table
+from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.measures.steps import steps_table
 from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.statistics.autocorrelation import autocorrelation_table
 from vla_attention.analyze.statistics.bootstrap import (

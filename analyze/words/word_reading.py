@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vla_attention.analyze.measures.aggregate import EPISODE_KEYS, LAYERS_AVG, overall_layer
 from vla_attention.analyze.measures.masses import group_measures, masses
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.steps import SelectedEpisode
+from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_SEED, POSITIVE, SHARE
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals

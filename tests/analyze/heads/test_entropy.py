@@ -17,7 +17,7 @@ from tests.kit.store_kit import StoreSpec, write_store
 from tests.kit.strategies import episode_tokens, groupings
 from vla_attention.analyze.heads.entropy import effective_keys, entropies, top_mass
 from vla_attention.analyze.heads.row_metrics import RowOptions, groups_with_valid_keys, row_metrics_table
-from vla_attention.analyze.measures.steps import resolve_all
+from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.schemas.groupings.grouping import Grouping
 
 

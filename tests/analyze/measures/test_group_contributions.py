@@ -17,7 +17,7 @@ from vla_attention.analyze.measures.group_contributions import (
     whole_segments,
 )
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.steps import resolve_all
+from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 from vla_attention.schemas.segments import Segment, segments_of

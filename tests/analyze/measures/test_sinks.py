@@ -17,8 +17,9 @@ from tests.kit.store_kit import StoreSpec, make_tokens, small_layout, write_stor
 from tests.kit.strategies import episode_tokens, groupings
 from vla_attention.analyze.heads.head_study import study_heads
 from vla_attention.analyze.heads.row_metrics import RowOptions, row_metrics_table
+from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.analyze.measures.sinks import SinkRule, describe_sinks, key_sums, sinks_table, without_sinks
-from vla_attention.analyze.measures.steps import resolve_all, steps_table
+from vla_attention.analyze.measures.steps import steps_table
 from vla_attention.schemas.layout import Role
 
 BOS = small_layout().span("prompt").start

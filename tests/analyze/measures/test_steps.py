@@ -16,7 +16,8 @@ from polars.testing import assert_frame_equal
 from tests.kit.store_kit import StoreSpec, root_attributes, write_store
 from tests.kit.strategies import episode_tokens, groupings
 from vla_attention.analyze.measures.question import AnalysisSettings, ask
-from vla_attention.analyze.measures.steps import load_tokens, steps_table, vocabulary_of
+from vla_attention.analyze.measures.selected import load_tokens, vocabulary_of
+from vla_attention.analyze.measures.steps import steps_table
 from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.analyze.stores.selection import parse_denoise_steps, select
 from vla_attention.schemas.errors import BadArgument

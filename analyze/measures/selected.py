@@ -1,0 +1,82 @@
+"""Selected episodes: an episode with its store and its tokens, and a grouping resolved on every one of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.schemas.groupings.grouping import Grouping
+from vla_attention.schemas.groupings.resolve import EmptyGroup, ResolvedGrouping, check_names, resolve
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary, collect_vocabulary
+from vla_attention.schemas.stores.reader import Store, StoredEpisode
+
+
+@dataclass(frozen=True)
+class SelectedEpisode:
+    """An episode together with its store and its tokens.
+
+    `without`: keys that are taken out of every group and of the valid keys (sinks; see `vla_attention.analyze.measures.sinks`).
+    """
+
+    store: Store
+    episode: StoredEpisode
+    tokens: EpisodeTokens
+    without: tuple[int, ...] = ()
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Keys that can hold information and were not taken out, shape (replan or 1, key)."""
+        valid = self.tokens.valid.copy()
+        valid[:, list(self.without)] = False
+        return valid
+
+
+def load_tokens(chosen: Sequence[tuple[Store, StoredEpisode]], site: str) -> list[SelectedEpisode]:
+    """Read the small part of every episode: what its keys are."""
+    return [SelectedEpisode(store, episode, episode.tokens(store.attributes, site)) for store, episode in chosen]
+
+
+def vocabulary_of(selected: Sequence[SelectedEpisode]) -> Vocabulary:
+    """The names that selectors may use over the selected episodes."""
+    return collect_vocabulary(item.tokens for item in selected)
+
+
+def resolve_all(
+    grouping: Grouping, selected: Sequence[SelectedEpisode], vocabulary: Vocabulary | None = None
+) -> list[ResolvedGrouping]:
+    """Resolve a grouping on every episode, with the checks that need all of them.
+
+    `vocabulary` is what `vocabulary_of` says of the episodes, where that is known already.
+
+    Raises:
+        SelectorError: a name exists in no selected episode.
+        OverlappingGroups: groups share keys and the grouping does not allow it.
+        EmptyGroup: a group has no key in any selected episode.
+    """
+    check_names(grouping, vocabulary or vocabulary_of(selected), selected[0].tokens.layout)
+    resolved = [resolve(grouping, item.tokens) for item in selected]
+    for i, name in enumerate(grouping.names):
+        if name not in grouping.allow_empty and not any(item.num_keys[:, i].any() for item in resolved):
+            selectors = " | ".join(grouping.groups[name])
+            raise EmptyGroup(
+                f"Group '{name}' ({selectors}) has no key in any of the {len(selected)} selected episodes; change its "
+                f'selector, or add allow_empty = ["{name}"] to the grouping.'
+            )
+    return [
+        _without(weights, item) if item.without else weights for item, weights in zip(selected, resolved, strict=True)
+    ]
+
+
+def _without(resolved: ResolvedGrouping, item: SelectedEpisode) -> ResolvedGrouping:
+    """The grouping without the keys that were taken out of the episode: in no group, not valid, not counted."""
+    weights = resolved.weights.copy()
+    weights[:, list(item.without)] = 0.0
+    return ResolvedGrouping(
+        names=resolved.names,
+        weights=weights,
+        num_keys=weights.sum(axis=1, dtype=np.float64),
+        num_valid=item.valid.sum(axis=1),
+    )
