@@ -29,7 +29,7 @@ from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.schemas.groupings.resolve import NO_COVERAGE
+from vla_attention.schemas.groupings.vocabulary import NO_COVERAGE
 
 Array = NDArray[np.float64]
 

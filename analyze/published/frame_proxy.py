@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from vla_attention.schemas.groupings.grouping import Grouping
-from vla_attention.schemas.groupings.selectors import Atom, parse_selector
+from vla_attention.schemas.groupings.selector_parser import Atom, parse_selector
 from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.results import FrameProxy
 from vla_attention.schemas.stores.store_format import RootAttributes

@@ -64,8 +64,8 @@ def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
             interest = listing([thing.name for thing in attributes.objects if thing.of_interest])
             yield f"  {attributes.task_id:>3}  {attributes.instruction}  ({count} episodes; objects of interest: {interest})"
     yield "Selectors"
-    for kind, meaning in SELECTOR_KINDS.items():
-        yield f"  {kind + ':':<9} {meaning}"
+    for name, kind in SELECTOR_KINDS.items():
+        yield f"  {name + ':':<9} {kind.takes}"
 
 
 def _describe_span(span: Span, tokens: EpisodeTokens) -> str:

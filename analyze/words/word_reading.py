@@ -21,7 +21,7 @@ from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.schemas.groupings.resolve import NO_WORDS
+from vla_attention.schemas.groupings.vocabulary import NO_WORDS
 from vla_attention.schemas.groupings.words import word_class
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.store_format import RootAttributes

@@ -11,7 +11,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from vla_attention.capture.store.arrays import write_whole
+from vla_attention.capture.store.codecs import write_whole
 from vla_attention.capture.store.durable_files import file_digest, flush_entry, flush_folder, naming_the_failure
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.site_writer import SiteWriter

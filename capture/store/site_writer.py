@@ -8,7 +8,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from vla_attention.capture.store.arrays import create_blocked, replans_per_block
+from vla_attention.capture.store.codecs import create_blocked, replans_per_block
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.precision import round_mantissa

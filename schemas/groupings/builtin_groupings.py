@@ -13,8 +13,7 @@ from vla_attention.schemas.groupings.grouping import (
     Ratio,
     read_grouping_file,
 )
-from vla_attention.schemas.groupings.resolve import NO_COVERAGE, NO_WORDS
-from vla_attention.schemas.groupings.vocabulary import Vocabulary
+from vla_attention.schemas.groupings.vocabulary import NO_COVERAGE, NO_WORDS, Vocabulary
 
 _TEXT = "role:bos | role:template | role:instruction | role:text"
 

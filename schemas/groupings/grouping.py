@@ -9,7 +9,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from vla_attention.schemas.errors import UserError, did_you_mean, listing
-from vla_attention.schemas.groupings.selectors import SelectorError, atoms_of, parse_selector
+from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
+from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.jsonable import MalformedDocument, from_json
 
 #: The selector that, alone, means: whatever no other group of the grouping takes.

@@ -7,32 +7,16 @@ intersection and difference are exact, and a key's weight is the covered area of
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.schemas.errors import did_you_mean, listing
 from vla_attention.schemas.groupings.grouping import REST, Grouping, GroupingError
-from vla_attention.schemas.groupings.selectors import (
-    Atom,
-    Everything,
-    Selector,
-    SelectorError,
-    atoms_of,
-    parse_selector,
-)
+from vla_attention.schemas.groupings.selector_parser import Atom, Everything, Selector, atoms_of, parse_selector
+from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS, Membership, SelectorError, no_keys
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
-from vla_attention.schemas.groupings.words import Word, find_phrase, has_phrase, split_words, word_class
-from vla_attention.schemas.layout import SiteLayout, find_role
-
-#: Axes (replan or 1, key, cell or 1).
-Membership = NDArray[np.bool_]
-
-_PATCH = re.compile(r"(?P<camera>.+?)\[(?P<r0>\d*):(?P<r1>\d*)\s*,\s*(?P<c0>\d*):(?P<c1>\d*)\]$")
-_KEYS = re.compile(r"(\d+)(?:-(\d+))?$")
+from vla_attention.schemas.layout import SiteLayout
 
 
 class OverlappingGroups(GroupingError):
@@ -61,84 +45,13 @@ class ResolvedGrouping:
 
 
 def check_names(grouping: Grouping, vocabulary: Vocabulary, layout: SiteLayout) -> None:
-    """Raise `SelectorError` for the first selector that names something which exists nowhere in the selection."""
-    known = {
-        "camera": layout.cameras,
-        "patch": layout.cameras,
-        "span": vocabulary.spans,
-    }
+    """Raise `SelectorError` or `UnknownName` for the first selector that names something which no selected episode has."""
     for group, selectors in grouping.groups.items():
         for text in selectors:
             for atom in atoms_of(parse_selector(text)):
-                if atom.kind == "frame":
-                    layout.frame(atom.argument)
-                problem = _unknown(atom, known, vocabulary)
+                problem = SELECTOR_KINDS[atom.kind].problem(atom.argument, vocabulary, layout)
                 if problem:
                     raise SelectorError(f"Group '{group}', selector '{text}': {problem}")
-
-
-def _unknown(atom: Atom, known: dict[str, tuple[str, ...]], vocabulary: Vocabulary) -> str | None:
-    name = atom.argument
-    if atom.kind == "role":
-        find_role(name)
-        return None
-    if atom.kind in ("word", "words"):
-        return _unknown_words(atom, vocabulary)
-    if atom.kind == "object":
-        if name.startswith("@") and name not in _SPECIAL_OBJECTS:
-            return _no_such("object class", name, _SPECIAL_OBJECTS)
-        if not vocabulary.objects:
-            return f"{NO_COVERAGE}."
-        return (
-            None if name in (*vocabulary.objects, *_SPECIAL_OBJECTS) else _no_such("object", name, vocabulary.objects)
-        )
-    if atom.kind in known:
-        if atom.kind == "patch":
-            name = name.partition("[")[0]
-        return (
-            None if name in known[atom.kind] else _no_such(atom.kind.replace("patch", "camera"), name, known[atom.kind])
-        )
-    return None
-
-
-def _unknown_words(atom: Atom, vocabulary: Vocabulary) -> str | None:
-    if atom.kind == "words" and atom.argument.casefold() not in _WORD_CLASSES:
-        return _no_such("word class", atom.argument, _WORD_CLASSES)
-    if not vocabulary.words:
-        return f"{NO_WORDS}."
-    if atom.kind == "words":
-        return None
-    words = [atom.argument[start:stop] for start, stop in split_words(atom.argument)]
-    if not words:
-        return f"'{atom.argument}' has no letter or digit, so it is no word."
-    for word in words:
-        if word.casefold() not in vocabulary.words:
-            near = did_you_mean(word, vocabulary.words)
-            return f"no instruction has the word '{word}'.{near} Words: {listing(vocabulary.words, 40)}."
-    if not any(has_phrase(sentence, atom.argument) for sentence in vocabulary.sentences):
-        nearest = max(vocabulary.sentences, key=lambda sentence: sum(word.casefold() in sentence for word in words))
-        return (
-            f"no instruction has the words '{atom.argument}' one after the other. Nearest: '{' '.join(nearest)}'; a list of "
-            "word: selectors takes single words."
-        )
-    return None
-
-
-def _no_such(kind: str, name: str, existing: tuple[str, ...]) -> str:
-    return f"there is no {kind} '{name}'.{did_you_mean(name, existing)} Existing: {listing(existing, 40)}."
-
-
-_SPECIAL_OBJECTS = ("@interest", "@robot", "@background")
-_WORD_CLASSES = ("content", "stop", "all")
-#: Why there is nothing to name, and what to do about it.
-NO_WORDS = (
-    "the keys of this site spell no words; choose a site with text by --site (Cosmos: cross); a text that was captured without "
-    "its tokenizer needs a capture with --t5-tokenizer"
-)
-NO_COVERAGE = (
-    "no selected episode has object coverage at this site, which is recorded from the simulator's segmentation; choose a site "
-    "with pictures by --site (Cosmos: self), or use a store as vla-capture wrote it, not a copy without objects"
-)
 
 
 def resolve(grouping: Grouping, tokens: EpisodeTokens) -> ResolvedGrouping:
@@ -164,12 +77,12 @@ def resolve(grouping: Grouping, tokens: EpisodeTokens) -> ResolvedGrouping:
 def memberships(grouping: Grouping, tokens: EpisodeTokens) -> dict[str, Membership]:
     """Which (key, cell) pairs each group takes, shape (replan or 1, key, cell or 1); disjointness is checked here."""
     members: dict[str, Membership] = {}
-    taken: Membership = np.zeros((1, tokens.layout.num_keys, 1), dtype=bool)
+    taken = no_keys(tokens)
     for group, selectors in grouping.groups.items():
         if selectors[0].strip() == REST:
             members[group] = taken  # replaced below, when everything else is known
             continue
-        member: Membership = np.zeros((1, tokens.layout.num_keys, 1), dtype=bool)
+        member = no_keys(tokens)
         for selector in selectors:
             try:
                 member = member | _evaluate(parse_selector(selector), tokens)
@@ -244,118 +157,8 @@ def _evaluate(selector: Selector, tokens: EpisodeTokens) -> Membership:
     if isinstance(selector, Everything):
         return np.ones((1, tokens.layout.num_keys, 1), dtype=bool)
     if isinstance(selector, Atom):
-        return _ATOMS[selector.kind](selector.argument, tokens)
+        return SELECTOR_KINDS[selector.kind].keys(selector.argument, tokens)
     left, right = _evaluate(selector.left, tokens), _evaluate(selector.right, tokens)
     if selector.operator == "&":
         return left & right
     return left | right if selector.operator == "|" else left & ~right
-
-
-def _key_range(tokens: EpisodeTokens, start: int, stop: int) -> Membership:
-    member = np.zeros((1, tokens.layout.num_keys, 1), dtype=bool)
-    member[0, start:stop] = True
-    return member
-
-
-def _camera(argument: str, tokens: EpisodeTokens) -> Membership:
-    span = tokens.layout.camera_span(argument)
-    return _key_range(tokens, span.start, span.stop)
-
-
-def _role(argument: str, tokens: EpisodeTokens) -> Membership:
-    return (tokens.static_roles == int(find_role(argument)))[:, :, None]
-
-
-def _span(argument: str, tokens: EpisodeTokens) -> Membership:
-    span = tokens.layout.span(argument)
-    return _key_range(tokens, span.start, span.stop)
-
-
-def _frame(argument: str, tokens: EpisodeTokens) -> Membership:
-    span = tokens.layout.frame(argument)
-    return _key_range(tokens, span.start, span.stop)
-
-
-def _word(argument: str, tokens: EpisodeTokens) -> Membership:
-    return _keys_of_words(tokens, [find_phrase(words, argument) for words in tokens.words])
-
-
-def _words(argument: str, tokens: EpisodeTokens) -> Membership:
-    wanted = argument.casefold()
-    if wanted not in _WORD_CLASSES:
-        raise SelectorError("T" + _no_such("word class", argument, _WORD_CLASSES)[1:])
-    chosen = [[word for word in words if wanted in ("all", word_class(word.text))] for words in tokens.words]
-    return _keys_of_words(tokens, chosen)
-
-
-def _keys_of_words(tokens: EpisodeTokens, chosen: Sequence[Sequence[Word]]) -> Membership:
-    """The keys of the words that were chosen from each of the episode's prompts."""
-    by_prompt = np.zeros((max(1, len(tokens.prompts)), tokens.layout.num_keys), dtype=bool)
-    for row, words in zip(by_prompt, chosen, strict=False):
-        for word in words:
-            row[list(word.keys)] = True
-    if len(by_prompt) == 1 or tokens.prompt_index is None:
-        return by_prompt[:1, :, None]
-    return by_prompt[tokens.prompt_index, :, None]
-
-
-def _object(argument: str, tokens: EpisodeTokens) -> Membership:
-    chosen = np.zeros(1 + len(tokens.objects), dtype=bool)
-    for i, thing in enumerate(tokens.objects, start=1):
-        chosen[i] = {
-            "@interest": thing.of_interest,
-            "@robot": thing.kind == "robot",
-            "@background": thing.kind == "background",
-        }.get(argument, thing.name == argument)
-    covered = np.zeros(tokens.layout.num_keys, dtype=bool)
-    for camera in tokens.coverage or {}:
-        span = tokens.layout.camera_span(camera)
-        covered[span.start : span.stop] = True
-    return (covered[:, None] & chosen)[None]
-
-
-def _patch(argument: str, tokens: EpisodeTokens) -> Membership:
-    match = _PATCH.match(argument)
-    if match is None:
-        raise SelectorError(f"Cannot read selector 'patch:{argument}'; expected patch:CAMERA[r0:r1,c0:c1].")
-    span = tokens.layout.camera_span(match["camera"])
-    if span.grid is None:
-        raise SelectorError(f"Camera '{match['camera']}' has no patch grid.")
-    rows, columns = span.grid.rows, span.grid.columns
-    r0, r1 = int(match["r0"] or 0), int(match["r1"] or rows)
-    c0, c1 = int(match["c0"] or 0), int(match["c1"] or columns)
-    if not (0 <= r0 < r1 <= rows and 0 <= c0 < c1 <= columns):
-        raise SelectorError(
-            f"Selector 'patch:{argument}' leaves the grid of camera '{match['camera']}', which has {rows} rows and "
-            f"{columns} columns of patches; expected 0 <= r0 < r1 <= {rows} and 0 <= c0 < c1 <= {columns}."
-        )
-    grid = np.zeros((rows, columns), dtype=bool)
-    grid[r0:r1, c0:c1] = True
-    member = np.zeros((1, tokens.layout.num_keys, 1), dtype=bool)
-    member[0, span.start : span.stop, 0] = grid.ravel()
-    return member
-
-
-def _keys(argument: str, tokens: EpisodeTokens) -> Membership:
-    match = _KEYS.match(argument)
-    if match is None:
-        raise SelectorError(f"Cannot read selector 'keys:{argument}'; expected keys:a or keys:a-b.")
-    first, last = int(match[1]), int(match[2] or match[1])
-    if not first <= last < tokens.layout.num_keys:
-        raise SelectorError(
-            f"Selector 'keys:{argument}' leaves the site's keys; expected a <= b <= {tokens.layout.num_keys - 1}."
-        )
-    return _key_range(tokens, first, last + 1)
-
-
-_ATOMS = {
-    "camera": _camera,
-    "role": _role,
-    "span": _span,
-    "frame": _frame,
-    "word": _word,
-    "words": _words,
-    "object": _object,
-    "patch": _patch,
-    "keys": _keys,
-}

@@ -1,32 +1,30 @@
-"""The selector language: a pure parser from text to a small tree. It knows nothing about layouts.
+"""The kinds of selectors: what each one takes, which keys it gives, and when a name is wrong. One entry of `SELECTOR_KINDS` per kind.
 
-    selector   = term { ("|" | "-") term }          left to right
-    term       = factor { "&" factor }              binds tighter than | and -
-    factor     = "(" selector ")" | "*" | kind ":" argument
-    argument   = "quoted text" | 'quoted text' | a run without spaces, &, |, ( and ) | name[r0:r1,c0:c1]
-
-`-` is an operator only with spaces around it, so that names and ranges (`keys:3-9`) may contain it. `*` is every key.
+To add a kind, write its two functions and its entry in the table at the end; the parser, the checks, the errors and `--list`
+take it from there. The grammar that joins selectors (`&`, `|`, `-`, parentheses) is in `selector_parser`.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from vla_attention.schemas.errors import UserError, did_you_mean, listing
+import numpy as np
+from numpy.typing import NDArray
 
-#: What a selector may begin with, and what it takes. Shown in errors and in the documentation.
-SELECTOR_KINDS: dict[str, str] = {
-    "camera": "the patches of one camera",
-    "role": "every key with one role",
-    "span": "every key of one span",
-    "frame": "every key of one latent frame",
-    "word": "every piece of a word of the instruction; a phrase in quotes",
-    "words": "the words of the instruction by class: content, stop (a shipped list of function words) or all",
-    "object": "the patches that an object covers, by covered area; @interest, @robot or @background",
-    "patch": "a region of a camera's patch grid: camera[r0:r1,c0:c1], rows and columns from the top left, r1 and c1 excluded",
-    "keys": "keys by number, a-b with both ends",
-}
+from vla_attention.schemas.errors import UserError, did_you_mean, listing
+from vla_attention.schemas.groupings.vocabulary import NO_COVERAGE, NO_WORDS, EpisodeTokens, Vocabulary
+from vla_attention.schemas.groupings.words import Word, find_phrase, has_phrase, split_words, word_class
+from vla_attention.schemas.layout import SiteLayout, find_role
+
+#: The (key, cell) pairs that a selector takes, axes (replan or 1, key, cell or 1). `resolve` says what a cell is.
+Membership = NDArray[np.bool_]
+
+_PATCH = re.compile(r"(?P<camera>.+?)\[(?P<r0>\d*):(?P<r1>\d*)\s*,\s*(?P<c0>\d*):(?P<c1>\d*)\]$")
+_KEYS = re.compile(r"(\d+)(?:-(\d+))?$")
+_OBJECT_CLASSES = ("@interest", "@robot", "@background")
+_WORD_CLASSES = ("content", "stop", "all")
 
 
 class SelectorError(UserError, ValueError):
@@ -34,127 +32,226 @@ class SelectorError(UserError, ValueError):
 
 
 @dataclass(frozen=True)
-class Atom:
-    """One `kind:argument`."""
+class SelectorKind:
+    """One kind of selector, `kind:argument`.
 
-    kind: str
-    argument: str
+    Attributes:
+        takes: what it selects, in words, for errors and `--list`.
+        keys: argument and an episode's tokens to the keys that it takes.
+        problem: argument, the names in all selected episodes and the site's layout to what is wrong with the argument, as the end
+            of a sentence; None when nothing is. An episode that lacks an existing name gives a group without keys.
+    """
 
-
-@dataclass(frozen=True)
-class Everything:
-    """`*`: every key."""
-
-
-@dataclass(frozen=True)
-class Operation:
-    """Two selectors joined by `&`, `|` or `-`."""
-
-    operator: str
-    left: Selector
-    right: Selector
+    takes: str
+    keys: Callable[[str, EpisodeTokens], Membership]
+    problem: Callable[[str, Vocabulary, SiteLayout], str | None]
 
 
-Selector = Atom | Everything | Operation
-
-_TOKEN = re.compile(
-    r"""\s*(?:
-      (?P<open>\() | (?P<close>\)) | (?P<and>&) | (?P<or>\|) | (?P<minus>-(?=\s|$)) | (?P<star>\*)
-      | (?P<kind>[A-Za-z_]+):(?P<argument>"[^"]*" | '[^']*' | [^\s&|()\[\]"']+[^\s&|()\[\]"]*(?:\[[^\]]*\])? | )
-    )""",
-    re.VERBOSE,
-)
+def no_keys(tokens: EpisodeTokens) -> Membership:
+    """No key at all, axes (1, key, 1)."""
+    return np.zeros((1, tokens.layout.num_keys, 1), dtype=bool)
 
 
-def parse_selector(text: str) -> Selector:
-    """Parse one selector; raises `SelectorError` that quotes it and says what was expected where."""
-    return _Parser(text).parse()
+def _key_range(tokens: EpisodeTokens, start: int, stop: int) -> Membership:
+    member = no_keys(tokens)
+    member[0, start:stop] = True
+    return member
 
 
-def atoms_of(selector: Selector) -> tuple[Atom, ...]:
-    """All `kind:argument` parts of a selector, left to right."""
-    if isinstance(selector, Operation):
-        return atoms_of(selector.left) + atoms_of(selector.right)
-    return (selector,) if isinstance(selector, Atom) else ()
+def _missing(kind: str, name: str, existing: Sequence[str]) -> str | None:
+    """The problem of a name that is not among the existing ones."""
+    if name in existing:
+        return None
+    return f"there is no {kind} '{name}'.{did_you_mean(name, existing)} Existing: {listing(existing, 40)}."
 
 
-def _unquoted(argument: str) -> str:
-    return argument[1:-1] if argument[:1] in ('"', "'") else argument
+# camera, span, frame: spans of the layout.
 
 
-class _Parser:
-    def __init__(self, text: str) -> None:
-        self.text = text
-        self.tokens = self._tokenise()
-        self.next = 0
+def _camera_keys(argument: str, tokens: EpisodeTokens) -> Membership:
+    span = tokens.layout.camera_span(argument)
+    return _key_range(tokens, span.start, span.stop)
 
-    def _fail(self, position: int, problem: str) -> SelectorError:
-        return SelectorError(f"Cannot read selector '{self.text}' at character {position + 1}: {problem}.")
 
-    def _tokenise(self) -> list[tuple[str, str, int]]:
-        tokens: list[tuple[str, str, int]] = []
-        position, end = 0, len(self.text.rstrip())
-        while position < end:
-            match = _TOKEN.match(self.text, position)
-            start = position + len(self.text[position:]) - len(self.text[position:].lstrip())
-            if match is None:
-                raise self._fail(start, f"expected KIND:NAME, where KIND is one of {listing(SELECTOR_KINDS)}")
-            kind = match.lastgroup or ""
-            if kind == "argument":
-                self._check_atom(match, start)
-                tokens.append(("atom", match["kind"] + ":" + _unquoted(match["argument"]), start))
-            else:
-                tokens.append((kind, match[kind], start))
-            position = match.end()
-        return tokens
+def _camera_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
+    return _missing("camera", argument, layout.cameras)
 
-    def _check_atom(self, match: re.Match[str], start: int) -> None:
-        if match["kind"] not in SELECTOR_KINDS:
-            raise self._fail(
-                start,
-                f"unknown kind '{match['kind']}:';{did_you_mean(match['kind'], SELECTOR_KINDS).lower()} "
-                f"existing kinds: {listing(SELECTOR_KINDS)}",
-            )
-        if not _unquoted(match["argument"]).strip():
-            raise self._fail(start, f"expected a name after '{match['kind']}:'")
 
-    def _peek(self) -> tuple[str, str, int]:
-        return self.tokens[self.next] if self.next < len(self.tokens) else ("end", "", len(self.text))
+def _span_keys(argument: str, tokens: EpisodeTokens) -> Membership:
+    span = tokens.layout.span(argument)
+    return _key_range(tokens, span.start, span.stop)
 
-    def parse(self) -> Selector:
-        tree = self._selector()
-        kind, word, position = self._peek()
-        if kind != "end":
-            raise self._fail(position, f"expected '&', '|' or ' - ' before '{word}'")
-        return tree
 
-    def _selector(self) -> Selector:
-        tree = self._term()
-        while self._peek()[0] in ("or", "minus"):
-            operator = self._peek()[1]
-            self.next += 1
-            tree = Operation(operator, tree, self._term())
-        return tree
+def _span_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
+    return _missing("span", argument, vocabulary.spans)
 
-    def _term(self) -> Selector:
-        tree = self._factor()
-        while self._peek()[0] == "and":
-            self.next += 1
-            tree = Operation("&", tree, self._factor())
-        return tree
 
-    def _factor(self) -> Selector:
-        kind, word, position = self._peek()
-        self.next += 1
-        if kind == "open":
-            tree = self._selector()
-            if self._peek()[0] != "close":
-                raise self._fail(self._peek()[2], "expected ')'")
-            self.next += 1
-            return tree
-        if kind == "star":
-            return Everything()
-        if kind == "atom":
-            name, _, argument = word.partition(":")
-            return Atom(name, argument)
-        raise self._fail(position, "expected a selector such as camera:NAME, '(' or '*'")
+def _frame_keys(argument: str, tokens: EpisodeTokens) -> Membership:
+    span = tokens.layout.frame(argument)
+    return _key_range(tokens, span.start, span.stop)
+
+
+def _frame_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
+    layout.frame(argument)  # raises the error that lists the frames
+    return None
+
+
+# role: what a key is at each replan.
+
+
+def _role_keys(argument: str, tokens: EpisodeTokens) -> Membership:
+    return (tokens.static_roles == int(find_role(argument)))[:, :, None]
+
+
+def _role_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
+    find_role(argument)  # raises the error that lists the roles
+    return None
+
+
+# word, words: pieces of the instruction.
+
+
+def _word_keys(argument: str, tokens: EpisodeTokens) -> Membership:
+    return _keys_of_words(tokens, [find_phrase(words, argument) for words in tokens.words])
+
+
+def _word_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
+    if not vocabulary.words:
+        return f"{NO_WORDS}."
+    words = [argument[start:stop] for start, stop in split_words(argument)]
+    if not words:
+        return f"'{argument}' has no letter or digit, so it is no word."
+    for word in words:
+        if word.casefold() not in vocabulary.words:
+            near = did_you_mean(word, vocabulary.words)
+            return f"no instruction has the word '{word}'.{near} Words: {listing(vocabulary.words, 40)}."
+    if not any(has_phrase(sentence, argument) for sentence in vocabulary.sentences):
+        nearest = max(vocabulary.sentences, key=lambda sentence: sum(word.casefold() in sentence for word in words))
+        return (
+            f"no instruction has the words '{argument}' one after the other. Nearest: '{' '.join(nearest)}'; a list of "
+            "word: selectors takes single words."
+        )
+    return None
+
+
+def _words_keys(argument: str, tokens: EpisodeTokens) -> Membership:
+    wanted = argument.casefold()
+    problem = _missing("word class", argument, _WORD_CLASSES) if wanted not in _WORD_CLASSES else None
+    if problem:
+        raise SelectorError(problem[0].upper() + problem[1:])
+    chosen = [[word for word in words if wanted in ("all", word_class(word.text))] for words in tokens.words]
+    return _keys_of_words(tokens, chosen)
+
+
+def _words_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
+    if argument.casefold() not in _WORD_CLASSES:
+        return _missing("word class", argument, _WORD_CLASSES)
+    return None if vocabulary.words else f"{NO_WORDS}."
+
+
+def _keys_of_words(tokens: EpisodeTokens, chosen: Sequence[Sequence[Word]]) -> Membership:
+    """The keys of the words that were chosen from each of the episode's prompts."""
+    by_prompt = np.zeros((max(1, len(tokens.prompts)), tokens.layout.num_keys), dtype=bool)
+    for row, words in zip(by_prompt, chosen, strict=False):
+        for word in words:
+            row[list(word.keys)] = True
+    if len(by_prompt) == 1 or tokens.prompt_index is None:
+        return by_prompt[:1, :, None]
+    return by_prompt[tokens.prompt_index, :, None]
+
+
+# object, patch: parts of pictures.
+
+
+def _object_keys(argument: str, tokens: EpisodeTokens) -> Membership:
+    chosen = np.zeros(1 + len(tokens.objects), dtype=bool)
+    for i, thing in enumerate(tokens.objects, start=1):
+        chosen[i] = {
+            "@interest": thing.of_interest,
+            "@robot": thing.kind == "robot",
+            "@background": thing.kind == "background",
+        }.get(argument, thing.name == argument)
+    covered = np.zeros(tokens.layout.num_keys, dtype=bool)
+    for camera in tokens.coverage or {}:
+        span = tokens.layout.camera_span(camera)
+        covered[span.start : span.stop] = True
+    member: Membership = (covered[:, None] & chosen)[None]
+    return member
+
+
+def _object_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
+    if argument.startswith("@") and argument not in _OBJECT_CLASSES:
+        return _missing("object class", argument, _OBJECT_CLASSES)
+    if not vocabulary.objects:
+        return f"{NO_COVERAGE}."
+    return None if argument in _OBJECT_CLASSES else _missing("object", argument, vocabulary.objects)
+
+
+def _patch_keys(argument: str, tokens: EpisodeTokens) -> Membership:
+    match = _PATCH.match(argument)
+    if match is None:
+        raise SelectorError(f"Cannot read selector 'patch:{argument}'; expected patch:CAMERA[r0:r1,c0:c1].")
+    span = tokens.layout.camera_span(match["camera"])
+    if span.grid is None:
+        raise SelectorError(f"Camera '{match['camera']}' has no patch grid.")
+    rows, columns = span.grid.rows, span.grid.columns
+    r0, r1 = int(match["r0"] or 0), int(match["r1"] or rows)
+    c0, c1 = int(match["c0"] or 0), int(match["c1"] or columns)
+    if not (0 <= r0 < r1 <= rows and 0 <= c0 < c1 <= columns):
+        raise SelectorError(
+            f"Selector 'patch:{argument}' leaves the grid of camera '{match['camera']}', which has {rows} rows and "
+            f"{columns} columns of patches; expected 0 <= r0 < r1 <= {rows} and 0 <= c0 < c1 <= {columns}."
+        )
+    grid = np.zeros((rows, columns), dtype=bool)
+    grid[r0:r1, c0:c1] = True
+    member = no_keys(tokens)
+    member[0, span.start : span.stop, 0] = grid.ravel()
+    return member
+
+
+def _patch_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
+    return _camera_problem(argument.partition("[")[0], vocabulary, layout)
+
+
+# keys: numbers.
+
+
+def _number_keys(argument: str, tokens: EpisodeTokens) -> Membership:
+    match = _KEYS.match(argument)
+    if match is None:
+        raise SelectorError(f"Cannot read selector 'keys:{argument}'; expected keys:a or keys:a-b.")
+    first, last = int(match[1]), int(match[2] or match[1])
+    if not first <= last < tokens.layout.num_keys:
+        raise SelectorError(
+            f"Selector 'keys:{argument}' leaves the site's keys; expected a <= b <= {tokens.layout.num_keys - 1}."
+        )
+    return _key_range(tokens, first, last + 1)
+
+
+def _number_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
+    return None  # a range that leaves the site is found when the keys are taken
+
+
+SELECTOR_KINDS: dict[str, SelectorKind] = {
+    "camera": SelectorKind("the patches of one camera", _camera_keys, _camera_problem),
+    "role": SelectorKind("every key with one role", _role_keys, _role_problem),
+    "span": SelectorKind("every key of one span", _span_keys, _span_problem),
+    "frame": SelectorKind("every key of one latent frame", _frame_keys, _frame_problem),
+    "word": SelectorKind("every piece of a word of the instruction; a phrase in quotes", _word_keys, _word_problem),
+    "words": SelectorKind(
+        "the words of the instruction by class: content, stop (a shipped list of function words) or all",
+        _words_keys,
+        _words_problem,
+    ),
+    "object": SelectorKind(
+        "the patches that an object covers, by covered area; @interest, @robot or @background",
+        _object_keys,
+        _object_problem,
+    ),
+    "patch": SelectorKind(
+        "a region of a camera's patch grid: camera[r0:r1,c0:c1], rows and columns from the top left, r1 and c1 excluded",
+        _patch_keys,
+        _patch_problem,
+    ),
+    "keys": SelectorKind("keys by number, a-b with both ends", _number_keys, _number_problem),
+}

@@ -15,6 +15,16 @@ from vla_attention.schemas.layout import INVALID_ROLES, Prompt, Role, SiteLayout
 
 ObjectKind = Literal["object", "fixture", "robot", "background"]
 
+#: Why a site has no words to name, or no objects, and what to do about it.
+NO_WORDS = (
+    "the keys of this site spell no words; choose a site with text by --site (Cosmos: cross); a text that was captured without "
+    "its tokenizer needs a capture with --t5-tokenizer"
+)
+NO_COVERAGE = (
+    "no selected episode has object coverage at this site, which is recorded from the simulator's segmentation; choose a site "
+    "with pictures by --site (Cosmos: self), or use a store as vla-capture wrote it, not a copy without objects"
+)
+
 
 @dataclass(frozen=True)
 class SceneObject:

@@ -12,7 +12,8 @@ from tests.kit.strategies import episode_tokens as random_tokens
 from tests.kit.strategies import groupings
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import check_names, memberships, resolve, shared_keys
-from vla_attention.schemas.groupings.selectors import Atom, SelectorError, parse_selector
+from vla_attention.schemas.groupings.selector_parser import Atom, parse_selector
+from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vocabulary
 from vla_attention.schemas.groupings.words import split_words, stop_words, word_class
 from vla_attention.schemas.layout import SiteLayout, Span

@@ -2,14 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from vla_attention.schemas.groupings.selectors import (
-    Atom,
-    Everything,
-    Operation,
-    SelectorError,
-    atoms_of,
-    parse_selector,
-)
+from vla_attention.schemas.groupings.selector_parser import Atom, Everything, Operation, atoms_of, parse_selector
+from vla_attention.schemas.groupings.selectors import SelectorError
 
 
 def test_and_binds_tighter_than_or_and_minus():
