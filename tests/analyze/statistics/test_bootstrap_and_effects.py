@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,6 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import special, stats
 
+from vla_attention.analyze.statistics import bootstrap
 from vla_attention.analyze.statistics.bootstrap import (
     POSITIVE,
     SHARE,
@@ -259,8 +258,32 @@ def test_several_statistics_at_once_are_the_same_as_one_by_one():
         assert (interval.low, interval.high) == pytest.approx((alone.low, alone.high), rel=1e-12)
 
 
-def test_two_thousand_resamples_of_five_hundred_episodes_are_fast():
-    values = np.random.default_rng(0).random(500)
-    start = time.perf_counter()
-    bootstrap_interval(mean_over_episodes(values), np.arange(500) // 50, num_resamples=2000)
-    assert time.perf_counter() - start < 1.0
+class RecordedGenerator:
+    """numpy's generator; records the size of every array of uniform draws."""
+
+    def __init__(self, generator: np.random.Generator, sizes: list[int]):
+        self.integers = generator.integers
+        self._random, self._sizes = generator.random, sizes
+
+    def random(self, shape: tuple[int, ...]) -> np.ndarray:
+        self._sizes.append(int(np.prod(shape)))
+        return self._random(shape)
+
+
+@pytest.mark.parametrize("most", [bootstrap._DRAWS_AT_ONCE, 1_234])
+def test_draws_are_made_in_few_pieces_of_bounded_size(monkeypatch, most):
+    make, sizes = np.random.default_rng, []
+    monkeypatch.setattr(np.random, "default_rng", lambda seed: RecordedGenerator(make(seed), sizes))
+    monkeypatch.setattr(bootstrap, "_DRAWS_AT_ONCE", most)
+    num_resamples, tasks = 2000, np.arange(500) // 50
+    counts = resample_episodes(tasks, num_resamples, seed=most).counts
+    assert max(sizes) <= most
+    assert len(sizes) == -(-num_resamples // (most // len(tasks)))
+    assert sum(sizes) == num_resamples * len(tasks)
+    assert np.array_equal(counts.sum(axis=1), np.full(num_resamples, len(tasks)))
+
+
+def test_draws_for_the_same_episodes_are_made_once():
+    tasks = np.arange(500) // 50
+    assert resample_episodes(tasks, 100, seed=4) is resample_episodes(tasks + 7, 100, seed=4)
+    assert resample_episodes(tasks, 100, seed=4) is not resample_episodes(tasks, 100, seed=5)
