@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal, cast
 
-import numpy as np
-
+from vla_attention.capture.environments.protocol import WAIT_STEPS
 from vla_attention.capture.environments.suites import check_initial_state_index, list_tasks
 from vla_attention.capture.jobs.job import this_worker
 from vla_attention.capture.jobs.run_records import PlannedTask, RecordKeeper, forget_runs, planned_tasks, read_records
 from vla_attention.capture.jobs.termination import Termination
-from vla_attention.capture.machine import describe_machine
-from vla_attention.capture.policies.base import Policy
-from vla_attention.capture.policies.identity import identify
+from vla_attention.capture.policies.policy import Policy, camera_grid
+from vla_attention.capture.provenance import describe_machine
 from vla_attention.capture.recording.episode_loop import EpisodeLoop, say
 from vla_attention.capture.recording.rollout import EpisodeResult, check_protocol, max_replans
 from vla_attention.capture.settings import RecordingSettings, RunSettings
@@ -28,7 +26,7 @@ _QUERIES = {"mean": "the mean over", "steps": "the action steps' means over", "a
 
 def plan_recording(settings: RecordingSettings, policy: Policy) -> tuple[Recording, str | None]:
     """Check what is asked for against the policy; also returns the line to print when layer numbers were translated."""
-    layers = select_layers(settings.layers, policy.num_layers, policy.provenance()["family"])
+    layers = select_layers(settings.layers, policy.num_layers, policy.family)
     steps = _denoise_steps(settings.denoise_steps, policy.num_denoise_steps)
     heads = tuple(range(policy.num_heads)) if settings.heads is None else settings.heads
     for head in heads:
@@ -79,7 +77,7 @@ def run_capture(
     protocol = Protocol(
         suite=settings.suite.name,
         seed=settings.seed,
-        wait_steps=10,
+        wait_steps=WAIT_STEPS,
         replan_steps=policy.default_replan_steps if settings.replan_steps is None else settings.replan_steps,
         max_steps=settings.max_steps,
     )
@@ -90,11 +88,10 @@ def run_capture(
     for task in wanted:
         check_initial_state_index(task, settings.num_episodes - 1)
     machine = describe_machine(device)
-    identity = identify(policy)
     attributes = RootAttributes(
         format=FORMAT_NAME,
         format_version=FORMAT_VERSION,
-        policy=identity,
+        policy=policy.identity(),
         protocol=protocol,
         recording=recording,
         sites=policy.sites,
@@ -154,7 +151,8 @@ def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int) -
             f"cameras {listing(f'{camera.name} = {camera.source}' for camera in identity.cameras)}."
         )
     say(f"A policy call gives {identity.action_horizon} actions, of which {protocol.replan_steps} are executed.")
-    pictures = [np.prod((camera.grid.image_height, camera.grid.image_width, 3)).item() for camera in policy.cameras]
+    grids = [camera_grid(policy.sites, camera.name) for camera in policy.cameras]
+    pictures = [grid.image_height * grid.image_width * 3 for grid in grids]
     say(
         f"Recording {len(recording.layers)} layers, denoise steps {listing(recording.denoise_steps)}, {len(recording.heads)} heads, "
         f"{_QUERIES[recording.queries]} {recording.num_action_queries} action queries, "

@@ -1,37 +1,48 @@
-"""Which policy ran: the part of a policy's provenance that two episodes of one run must share."""
+"""Which policy ran: where its weights come from, and its description in a store's root attributes."""
 
 from __future__ import annotations
 
-from vla_attention.capture.policies.base import Policy
-from vla_attention.schemas.stores.store_format import PolicyCameraView, PolicyIdentity
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
-#: Named fields of `PolicyIdentity`, or facts of the machine and not of the policy.
-_NOT_CONFIG = ("policy", "family", "checkpoint", "checkpoint_format", "weights_digest", "untrained", "device")
+from vla_attention.schemas.stores.store_format import PolicyIdentity
+
+if TYPE_CHECKING:
+    from vla_attention.capture.policies.policy import Policy
 
 
-def identify(policy: Policy) -> PolicyIdentity:
-    """Describe a policy for the store's root attributes. Hashes all weights the first time."""
-    facts = policy.provenance()
+@dataclass(frozen=True)
+class PolicySource:
+    """Where a policy's weights come from.
+
+    checkpoint: a path, a name on a hub, or for random weights how they were drawn. untrained: the weights are random.
+    configuration: what fixed the sizes and the layout: the checkpoint itself, a named configuration, a case.json.
+    """
+
+    name: str
+    checkpoint: str
+    checkpoint_format: str
+    untrained: bool
+    configuration: str = "built in"
+
+
+def describe_policy(policy: Policy, source: PolicySource, digest: str, config: dict[str, Any]) -> PolicyIdentity:
+    """Return a policy's identity for the store.
+
+    digest: SHA-256 (hex) over the weights. config: what else tells policies of the family apart, as plain JSON values; two runs
+    that differ in it are never merged.
+    """
     return PolicyIdentity(
         name=policy.name,
-        family=facts["family"],
-        checkpoint=facts["checkpoint"],
-        checkpoint_format=facts["checkpoint_format"],
-        digest=facts["weights_digest"],
-        untrained=facts["untrained"],
+        family=policy.family,
+        checkpoint=source.checkpoint,
+        checkpoint_format=source.checkpoint_format,
+        digest=digest,
+        untrained=source.untrained,
         num_layers=policy.num_layers,
         num_heads=policy.num_heads,
         num_denoise_steps=policy.num_denoise_steps,
         action_horizon=policy.action_horizon,
-        cameras=tuple(
-            PolicyCameraView(
-                name=camera.slot,
-                source=camera.environment_camera,
-                upright=camera.flip_rows,
-                mirrored=camera.flip_columns,
-                visible=camera.visible,
-            )
-            for camera in policy.cameras
-        ),
-        config={name: value for name, value in facts.items() if name not in _NOT_CONFIG},
+        cameras=policy.cameras,
+        config={"configuration": source.configuration, **config},
     )

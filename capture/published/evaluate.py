@@ -172,7 +172,7 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], termination: T
     device = choose_device(arguments.device)
     policy = build_policy(arguments, device)
     # A layer that does not exist is found before the capture, not after it.
-    select_layers(arguments.layers, policy.num_layers, policy.provenance()["family"])
+    select_layers(arguments.layers, policy.num_layers, policy.family)
     for job in jobs:
         if len(jobs) > 1:
             say(f"Suite {job.settings.suite.name}:")

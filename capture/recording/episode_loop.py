@@ -16,7 +16,7 @@ from vla_attention.capture.jobs.claims import Claims, Holder
 from vla_attention.capture.jobs.job import Worker
 from vla_attention.capture.jobs.run_records import RecordKeeper
 from vla_attention.capture.jobs.termination import Terminated, Termination
-from vla_attention.capture.policies.base import Policy
+from vla_attention.capture.policies.policy import Policy
 from vla_attention.capture.recording.rollout import EpisodeResult, run_episode
 from vla_attention.capture.store.disk_estimate import format_bytes
 from vla_attention.capture.store.store_writer import RunStore

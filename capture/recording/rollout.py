@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import Environment, Observation, Task
 from vla_attention.capture.environments.coverage import patch_coverage
-from vla_attention.capture.policies.base import Policy
+from vla_attention.capture.policies.policy import Policy, camera_grid
 from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan
 from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
 from vla_attention.capture.store.store_writer import RunStore
@@ -151,16 +151,17 @@ def _replan(
     recorders = make_recorders(recording, policy.sites, policy_input.key_role, pools)
     actions = policy.act(policy_input, seed, recorders)
     coverage = {
-        camera.slot: patch_coverage(
-            environment.segmentation(camera.environment_camera),
+        camera.name: patch_coverage(
+            environment.segmentation(camera.source),
             len(environment.objects),
-            camera.grid.rows,
-            camera.grid.columns,
-            flip_rows=camera.flip_rows,
-            flip_columns=camera.flip_columns,
+            grid.rows,
+            grid.columns,
+            flip_rows=camera.upright,
+            flip_columns=camera.mirrored,
             visible=camera.visible,
         )
         for camera in policy.cameras
+        for grid in [camera_grid(policy.sites, camera.name)]
     }
     writer.append(
         ReplanRecord(

@@ -86,7 +86,7 @@ def test_the_three_formats_of_one_model_have_one_digest(small_tokenizer):
     from vla_attention.capture.policies.pi.loading import load_pi_policy
 
     digests = {
-        load_pi_policy(GOLDEN / name, small_tokenizer).provenance()["weights_digest"]
+        load_pi_policy(GOLDEN / name, small_tokenizer).identity().digest
         for name in CHECKPOINTS
         if name.startswith("pi0_")
     }

@@ -22,13 +22,14 @@ from vla_attention.capture.policies.cosmos.locate import (
     find_weights,
 )
 from vla_attention.capture.policies.cosmos.model import CosmosModel
-from vla_attention.capture.policies.cosmos.policy import ACTION_FRAME, CosmosPolicy, CosmosSource
+from vla_attention.capture.policies.cosmos.policy import ACTION_FRAME, CosmosPolicy
 from vla_attention.capture.policies.cosmos.preprocess import read_statistics
 from vla_attention.capture.policies.cosmos.t5_encoder import T5Encoder
 from vla_attention.capture.policies.cosmos.t5_pickle import read_embeddings
 from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
 from vla_attention.capture.policies.cosmos.text import PieceTokenizer, PrecomputedText
 from vla_attention.capture.policies.cosmos.vae import build_encoder, infer_vae_config
+from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.schemas.errors import BadArgument
 
 
@@ -121,7 +122,7 @@ def load_cosmos_policy(
         build_dit(config.dit, weights, dtype=dtype, device=device),
         build_encoder(config.vae, vae_state, dtype=dtype, device=device),
     )
-    source = CosmosSource(
+    source = PolicySource(
         name="cosmos",
         checkpoint=str(checkpoint),
         checkpoint_format=weights_path.suffix.removeprefix("."),

@@ -7,7 +7,6 @@ rows are neither uniform nor on one key, and depend on pictures, words, noise an
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -18,10 +17,12 @@ from torch import Tensor
 from vla_attention.capture.policies.cosmos.config import CosmosConfig, DitConfig, SamplerConfig, VaeConfig
 from vla_attention.capture.policies.cosmos.dit_weights import build_dit, expected_shapes
 from vla_attention.capture.policies.cosmos.model import CosmosModel
-from vla_attention.capture.policies.cosmos.policy import ACTION_FRAME, CosmosPolicy, CosmosSource
+from vla_attention.capture.policies.cosmos.policy import ACTION_FRAME, CosmosPolicy
 from vla_attention.capture.policies.cosmos.preprocess import Statistics, make_statistics
 from vla_attention.capture.policies.cosmos.text import PieceTokenizer, SeededText
 from vla_attention.capture.policies.cosmos.vae import build_encoder, expected_vae_shapes
+from vla_attention.capture.policies.identity import PolicySource
+from vla_attention.capture.policies.weights import random_tensor
 
 #: The small sentencepiece model that comes with this package.
 TOKENIZER_PATH = Path(__file__).parents[1] / "pi" / "embedded" / "tokenizer.model"
@@ -58,12 +59,6 @@ def builtin_statistics() -> Statistics:
     return make_statistics(BUILTIN_RANGES, "that come with the program", action_dim=7, proprio_dim=9)
 
 
-def _normal(seed: int, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Standard normal numbers from a stream of the tensor's own: the same on every machine."""
-    stream = np.random.Philox(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
-    return np.random.Generator(stream).standard_normal(shape, dtype=np.float32)
-
-
 def random_dit_weights(config: DitConfig, seed: int) -> dict[str, Tensor]:
     """Return float32 weights of a `Dit(config)` by model name, drawn from `seed` alone."""
     weights = {}
@@ -71,7 +66,7 @@ def random_dit_weights(config: DitConfig, seed: int) -> dict[str, Tensor]:
         if name.startswith("pos_embedder."):
             weights[name] = _rotary_buffer(name, shape[0], config)
         else:
-            weights[name] = torch.from_numpy(_scaled(name, _normal(seed, name, shape), config))
+            weights[name] = torch.from_numpy(_scaled(name, random_tensor(seed, name, shape), config))
     return weights
 
 
@@ -106,7 +101,7 @@ def random_vae_weights(config: VaeConfig, seed: int) -> dict[str, Tensor]:
     """Return float32 weights of a whole VAE by its published names, drawn from `seed` alone."""
     weights = {}
     for name, shape in expected_vae_shapes(config).items():
-        normal = _normal(seed, name, shape)
+        normal = random_tensor(seed, name, shape)
         if name.endswith("gamma"):
             scaled = np.ones_like(normal)
         elif name.endswith("bias"):
@@ -139,7 +134,7 @@ def random_policy(
         build_random_model(config, seed, device),
         text,
         builtin_statistics(),
-        CosmosSource(name=name, checkpoint=f"random weights, seed {seed}", checkpoint_format="seeded", untrained=True),
+        PolicySource(name=name, checkpoint=f"random weights, seed {seed}", checkpoint_format="seeded", untrained=True),
         open_loop_steps=config.chunk_size if open_loop_steps is None else open_loop_steps,
         query_frame=query_frame,
     )

@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.policies.base import PolicyCamera
 from vla_attention.capture.policies.cosmos.config import CosmosConfig
 from vla_attention.capture.policies.cosmos.preprocess import visible_area
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, roles_from_spans
+from vla_attention.schemas.stores.store_format import PolicyCameraView
 
 SELF: Final = "self"
 CROSS: Final = "cross"
@@ -35,17 +35,10 @@ def patch_grid(config: CosmosConfig) -> PatchGrid:
     return PatchGrid(rows, columns, config.image_size, config.image_size)
 
 
-def cameras(config: CosmosConfig) -> tuple[PolicyCamera, ...]:
+def cameras(config: CosmosConfig) -> tuple[PolicyCameraView, ...]:
     """Return the cameras in key order: wrist, then primary."""
     return tuple(
-        PolicyCamera(
-            slot=name,
-            environment_camera=CAMERA_OF_FRAME[name],
-            flip_rows=True,
-            flip_columns=False,
-            grid=patch_grid(config),
-            visible=visible_area(),
-        )
+        PolicyCameraView(name, source=CAMERA_OF_FRAME[name], upright=True, mirrored=False, visible=visible_area())
         for name in config.frames.names
         if name in CAMERA_OF_FRAME
     )

@@ -6,13 +6,11 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import Observation
-from vla_attention.capture.policies.base import PolicyInput, camera_frame, weights_digest
 from vla_attention.capture.policies.cosmos.config import CosmosConfig
 from vla_attention.capture.policies.cosmos.latents import action_shares, query_pools, read_actions, read_value
 from vla_attention.capture.policies.cosmos.layout import CROSS, SELF, cameras, self_roles
@@ -20,21 +18,14 @@ from vla_attention.capture.policies.cosmos.model import CosmosModel, Recorders
 from vla_attention.capture.policies.cosmos.preprocess import Statistics, model_picture, proprio_of, upright
 from vla_attention.capture.policies.cosmos.sampler import flow_time
 from vla_attention.capture.policies.cosmos.text import TextSource
+from vla_attention.capture.policies.identity import PolicySource, describe_policy
+from vla_attention.capture.policies.policy import PolicyInput, camera_frame
+from vla_attention.capture.policies.weights import weights_digest
 from vla_attention.capture.recording.attention import RowCollector
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.stores.store_format import PolicyIdentity
 
 ACTION_FRAME, VALUE_FRAME = "action", "value"
-
-
-@dataclass(frozen=True)
-class CosmosSource:
-    """Where a policy's weights come from: `checkpoint` is a path or a name, or a description of how they were made."""
-
-    name: str
-    checkpoint: str
-    checkpoint_format: str
-    untrained: bool
-    configuration: str = "built in"
 
 
 @dataclass(frozen=True)
@@ -57,7 +48,7 @@ class CosmosPolicy:
         model: CosmosModel,
         text: TextSource,
         statistics: Statistics,
-        source: CosmosSource,
+        source: PolicySource,
         *,
         open_loop_steps: int = 16,
         query_frame: str = ACTION_FRAME,
@@ -73,6 +64,7 @@ class CosmosPolicy:
         self.statistics = statistics
         self.source = source
         self.name = source.name
+        self.family = "cosmos"
         self.query_frame = config.frames.names[config.frames.index(query_frame)]
         self.sites = model.sites
         self.num_layers = config.dit.num_blocks
@@ -115,25 +107,18 @@ class CosmosPolicy:
     def _digest(self) -> str:
         return weights_digest(self.model)
 
-    def provenance(self) -> dict[str, Any]:
-        """Return what identifies the policy, as plain JSON values; reading all weights, it is slow the first time."""
-        return {
-            "policy": self.name,
-            "family": "cosmos",
-            "checkpoint": self.source.checkpoint,
-            "checkpoint_format": self.source.checkpoint_format,
-            "weights_digest": self._digest,
-            "untrained": self.source.untrained,
-            "configuration": self.source.configuration,
+    def identity(self) -> PolicyIdentity:
+        """Return the policy's description for the store. Slow the first time, because it reads all weights."""
+        facts = {
             "config": json.loads(json.dumps(asdict(self.config))),
             "dtype": str(self.model.dtype).removeprefix("torch."),
-            "device": str(self.model.device),
             "normalisation": "min-max",
             "statistics": self.statistics.as_json(),
             "query_frame": self.query_frame,
             "noise": "the same at every replan",
             **self.text.provenance(),
         }
+        return describe_policy(self, self.source, self._digest, facts)
 
     def prepare(self, observation: Observation, instruction: str) -> PolicyInput:
         """Turn an observation and an instruction into the model's input (batch 1).
@@ -143,7 +128,7 @@ class CosmosPolicy:
         """
         config = self.config
         frames = {
-            camera.slot: model_picture(upright(camera_frame(observation, camera.environment_camera)), config.image_size)
+            camera.name: model_picture(upright(camera_frame(observation, camera.source)), config.image_size)
             for camera in self.cameras
         }
         proprio = proprio_of(observation.gripper_qpos, observation.eef_pos, observation.eef_quat)

@@ -6,20 +6,21 @@ its attention has structure: rows are neither uniform nor on one key, and depend
 
 from __future__ import annotations
 
-import zlib
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.pi.config import GemmaConfig, PiConfig, SiglipConfig, find_variant
 from vla_attention.capture.policies.pi.model import PiModel
-from vla_attention.capture.policies.pi.policy import PiPolicy, PiSource
+from vla_attention.capture.policies.pi.policy import PiPolicy
 from vla_attention.capture.policies.pi.preprocess import NormStats, Statistics
 from vla_attention.capture.policies.pi.processing import OPENPI_REPLAN_STEPS, OpenpiProcessing
 from vla_attention.capture.policies.pi.strict import Shapes, expected_shapes, model_from_state
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
+from vla_attention.capture.policies.weights import random_tensor
 
 TOKENIZER_PATH = Path(__file__).parent / "embedded" / "tokenizer.model"
 
@@ -78,17 +79,11 @@ def builtin_stats() -> NormStats:
 
 
 def random_weights(config: PiConfig, seed: int) -> dict[str, Tensor]:
-    """Return float32 weights of a `PiModel(config)`, drawn from `seed` alone.
-
-    Every tensor has its own counter-based numpy stream, named by seed and tensor: torch's normal numbers differ in the
-    last bits between processors, and then so would the digest of "the same" weights.
-    """
+    """Return float32 weights of a `PiModel(config)` by tensor name, drawn from `seed` alone."""
     shapes: Shapes = expected_shapes(config)
     state = {}
     for name, shape in shapes.items():
-        stream = np.random.Philox(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
-        normal = np.random.Generator(stream).standard_normal(shape, dtype=np.float32)
-        state[name] = torch.from_numpy(_scaled(name, normal, config))
+        state[name] = torch.from_numpy(_scaled(name, random_tensor(seed, name, shape), config))
     return state
 
 
@@ -135,7 +130,7 @@ def _random_policy(
         build_random_model(config, seed, device),
         PromptTokenizer(TOKENIZER_PATH),
         OpenpiProcessing(config, builtin_stats(), normalisation="quantile", replan_steps=replan_steps),
-        PiSource(name=name, checkpoint=f"random weights, seed {seed}", checkpoint_format="seeded", untrained=True),
+        PolicySource(name=name, checkpoint=f"random weights, seed {seed}", checkpoint_format="seeded", untrained=True),
     )
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.pi.case import CASE_FILE, read_config
 from vla_attention.capture.policies.pi.checkpoint import load_openpi_torch
 from vla_attention.capture.policies.pi.config import PiConfig, find_config
@@ -14,7 +15,7 @@ from vla_attention.capture.policies.pi.formats import CheckpointFormat, detect_f
 from vla_attention.capture.policies.pi.lerobot import load_lerobot, load_lerobot_weights
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.orbax import implied_config_name, list_leaves, load_openpi_jax
-from vla_attention.capture.policies.pi.policy import PiPolicy, PiSource
+from vla_attention.capture.policies.pi.policy import PiPolicy
 from vla_attention.capture.policies.pi.preprocess import read_norm_stats
 from vla_attention.capture.policies.pi.processing import OpenpiProcessing, Processing
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
@@ -87,7 +88,7 @@ def load_pi_policy(
         processing = OpenpiProcessing(
             model.config, norm_stats, normalisation="quantile" if pi05 else "z-score", relative_actions=not pi05
         )
-    source = PiSource(
+    source = PolicySource(
         name="pi05" if model.config.pi05 else "pi0",
         checkpoint=str(checkpoint),
         checkpoint_format=found,

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,32 +13,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vla_attention.capture.environments.base import Observation
-from vla_attention.capture.policies.base import PolicyCamera, PolicyInput, camera_frame, initial_noise, weights_digest
+from vla_attention.capture.policies.identity import PolicySource, describe_policy
+from vla_attention.capture.policies.noise import initial_noise, noise_seed
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.flow_time import denoise_times
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.preprocess import libero_state, pad_to
 from vla_attention.capture.policies.pi.processing import Processing
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, TokenizedPrompt, check_vocabulary
+from vla_attention.capture.policies.policy import PolicyInput, camera_frame
+from vla_attention.capture.policies.weights import weights_digest
 from vla_attention.capture.recording.attention import RowCollector
-from vla_attention.capture.recording.noise import noise_seed
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, roles_from_spans
+from vla_attention.schemas.stores.store_format import PolicyCameraView, PolicyIdentity
 
 PROMPT_SPAN, STATE_SPAN, ACTION_SPAN = "prompt", "state", "actions"
-
-
-@dataclass(frozen=True)
-class PiSource:
-    """Where a policy's weights come from: `checkpoint` is a path, or a description of how they were made.
-
-    `configuration`: what fixed the sizes and the layout: the checkpoint itself, a named configuration, a case.json.
-    """
-
-    name: str
-    checkpoint: str
-    checkpoint_format: str
-    untrained: bool
-    configuration: str = "built in"
 
 
 def site_layout(config: PiConfig) -> SiteLayout:
@@ -72,7 +60,7 @@ def patch_grid(config: PiConfig) -> PatchGrid:
 class PiPolicy:
     """A pi0 or pi0.5 model with its tokenizer and its processing, for LIBERO-like observations."""
 
-    def __init__(self, model: PiModel, tokenizer: PromptTokenizer, processing: Processing, source: PiSource):
+    def __init__(self, model: PiModel, tokenizer: PromptTokenizer, processing: Processing, source: PolicySource):
         config = model.config
         check_vocabulary(tokenizer, config.vocab_size, source.name)
         self.model = model
@@ -80,6 +68,7 @@ class PiPolicy:
         self.processing = processing
         self.source = source
         self.name = source.name
+        self.family = "pi05" if config.pi05 else "pi0"
         self.sites = (site_layout(config),)
         self.num_layers = config.action_expert.depth
         self.num_heads = config.action_expert.num_heads
@@ -88,11 +77,9 @@ class PiPolicy:
         self.num_action_queries = config.action_horizon
         self.default_replan_steps = processing.default_replan_steps
         self.cameras = tuple(
-            PolicyCamera(
-                slot, processing.environment_cameras[slot], flip_rows=True, flip_columns=True, grid=patch_grid(config)
-            )
-            for slot in config.cameras
-            if slot in processing.environment_cameras
+            PolicyCameraView(name, source=processing.environment_cameras[name], upright=True, mirrored=True)
+            for name in config.cameras
+            if name in processing.environment_cameras
         )
         self._warned: set[str] = set()
 
@@ -112,32 +99,25 @@ class PiPolicy:
     def _digest(self) -> str:
         return weights_digest(self.model)
 
-    def provenance(self) -> dict[str, Any]:
-        """Return what identifies the policy, as plain JSON values; reading all weights, it is slow the first time."""
+    def identity(self) -> PolicyIdentity:
+        """Return the policy's description for the store. Slow the first time, because it reads all weights."""
         config = self.model.config
-        return {
-            "policy": self.name,
-            "family": "pi05" if config.pi05 else "pi0",
-            "checkpoint": self.source.checkpoint,
-            "checkpoint_format": self.source.checkpoint_format,
-            "weights_digest": self._digest,
-            "untrained": self.source.untrained,
-            "configuration": self.source.configuration,
+        facts = {
             "config": {**asdict(config), "cameras": list(config.cameras)},
             "dtype": str(self.model.dtype).removeprefix("torch."),
-            "device": str(self.model.device),
             **self.processing.provenance(),
             "prompt_format": self.processing.prompt_format,
             "long_prompts": "cut" if self.processing.cut_long_prompts else "refused",
             "tokenizer_digest": self.tokenizer.digest,
         }
+        return describe_policy(self, self.source, self._digest, facts)
 
     def prepare(self, observation: Observation, instruction: str) -> PolicyInput:
         """Turn an observation and an instruction into the model's input (batch 1)."""
         config, device = self.model.config, self.model.device
         size = config.siglip.image_size
         pictures = {
-            camera.slot: self.processing.model_picture(camera_frame(observation, camera.environment_camera), size)
+            camera.name: self.processing.model_picture(camera_frame(observation, camera.source), size)
             for camera in self.cameras
         }
         state = libero_state(observation.eef_pos, observation.eef_quat, observation.gripper_qpos)

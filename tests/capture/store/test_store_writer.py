@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from tests.kit.store_kit import StoreSpec, denoise_times, episode_records, root_attributes, write_episode, write_store
 from tests.kit.strategies import episode_tokens
-from vla_attention.capture.store import arrays as store_arrays
+from vla_attention.capture.store import codecs as store_arrays
 from vla_attention.capture.store.codecs import replans_per_block, write_whole
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.store_writer import open_run

@@ -50,10 +50,10 @@ def test_a_folder_gives_the_policy_that_was_written(folder, dummy, capsys):
     observation = make_observation(0)
     ours = policy.act(policy.prepare(observation, INSTRUCTION), 195)
     assert np.array_equal(ours, dummy.act(dummy.prepare(observation, INSTRUCTION), 195))
-    facts = policy.provenance()
-    assert facts["untrained"] is False
-    assert facts["checkpoint_format"] == "pt"
-    assert facts["weights_digest"] == dummy.provenance()["weights_digest"]
+    identity = policy.identity()
+    assert identity.untrained is False
+    assert identity.checkpoint_format == "pt"
+    assert identity.digest == dummy.identity().digest
 
 
 def test_the_file_of_weights_may_be_named_itself(folder):
@@ -166,4 +166,4 @@ def test_untrained_policies_of_one_seed_are_the_same():
     policy = build_cosmos_policy("embedded", device="cpu")
     assert policy.num_layers == 28
     again = random_policy("embedded", policy.config)
-    assert again.provenance()["weights_digest"] == policy.provenance()["weights_digest"]
+    assert again.identity().digest == policy.identity().digest

@@ -11,15 +11,17 @@ import pytest
 import torch
 
 from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, KeepAll, make_observation, recorders_of
-from vla_attention.capture.policies.base import PolicyCamera
 from vla_attention.capture.policies.cosmos.build import build_cosmos_policy
 from vla_attention.capture.policies.cosmos.calls import select_call
 from vla_attention.capture.policies.cosmos.config import LIBERO_FRAMES, CosmosConfig, FrameConfig
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, random_policy
 from vla_attention.capture.policies.cosmos.layout import cross_layout, self_layout
+from vla_attention.capture.policies.policy import camera_grid
 from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan
 from vla_attention.schemas.errors import BadArgument, MissingDependency, UnknownName
+from vla_attention.schemas.jsonable import from_json, to_json
 from vla_attention.schemas.layout import Role
+from vla_attention.schemas.stores.store_format import PolicyIdentity
 
 
 def recorders_for(policy, queries="mean"):
@@ -135,11 +137,13 @@ def test_frames_are_what_the_model_sees(dummy, prepared):
     assert {frame.shape for frame in prepared.frames.values()} == {(64, 64, 3)}
     assert prepared.state.shape == (9,)
     for camera in dummy.cameras:
-        assert isinstance(camera, PolicyCamera)
-        assert camera.flip_rows
-        assert camera.flip_rows
-        assert not camera.flip_columns
+        assert camera.upright
+        assert not camera.mirrored
         assert camera.visible == pytest.approx(212 / 224)
+        assert (camera_grid(dummy.sites, camera.name).rows, camera_grid(dummy.sites, camera.name).image_width) == (
+            4,
+            64,
+        )
 
 
 def test_frames_are_found_by_name_and_number():
@@ -166,14 +170,14 @@ def test_a_call_that_never_was_is_an_error():
         select_call(config, None, "middle")
 
 
-def test_provenance_is_plain_and_names_what_matters(dummy):
-    facts = dummy.provenance()
-    assert json.loads(json.dumps(facts)) == facts
-    assert facts["family"] == "cosmos"
-    assert facts["untrained"] is True
-    for name in ("dtype", "configuration", "normalisation", "prompt_format", "weights_digest", "query_frame"):
-        assert name in facts
-    assert random_policy("dummy", DUMMY_CONFIG, 1).provenance()["weights_digest"] != facts["weights_digest"]
+def test_identity_survives_json_and_names_what_matters(dummy):
+    identity = dummy.identity()
+    assert from_json(PolicyIdentity, json.loads(json.dumps(to_json(identity)))) == identity
+    assert identity.family == "cosmos"
+    assert identity.untrained is True
+    for name in ("dtype", "configuration", "normalisation", "prompt_format", "query_frame"):
+        assert name in identity.config
+    assert random_policy("dummy", DUMMY_CONFIG, 1).identity().digest != identity.digest
 
 
 def test_denoise_times_and_noise_seeds(dummy):

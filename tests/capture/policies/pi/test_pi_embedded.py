@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from tests.kit.pi_golden import make_observation
-from vla_attention.capture.policies.base import weights_digest
 from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, build_random_model, builtin_stats
 from vla_attention.capture.policies.pi.policy import site_layout
+from vla_attention.capture.policies.weights import weights_digest
 from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan
 from vla_attention.schemas.layout import Role
 
@@ -41,7 +41,7 @@ def test_layout_is_that_of_pi05_libero(embedded):
 
 def test_weights_are_reproducible(embedded):
     assert weights_digest(embedded.model) == DIGEST
-    assert embedded.provenance()["checkpoint"] == "random weights, seed 0"
+    assert embedded.identity().checkpoint == "random weights, seed 0"
 
 
 def test_weights_follow_the_seed_and_leave_the_global_generators_alone():

@@ -10,7 +10,6 @@ from safetensors.torch import load_file, save_file
 
 from tests.kit.pi_golden import GOLDEN, make_observation
 from tests.kit.small_tokenizer import train_small_tokenizer
-from vla_attention.capture.policies.base import Policy
 from vla_attention.capture.policies.pi.formats import UnreadableCheckpoint, UnsupportedCheckpoint
 from vla_attention.capture.policies.pi.lerobot_config import UnsupportedLerobotFeature, read_lerobot_config
 from vla_attention.capture.policies.pi.lerobot_pipeline import LerobotNormaliser, read_lerobot_pipeline
@@ -19,6 +18,7 @@ from vla_attention.capture.policies.pi.loading import CheckpointOptions, load_pi
 from vla_attention.capture.policies.pi.preprocess import UnusableNormStats, libero_state
 from vla_attention.capture.policies.pi.strict import CheckpointMismatch
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, digitise_state
+from vla_attention.capture.policies.policy import Policy
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.layout import Role
 
@@ -142,15 +142,16 @@ def test_the_files_decide_everything(checkpoint, tokenizer_path):
     pi05 = policy.name == "pi05"
     config = policy.model.config
     assert config.cameras == ("image", "image2", "empty_camera_0")
-    assert [(camera.slot, camera.environment_camera) for camera in policy.cameras] == [
+    assert [(camera.name, camera.source) for camera in policy.cameras] == [
         ("image", "agentview"),
         ("image2", "robot0_eye_in_hand"),
     ]
     assert (policy.action_horizon, policy.default_replan_steps) == ((6, 5) if pi05 else (7, 5))
     assert (config.max_token_len, config.num_denoise_steps) == ((24, 10) if pi05 else (16, 5))
     assert config.time_convention == "stepped"
-    facts = policy.provenance()
-    assert facts["checkpoint_format"] == "lerobot"
+    identity = policy.identity()
+    assert identity.checkpoint_format == "lerobot"
+    facts = identity.config
     assert facts["normalisation"] == "state {0}, action {0}".format("QUANTILES" if pi05 else "MEAN_STD")
     assert facts["prompt_format"] == ("task-state-action" if pi05 else "raw-instruction-newline")
     assert facts["configuration"] == "case.json beside the checkpoint"
@@ -206,7 +207,7 @@ def test_renamed_cameras_and_empty_cameras_that_only_a_number_states(checkpoint,
     edit(checkpoint / "policy_preprocessor.json", lambda content: content["steps"].__setitem__(0, step))
     policy = load_pi_policy(checkpoint, tokenizer_path)
     assert policy.model.config.cameras == ("wrist", "top", "empty_camera_0")
-    assert [camera.environment_camera for camera in policy.cameras] == ["agentview"]
+    assert [camera.source for camera in policy.cameras] == ["agentview"]
 
 
 def test_older_pipelines_lack_the_relative_steps(checkpoint, tokenizer_path):
@@ -221,13 +222,13 @@ def test_older_pipelines_lack_the_relative_steps(checkpoint, tokenizer_path):
 
 
 def test_weights_without_prefix_and_without_embed_tokens(checkpoint, tokenizer_path):
-    whole = load_pi_policy(checkpoint, tokenizer_path).provenance()["weights_digest"]
+    whole = load_pi_policy(checkpoint, tokenizer_path).identity().digest
     tensors = load_file(checkpoint / "model.safetensors")
     table = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
     older = {name.removeprefix("model."): tensor for name, tensor in tensors.items()}
     older["paligemma_with_expert.paligemma.lm_head.weight"] = older.pop(table)
     save_file(older, checkpoint / "model.safetensors")
-    assert load_pi_policy(checkpoint, tokenizer_path).provenance()["weights_digest"] == whole
+    assert load_pi_policy(checkpoint, tokenizer_path).identity().digest == whole
 
 
 # --- refusals
@@ -341,7 +342,10 @@ def test_sizes_that_only_a_case_file_states(checkpoint, tokenizer_path, tmp_path
         load_pi_policy(checkpoint, tokenizer_path)
     options = CheckpointOptions(model_config=tmp_path / "sizes.json")
     assert (
-        load_pi_policy(checkpoint, tokenizer_path, options=options).provenance()["configuration"].endswith("sizes.json")
+        load_pi_policy(checkpoint, tokenizer_path, options=options)
+        .identity()
+        .config["configuration"]
+        .endswith("sizes.json")
     )
     for contradiction in (
         CheckpointOptions(config_name="pi05_libero"),

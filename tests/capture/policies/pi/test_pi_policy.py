@@ -10,17 +10,22 @@ from safetensors.torch import save_file
 
 from tests.kit.pi_golden import GOLDEN, make_observation
 from vla_attention.capture.environments.base import Observation
-from vla_attention.capture.policies.base import Policy, initial_noise, weights_digest
+from vla_attention.capture.policies.identity import PolicySource
+from vla_attention.capture.policies.noise import initial_noise
 from vla_attention.capture.policies.pi.config import find_config
 from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, TOKENIZER_PATH, build_random_model, builtin_stats
 from vla_attention.capture.policies.pi.loading import load_pi_policy
-from vla_attention.capture.policies.pi.policy import PiPolicy, PiSource, site_layout
+from vla_attention.capture.policies.pi.policy import PiPolicy, site_layout
 from vla_attention.capture.policies.pi.preprocess import model_image
 from vla_attention.capture.policies.pi.processing import OpenpiProcessing
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, TokenizerNotFound, check_vocabulary
+from vla_attention.capture.policies.policy import Policy
+from vla_attention.capture.policies.weights import weights_digest
 from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan
 from vla_attention.schemas.errors import BadArgument, UnknownName
+from vla_attention.schemas.jsonable import from_json, to_json
 from vla_attention.schemas.layout import Role
+from vla_attention.schemas.stores.store_format import PolicyIdentity
 
 INSTRUCTION = "put the black bowl on the plate"
 
@@ -48,7 +53,7 @@ def dummy_pi0():
         build_random_model(config, 0),
         PromptTokenizer(TOKENIZER_PATH),
         OpenpiProcessing(config, builtin_stats(), normalisation="z-score", relative_actions=True),
-        PiSource("dummy-pi0", "random weights, seed 0", "seeded", untrained=True),
+        PolicySource("dummy-pi0", "random weights, seed 0", "seeded", untrained=True),
     )
 
 
@@ -80,13 +85,13 @@ def test_full_size_layouts():
 def test_frames_are_the_rotated_pictures_of_the_real_cameras(policy, observation):
     given = policy.prepare(observation, INSTRUCTION)
     size = policy.model.config.siglip.image_size
-    assert list(given.frames) == [camera.slot for camera in policy.cameras] == ["base_0_rgb", "left_wrist_0_rgb"]
+    assert list(given.frames) == [camera.name for camera in policy.cameras] == ["base_0_rgb", "left_wrist_0_rgb"]
     for camera in policy.cameras:
-        assert camera.flip_rows
-        assert camera.flip_columns
-        expected = model_image(observation.images[camera.environment_camera], size)
-        np.testing.assert_array_equal(given.frames[camera.slot], expected)
-        tensor = given.tensors[f"image:{camera.slot}"]
+        assert camera.upright
+        assert camera.mirrored
+        expected = model_image(observation.images[camera.source], size)
+        np.testing.assert_array_equal(given.frames[camera.name], expected)
+        tensor = given.tensors[f"image:{camera.name}"]
         np.testing.assert_allclose((tensor[0].permute(1, 2, 0).numpy() + 1) * 127.5, expected, atol=1e-4)
     assert (given.tensors["image:right_wrist_0_rgb"] == -1).all()
     assert not given.tensors["image_mask:right_wrist_0_rgb"].any()
@@ -165,12 +170,12 @@ def test_denoise_times_start_at_noise(policy):
     assert (np.diff(times) < 0).all()
 
 
-def test_provenance_is_json_and_names_the_weights(policy):
-    provenance = policy.provenance()
-    assert json.loads(json.dumps(provenance)) == provenance or "config" in provenance
-    assert provenance["weights_digest"] == weights_digest(policy.model)
-    assert provenance["untrained"] is True
-    assert provenance["dtype"] == "float32"
+def test_identity_survives_json_and_names_the_weights(policy):
+    identity = policy.identity()
+    assert from_json(PolicyIdentity, json.loads(json.dumps(to_json(identity)))) == identity
+    assert identity.digest == weights_digest(policy.model)
+    assert identity.untrained is True
+    assert identity.config["dtype"] == "float32"
 
 
 def test_digest_sees_a_single_changed_weight_and_handles_bfloat16():
@@ -221,7 +226,7 @@ def test_a_prompt_that_is_cut_is_said_once_and_stays_visible(dummy, observation,
     assert len(given.prompt.pieces) == 11
     assert given.prompt.text.endswith(";\nAction: ")
     assert given.prompt.pieces[-1].stop < len(given.prompt.text)
-    assert policy.provenance()["long_prompts"] == "cut"
+    assert policy.identity().config["long_prompts"] == "cut"
     assert np.isfinite(policy.act(given, 0)).all()
 
 
@@ -239,8 +244,8 @@ def test_policy_from_a_checkpoint_folder(tmp_path, observation):
     stats.parent.mkdir(parents=True)
     stats.write_text((GOLDEN / "libero_preproc" / "norm_stats.json").read_text())
     policy = load_pi_policy(tmp_path, TOKENIZER_PATH, config=config)
-    assert policy.provenance()["weights_digest"] == weights_digest(model)
-    assert policy.provenance()["untrained"] is False
+    assert policy.identity().digest == weights_digest(model)
+    assert policy.identity().untrained is False
     assert policy.name == "pi05"
     assert np.isfinite(policy.act(policy.prepare(observation, INSTRUCTION), 0)).all()
     with pytest.raises(TokenizerNotFound):

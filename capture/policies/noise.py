@@ -1,0 +1,20 @@
+"""Noise of the denoise loop: seeds that depend on the episode and replan only, and normal numbers from a seed."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def noise_seed(run_seed: int, task_id: int, episode_index: int, replan: int) -> int:
+    """Return the seed of one replan's initial noise: an unsigned 63-bit number, which fits the signed integers of every reader.
+
+    It is derived from the run's seed and these indices, so that an episode never depends on what ran before it.
+    """
+    words = np.random.SeedSequence([run_seed, task_id, episode_index, replan]).generate_state(1, dtype=np.uint64)
+    return int(words[0] >> np.uint64(1))
+
+
+def initial_noise(seed: int, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return standard normal noise from a counter-based generator: the same on every device and with every torch."""
+    return np.random.Generator(np.random.Philox(seed)).standard_normal(shape, dtype=np.float32)

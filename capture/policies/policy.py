@@ -1,0 +1,119 @@
+"""The interface of a policy: what the rollout and the store need of it.
+
+A policy is a small adapter around a model. It has cameras, a prompt format and a normalisation; it has no access to the simulator,
+to episodes or to files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from vla_attention.capture.environments.base import Observation
+from vla_attention.capture.recording.attention import RowCollector
+from vla_attention.schemas.errors import unknown_name
+from vla_attention.schemas.layout import PatchGrid, Prompt, SiteLayout
+from vla_attention.schemas.stores.store_format import PolicyCameraView, PolicyIdentity
+
+
+@dataclass(frozen=True)
+class PolicyInput:
+    """One observation and instruction, ready for the model.
+
+    frames: camera -> (height, width, 3) uint8, the images as the model sees them. key_role: site -> (key,) uint8 codes of `Role`.
+    state: (state dim,) float64, not normalised. tensors: the model's inputs by its own names, batch 1.
+    """
+
+    frames: Mapping[str, NDArray[np.uint8]]
+    key_role: Mapping[str, NDArray[np.uint8]]
+    prompt: Prompt
+    state: NDArray[np.float64]
+    tensors: Mapping[str, Tensor]
+
+
+class Policy(Protocol):
+    """A policy whose attention can be recorded."""
+
+    @property
+    def name(self) -> str:
+        """Short name, as the store and the first lines of a run show it."""
+
+    @property
+    def family(self) -> str:
+        """Kind of model, as the store names it; it decides which layer numbers are accepted."""
+
+    @property
+    def sites(self) -> tuple[SiteLayout, ...]:
+        """The sites whose rows can be recorded, with the layout of their keys."""
+
+    @property
+    def num_layers(self) -> int:
+        """Transformer blocks, numbered from 0."""
+
+    @property
+    def num_heads(self) -> int:
+        """Attention heads of a block."""
+
+    @property
+    def num_denoise_steps(self) -> int:
+        """Network evaluations of one replan."""
+
+    @property
+    def action_horizon(self) -> int:
+        """Actions of one chunk."""
+
+    @property
+    def default_replan_steps(self) -> int:
+        """Actions of a chunk that the policy's own published evaluation executes before the next policy call."""
+
+    @property
+    def num_action_queries(self) -> int:
+        """Action queries of every recorded call."""
+
+    @property
+    def cameras(self) -> tuple[PolicyCameraView, ...]:
+        """The cameras whose pictures reach the model, in key order."""
+
+    def query_pools(self) -> NDArray[np.float64]:
+        """Return the weights (pool, action query) of the means that stand for single action steps."""
+
+    def replan_noise_seed(self, run_seed: int, task_id: int, episode_index: int, replan: int) -> int:
+        """Return the seed of one replan's initial noise; it never depends on what ran before."""
+
+    def denoise_times(self) -> NDArray[np.float64]:
+        """Return the noise level or flow time of each denoise step, (denoise,)."""
+
+    def identity(self) -> PolicyIdentity:
+        """Return the policy's description for the store. Slow the first time, because it reads all weights."""
+
+    def prepare(self, observation: Observation, instruction: str) -> PolicyInput:
+        """Turn an observation and an instruction into the model's input."""
+
+    def act(
+        self, policy_input: PolicyInput, noise_seed: int, recorders: Mapping[str, RowCollector] | None = None
+    ) -> NDArray[np.float64]:
+        """Return the action chunk (horizon, 7) for the environment. The same seed gives the same noise on every machine.
+
+        `recorders`: the row collector of each site that is recorded.
+        """
+
+
+def camera_frame(observation: Observation, camera: str) -> NDArray[np.uint8]:
+    """Return a camera's picture (height, width, 3); `UnknownName` lists the cameras that the environment has."""
+    if camera not in observation.images:
+        raise unknown_name("environment camera", camera, observation.images)
+    return observation.images[camera]
+
+
+def camera_grid(sites: Sequence[SiteLayout], camera: str) -> PatchGrid:
+    """Return how the patches of a camera tile its model image, from the site that has the camera's keys."""
+    for site in sites:
+        for span in site.spans:
+            if span.camera == camera and span.grid is not None:
+                return span.grid
+    raise unknown_name("camera", camera, [name for site in sites for name in site.cameras])
