@@ -236,7 +236,7 @@ class OpenStores(Opened):
         '<!doctype html>'
         """
         from vla_attention.analyze.report.page import DEFAULT_EPISODES, DEFAULT_REPLANS, report_html
-        from vla_attention.analyze.show.atomic_file import write_text
+        from vla_attention.analyze.show.output_files import write_text
 
         page = report_html(
             self.analysis(**settings),

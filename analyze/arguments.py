@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -98,10 +97,3 @@ def settings_of(arguments: argparse.Namespace) -> AnalysisSettings:
 def output_folder(arguments: argparse.Namespace, name: str) -> Path:
     """Where results go: `--output`, or results/STORE/NAME."""
     return arguments.output or Path("results") / arguments.stores[0].stem / name
-
-
-def report_files(folder: Path, files: Sequence[Path]) -> None:
-    """Say where results went."""
-    print(f"{len(files)} files in {folder}:")
-    for file in files:
-        print(f"  {file.relative_to(folder)}")

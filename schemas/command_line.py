@@ -1,14 +1,18 @@
-"""What both command lines share: mistakes end with one sentence and exit code 2, never with a traceback."""
+"""What both command lines share: parsers, byte counts, and mistakes that end with one sentence and exit code 2."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import sys
+import textwrap
 from collections.abc import Callable
 from typing import NoReturn
 
 from vla_attention.schemas.errors import UserError
+
+#: Columns of a help text's description.
+_HELP_WIDTH = 100
 
 
 class OneSentenceParser(argparse.ArgumentParser):
@@ -17,6 +21,25 @@ class OneSentenceParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the problem and where help is; exit code 2."""
         self.exit(2, f"{self.prog}: {message}. See {self.prog} --help.\n")
+
+
+def command_parser(prog: str, description: str, examples: str = "") -> OneSentenceParser:
+    """A parser whose help shows the description, wrapped, and below the arguments the examples as they are."""
+    return OneSentenceParser(
+        prog=prog,
+        description=textwrap.fill(description, _HELP_WIDTH),
+        epilog=examples or None,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def format_bytes(count: float) -> str:
+    """A byte count with 3 significant digits and a decimal unit: 1.23 GB."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 999.5:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} TB"
 
 
 def run_command(program: str, command: Callable[[], int], if_stopped: str) -> int:

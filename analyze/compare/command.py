@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vla_attention.analyze.arguments import add_grouping, add_output, add_selection, report_files, settings_of
+from vla_attention.analyze.arguments import add_grouping, add_output, add_selection, settings_of
+from vla_attention.analyze.show.output_files import report_files
 from vla_attention.schemas.command_line import OneSentenceParser
 
 _EXAMPLES = """examples:
@@ -53,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     from vla_attention.analyze.compare.comparison import compare
     from vla_attention.analyze.compare.runs import open_runs, parse_runs
     from vla_attention.analyze.compare.text import comparison_text
-    from vla_attention.analyze.show.table_files import write_parquet
+    from vla_attention.analyze.show.output_files import write_parquet
 
     runs = open_runs(parse_runs(arguments.runs), settings_of(arguments), arguments.allow_mismatch)
     comparison = compare(runs, arguments.allow_mismatch)

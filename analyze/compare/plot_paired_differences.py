@@ -13,18 +13,10 @@ from vla_attention.analyze.compare.comparison import LOG2_RATIO, Comparison
 from vla_attention.analyze.compare.plot_forest import factor_axis
 from vla_attention.analyze.compare.text import overall_layer_of
 from vla_attention.analyze.measures.aggregate import LAYERS_AVG
-from vla_attention.analyze.show.plot_style import (
-    DATA_COLOR,
-    NOTE_COLOR,
-    drawn_in_our_style,
-    explain,
-    named,
-    new_figure,
-    plural,
-    save_figure,
-    title,
-    wrapped,
-)
+from vla_attention.analyze.show.numbers import plural
+from vla_attention.analyze.show.plot_colours import DATA_COLOR, NOTE_COLOR
+from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
+from vla_attention.analyze.show.plot_text import explain, named, title, wrapped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,7 +10,8 @@ import polars as pl
 from vla_attention.analyze.compare.comparison import LOG2_RATIO, SUCCESS, Comparison
 from vla_attention.analyze.compare.runs import Run
 from vla_attention.analyze.measures.aggregate import LAYERS_AVG
-from vla_attention.analyze.show.text_table import format_interval, format_number, text_table
+from vla_attention.analyze.show.numbers import format_interval, format_number
+from vla_attention.analyze.show.text_table import text_table
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.stores.store_format import episode_name
 

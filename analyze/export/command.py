@@ -10,9 +10,9 @@ from vla_attention.analyze.arguments import (
     add_selection,
     add_stores,
     output_folder,
-    report_files,
     settings_of,
 )
+from vla_attention.analyze.show.output_files import report_files
 from vla_attention.schemas.command_line import OneSentenceParser
 from vla_attention.schemas.errors import BadArgument
 

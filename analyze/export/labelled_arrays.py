@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
 from vla_attention.analyze.measures.steps import episode_masses
-from vla_attention.analyze.show.atomic_file import replacing
+from vla_attention.analyze.show.output_files import replacing
 from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.schemas.errors import BadArgument, MissingDependency

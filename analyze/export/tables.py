@@ -8,7 +8,7 @@ from pathlib import Path
 import polars as pl
 
 from vla_attention.analyze.ratios.analysis import Analysis
-from vla_attention.analyze.show.table_files import write_csv, write_parquet
+from vla_attention.analyze.show.output_files import write_csv, write_parquet
 from vla_attention.schemas.errors import BadArgument
 
 #: Tables that can be exported, and what a row of each is.

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vla_attention.analyze.arguments import add_grouping, add_stores, output_folder, report_files, settings_of
+from vla_attention.analyze.arguments import add_grouping, add_stores, output_folder, settings_of
+from vla_attention.analyze.show.output_files import report_files
 from vla_attention.schemas.command_line import OneSentenceParser
 
 _EXAMPLES = """examples:
@@ -49,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Print what the groups take; write tables and the picture."""
     from vla_attention.analyze.groups.group_preview import check_replan, find_example, preview_groups, preview_text
     from vla_attention.analyze.measures.question import ask
-    from vla_attention.analyze.show.table_files import write_parquet
+    from vla_attention.analyze.show.output_files import write_parquet
     from vla_attention.schemas.stores.reader import open_store
 
     question = ask([open_store(path) for path in arguments.stores], settings_of(arguments))

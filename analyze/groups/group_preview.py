@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from vla_attention.analyze.measures.masses import ratio
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
-from vla_attention.analyze.show.plot_style import plural
-from vla_attention.analyze.show.text_table import format_number, text_table
+from vla_attention.analyze.show.numbers import format_number, plural
+from vla_attention.analyze.show.text_table import text_table
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.groupings.grouping import REST, Grouping
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping, resolve, shared_keys

@@ -13,16 +13,9 @@ from numpy.typing import NDArray
 from vla_attention.analyze.measures.patch_maps import seen_cameras
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.show.patch_pictures import NO_PICTURE, upright
-from vla_attention.analyze.show.plot_style import (
-    NOTE_COLOR,
-    drawn_in_our_style,
-    explain,
-    group_styles,
-    new_figure,
-    save_figure,
-    shortened,
-    title,
-)
+from vla_attention.analyze.show.plot_colours import NOTE_COLOR, group_styles
+from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
+from vla_attention.analyze.show.plot_text import explain, shortened, title
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import resolve
 from vla_attention.schemas.layout import PatchGrid, Piece

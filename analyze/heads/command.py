@@ -11,10 +11,10 @@ from vla_attention.analyze.arguments import (
     add_sink_rule,
     add_stores,
     output_folder,
-    report_files,
     settings_of,
     sink_rule,
 )
+from vla_attention.analyze.show.output_files import report_files
 from vla_attention.schemas.command_line import OneSentenceParser
 
 _EXAMPLES = """examples:
@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     from vla_attention.analyze.heads.row_metrics import RowOptions
     from vla_attention.analyze.heads.text import heads_text
     from vla_attention.analyze.measures.question import ask
-    from vla_attention.analyze.show.table_files import write_parquet
+    from vla_attention.analyze.show.output_files import write_parquet
     from vla_attention.schemas.errors import BadArgument
     from vla_attention.schemas.stores.reader import open_store
 

@@ -6,8 +6,11 @@ from pathlib import Path
 
 import polars as pl
 
-from vla_attention.analyze.show.plot_style import drawn_in_our_style, named, new_figure, plural, save_figure, title
-from vla_attention.analyze.show.profile import draw_profile, shown_groups
+from vla_attention.analyze.show.numbers import plural
+from vla_attention.analyze.show.plot_profile import draw_profile, shown_groups
+from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
+from vla_attention.analyze.show.plot_text import named, title
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 from vla_attention.schemas.groupings.grouping import Grouping
 
 STEM = "denoise_profile"
@@ -24,7 +27,7 @@ def plot_denoise_profile(table: pl.DataFrame, grouping: Grouping, folder: Path) 
         note += f" {table['nonfinite_layers'].sum()} ratios of single layers are not finite and in no mean."
     title(figure, f"Denoise steps, {named(grouping)}", note)
     labels = [f"{step}\n({time:.3g})" for step, time in table.select("denoise_step", "denoise_time").iter_rows()]
-    draw_profile(figure, table, grouping, labels, "denoise step (in brackets its time, which ends at 0)")
+    draw_profile(figure, table, grouping, labels, "denoise step (in brackets its time, which ends at 0)", DEFAULT_LEVEL)
     columns = [f"{name}_fraction{end}" for name in shown_groups(table, grouping) for end in ("", "_low", "_high")]
     if grouping.ratio is not None:
         columns = ["ratio_mean", "ratio_mean_low", "ratio_mean_high", "uniform_ratio", "num_nonfinite", *columns]

@@ -9,17 +9,10 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.heads.head_measures import main_group
-from vla_attention.analyze.show.heat_map import draw_log2_map, label_axis, map_height
-from vla_attention.analyze.show.plot_style import (
-    drawn_in_our_style,
-    explain,
-    named,
-    new_figure,
-    plural,
-    ratio_name,
-    save_figure,
-    title,
-)
+from vla_attention.analyze.show.numbers import plural
+from vla_attention.analyze.show.plot_heat_map import draw_log2_map, label_axis, map_height
+from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
+from vla_attention.analyze.show.plot_text import explain, named, ratio_name, title
 from vla_attention.schemas.groupings.grouping import Grouping
 
 STEM = "head_grid"

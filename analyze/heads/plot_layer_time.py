@@ -9,18 +9,10 @@ import numpy as np
 import polars as pl
 
 from vla_attention.analyze.heads.layer_time import layer_time_table
-from vla_attention.analyze.show.heat_map import draw_log2_map, label_axis, map_height
-from vla_attention.analyze.show.plot_style import (
-    drawn_in_our_style,
-    explain,
-    named,
-    new_figure,
-    plural,
-    ratio_name,
-    save_figure,
-    title,
-    wrapped,
-)
+from vla_attention.analyze.show.numbers import plural
+from vla_attention.analyze.show.plot_heat_map import draw_log2_map, label_axis, map_height
+from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
+from vla_attention.analyze.show.plot_text import explain, named, ratio_name, title, wrapped
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_SEED
 from vla_attention.schemas.groupings.grouping import Grouping
 

@@ -13,8 +13,9 @@ from vla_attention.analyze.heads.head_study import HeadStudy
 from vla_attention.analyze.heads.row_metrics import episode_layer_means
 from vla_attention.analyze.measures.aggregate import LAYERS_AVG, overall_rows
 from vla_attention.analyze.measures.sinks import SinkRule, merged_sinks
-from vla_attention.analyze.show.text_header import WIDTH, header
-from vla_attention.analyze.show.text_table import format_interval, format_number, text_table
+from vla_attention.analyze.show.headings import WIDTH
+from vla_attention.analyze.show.numbers import format_interval, format_number
+from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.bootstrap import POSITIVE
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
 from vla_attention.schemas.errors import listing
@@ -50,7 +51,7 @@ def row_summary(study: HeadStudy) -> pl.DataFrame:
 def _header(study: HeadStudy) -> str:
     question, chosen = study.question, study.question.selection
     layer = LAYERS_AVG if len(chosen.layer_labels) > 1 else str(chosen.layer_labels[0])
-    lines = header(question, "HEADS, LAYERS, DENOISE STEPS", layer)
+    lines = question.header("HEADS, LAYERS, DENOISE STEPS", layer)
     told = [
         f"Layers {listing(chosen.layer_labels, 40)}; denoise steps {listing(chosen.denoise_steps, 40)}; heads "
         f"{listing(chosen.head_numbers, 40)}",

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from vla_attention.analyze.measures.aggregate import LAYERS_AVG
 from vla_attention.analyze.measures.masses import ratio
 from vla_attention.analyze.ratios.summary import WIDTH
-from vla_attention.analyze.show.text_table import format_interval, format_number, text_table
+from vla_attention.analyze.show.numbers import format_interval, format_number
+from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.bootstrap import POSITIVE, bootstrap_interval, mean_over_episodes
 from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.analyze.stores.selection import Selection

@@ -71,6 +71,11 @@ def _labels(name: str, labels: Sequence[Any] | NDArray[Any]) -> pl.Series:
     return pl.Series(name, given, dtype=kinds[type(known)])
 
 
+def layer_name(layer: str) -> str:
+    """A layer's label in tables as text: `layer 5`, or `all layers` for the mean over the selected ones."""
+    return "all layers" if layer == LAYERS_AVG else f"layer {layer}"
+
+
 def replan_axis(item: SelectedEpisode) -> Axis:
     """Labels `replan` and `env_step`."""
     steps = item.episode.read("env_step").astype(np.int64)

@@ -19,7 +19,8 @@ from vla_attention.analyze.measures.masses import ratio
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.ratios.summary import WIDTH
-from vla_attention.analyze.show.text_table import format_interval, format_number, text_table
+from vla_attention.analyze.show.numbers import format_interval, format_number
+from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.bootstrap import POSITIVE
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
 from vla_attention.analyze.stores.parallel import map_episodes

@@ -8,9 +8,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from vla_attention.analyze.measures.frames import layer_name
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
+from vla_attention.analyze.show.headings import run_header
 from vla_attention.analyze.show.progress import progress_bar
-from vla_attention.analyze.stores.selection import Selection, check_combinable, choose_site, select, select_episodes
+from vla_attention.analyze.stores.selection import (
+    Selection,
+    check_combinable,
+    choose_site,
+    select,
+    select_episodes,
+)
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.builtin_groupings import find_grouping
 from vla_attention.schemas.groupings.grouping import Grouping, parse_group_argument, parse_ratio_argument, with_groups
@@ -69,6 +77,29 @@ class Question:
     def episodes(self) -> list[tuple[Store, StoredEpisode]]:
         """The episodes, each with its store."""
         return [(item.store, item.episode) for item in self.selected]
+
+    @property
+    def num_tasks(self) -> int:
+        """Number of tasks of the selected episodes; equal numbers in different suites are different tasks."""
+        return len({(item.store.suite, item.episode.attributes.task_id) for item in self.selected})
+
+    @property
+    def untrained(self) -> bool:
+        """Whether a store's policy has random weights."""
+        return any(store.attributes.policy.untrained for store in self.stores)
+
+    def header(self, title: str, layer: str) -> list[str]:
+        """The first lines of a printed result, see `run_header`; `layer` is a layer's label in tables."""
+        return run_header(
+            title,
+            stores=[store.path for store in self.stores],
+            untrained=self.untrained,
+            site=self.site,
+            layer=layer_name(layer),
+            num_episodes=len(self.selected),
+            num_tasks=self.num_tasks,
+            notes=self.skipped,
+        )
 
 
 def ask(stores: Sequence[Store], settings: AnalysisSettings) -> Question:

@@ -9,9 +9,9 @@ from vla_attention.analyze.arguments import (
     add_selection,
     add_stores,
     output_folder,
-    report_files,
     settings_of,
 )
+from vla_attention.analyze.show.output_files import report_files
 from vla_attention.schemas.command_line import OneSentenceParser
 
 _EXAMPLES = """examples:
@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
         strongest_followers,
     )
     from vla_attention.analyze.objects.objects_in_view import ObjectSettings, site_of_pictures
-    from vla_attention.analyze.show.table_files import write_parquet
+    from vla_attention.analyze.show.output_files import write_parquet
     from vla_attention.schemas.stores.reader import open_store
 
     settings = ObjectSettings(

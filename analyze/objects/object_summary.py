@@ -10,9 +10,9 @@ import polars as pl
 from vla_attention.analyze.measures.aggregate import LAYERS_AVG, overall_layer
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.objects.objects_in_view import ALL_CAMERAS, CLASSES, ObjectSettings
-from vla_attention.analyze.show.plot_style import plural
-from vla_attention.analyze.show.text_header import WIDTH, header
-from vla_attention.analyze.show.text_table import format_interval, format_number, text_table
+from vla_attention.analyze.show.headings import WIDTH
+from vla_attention.analyze.show.numbers import format_interval, format_number, plural
+from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_SEED, POSITIVE, SHARE
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
 
@@ -95,7 +95,7 @@ def objects_text(
 ) -> str:
     """The summaries as text: shares and lifts, then how well maps find the objects, by camera."""
     tasks = {(item.store.suite, item.episode.attributes.task_id) for item in question.selected}
-    lines = header(question, "OBJECTS: which objects are looked at", layer)
+    lines = question.header("OBJECTS: which objects are looked at", layer)
     for camera in summary["camera"].unique(maintain_order=True):
         part = _printed(summary.filter(pl.col("camera") == camera))
         if camera == ALL_CAMERAS:

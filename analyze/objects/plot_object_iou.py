@@ -10,16 +10,9 @@ import polars as pl
 
 from vla_attention.analyze.objects.objects_in_view import ObjectSettings
 from vla_attention.analyze.objects.plot_object_shares import CLASS_COLORS
-from vla_attention.analyze.show.plot_style import (
-    DATA_COLOR,
-    NOTE_COLOR,
-    drawn_in_our_style,
-    explain,
-    new_figure,
-    save_figure,
-    shortened,
-    title,
-)
+from vla_attention.analyze.show.plot_colours import DATA_COLOR, NOTE_COLOR
+from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
+from vla_attention.analyze.show.plot_text import explain, shortened, title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,18 +11,11 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.objects.objects_in_view import ALL_CAMERAS, CLASSES
-from vla_attention.analyze.show.plot_style import (
-    BASELINE_COLOR,
-    FURTHER_COLORS,
-    drawn_in_our_style,
-    new_figure,
-    plural,
-    ratio_axis,
-    save_figure,
-    shortened,
-    title,
-    whole_numbers,
-)
+from vla_attention.analyze.show.numbers import plural
+from vla_attention.analyze.show.plot_axes import ratio_axis, whole_numbers
+from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, FURTHER_COLORS
+from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
+from vla_attention.analyze.show.plot_text import shortened, title
 from vla_attention.analyze.statistics.bootstrap import (
     DEFAULT_SEED,
     SHARE,

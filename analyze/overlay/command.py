@@ -14,9 +14,9 @@ from vla_attention.analyze.arguments import (
     add_selection,
     add_stores,
     output_folder,
-    report_files,
     settings_of,
 )
+from vla_attention.analyze.show.output_files import report_files
 from vla_attention.schemas.command_line import OneSentenceParser
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.video:
         files.append(_write_video(arguments, overlay, question.grouping, folder / f"{stem}.{arguments.video}"))
     if arguments.no_plots or arguments.video:
-        from vla_attention.analyze.show.atomic_file import replacing
+        from vla_attention.analyze.show.output_files import replacing
 
         path = folder / f"{stem}_all.csv"
         with replacing(path) as temporary:
@@ -166,8 +166,9 @@ def _write_video(arguments: argparse.Namespace, overlay: EpisodeOverlay, groupin
 
 def _text(overlay: EpisodeOverlay, replans: tuple[int, ...]) -> str:
     """A line per replan of the strip: ratio, each camera's share of image attention, its brightest patch."""
+    from vla_attention.analyze.show.numbers import format_number
     from vla_attention.analyze.show.patch_pictures import upright
-    from vla_attention.analyze.show.text_table import format_number, text_table
+    from vla_attention.analyze.show.text_table import text_table
 
     attributes = overlay.item.episode.attributes
     header = ["replan", "step", *(["ratio"] if overlay.ratio is not None else [])]

@@ -15,23 +15,22 @@ from vla_attention.analyze.measures.patch_maps import mean_rows, seen_cameras
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.measures.steps import steps_table
-from vla_attention.analyze.show.patch_pictures import (
+from vla_attention.analyze.overlay.colours import (
+    OUTLINE_COLORS,
     Measure,
     Scale,
     outline,
     overlay_image,
     patch_values,
     scale_for,
-    upright,
 )
+from vla_attention.analyze.show.patch_pictures import upright
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.groupings.grouping import Grouping, parse_group_argument, with_groups
 from vla_attention.schemas.groupings.resolve import check_names, resolve
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.store_format import PolicyCameraView
 
-#: Colours of outlines, which none of the scale's colours are: cyan, green, white, pink.
-OUTLINE_COLORS = ((0, 229, 255), (118, 255, 3), (255, 255, 255), (255, 128, 171))
 #: A group's patches are those of which it takes at least this share.
 OUTLINE_WEIGHT = 0.5
 

@@ -9,24 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.analyze.overlay.overlay_data import (
-    OUTLINE_COLORS,
-    EpisodeOverlay,
-    draw,
-    orientation_note,
-    overlay_table,
-)
-from vla_attention.analyze.show.patch_pictures import Measure, Scale, color_bar
-from vla_attention.analyze.show.plot_style import (
-    NOTE_COLOR,
-    drawn_in_our_style,
-    new_figure,
-    ratio_name,
-    save_figure,
-    title,
-    wrapped,
-)
-from vla_attention.analyze.show.text_table import format_number
+from vla_attention.analyze.overlay.colours import OUTLINE_COLORS, Measure, Scale, color_bar
+from vla_attention.analyze.overlay.overlay_data import EpisodeOverlay, draw, orientation_note, overlay_table
+from vla_attention.analyze.show.numbers import format_number
+from vla_attention.analyze.show.plot_colours import NOTE_COLOR
+from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
+from vla_attention.analyze.show.plot_text import ratio_name, title, wrapped
 from vla_attention.schemas.groupings.grouping import Grouping
 
 if TYPE_CHECKING:

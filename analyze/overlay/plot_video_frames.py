@@ -8,22 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.analyze.overlay.colours import Measure
 from vla_attention.analyze.overlay.overlay_data import EpisodeOverlay, draw, orientation_note
 from vla_attention.analyze.overlay.plot_strip import draw_scale, shown_ratio
-from vla_attention.analyze.show.patch_pictures import Measure
-from vla_attention.analyze.show.plot_style import (
-    BASELINE_COLOR,
-    BASELINE_LABEL,
-    DATA_COLOR,
-    drawn_in_our_style,
-    explain,
-    new_figure,
-    ratio_axis,
-    title,
-    whole_numbers,
-    wrapped,
-)
-from vla_attention.analyze.show.text_table import format_number
+from vla_attention.analyze.show.numbers import format_number
+from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, ratio_axis, whole_numbers
+from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR
+from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure
+from vla_attention.analyze.show.plot_text import explain, title, wrapped
 from vla_attention.schemas.groupings.grouping import Grouping
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.analyze.show.atomic_file import replacing
+from vla_attention.analyze.show.output_files import replacing
 from vla_attention.schemas.errors import BadArgument, MissingDependency
 
 VideoFormat = Literal["gif", "mp4"]

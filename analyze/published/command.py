@@ -134,7 +134,7 @@ def _wrapped(text: str) -> str:
 
 
 def _write_summary(path: Path, text: str) -> list[Path]:
-    from vla_attention.analyze.show.atomic_file import write_text
+    from vla_attention.analyze.show.output_files import write_text
     from vla_attention.schemas.errors import BadArgument
 
     try:

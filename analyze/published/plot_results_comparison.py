@@ -11,17 +11,11 @@ import polars as pl
 
 from vla_attention.analyze.measures.aggregate import LAYERS_AVG, overall_layer, overall_rows
 from vla_attention.analyze.published.results_tables import ResultsTables
-from vla_attention.analyze.show.plot_style import (
-    FIXED_COLORS,
-    NOTE_COLOR,
-    drawn_in_our_style,
-    new_figure,
-    plural,
-    ratio_axis,
-    save_figure,
-    title,
-    wrapped,
-)
+from vla_attention.analyze.show.numbers import plural
+from vla_attention.analyze.show.plot_axes import ratio_axis
+from vla_attention.analyze.show.plot_colours import FIXED_COLORS, NOTE_COLOR
+from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
+from vla_attention.analyze.show.plot_text import title, wrapped
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 
 if TYPE_CHECKING:

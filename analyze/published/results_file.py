@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import polars as pl
 
 from vla_attention.analyze.measures.aggregate import EPISODE_KEYS, LAYERS_AVG
-from vla_attention.analyze.show.atomic_file import replacing
+from vla_attention.analyze.show.output_files import replacing
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.jsonable import MalformedDocument, from_json
 from vla_attention.schemas.results import EpisodeResult, FrameProxy, ResultsError, ResultsNotFound, results_file_name

@@ -18,7 +18,8 @@ from vla_attention.analyze.published.results_tables import (
     spread_of,
 )
 from vla_attention.analyze.ratios.summary import LINGUISTIC_BELOW, VISUAL_ABOVE, WIDTH, verdict
-from vla_attention.analyze.show.text_table import format_interval, format_number, text_table
+from vla_attention.analyze.show.numbers import format_interval, format_number
+from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 from vla_attention.schemas.errors import listing
 

@@ -18,8 +18,8 @@ from vla_attention.analyze.measures.steps import steps_table
 from vla_attention.analyze.published.frame_proxy import frame_proxy
 from vla_attention.analyze.published.results_file import write_results_of_suites
 from vla_attention.analyze.ratios.summary import AnalysedRun, summary_text, write_summary
+from vla_attention.analyze.show.output_files import write_parquet
 from vla_attention.analyze.show.progress import progress_bar
-from vla_attention.analyze.show.table_files import write_parquet
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.groupings.grouping import Grouping

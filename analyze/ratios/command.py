@@ -11,11 +11,11 @@ from vla_attention.analyze.arguments import (
     add_sink_rule,
     add_stores,
     output_folder,
-    report_files,
     settings_of,
     sink_rule,
 )
 from vla_attention.analyze.commands import list_of_commands
+from vla_attention.analyze.show.output_files import report_files
 from vla_attention.schemas.command_line import OneSentenceParser
 
 _EXAMPLES = """examples:
@@ -87,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
     folder = output_folder(arguments, question.grouping.name)
     written = write_tables(analysis, folder)
     if sinks is not None:
-        from vla_attention.analyze.show.table_files import write_parquet
+        from vla_attention.analyze.show.output_files import write_parquet
 
         written.files += write_parquet(folder, sinks=sinks)
     print(analysis.summary)

@@ -8,16 +8,10 @@ import numpy as np
 import polars as pl
 
 from vla_attention.analyze.measures.aggregate import LAYERS_AVG, layer_order, overall_layer, overall_rows
-from vla_attention.analyze.show.plot_style import (
-    drawn_in_our_style,
-    group_styles,
-    named,
-    new_figure,
-    plural,
-    save_figure,
-    title,
-    wrapped,
-)
+from vla_attention.analyze.show.numbers import plural
+from vla_attention.analyze.show.plot_colours import group_styles
+from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
+from vla_attention.analyze.show.plot_text import named, title, wrapped
 from vla_attention.schemas.groupings.grouping import Grouping
 
 STEM = "attention_fractions"

@@ -7,8 +7,11 @@ from pathlib import Path
 import polars as pl
 
 from vla_attention.analyze.measures.aggregate import LAYERS_AVG, layer_order, overall_rows
-from vla_attention.analyze.show.plot_style import drawn_in_our_style, named, new_figure, plural, save_figure, title
-from vla_attention.analyze.show.profile import draw_profile, shown_groups
+from vla_attention.analyze.show.numbers import plural
+from vla_attention.analyze.show.plot_profile import draw_profile, shown_groups
+from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
+from vla_attention.analyze.show.plot_text import named, title
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 from vla_attention.schemas.groupings.grouping import Grouping
 
 STEM = "layer_profile"
@@ -25,7 +28,7 @@ def plot_layer_profile(tasks: pl.DataFrame, grouping: Grouping, folder: Path) ->
     if grouping.ratio is not None and rows["num_nonfinite"].sum():
         note += f" {rows['num_nonfinite'].sum()} of {rows['num_replans'].sum()} ratios are not finite and in no mean."
     title(figure, f"Layers, {named(grouping)}", note)
-    draw_profile(figure, rows, grouping, layers, "layer")
+    draw_profile(figure, rows, grouping, layers, "layer", DEFAULT_LEVEL)
     columns = [f"{name}_fraction{end}" for name in shown_groups(rows, grouping) for end in ("", "_low", "_high")]
     if grouping.ratio is not None:
         columns = ["ratio_mean", "ratio_mean_low", "ratio_mean_high", "uniform_ratio", "num_nonfinite", *columns]

@@ -10,22 +10,11 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.aggregate import LAYERS_AVG, layer_order, overall_layer
-from vla_attention.analyze.show.plot_style import (
-    BASELINE_COLOR,
-    BASELINE_LABEL,
-    DATA_COLOR,
-    NOTE_COLOR,
-    drawn_in_our_style,
-    explain,
-    named,
-    new_figure,
-    plural,
-    ratio_axis,
-    ratio_name,
-    save_figure,
-    title,
-    whole_numbers,
-)
+from vla_attention.analyze.show.numbers import plural
+from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, ratio_axis, whole_numbers
+from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, NOTE_COLOR
+from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
+from vla_attention.analyze.show.plot_text import explain, named, ratio_name, title
 from vla_attention.schemas.groupings.grouping import Grouping
 
 if TYPE_CHECKING:

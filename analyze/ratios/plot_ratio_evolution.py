@@ -12,24 +12,11 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.aggregate import LAYERS_AVG
-from vla_attention.analyze.show.plot_style import (
-    BASELINE_COLOR,
-    BASELINE_LABEL,
-    DATA_COLOR,
-    NOTE_COLOR,
-    drawn_in_our_style,
-    explain,
-    group_styles,
-    new_figure,
-    plural,
-    ratio_axis,
-    ratio_name,
-    save_figure,
-    title,
-    whole_numbers,
-    wrapped,
-)
-from vla_attention.analyze.show.text_table import format_number
+from vla_attention.analyze.show.numbers import format_number, plural
+from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, ratio_axis, whole_numbers
+from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, NOTE_COLOR, group_styles
+from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
+from vla_attention.analyze.show.plot_text import explain, ratio_name, title, wrapped
 from vla_attention.analyze.statistics.bootstrap import geometric_mean, ratio_of_means_over_episodes, summarize
 from vla_attention.schemas.groupings.grouping import Grouping
 

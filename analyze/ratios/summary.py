@@ -11,8 +11,9 @@ from pathlib import Path
 import polars as pl
 
 from vla_attention.analyze.measures.aggregate import LAYERS_AVG, layer_order, overall_layer, overall_rows
-from vla_attention.analyze.show.atomic_file import write_text
-from vla_attention.analyze.show.text_table import format_interval, format_number, text_table
+from vla_attention.analyze.show.numbers import format_interval, format_number
+from vla_attention.analyze.show.output_files import write_text
+from vla_attention.analyze.show.text_table import text_table
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
 

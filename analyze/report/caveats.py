@@ -12,8 +12,7 @@ from vla_attention.analyze.measures.aggregate import overall_layer, overall_rows
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.ratios.analysis import Analysis
 from vla_attention.analyze.ratios.summary import FEW_EPISODES, LINGUISTIC_BELOW, VISUAL_ABOVE, verdict
-from vla_attention.analyze.show.plot_style import plural
-from vla_attention.analyze.show.text_table import format_number
+from vla_attention.analyze.show.numbers import format_number, plural
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.layout import Role

@@ -51,8 +51,8 @@ def run(arguments: argparse.Namespace) -> int:
     from vla_attention.analyze.measures.question import ask
     from vla_attention.analyze.ratios.analysis import analyse
     from vla_attention.analyze.report.page import report_html
-    from vla_attention.analyze.show.atomic_file import write_text
-    from vla_attention.analyze.show.plot_style import plural
+    from vla_attention.analyze.show.numbers import plural
+    from vla_attention.analyze.show.output_files import write_text
     from vla_attention.schemas.errors import BadArgument
     from vla_attention.schemas.stores.reader import open_store
 

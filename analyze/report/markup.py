@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from vla_attention.analyze.show.text_table import format_interval, format_number
+from vla_attention.analyze.show.numbers import format_interval, format_number
 
 
 def text(value: object) -> str:

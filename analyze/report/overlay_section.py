@@ -10,6 +10,7 @@ import polars as pl
 from vla_attention.analyze.measures.patch_maps import seen_cameras
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.overlay.colours import Scale, color_bar, scale_for
 from vla_attention.analyze.overlay.overlay_data import (
     EpisodeOverlay,
     camera_names,
@@ -21,9 +22,9 @@ from vla_attention.analyze.overlay.overlay_data import (
 from vla_attention.analyze.report.markup import paragraph, text
 from vla_attention.analyze.report.pictures import photograph, png_uri
 from vla_attention.analyze.report.sections import Section
-from vla_attention.analyze.show.patch_pictures import Scale, color_bar, scale_for, upright
+from vla_attention.analyze.show.numbers import format_number
+from vla_attention.analyze.show.patch_pictures import upright
 from vla_attention.analyze.show.progress import progress_bar
-from vla_attention.analyze.show.text_table import format_number
 
 #: Pixels of the longer side of a camera picture in the page.
 LARGEST_SIDE = 224

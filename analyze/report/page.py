@@ -33,7 +33,7 @@ from vla_attention.analyze.report.sections import (
     run_section,
     task_section,
 )
-from vla_attention.analyze.show.plot_style import plural
+from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.show.progress import progress_bar
 
 DEFAULT_EPISODES, DEFAULT_REPLANS = 4, 24

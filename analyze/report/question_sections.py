@@ -29,7 +29,7 @@ from vla_attention.analyze.report.markup import (
 )
 from vla_attention.analyze.report.pictures import drawn, figure, take
 from vla_attention.analyze.report.sections import Section
-from vla_attention.analyze.show.text_table import format_number
+from vla_attention.analyze.show.numbers import format_number
 from vla_attention.analyze.time.plot_time_course import plot_time_courses
 from vla_attention.analyze.time.time_courses import time_courses
 from vla_attention.analyze.words.plot_word_bars import plot_word_bars

@@ -29,7 +29,7 @@ from vla_attention.analyze.report.markup import (
     text_cell,
 )
 from vla_attention.analyze.report.pictures import drawn
-from vla_attention.analyze.show.text_table import format_interval, format_number
+from vla_attention.analyze.show.numbers import format_interval, format_number
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_RESAMPLES
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.jsonable import to_json

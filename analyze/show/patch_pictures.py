@@ -1,4 +1,4 @@
-"""Attention drawn over the stored pictures: which way up, which pixels a patch has, colours. Pure functions on arrays.
+"""Patches of stored pictures: which pixels a patch has, and which way up a person sees them. Pure functions on arrays.
 
 The stored frame is what the model sees (turned, resized and cropped already, see `PolicyCameraView`), and a camera's patches tile
 all of it evenly, row by row from its top left corner. Frame and map are therefore laid over each other first, and only then
@@ -7,8 +7,7 @@ turned to the way a person sees the scene.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,89 +15,8 @@ from numpy.typing import NDArray
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.store_format import PolicyCameraView
 
-Measure = Literal["lift", "share"]
-MEASURES: tuple[Measure, ...] = ("lift", "share")
-#: Perceptually uniform, readable with any colour vision, and its bright end is in few photographs.
-COLORMAP = "inferno"
-#: Opacity of attention at the top of the scale; at the bottom it is 0, and between them it grows with the value.
-OPACITY = 0.8
-#: How much of the picture's own colour is kept under the attention, so that a yellow cup is not taken for a bright patch.
-COLOR_KEPT = 0.35
 #: Grey that stands for a picture that was not stored.
 NO_PICTURE = 205
-#: The scale ends at this quantile of all values that are shown with it: a single patch shall not hide the others.
-_TOP_QUANTILE = 0.995
-#: The scale never ends before this many times what uniform attention gives.
-_LEAST_TOP = 4.0
-
-
-@dataclass(frozen=True)
-class Scale:
-    """What the colours of a set of overlays stand for: 0 has none, `high` and more have the last one.
-
-    `uniform` is the value that attention gives which treats all keys alike, None where that differs from replan to replan.
-    """
-
-    high: float
-    label: str
-    uniform: float | None = 1.0
-    unit: str = ""
-
-    def position(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Place of values (...) on the scale, 0 to 1."""
-        return np.clip(np.asarray(values, dtype=np.float64) / self.high, 0.0, 1.0)
-
-    def colors(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Colour and opacity (..., 4) of values (...), all in 0 to 1."""
-        from matplotlib import colormaps
-
-        place = self.position(values)
-        rgba = np.asarray(colormaps[COLORMAP](place))
-        rgba[..., 3] = OPACITY * place
-        return rgba
-
-
-def patch_values(
-    mass: NDArray[np.floating], image_mass: NDArray[np.floating], uniform_mass: NDArray[np.floating], measure: Measure
-) -> NDArray[np.float64]:
-    """What an overlay shows of patches' masses.
-
-    share: 100 x mass / summed mass of all image keys of the replan, in per cent.
-    lift: mass / (mean mass of a valid key of the replan), so that attention that is uniform over all valid keys gives 1.
-
-    Args:
-        mass: (replan, row, column).
-        image_mass: (replan,), mass of all image keys of all cameras.
-        uniform_mass: (replan,), mass of all valid keys / their number.
-        measure: which of the two.
-
-    Returns:
-        (replan, row, column); NaN where the divisor is 0.
-    """
-    below = uniform_mass if measure == "lift" else np.asarray(image_mass) / 100.0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(mass, dtype=np.float64) / np.asarray(below)[:, None, None]
-
-
-def scale_for(values: NDArray[np.floating], measure: Measure, num_patches: int) -> Scale:
-    """The scale of all overlays that shall be compared: from 0 to the 99.5 % quantile of `values`, at least 4 times the uniform value.
-
-    That limit keeps attention that is nearly uniform from looking as if it were somewhere. `num_patches`: image keys of
-    all cameras together, which share 100 %.
-    """
-    uniform = 1.0 if measure == "lift" else 100.0 / num_patches
-    finite = np.asarray(values)[np.isfinite(values)]
-    top = float(np.quantile(finite, _TOP_QUANTILE)) if finite.size else 0.0
-    high = _round_up(max(top, _LEAST_TOP * uniform))
-    if measure == "lift":
-        return Scale(high, "lift of a patch (mass / mean mass of a valid key)", uniform)
-    return Scale(high, "share of a patch in all image attention (%)", uniform, "%")
-
-
-def _round_up(value: float) -> float:
-    """To two significant digits, upwards: a scale that ends on a number one can say."""
-    step = 10.0 ** (np.floor(np.log10(value)) - 1)
-    return float(np.round(np.ceil(np.round(value / step, 9)) * step, 12))
 
 
 def upright(image: NDArray[Any], view: PolicyCameraView) -> NDArray[Any]:
@@ -134,59 +52,3 @@ def enlarge(patch_map: NDArray[np.floating], height: int, width: int, smooth: bo
 def _centres(pixels: int, cells: int) -> NDArray[np.float64]:
     """Where the pixels' centres lie, in units of a cell."""
     return (np.arange(pixels) + 0.5) * cells / pixels
-
-
-def overlay_image(
-    frame: NDArray[np.uint8] | None,
-    patch_map: NDArray[np.floating],
-    scale: Scale,
-    smooth: bool = False,
-    size: tuple[int, int] | None = None,
-) -> NDArray[np.uint8]:
-    """Lay a patch map over the picture that it belongs to, both as they are stored.
-
-    Colours are of `inferno`; opacity grows linearly from 0 at the bottom of the scale to 0.8 at its top; the picture is drawn with a
-    third of its own colour. A value that is undefined (NaN) leaves the picture as it is.
-
-    Args:
-        frame: (row, column, 3) uint8; None when no picture was stored: the map alone, on grey.
-        patch_map: (row, column) values of patches.
-        scale: what the colours stand for.
-        smooth: bilinear instead of nearest; see `enlarge`.
-        size: (height, width) of the result without a frame.
-
-    Returns:
-        (row, column, 3) uint8, of the frame's size.
-    """
-    if frame is None:
-        if size is None:
-            raise BadArgument("An overlay without a picture needs the size of one.")
-        frame = np.full((*size, 3), NO_PICTURE, dtype=np.uint8)
-    values = enlarge(patch_map, frame.shape[0], frame.shape[1], smooth)
-    picture = frame.astype(np.float64)
-    grey = picture @ np.array([0.299, 0.587, 0.114])
-    picture = COLOR_KEPT * picture + (1.0 - COLOR_KEPT) * grey[:, :, None]
-    color = scale.colors(np.nan_to_num(values))
-    opacity = np.where(np.isnan(values), 0.0, color[..., 3])[:, :, None]
-    mixed = (1.0 - opacity) * picture + opacity * 255.0 * color[..., :3]
-    return np.clip(np.round(mixed), 0, 255).astype(np.uint8)
-
-
-def outline(
-    image: NDArray[np.uint8], member: NDArray[np.bool_], color: tuple[int, int, int], width: int = 2
-) -> NDArray[np.uint8]:
-    """Draw a line of `width` pixels along the inner border of the patches (row, column) that are members, on (row, column, 3)."""
-    inside = enlarge(member.astype(np.float64), image.shape[0], image.shape[1]) > 0.5
-    kept = inside.copy()
-    for _ in range(width):
-        padded = np.pad(kept, 1)
-        kept &= padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
-    result = image.copy()
-    result[inside & ~kept] = color
-    return result
-
-
-def color_bar(scale: Scale, length: int = 256, thickness: int = 16) -> NDArray[np.uint8]:
-    """The scale as a picture (thickness, length, 3), from 0 on the left: colours as they look on a grey picture."""
-    values = np.broadcast_to((np.arange(length) + 0.5) / length * scale.high, (thickness, length))
-    return overlay_image(np.full((thickness, length, 3), 128, dtype=np.uint8), values, scale)

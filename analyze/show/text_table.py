@@ -1,32 +1,11 @@
-"""Numbers and tables as plain aligned text."""
+"""Tables as plain aligned text."""
 
 from __future__ import annotations
 
-import math
 import textwrap
 from collections.abc import Sequence
 
-
-def format_number(value: float | None) -> str:
-    """At most five characters from 0.001 to 99999, with three to four significant digits, else as 1.2e-05; - for none."""
-    if value is None or math.isnan(value):
-        return "-"
-    if math.isinf(value):
-        return "inf" if value > 0 else "-inf"
-    size = abs(value)
-    if size != 0 and (size < 0.001 or size >= 99999.5):
-        return f"{value:.1e}"
-    if size >= 999.5:
-        return f"{value:.0f}"
-    decimals = 1 if size >= 99.95 else 2 if size >= 9.995 else 3
-    text = f"{value:.{decimals}f}"
-    # Whole numbers (keys, exact baselines) need no zeros behind the point.
-    return f"{value:.0f}" if value == round(value) else text
-
-
-def format_interval(low: float | None, high: float | None) -> str:
-    """`[low, high]`, or - when there is no interval."""
-    return "-" if low is None or high is None else f"[{format_number(low)}, {format_number(high)}]"
+from vla_attention.analyze.show.headings import WIDTH
 
 
 def text_table(
@@ -35,7 +14,7 @@ def text_table(
     left: Sequence[int] = (),
     last: str = "",
     texts: Sequence[str] | None = None,
-    width: int = 100,
+    width: int = WIDTH,
 ) -> str:
     """Columns aligned to the right (those in `left` to the left), with a rule under the header.
 

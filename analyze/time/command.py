@@ -11,9 +11,9 @@ from vla_attention.analyze.arguments import (
     add_selection,
     add_stores,
     output_folder,
-    report_files,
     settings_of,
 )
+from vla_attention.analyze.show.output_files import report_files
 from vla_attention.schemas.command_line import OneSentenceParser
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def build_parser() -> argparse.ArgumentParser:
 def run(arguments: argparse.Namespace) -> int:
     """Print the findings; write tables and pictures."""
     from vla_attention.analyze.measures.question import ask
-    from vla_attention.analyze.show.table_files import write_parquet
+    from vla_attention.analyze.show.output_files import write_parquet
     from vla_attention.analyze.time.text import time_text
     from vla_attention.analyze.time.time_courses import TimeSettings, time_courses
     from vla_attention.schemas.stores.reader import open_store

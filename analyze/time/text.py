@@ -10,7 +10,8 @@ import polars as pl
 
 from vla_attention.analyze.measures.aggregate import LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.show.text_table import format_interval, format_number, text_table
+from vla_attention.analyze.show.numbers import format_interval, format_number
+from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.time.time_courses import (
     ALL,
     EPISODE_TIME,

@@ -9,9 +9,9 @@ from vla_attention.analyze.arguments import (
     add_selection,
     add_stores,
     output_folder,
-    report_files,
     settings_of,
 )
+from vla_attention.analyze.show.output_files import report_files
 from vla_attention.schemas.command_line import OneSentenceParser
 
 _EXAMPLES = """examples:
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Measure the words; print them, write the table and the picture."""
     from vla_attention.analyze.measures.aggregate import overall_layer
     from vla_attention.analyze.measures.question import ask
-    from vla_attention.analyze.show.table_files import write_parquet
+    from vla_attention.analyze.show.output_files import write_parquet
     from vla_attention.analyze.words.text import words_text
     from vla_attention.analyze.words.word_reading import site_of_words, strongest_readers, words_summary, words_table
     from vla_attention.schemas.errors import BadArgument

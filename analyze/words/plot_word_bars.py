@@ -8,19 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.show.plot_style import (
-    BASELINE_COLOR,
-    BASELINE_LABEL,
-    NOTE_COLOR,
-    drawn_in_our_style,
-    explain,
-    new_figure,
-    plural,
-    ratio_axis,
-    save_figure,
-    shortened,
-    title,
-)
+from vla_attention.analyze.show.numbers import plural
+from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, ratio_axis
+from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, NOTE_COLOR
+from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
+from vla_attention.analyze.show.plot_text import explain, shortened, title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

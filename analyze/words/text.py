@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import polars as pl
 
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.show.text_header import WIDTH, header
-from vla_attention.analyze.show.text_table import format_interval, format_number, text_table
+from vla_attention.analyze.show.headings import WIDTH
+from vla_attention.analyze.show.numbers import format_interval, format_number
+from vla_attention.analyze.show.text_table import text_table
 
 _NOTE = (
     "lift: mass per piece over that of the average valid key (1: uniform attention). share: of all linguistic mass (bos, template, "
@@ -23,7 +24,7 @@ def words_text(
     """What `words_summary` and `strongest_readers` hold, in lines of at most `WIDTH` characters (but for long instructions)."""
     tasks = {(item.store.suite, item.episode.attributes.task_id) for item in question.selected}
     lines = [
-        *header(question, "WORDS: which words of the instruction are read", layer),
+        *question.header("WORDS: which words of the instruction are read", layer),
         *([f"Instruction: {instruction}"] if instruction else []),
         "",
         _table(summary.filter(pl.col("kind") == "word"), len(tasks) > 1),

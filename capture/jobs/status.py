@@ -11,8 +11,8 @@ from pathlib import Path
 from vla_attention.capture.environments.suites import SUITES
 from vla_attention.capture.jobs.claims import Holder, holders
 from vla_attention.capture.jobs.run_records import planned_tasks, read_records
-from vla_attention.capture.store.disk_estimate import format_bytes
 from vla_attention.capture.store.store_root import episode_folders, read_root
+from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
 from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
 from vla_attention.schemas.stores.store_format import EpisodeAttributes, StoreNotFound, parse_episode_name

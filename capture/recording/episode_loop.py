@@ -18,8 +18,8 @@ from vla_attention.capture.jobs.run_records import RecordKeeper
 from vla_attention.capture.jobs.termination import Terminated, Termination
 from vla_attention.capture.policies.policy import Policy
 from vla_attention.capture.recording.rollout import EpisodeResult, run_episode
-from vla_attention.capture.store.disk_estimate import format_bytes
 from vla_attention.capture.store.store_writer import RunStore
+from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.stores.store_format import StoreExists, episode_name
 

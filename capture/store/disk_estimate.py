@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
 from vla_attention.schemas.stores.store_format import Recording
@@ -68,15 +69,6 @@ def estimate_disk(
         total += sum(_BYTES_PER_PIECE * span.num_keys for span in site.spans if span.kind == "text")
         total += sum(_COVERAGE_BYTES_PER_PATCH * span.num_keys for span in site.spans if span.camera is not None)
     return DiskEstimate(int(total), replans, episodes)
-
-
-def format_bytes(count: float) -> str:
-    """A byte count for people: 3 significant digits, decimal units."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if count < 999.5:
-            return f"{count:.3g} {unit}"
-        count /= 1000
-    return f"{count:.3g} TB"
 
 
 def describe(estimate: DiskEstimate, path: Path) -> str:

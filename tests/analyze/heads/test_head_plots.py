@@ -17,7 +17,8 @@ from vla_attention.analyze.heads.plot_head_grid import plot_head_grid
 from vla_attention.analyze.heads.plot_layer_time import plot_layer_time
 from vla_attention.analyze.measures.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
 from vla_attention.analyze.ratios.plot_layer_profile import plot_layer_profile
-from vla_attention.analyze.show.heat_map import diverging_colors, draw_log2_map
+from vla_attention.analyze.show.plot_colours import diverging_colors
+from vla_attention.analyze.show.plot_heat_map import draw_log2_map
 from vla_attention.analyze.show.plot_style import new_figure
 from vla_attention.schemas.groupings.grouping import Grouping
 

@@ -18,9 +18,9 @@ from vla_attention.analyze.measures.aggregate import (
     per_replan,
     tasks_table,
 )
-from vla_attention.analyze.show.heat_map import draw_log2_map, map_height
+from vla_attention.analyze.show.plot_heat_map import draw_log2_map, map_height
+from vla_attention.analyze.show.plot_profile import draw_profile
 from vla_attention.analyze.show.plot_style import new_figure
-from vla_attention.analyze.show.profile import draw_profile
 from vla_attention.schemas.groupings.grouping import Grouping
 
 
@@ -30,7 +30,7 @@ def drawn(steps: pl.DataFrame, grouping: Grouping):
     rows = overall_rows(tasks_table(episodes_table(replans, grouping), grouping, num_resamples=50))
     rows = rows.filter(pl.col("layer") != LAYERS_AVG).sort("layer_number")
     figure = new_figure(7, 5)
-    draw_profile(figure, rows, grouping, rows["layer"].to_list(), "layer")
+    draw_profile(figure, rows, grouping, rows["layer"].to_list(), "layer", 0.95)
     figure.canvas.draw()
     return figure.axes, rows
 

@@ -8,19 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from vla_attention.analyze.show.patch_pictures import (
+from vla_attention.analyze.overlay.colours import (
     COLOR_KEPT,
-    NO_PICTURE,
     OPACITY,
     Scale,
     color_bar,
-    enlarge,
     outline,
     overlay_image,
     patch_values,
     scale_for,
-    upright,
 )
+from vla_attention.analyze.show.patch_pictures import NO_PICTURE, enlarge, upright
 from vla_attention.capture.environments.coverage import patch_coverage
 from vla_attention.capture.policies.cosmos.preprocess import crop_and_enlarge, visible_area
 from vla_attention.schemas.errors import BadArgument

@@ -14,7 +14,9 @@ from vla_attention.analyze.ratios.plot_attention_fractions import plot_attention
 from vla_attention.analyze.ratios.plot_ratio_distribution import plot_ratio_distribution
 from vla_attention.analyze.ratios.plot_ratio_evolution import evolution_stem, plot_all_evolutions, plot_ratio_evolution
 from vla_attention.analyze.ratios.plot_ratio_per_task import plot_ratio_per_task
-from vla_attention.analyze.show.plot_style import FIXED_COLORS, group_styles, new_figure, ratio_axis
+from vla_attention.analyze.show.plot_axes import ratio_axis
+from vla_attention.analyze.show.plot_colours import FIXED_COLORS, group_styles
+from vla_attention.analyze.show.plot_style import new_figure
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -6,7 +6,8 @@ import pytest
 from tests.kit.synthetic import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups
 from vla_attention.analyze.measures.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
 from vla_attention.analyze.ratios.summary import AnalysedRun, summary_text, verdict, write_summary
-from vla_attention.analyze.show.text_table import format_interval, format_number, text_table
+from vla_attention.analyze.show.numbers import format_interval, format_number
+from vla_attention.analyze.show.text_table import text_table
 
 RUN = AnalysedRun(
     stores=["runs/pi05_libero_10.zarr"],

@@ -19,7 +19,7 @@ from vla_attention.analyze.report.caveats import caveats, role_shares, verdict_s
 from vla_attention.analyze.report.markup import Cell, interval_cell, number_cell, table
 from vla_attention.analyze.report.overlay_section import choose_episodes
 from vla_attention.analyze.report.page import report_html
-from vla_attention.analyze.show.text_table import format_number
+from vla_attention.analyze.show.numbers import format_number
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import open_store

@@ -8,16 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.show.plot_style import (
-    BASELINE_COLOR,
-    BASELINE_LABEL,
-    DATA_COLOR,
-    explain,
-    group_styles,
-    ratio_axis,
-    ratio_name,
-    wrapped,
-)
+from vla_attention.analyze.show.numbers import interval_name
+from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, label_positions, legend_beside, ratio_axis
+from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, group_styles
+from vla_attention.analyze.show.plot_text import explain, ratio_name, wrapped
 from vla_attention.schemas.groupings.grouping import Grouping
 
 if TYPE_CHECKING:
@@ -29,12 +23,17 @@ _MOST_GROUPS = 6
 _MOST_LABELS = 20
 
 
-def draw_profile(figure: Figure, rows: pl.DataFrame, grouping: Grouping, labels: Sequence[str], along: str) -> None:
-    """Draw rows of `aggregate.tasks_table`, one per position: ratio (if there is one) above, fractions below."""
+def draw_profile(
+    figure: Figure, rows: pl.DataFrame, grouping: Grouping, labels: Sequence[str], along: str, level: float
+) -> None:
+    """Draw rows of `aggregate.tasks_table`, one per position: ratio (if there is one) above, fractions below.
+
+    `along` names the positions; `level` is that of the intervals in `rows`.
+    """
     panels = 1 if grouping.ratio is None else 2
     every = figure.subplots(panels, 1, squeeze=False, sharex=False)[:, 0]
     if grouping.ratio is not None:
-        _ratio_panel(every[0], rows, grouping)
+        _ratio_panel(every[0], rows, grouping, level)
         if every[0].axison and every[0].get_xticks().size:
             _positions(every[0], labels)
     _fraction_panel(every[-1], rows, grouping)
@@ -51,7 +50,7 @@ def shown_groups(rows: pl.DataFrame, grouping: Grouping) -> list[str]:
     return [name for name in grouping.names if name in ranked]
 
 
-def _ratio_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping) -> None:
+def _ratio_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping, level: float) -> None:
     assert grouping.ratio is not None
     mean, low, high, uniform = (
         rows[column].cast(pl.Float64).fill_null(float("nan")).to_numpy()
@@ -71,13 +70,13 @@ def _ratio_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping) -> None:
     # The line breaks where there is no ratio: nothing is known there.
     shown = np.where(drawn, mean, np.nan)
     axes.plot(at, shown, "o-", color=DATA_COLOR, markersize=4.5, label="mean over episodes", zorder=3)
-    axes.vlines(at, low, high, color=DATA_COLOR, linewidth=2.2, alpha=0.55, zorder=2, label=_interval(low))
+    axes.vlines(at, low, high, color=DATA_COLOR, linewidth=2.2, alpha=0.55, zorder=2, label=_interval(low, level))
     axes.plot(at, uniform, "--", color=BASELINE_COLOR, linewidth=1.2, label=BASELINE_LABEL)
     if len(at) == 1 and np.isfinite(uniform[0]):
         axes.plot([-0.4, 0.4], [uniform[0]] * 2, "--", color=BASELINE_COLOR, linewidth=1.2)
     axes.set_ylabel(f"ratio, {ratio_name(grouping.ratio)}\n(logarithmic)")
     axes.grid(axis="y")
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    legend_beside(axes)
 
 
 def _fraction_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping) -> None:
@@ -107,15 +106,13 @@ def _fraction_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping) -> None:
     axes.grid(axis="y")
     having = sum((rows[f"{name}_fraction"].fill_null(0.0) > 0).any() for name in grouping.names)
     heading = f"{len(groups)} of {having} groups" if having > len(groups) else None
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), title=heading, title_fontsize=8, alignment="left")
+    legend_beside(axes, title=heading, title_fontsize=8, alignment="left")
 
 
 def _positions(axes: Axes, labels: Sequence[str]) -> None:
-    step = -(-len(labels) // _MOST_LABELS)
-    positions = list(range(0, len(labels), step))
-    axes.set_xticks(positions, [labels[i] for i in positions])
+    label_positions(axes.xaxis, labels, _MOST_LABELS)
     axes.set_xlim(-0.6, len(labels) - 0.4)
 
 
-def _interval(low: np.ndarray) -> str:
-    return "95% bootstrap interval" if np.isfinite(low).any() else "no interval (one episode)"
+def _interval(low: np.ndarray, level: float) -> str:
+    return interval_name(level, "bootstrap") if np.isfinite(low).any() else "no interval (one episode)"

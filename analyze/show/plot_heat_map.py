@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.analyze.show.plot_axes import hide_frame, label_positions
+from vla_attention.analyze.show.plot_colours import diverging_colors
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
-#: Towards the numerator as the visual group is drawn, towards the denominator as the linguistic one: apart for colour-blind eyes.
-_LESS, _EVEN, _MORE = "#A63C00", "#F7F7F7", "#00507D"
-_NOTHING = "#D9D9D9"
 #: Half of what the colours span at least, in powers of two: tiny differences must not look large.
 _LEAST_SPAN = 0.5
 #: Marks of the colour bar, on either side of 1.
@@ -70,23 +69,11 @@ def _has_numbers(num_rows: int, num_columns: int) -> bool:
     return num_rows * num_columns <= _MOST_NUMBERS and num_columns <= _MOST_NUMBERED_COLUMNS
 
 
-def diverging_colors() -> Colormap:
-    """From less through even to more; grey where there is no value."""
-    from matplotlib.colors import LinearSegmentedColormap
-
-    stops = [_LESS, "#E69A6B", _EVEN, "#7FB2D3", _MORE]
-    return LinearSegmentedColormap.from_list("less_more", stops).with_extremes(bad=_NOTHING)
-
-
 def label_axis(axes: Axes, which: str, labels: Sequence[str]) -> None:
-    """Labels at whole positions of the x or y axis; every second, third ... one where all would touch."""
-    step = -(-len(labels) // _MOST_LABELS)
-    positions = range(0, len(labels), step)
-    shown = [labels[i] for i in positions]
-    (axes.set_xticks if which == "x" else axes.set_yticks)(list(positions), shown)
+    """Label the rows ("y") or columns ("x") of a map."""
+    label_positions(axes.xaxis if which == "x" else axes.yaxis, labels, _MOST_LABELS)
     axes.tick_params(length=0)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
+    hide_frame(axes)
 
 
 def _ink(log2: float, span: float) -> str:

@@ -1,0 +1,90 @@
+"""Files that a command writes: each appears whole or not at all, and a place that cannot be written to is one sentence."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vla_attention.analyze.show.numbers import plural
+from vla_attention.schemas.errors import BadArgument, UserError
+
+if TYPE_CHECKING:
+    import polars as pl
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; on success it replaces `path`, on an error it is removed.
+
+    The folder is made if it is missing. The temporary name starts with a dot and holds the process id, so that two
+    processes never write to the same file.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def writing(what: str, path: Path, instead: str = "another --output") -> Iterator[None]:
+    """Turn an `OSError` in the block into one sentence: `what` cannot be written to `path`; give `instead`.
+
+    Raises:
+        BadArgument: the block raised an `OSError` that is no `UserError`.
+    """
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, UserError):
+            raise
+        raise BadArgument(f"Cannot write {what} to {path}: {error.strerror or error}; give {instead}.") from None
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a UTF-8 text file atomically."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_parquet(folder: Path, **tables: pl.DataFrame) -> list[Path]:
+    """Write each table as `NAME.parquet` into a folder, which is made if it is missing; returns the paths.
+
+    Raises:
+        BadArgument: the folder cannot be made or written to.
+    """
+    return _write(folder, "parquet", tables, lambda table, path: table.write_parquet(path))
+
+
+def write_csv(folder: Path, **tables: pl.DataFrame) -> list[Path]:
+    """Write each table as `NAME.csv`, otherwise like `write_parquet`: UTF-8, a header, nothing for null, `inf` for infinite."""
+    return _write(folder, "csv", tables, lambda table, path: table.write_csv(path))
+
+
+def _write(
+    folder: Path, ending: str, tables: Mapping[str, pl.DataFrame], write: Callable[[pl.DataFrame, Path], object]
+) -> list[Path]:
+    written = []
+    with writing("results", folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(13, "Permission denied")
+        for name, table in tables.items():
+            path = folder / f"{name}.{ending}"
+            with replacing(path) as temporary:
+                write(table, temporary)
+            written.append(path)
+    return written
+
+
+def report_files(folder: Path, files: Sequence[Path]) -> None:
+    """Print which files were written into a folder."""
+    print(f"{plural(len(files), 'file')} in {folder}:")
+    for file in files:
+        print(f"  {file.relative_to(folder)}")
