@@ -23,12 +23,14 @@ from vla_attention.analyze.measures.aggregate import LAYERS_AVG, episodes_table
 from vla_attention.analyze.statistics.bootstrap import (
     POSITIVE,
     SHARE,
-    Interval,
     Resamples,
     bootstrap_intervals,
+    ends,
     geometric_mean_over_episodes,
     mean_over_episodes,
+    named_interval,
     resample_episodes,
+    values_with_intervals,
 )
 from vla_attention.analyze.statistics.effect_sizes import contrast
 from vla_attention.analyze.time.time_courses import replans_of
@@ -37,7 +39,6 @@ from vla_attention.schemas.groupings.grouping import Grouping
 LOG2_RATIO, SUCCESS = "log2_ratio", "success"
 #: What makes two episodes a pair; `occurrence` tells apart episodes of one run that began alike.
 PAIR_KEYS = ("suite", "task_id", "initial_state_digest", "seed", "occurrence")
-_LEVEL = 0.95
 
 
 @dataclass(frozen=True)
@@ -189,17 +190,18 @@ def _without_partner(table: pl.DataFrame, joined: pl.DataFrame, side: str, run: 
 
 
 def _paired(joined: pl.DataFrame, quantities: Sequence[str], seed: int) -> pl.DataFrame:
-    draws = _Draws(seed)
     rows: list[dict[str, Any]] = []
     for scope, part in _scopes(joined):
         tasks = _tasks(part)
-        resamples = draws.of(tasks)
+        resamples = resample_episodes(tasks, seed=seed)
         values = [_numbers(part, f"{quantity}_difference") for quantity in quantities]
         statistics = [mean_over_episodes(value) for value in values]
-        intervals = bootstrap_intervals(statistics, resamples, _LEVEL)
+        intervals = bootstrap_intervals(statistics, resamples)
         for quantity, value, statistic, interval in zip(quantities, values, statistics, intervals, strict=True):
             used = statistic.used
             certain = quantity == SUCCESS and bool(used.any()) and not np.ptp(value[used])
+            # When all pairs end alike, all resamples do so too: that is no certainty about success.
+            low, high = ends(None if certain else interval)
             rows.append(
                 {
                     **scope,
@@ -212,8 +214,8 @@ def _paired(joined: pl.DataFrame, quantities: Sequence[str], seed: int) -> pl.Da
                     "mean_first": _mean(_numbers(part, f"{quantity}_first")[used]),
                     "mean_other": _mean(_numbers(part, f"{quantity}_other")[used]),
                     "difference": statistic.value,
-                    # When all pairs end alike, resamples do so too: that is no certainty about success.
-                    **_ends(None if certain else interval),
+                    "low": low,
+                    "high": high,
                     "effect": _standardised(value[used]),
                 }
             )
@@ -238,7 +240,8 @@ def _unpaired(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str
         for quantity in quantities:
             values = _numbers(part, quantity)
             certain = quantity == SUCCESS and not np.ptp(values[is_other]) and not np.ptp(values[~is_other])
-            found = contrast(values, is_other, resamples, _LEVEL)
+            found = contrast(values, is_other, resamples)
+            low, high = ends(None if certain else found.difference_interval)
             rows.append(
                 {
                     **scope,
@@ -251,7 +254,8 @@ def _unpaired(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str
                     "mean_first": found.mean_second,
                     "mean_other": found.mean_first,
                     "difference": found.difference,
-                    **_ends(None if certain else found.difference_interval),
+                    "low": low,
+                    "high": high,
                     "effect": found.hedges_g,
                 }
             )
@@ -311,7 +315,6 @@ def _scopes(table: pl.DataFrame) -> list[tuple[dict[str, Any], pl.DataFrame]]:
 
 
 def _estimates(run: str, table: pl.DataFrame, quantities: Sequence[str], seed: int) -> pl.DataFrame:
-    draws = _Draws(seed)
     rows = []
     for part in table.partition_by("suite", "layer", maintain_order=True):
         tasks = _tasks(part)
@@ -336,32 +339,15 @@ def _estimates(run: str, table: pl.DataFrame, quantities: Sequence[str], seed: i
             row["uniform_ratio"] = mean_over_episodes(_numbers(part, "uniform_ratio")).value
             row["episodes_without_ratio"] = statistics["ratio"].num_left_out
             row["num_nonfinite"] = int(part["num_nonfinite"].sum())
-        intervals = bootstrap_intervals(list(statistics.values()), draws.of(tasks), _LEVEL)
-        for (name, statistic), interval in zip(statistics.items(), intervals, strict=True):
-            ends = _ends(interval)
-            # When all episodes end alike, resamples do so too: that is no certainty about a success rate.
-            if name == SUCCESS and statistic.value in (0.0, 1.0):
-                ends = _ends(None)
-            row |= {name: statistic.value, f"{name}_low": ends["low"], f"{name}_high": ends["high"]}
+        row |= values_with_intervals(statistics, resample_episodes(tasks, seed=seed))
+        # When all episodes end alike, all resamples do so too: that is no certainty about a success rate.
+        if row[SUCCESS] in (0.0, 1.0):
+            row |= named_interval(SUCCESS, row[SUCCESS], None)
         rows.append(row)
     text = dict.fromkeys(("run", "suite", "layer"), pl.String)
     counts = ("block", "num_tasks", "num_episodes", "episodes_without_ratio", "num_nonfinite")
     whole = dict.fromkeys(counts, pl.Int64)
     return pl.DataFrame(rows, schema={name: {**text, **whole}.get(name, pl.Float64) for name in rows[0]})
-
-
-class _Draws:
-    """Resamples by the pattern of tasks: layers and quantities of the same episodes share theirs."""
-
-    def __init__(self, seed: int) -> None:
-        self._seed = seed
-        self._known: dict[bytes, Resamples] = {}
-
-    def of(self, tasks: NDArray[np.int64]) -> Resamples:
-        key = (tasks - tasks[0]).tobytes()
-        if key not in self._known:
-            self._known[key] = resample_episodes(tasks, seed=self._seed)
-        return self._known[key]
 
 
 def _tasks(part: pl.DataFrame) -> NDArray[np.int64]:
@@ -380,7 +366,3 @@ def _standardised(differences: NDArray[np.float64]) -> float | None:
     """Mean / standard deviation (ddof 1) of paired differences (Cohen 1988, d_z); None without any spread."""
     spread = float(differences.std(ddof=1)) if len(differences) > 1 else 0.0
     return float(differences.mean() / spread) if spread > 0 else None
-
-
-def _ends(interval: Interval | None) -> dict[str, float | None]:
-    return {"low": interval.low if interval else None, "high": interval.high if interval else None}

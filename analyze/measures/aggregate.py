@@ -25,12 +25,12 @@ from vla_attention.analyze.statistics.bootstrap import (
     SHARE,
     EpisodeStatistic,
     Resamples,
-    bootstrap_intervals,
     geometric_mean_over_episodes,
     mean_over_episodes,
     ratio_of_means_over_episodes,
     resample_episodes,
     summarize,
+    values_with_intervals,
 )
 from vla_attention.schemas.groupings.grouping import Grouping
 
@@ -168,15 +168,10 @@ def tasks_table(
     episodes = _sorted(episodes).with_columns(pl.col(pl.Float64).fill_null(float("nan")))
     # Task ids repeat between suites; a task is a pair of both.
     episodes = episodes.with_columns(pl.struct("suite", "task_id").rank("dense").cast(pl.Int64).alias(_TASK))
-    draws: dict[bytes, Resamples] = {}
     rows = []
     for part, scope in _scopes(episodes):
-        tasks = part[_TASK].to_numpy()
-        # Where only one task is left, all that matters is how many episodes it has.
-        key = (tasks - tasks[0]).tobytes()
-        if key not in draws:
-            draws[key] = resample_episodes(tasks, num_resamples, seed)
-        rows.append({**scope, **_task_row(part, grouping, draws[key], level)})
+        draws = resample_episodes(part[_TASK].to_numpy(), num_resamples, seed)
+        rows.append({**scope, **_task_row(part, grouping, draws, level)})
     table = pl.DataFrame(rows, schema_overrides=_task_schema(grouping), infer_schema_length=None)
     order = pl.col("scope").replace_strict({"task": 0, "all": 1, "combined": 2}, return_dtype=pl.Int64)
     return table.sort(
@@ -243,12 +238,7 @@ def _task_row(
         bounded["geometric_mean"] = geometric_mean_over_episodes(values("log_ratio_mean"))
         bounded["ratio_lift"] = mean_over_episodes(values("ratio_lift"), POSITIVE)
     row |= dict(zip(plain, _finite_means(part.select(plain).to_numpy()), strict=True))
-    intervals = bootstrap_intervals(list(bounded.values()), resamples, level)
-    for (column, statistic), interval in zip(bounded.items(), intervals, strict=True):
-        row[column] = statistic.value
-        row[f"{column}_low"] = interval.low if interval else None
-        row[f"{column}_high"] = interval.high if interval else None
-    return row
+    return row | values_with_intervals(bounded, resamples, level)
 
 
 def _finite_means(columns: NDArray[np.float64]) -> list[float | None]:

@@ -1,25 +1,26 @@
 """Summaries and two-level bootstrap intervals. Pure numpy functions on arrays, seeded, no tables and no I/O.
 
-Replans inside an episode follow each other within a second and are strongly correlated, so the episode is the unit of
-replication: whatever has an interval here is first reduced to one value (or one pair of sums) per episode.
-Resampling has two levels, tasks and then episodes within the drawn tasks, because episodes of one task share their
-instruction and their scene (a cluster bootstrap; Davison & Hinkley 1997, section 3.8).
+Replans of one episode follow each other within a second and are strongly correlated. The episode is therefore the unit:
+every function here takes one value (or one pair of sums) per episode. Resampling has two levels, tasks and then
+episodes within the drawn tasks, because episodes of one task share their instruction and their scene (a cluster
+bootstrap; Davison & Hinkley 1997, section 3.8).
 
-What an interval is about: the value for tasks like these, of which these are taken to be a sample, when there are several
-tasks; the value of the task, for episodes like these, when there is one. For these very tasks it is wider than it need be.
+With several tasks, an interval is about tasks like these: they are taken to be a sample of tasks. With one task it is
+about episodes like these of that task. For exactly the tasks in the store the interval is wider than necessary.
 
-Intervals are percentile intervals, widened by a factor for few tasks or episodes (`small_samples`): plain percentile
-intervals of nominal 95 % cover 84 % with 5 episodes of a task and 90 % with 10 tasks that differ. Where tasks do not differ,
-two-level intervals cover more than their level, because the noise of episodes enters at both levels (the same section).
+Intervals are percentile intervals, widened by a factor for few tasks or episodes (`small_samples`). Plain percentile
+intervals of nominal 95 % cover 84 % with 5 episodes of a task and 90 % with 10 tasks that differ. Where tasks do not
+differ, two-level intervals cover more than their level, because the noise of episodes enters at both levels (Davison &
+Hinkley, the same section).
 
-A ratio can be infinite (nothing on the denominator) or undefined (nothing on either side). Neither takes part in a mean;
+A ratio can be infinite (no mass in the denominator) or undefined (no mass on either side). Such values are in no mean;
 each function here returns how many values it left out.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,17 +31,20 @@ from vla_attention.analyze.statistics.small_samples import widen, widening
 DEFAULT_RESAMPLES = 2000
 DEFAULT_LEVEL = 0.95
 DEFAULT_SEED = 0
-#: Natural limits of a quantity, for `mean_over_episodes`: an interval never leaves them.
+#: Natural limits of a quantity, for `mean_over_episodes`. An interval never leaves them.
 NO_LIMITS = (-np.inf, np.inf)
 POSITIVE = (0.0, np.inf)
 SHARE = (0.0, 1.0)
-#: Draws made at once: bounds the memory of the bootstrap at some tens of megabytes for any number of episodes.
+#: Draws made at once. This bounds the working memory to some tens of megabytes for any number of episodes.
 _DRAWS_AT_ONCE = 2_000_000
+#: Sets of draws that are kept; one takes 16 kB per episode. A store needs one per number of episodes of a task, and a
+#: few more.
+_KEPT_DRAWS = 64
 
 
 @dataclass(frozen=True)
 class SampleSummary:
-    """A sample in five numbers, over its finite values (None when there is none), and how many values are not finite.
+    """Five numbers over the finite values of a sample (None without any), and how many values are not finite.
 
     `std` is the standard deviation of the values themselves (ddof 0), as in the published scripts.
     """
@@ -55,7 +59,7 @@ class SampleSummary:
 
 @dataclass(frozen=True)
 class Interval:
-    """An interval. `num_undefined`: resamples in which the statistic had no finite value, and that were left out."""
+    """An interval. `num_undefined` counts the resamples without a finite value of the statistic; they were left out."""
 
     low: float
     high: float
@@ -69,10 +73,11 @@ class EpisodeStatistic:
 
     Attributes:
         numerator: (episode,) float64.
-        denominator: (episode,) float64; for a mean this is 1 for episodes that take part and 0 for those left out.
-        used: (episode,) bool, which episodes take part.
+        denominator: (episode,) float64; for a mean it is 1 for the episodes that are used and 0 for the others.
+        used: (episode,) bool, which episodes are used.
         exponentiate: g is exp (geometric mean) instead of the identity.
-        limits: natural limits of the quotient before g, which its interval never leaves: `NO_LIMITS`, `POSITIVE`, `SHARE`.
+        limits: natural limits of the quotient before g, which its interval never leaves: `NO_LIMITS`, `POSITIVE`,
+            `SHARE`.
     """
 
     numerator: NDArray[np.float64]
@@ -83,7 +88,7 @@ class EpisodeStatistic:
 
     @property
     def num_left_out(self) -> int:
-        """Episodes that have no finite value and therefore do not take part."""
+        """Number of episodes that have no finite value and are not used."""
         return int((~self.used).sum())
 
     @property
@@ -106,7 +111,7 @@ class Resamples:
     task_of: NDArray[np.int64]
 
     def num_units(self, used: NDArray[np.bool_]) -> int:
-        """The units that an interval rests on: tasks that take part or, where only one does, its episodes."""
+        """Number of units of an interval: tasks with used episodes or, with one such task, its used episodes."""
         tasks = len(np.unique(self.task_of[used]))
         return tasks if tasks > 1 else int(used.sum())
 
@@ -129,9 +134,9 @@ def summarize(values: ArrayLike) -> SampleSummary:
 
 
 def geometric_mean(ratios: ArrayLike) -> tuple[float | None, int]:
-    """exp(mean(log ratio)) over finite positive ratios of shape (n,), and how many ratios were left out.
+    """exp(mean(log ratio)) over the finite positive ratios of shape (n,), and how many ratios were left out.
 
-    Unlike the mean, it does not depend on which side is called numerator: geometric_mean(1/x) = 1/geometric_mean(x).
+    Unlike the mean, it does not depend on which side is the numerator: geometric_mean(1/x) = 1/geometric_mean(x).
     """
     sample = np.asarray(ratios, dtype=np.float64)
     usable = sample[np.isfinite(sample) & (sample > 0)]
@@ -142,7 +147,7 @@ def geometric_mean(ratios: ArrayLike) -> tuple[float | None, int]:
 def mean_over_episodes(values: ArrayLike, limits: tuple[float, float] = NO_LIMITS) -> EpisodeStatistic:
     """Mean of one value per episode, shape (episode,); episodes whose value is not finite are left out and counted.
 
-    `limits`: `POSITIVE` for masses and ratios, `SHARE` for fractions, so that no interval reaches what cannot be.
+    `limits`: `POSITIVE` for masses and ratios, `SHARE` for fractions; an interval never contains impossible values.
     """
     sample = np.asarray(values, dtype=np.float64)
     used = np.isfinite(sample)
@@ -150,7 +155,7 @@ def mean_over_episodes(values: ArrayLike, limits: tuple[float, float] = NO_LIMIT
 
 
 def ratio_of_means_over_episodes(numerator: ArrayLike, denominator: ArrayLike) -> EpisodeStatistic:
-    """Mean numerator mass / mean denominator mass, both of shape (episode,). Infinite ratios take part as what they are."""
+    """Mean numerator mass / mean denominator mass, both (episode,). It uses episodes with an infinite ratio."""
     above, below = np.asarray(numerator, dtype=np.float64), np.asarray(denominator, dtype=np.float64)
     used = np.isfinite(above) & np.isfinite(below)
     return EpisodeStatistic(np.where(used, above, 0.0), np.where(used, below, 0.0), used, limits=POSITIVE)
@@ -163,11 +168,13 @@ def geometric_mean_over_episodes(log_means: ArrayLike) -> EpisodeStatistic:
 
 
 def resample_episodes(tasks: ArrayLike, num_resamples: int = DEFAULT_RESAMPLES, seed: int = DEFAULT_SEED) -> Resamples:
-    """How often each episode is drawn in each resample of the two-level bootstrap.
+    """Draw episodes for the two-level bootstrap: how often each episode is in each resample.
 
-    Level one draws as many tasks as there are, with replacement; level two draws, for each drawn task, as many of its
-    episodes as it has, with replacement. With one task only the second level is left: the usual bootstrap over episodes.
-    A statistic that is a quotient of sums is then two matrix products, for any number of statistics with the same draws.
+    Level one draws as many tasks as there are, with replacement. Level two draws, for each drawn task, as many of its
+    episodes as it has, with replacement. With one task only the second level is left: the usual bootstrap over
+    episodes. For statistics that are quotients of sums, all resamples are then two matrix products.
+
+    Draws are kept, because many statistics are over the same episodes; labels that sort alike share theirs.
 
     Args:
         tasks: (episode,) labels of the episodes' tasks. Which episodes are drawn depends on their order.
@@ -178,9 +185,9 @@ def resample_episodes(tasks: ArrayLike, num_resamples: int = DEFAULT_RESAMPLES, 
     return _drawn(task_of.astype(np.int64).tobytes(), num_resamples, seed)
 
 
-@functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=_KEPT_DRAWS)
 def _drawn(tasks: bytes, num_resamples: int, seed: int) -> Resamples:
-    """The draws for episodes of tasks numbered from 0 (int64 as bytes). Kept: many statistics are of the same episodes."""
+    """The draws for episodes of tasks numbered from 0 (int64 as bytes)."""
     task_of = np.frombuffer(tasks, dtype=np.int64)
     by_task = np.argsort(task_of, kind="stable")
     size = np.bincount(task_of)
@@ -211,19 +218,20 @@ def bootstrap_intervals(
     level: float = DEFAULT_LEVEL,
     widened: bool = True,
 ) -> list[Interval | None]:
-    """Intervals of several statistics over the same episodes, from `resample_episodes`.
+    """Intervals of several statistics over the same episodes, with draws from `resample_episodes`.
 
-    None where fewer than two episodes take part: a single episode says nothing about how much episodes differ.
-    `widened=False` gives the plain percentile interval, which covers less than its level when units are few.
+    None where fewer than two episodes are used: a single episode does not show how much episodes differ.
+    `widened=False` gives the plain percentile interval, which covers less than its level with few units.
     """
     if not statistics:
         return []
     above = np.stack([statistic.numerator for statistic in statistics]) @ resamples.counts.T
     below = np.stack([statistic.denominator for statistic in statistics]) @ resamples.counts.T
-    values = _quotient(above, below, exponentiate=False)  # (statistic, resample): quantiles are of contiguous numbers
+    values = _quotient(above, below, exponentiate=False)  # (statistic, resample): contiguous for quantiles
     finite = np.isfinite(values)
     tail = (1.0 - level) / 2.0
-    # All statistics at once, then again the few that hold undefined resamples. exp is monotonic: it may come after.
+    # Quantiles of all statistics at once; `_interval` computes them again for the few with undefined resamples. exp is
+    # monotonic, so it may be applied to the ends.
     quantiles = np.quantile(np.where(finite, values, 0.0), [tail, 1.0 - tail], axis=1)
     intervals: list[Interval | None] = []
     for i, statistic in enumerate(statistics):
@@ -233,10 +241,32 @@ def bootstrap_intervals(
         num_units = resamples.num_units(statistic.used)
         interval = _interval(values[i], estimate, num_units, level, statistic.limits, widened, bounds)
         if interval is not None and statistic.exponentiate:
-            ends = np.exp([interval.low, interval.high])
-            interval = Interval(float(ends[0]), float(ends[1]), level, interval.num_undefined)
+            low, high = np.exp([interval.low, interval.high])
+            interval = Interval(float(low), float(high), level, interval.num_undefined)
         intervals.append(interval)
     return intervals
+
+
+def values_with_intervals(
+    statistics: Mapping[str, EpisodeStatistic], resamples: Resamples, level: float = DEFAULT_LEVEL
+) -> dict[str, float | None]:
+    """Columns `X`, `X_low`, `X_high` of a table row for every statistic X; None without a value or an interval."""
+    intervals = bootstrap_intervals(list(statistics.values()), resamples, level)
+    row: dict[str, float | None] = {}
+    for (name, statistic), interval in zip(statistics.items(), intervals, strict=True):
+        row |= named_interval(name, statistic.value, interval)
+    return row
+
+
+def named_interval(name: str, value: float | None, interval: Interval | None) -> dict[str, float | None]:
+    """Columns `name`, `name_low`, `name_high` of a table row; None without an interval."""
+    low, high = ends(interval)
+    return {name: value, f"{name}_low": low, f"{name}_high": high}
+
+
+def ends(interval: Interval | None) -> tuple[float | None, float | None]:
+    """Both ends of an interval; None twice without one."""
+    return (None, None) if interval is None else (interval.low, interval.high)
 
 
 def bootstrap_interval(
@@ -260,7 +290,7 @@ def interval_of_values(
 ) -> Interval | None:
     """The widened interval of any statistic, from its values (resample,) and its value over all episodes.
 
-    `num_units`: what the statistic rests on, see `Resamples.num_units`; with fewer than two there is no interval.
+    `num_units`: see `Resamples.num_units`; with fewer than two there is no interval.
     """
     return None if estimate is None else _interval(values, estimate, num_units, level, limits)
 

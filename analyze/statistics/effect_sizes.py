@@ -1,10 +1,12 @@
-"""Success against failure: how much larger a quantity is in episodes that were solved. Pure numpy on one value per episode.
+"""Effect sizes: how much larger a quantity is in one of two classes of episodes, such as solved and failed.
 
-Two differences are given. `difference` is that of the means over all solved and all failed episodes. Where some tasks are
-solved more often than others it also holds the difference between tasks; `within_tasks` does not: it is the coefficient of
-success in a linear model with a constant for every task, that is the mean of the tasks' differences with weights
-n_success * n_failure / (n_success + n_failure), and tasks of one outcome only say nothing about it.
-Every interval is a two-level bootstrap, as in `statistics`; tasks count as units where several hold the rarer outcome.
+A contrast gives two differences. `difference` is that of the means over all episodes of either class. Where some tasks
+are solved more often than others, it also contains the difference between tasks. `within_tasks` does not: it is the
+coefficient of the class in a linear model with a constant for every task, which is the mean of the tasks' differences
+with weights n_first * n_second / (n_first + n_second). Tasks with one class only have weight 0.
+
+Every interval is a two-level bootstrap (see `bootstrap`); tasks are the units where several tasks have the rarer
+class. Pure numpy functions of one value per episode.
 """
 
 from __future__ import annotations
@@ -15,24 +17,32 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vla_attention.analyze.statistics.bootstrap import NO_LIMITS, Interval, Resamples, interval_of_values
+from vla_attention.analyze.statistics.bootstrap import (
+    DEFAULT_LEVEL,
+    NO_LIMITS,
+    Interval,
+    Resamples,
+    interval_of_values,
+    named_interval,
+)
 
-#: Fewer episodes than this of one outcome are no basis for a comparison.
+#: Each class needs at least this many episodes for a comparison.
 FEWEST = 2
 _BETWEEN_MINUS_ONE_AND_ONE = (-1.0, 1.0)
-#: Resamples handled at once where every pair of episodes is looked at.
+#: Resamples handled at once where all pairs of episodes are compared.
 _AT_ONCE = 256
 
 
 @dataclass(frozen=True)
 class Contrast:
-    """A quantity in two classes of episodes, first minus second; None (with `note`) where nothing can be said.
+    """A quantity in two classes of episodes, first minus second; None (with a `note`) where it cannot be computed.
 
     Attributes:
         num_first, num_second: episodes of either class with a finite value.
         mean_first, mean_second: means over these.
         difference: mean_first - mean_second, with its interval.
-        within_tasks: the difference inside tasks, with its interval, over the `num_tasks_with_both` tasks that hold both classes.
+        within_tasks: the difference inside tasks, with its interval, over the `num_tasks_with_both` tasks with both
+            classes.
         hedges_g: the difference in standard deviations, with its interval.
         cliffs_delta: P(first > second) - P(first < second), with its interval.
         note: why something is missing.
@@ -57,8 +67,9 @@ class Contrast:
 def hedges_g(first: ArrayLike, second: ArrayLike) -> float | None:
     """Standardised mean difference of two samples (n,) and (m,), corrected for small samples.
 
-    g = J * (mean1 - mean2) / s, with s^2 = ((n - 1) s1^2 + (m - 1) s2^2) / (n + m - 2) and J = 1 - 3 / (4 (n + m - 2) - 1)
-    (Hedges 1981, Journal of Educational Statistics 6). None with fewer than two values in either, or without any spread.
+    g = J * (mean1 - mean2) / s, with s^2 = ((n - 1) s1^2 + (m - 1) s2^2) / (n + m - 2)
+    and J = 1 - 3 / (4 (n + m - 2) - 1) (Hedges 1981, Journal of Educational Statistics 6).
+    None with fewer than two values in either sample, or without any spread.
     """
     x, y = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     if len(x) < FEWEST or len(y) < FEWEST:
@@ -72,8 +83,8 @@ def hedges_g(first: ArrayLike, second: ArrayLike) -> float | None:
 def cliffs_delta(first: ArrayLike, second: ArrayLike) -> float | None:
     """P(x > y) - P(x < y) over all pairs of two samples (n,) and (m,): -1 to 1, 0 when neither tends to be larger.
 
-    It needs no spread and no scale, and is the same for values and their logarithms (Cliff 1993, Psychological Bulletin 114).
-    None when a sample is empty.
+    It needs no spread and no scale, and is the same for values and their logarithms (Cliff 1993, Psychological
+    Bulletin 114). None when a sample is empty.
     """
     x, y = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     if len(x) == 0 or len(y) == 0:
@@ -81,13 +92,13 @@ def cliffs_delta(first: ArrayLike, second: ArrayLike) -> float | None:
     return float(np.sign(x[:, None] - y[None, :]).mean())
 
 
-def contrast(values: ArrayLike, is_first: ArrayLike, resamples: Resamples, level: float = 0.95) -> Contrast:
-    """Compare the episodes of which `is_first` holds with the others.
+def contrast(values: ArrayLike, is_first: ArrayLike, resamples: Resamples, level: float = DEFAULT_LEVEL) -> Contrast:
+    """Compare the episodes for which `is_first` is true with the others.
 
     Args:
-        values: (episode,) one value per episode; what is not finite takes no part.
+        values: (episode,) one value per episode; values that are not finite are left out.
         is_first: (episode,) bool.
-        resamples: of these episodes.
+        resamples: draws of these episodes.
         level: level of the intervals.
     """
     sample, chosen = np.asarray(values, dtype=np.float64), np.asarray(is_first, dtype=bool)
@@ -143,7 +154,7 @@ def _moments(weights: NDArray[np.float64], x: NDArray[np.float64], member: NDArr
     """Number, sum, and sum of squared deviations of the members, each (resample,)."""
     of_class, values = weights[:, member], x[member]
     number, total = of_class.sum(axis=1), of_class @ values
-    # About the class's own mean over all episodes: sums of squares of raw values would lose the digits that matter.
+    # Deviations from the class's mean over all episodes: sums of squares of raw values would lose the last digits.
     centre = values.mean()
     squares = of_class @ (values - centre) ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -165,6 +176,7 @@ def _standardised(first: _Moments, second: _Moments) -> NDArray[np.float64]:
 def _dominance(
     weights: NDArray[np.float64], x: NDArray[np.float64], first: NDArray[np.bool_], second: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
+    """Cliff's delta in every resample, (resample,)."""
     signs = np.sign(x[first][:, None] - x[second][None, :])
     values = np.empty(len(weights))
     for start in range(0, len(weights), _AT_ONCE):
@@ -182,6 +194,7 @@ def _within_tasks(
     classes: tuple[NDArray[np.bool_], NDArray[np.bool_]],
     task_of: NDArray[np.int64],
 ) -> NDArray[np.float64]:
+    """The difference inside tasks in every resample, (resample,)."""
     membership = (task_of[:, None] == np.unique(task_of)[None, :]).astype(np.float64)
 
     def per_task(member: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -193,14 +206,15 @@ def _within_tasks(
     with np.errstate(divide="ignore", invalid="ignore"):
         weight = np.where(both, number * other_number / (number + other_number), 0.0)
         gap = np.where(both, total / number - other_total / other_number, 0.0)
-        return (weight * gap).sum(axis=1) / weight.sum(axis=1)
+        within: NDArray[np.float64] = (weight * gap).sum(axis=1) / weight.sum(axis=1)
+    return within
 
 
 def _or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-#: What a contrast is called in a table, and how it is read off.
+#: The columns of a contrast in a table: its value and interval by name.
 CONTRAST_COLUMNS: dict[str, Callable[[Contrast], tuple[float | None, Interval | None]]] = {
     "difference": lambda found: (found.difference, found.difference_interval),
     "within_tasks": lambda found: (found.within_tasks, found.within_tasks_interval),
@@ -210,7 +224,11 @@ CONTRAST_COLUMNS: dict[str, Callable[[Contrast], tuple[float | None, Interval | 
 
 
 def contrast_row(found: Contrast, first: str, second: str) -> dict[str, float | int | str | None]:
-    """A contrast as a row: counts and means of either class by name, `X`, `X_low`, `X_high` of `CONTRAST_COLUMNS`, `note`."""
+    """A contrast as a table row.
+
+    Columns: `num_NAME` and `mean_NAME` of either class, `num_tasks_with_both`, and `X`, `X_low`, `X_high` of every X in
+    `CONTRAST_COLUMNS`, `note`.
+    """
     row: dict[str, float | int | str | None] = {
         f"num_{first}": found.num_first,
         f"num_{second}": found.num_second,
@@ -219,8 +237,5 @@ def contrast_row(found: Contrast, first: str, second: str) -> dict[str, float | 
         "num_tasks_with_both": found.num_tasks_with_both,
     }
     for name, read in CONTRAST_COLUMNS.items():
-        value, interval = read(found)
-        row[name] = value
-        row[f"{name}_low"] = interval.low if interval else None
-        row[f"{name}_high"] = interval.high if interval else None
+        row |= named_interval(name, *read(found))
     return row | {"note": found.note or None}

@@ -1,4 +1,7 @@
-"""Means with intervals of things that not every episode has (a word, an object), from a table with one row per episode and thing."""
+"""Means with intervals of items that not every episode has, such as words and objects.
+
+The input is a table with one row per (episode, item).
+"""
 
 from __future__ import annotations
 
@@ -11,13 +14,12 @@ from vla_attention.analyze.statistics.bootstrap import (
     DEFAULT_LEVEL,
     DEFAULT_RESAMPLES,
     DEFAULT_SEED,
-    Resamples,
-    bootstrap_intervals,
     mean_over_episodes,
     resample_episodes,
+    values_with_intervals,
 )
 
-_TASK = ("suite", "task_id")
+_TASK = "_task_of_suite"
 
 
 def means_with_intervals(
@@ -28,43 +30,35 @@ def means_with_intervals(
     level: float = DEFAULT_LEVEL,
     num_resamples: int = DEFAULT_RESAMPLES,
 ) -> pl.DataFrame:
-    """Mean over episodes of each value, with the two-level interval of `vla_attention.analyze.statistics.bootstrap`, for every thing.
+    """Mean over episodes of each value for every item, with its two-level interval (see `bootstrap`).
 
-    A thing that only some episodes have is about these: tasks and episodes are drawn from them alone. Values that are null or
-    not finite take no part in their mean.
+    The mean and the interval of an item use the episodes that have it, and tasks and episodes are drawn from these
+    alone. Values that are null or not finite are left out of their mean.
 
     Args:
-        table: one row per (episode, thing), with `suite` and `task_id`.
-        by: the columns that make a thing.
-        values: columns to average, with their natural limits (`statistics.NO_LIMITS`, `POSITIVE`, `SHARE`).
-        seed: of the bootstrap.
-        level: of the intervals.
-        num_resamples: of the bootstrap.
+        table: one row per (episode, item), with `suite` and `task_id`.
+        by: the columns that identify an item.
+        values: columns to average, with their natural limits (`bootstrap.NO_LIMITS`, `POSITIVE`, `SHARE`).
+        seed: seed of the bootstrap.
+        level: level of the intervals.
+        num_resamples: number of resamples.
 
     Returns:
-        One row per thing in order of first appearance: `by`, `num_episodes`, `num_tasks`, and per value `V`, `V_low`, `V_high`
-        (null where there is none) and `V_episodes`, how many episodes have a finite value.
+        One row per item in order of first appearance: `by`, `num_episodes`, `num_tasks`, and per value `V`, `V_low`,
+        `V_high` (null where there is none) and `V_episodes`, the number of episodes with a finite value.
     """
-    drawn: dict[tuple[Any, ...], Resamples] = {}
+    # Tasks in the order of their names as text: the draws depend on it.
+    task = pl.concat_str("suite", "task_id", separator="\t").rank("dense").cast(pl.Int64).alias(_TASK)
     rows = []
-    for key, part in table.group_by(by, maintain_order=True):
-        tasks = tuple(part.select(pl.concat_str(_TASK, separator="\t")).to_series().to_list())
-        if tasks not in drawn:
-            drawn[tasks] = resample_episodes(tasks, num_resamples, seed)
-        statistics = [
-            mean_over_episodes(part[name].cast(pl.Float64).to_numpy(), limits) for name, limits in values.items()
-        ]
-        intervals = bootstrap_intervals(statistics, drawn[tasks], level)
-        row: dict[str, Any] = {
-            **dict(zip(by, key, strict=True)),
-            "num_episodes": part.height,
-            "num_tasks": len(set(tasks)),
+    for key, part in table.with_columns(task).group_by(by, maintain_order=True):
+        tasks = part[_TASK].to_numpy()
+        statistics = {
+            name: mean_over_episodes(part[name].cast(pl.Float64).to_numpy(), limits) for name, limits in values.items()
         }
-        for name, statistic, interval in zip(values, statistics, intervals, strict=True):
-            row[name] = statistic.value
-            row[f"{name}_low"] = interval.low if interval else None
-            row[f"{name}_high"] = interval.high if interval else None
-            row[f"{name}_episodes"] = int(statistic.used.sum())
+        row: dict[str, Any] = dict(zip(by, key, strict=True))
+        row |= {"num_episodes": part.height, "num_tasks": part[_TASK].n_unique()}
+        row |= values_with_intervals(statistics, resample_episodes(tasks, num_resamples, seed), level)
+        row |= {f"{name}_episodes": int(statistic.used.sum()) for name, statistic in statistics.items()}
         rows.append(row)
     schema: dict[str, Any] = {name: table.schema[name] for name in by}
     schema |= {"num_episodes": pl.Int64, "num_tasks": pl.Int64}

@@ -1,14 +1,15 @@
-"""How far an interval from few tasks or few episodes must be widened. Pure numpy, no tables and no I/O.
+"""How far an interval from few tasks or few episodes is widened. Pure numpy, no tables and no I/O.
 
-A percentile bootstrap interval is too narrow when few units were drawn, for two reasons (Hesterberg 2015, "What teachers
-should know about the bootstrap", The American Statistician 69): resampling n units has the variance of
-a divisor n instead of n - 1, and it knows nothing of the uncertainty of that variance, which Student's t accounts for.
-For five episodes the nominal 95 % interval covers 84 %. Hesterberg moves the percentiles outwards; with five episodes there
-are no percentiles far enough out, so here the interval's ends are moved away from the estimate by the same factor,
+A percentile bootstrap interval is too narrow with few units, for two reasons (Hesterberg 2015, "What teachers should
+know about the bootstrap", The American Statistician 69). Resampling n units has the variance of a divisor n instead of
+n - 1. And it ignores the uncertainty of that variance, which Student's t includes. With five episodes the nominal 95 %
+interval covers 84 %. Hesterberg takes percentiles further out; five episodes have no percentiles far enough out, so
+here the ends of the interval are moved away from the estimate by the same factor,
 
     sqrt(n / (n - 1)) * t(n - 1) / z        n = 5: 1.58; n = 10: 1.22; n = 50: 1.04
 
-with the quantiles of Student's t and of the normal distribution. `benchmarks/interval_coverage.py` measures what that gives.
+with the quantiles of Student's t and of the normal distribution. `benchmarks/interval_coverage.py` measures the
+coverage.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ _MANY = 2000
 
 @functools.lru_cache(maxsize=4096)
 def student_quantile(level: float, degrees: int) -> float:
-    """The x with P(|t| < x) = `level` for Student's t with so many degrees of freedom (a whole number from 1).
+    """The x with P(|t| < x) = `level` for Student's t with `degrees` degrees of freedom (a whole number from 1).
 
     By bisection on the finite sums of Abramowitz & Stegun 1964, 26.7.3 and 26.7.4.
     """
     if degrees > _MANY:
         return NormalDist().inv_cdf(0.5 + level / 2)
     low, high = 0.0, math.pi / 2
-    # The sums are in the angle atan(t / sqrt(degrees)), which is bounded where t is not.
+    # The sums take the angle atan(t / sqrt(degrees)), which is bounded; t is not.
     for _ in range(60):
         middle = (low + high) / 2
         low, high = (middle, high) if _share_within(middle, degrees) < level else (low, middle)
@@ -63,8 +64,8 @@ def widen(
 ) -> NDArray[np.float64]:
     """Move both ends (2,) of an interval away from the estimate by a factor, without leaving the quantity's limits.
 
-    Distances are taken on a scale on which the limits are infinitely far: x itself without limits, log(x - low) above a lower
-    one, log((x - low) / (high - x)) between two. An end that lies on a limit stays there.
+    Distances are measured on a scale on which the limits are infinitely far away: x itself without limits, log(x - low)
+    above a lower limit, log((x - low) / (high - x)) between two limits. An end that lies on a limit stays there.
     """
     low, high = limits
     if math.isinf(low) and math.isinf(high):
@@ -85,7 +86,7 @@ def widen(
 
 
 def _power(ends: NDArray[np.float64], centre: float, factor: float) -> NDArray[np.float64]:
-    """(ends / centre) ** (factor - 1): what multiplies an end when its logarithm moves away from the centre's."""
+    """(ends / centre) ** (factor - 1): the multiplier of an end when its logarithm moves away from the centre's."""
     if centre <= 0:
         return np.ones_like(ends)
     with np.errstate(over="ignore"):

@@ -23,9 +23,9 @@ from vla_attention.analyze.statistics.autocorrelation import autocorrelation_tab
 from vla_attention.analyze.statistics.bootstrap import (
     SHARE,
     EpisodeStatistic,
-    Interval,
     Resamples,
     bootstrap_intervals,
+    ends,
     geometric_mean_over_episodes,
     mean_over_episodes,
     resample_episodes,
@@ -75,7 +75,8 @@ class TimeCourses:
         change: one row per quantity: mean change from before to after the closing (a factor for the ratio, a difference for
             fractions) with `low` and `high`, and how many episodes show both sides.
         outcomes: success against failure, one row per quantity, columns of `effect_sizes.contrast_row`; the ratio as log2.
-        autocorrelation: one row per episode, see `autocorrelation.autocorrelation_table`.
+        autocorrelation: one row per episode, see `autocorrelation.autocorrelation_table`: of log2_ratio, or of the first
+            group's fraction when the grouping has no ratio.
         num_nonfinite: (episode, replan) pairs without a finite log ratio, which take no part in the ratio's course.
     """
 
@@ -158,7 +159,11 @@ def time_courses(
         closing=_closing_table(episodes if has_actions else [], rows),
         change=_change_table(episodes, quantities, settings.window, seed),
         outcomes=_outcomes_table(episodes, quantities, seed),
-        autocorrelation=autocorrelation_table(rows, grouping),
+        autocorrelation=autocorrelation_table(
+            rows,
+            [*EPISODE_KEYS, "layer", "layer_number"],
+            "log2_ratio" if grouping.ratio else f"{grouping.names[0]}_fraction",
+        ),
         num_nonfinite=int(sum((~np.isfinite(values)).sum() for values in ratios)),
     )
 
@@ -228,7 +233,7 @@ def _course(
             rows.append(
                 (
                     *(alignment, outcome, quantity, *(float(place) for place in places[position])),
-                    *(statistic.value, *_ends(interval), int(statistic.used.sum()), num_tasks, uniform),
+                    *(statistic.value, *ends(interval), int(statistic.used.sum()), num_tasks, uniform),
                 )
             )
     text = dict.fromkeys(("alignment", "outcome", "quantity"), pl.String)
@@ -276,7 +281,7 @@ def _change_table(episodes: Sequence[_Episode], quantities: Sequence[str], windo
     ]
     rows = [
         (
-            *(quantity, statistic.value, *_ends(interval)),
+            *(quantity, statistic.value, *ends(interval)),
             *(int(statistic.used.sum()), len(np.unique(resamples.task_of[statistic.used]))),
         )
         for quantity, statistic, interval in zip(
@@ -305,7 +310,3 @@ def _outcomes_table(episodes: Sequence[_Episode], quantities: Sequence[str], see
 def _finite_mean(values: NDArray[np.float64]) -> float:
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if finite.size else float("nan")
-
-
-def _ends(interval: Interval | None) -> tuple[float | None, float | None]:
-    return (None, None) if interval is None else (interval.low, interval.high)

@@ -19,6 +19,7 @@ from vla_attention.analyze.statistics.bootstrap import (
     ratio_of_means_over_episodes,
     resample_episodes,
     summarize,
+    values_with_intervals,
 )
 from vla_attention.analyze.statistics.small_samples import student_quantile
 
@@ -198,7 +199,7 @@ def test_quantiles_of_students_t_agree_with_scipy(level):
 
 
 def test_five_episodes_are_covered_like_by_students_interval_and_far_better_than_by_percentiles():
-    """A thousand samples with a known mean. Student's interval covers 95 % of these exactly, but for the chance of the samples."""
+    """A thousand samples with a known mean. Student's interval covers exactly 95 % in the long run."""
     generator = np.random.default_rng(11)
     hits = {True: 0, False: 0, "student": 0}
     for i in range(1000):
@@ -283,7 +284,25 @@ def test_draws_are_made_in_few_pieces_of_bounded_size(monkeypatch, most):
     assert np.array_equal(counts.sum(axis=1), np.full(num_resamples, len(tasks)))
 
 
-def test_draws_for_the_same_episodes_are_made_once():
-    tasks = np.arange(500) // 50
-    assert resample_episodes(tasks, 100, seed=4) is resample_episodes(tasks + 7, 100, seed=4)
-    assert resample_episodes(tasks, 100, seed=4) is not resample_episodes(tasks, 100, seed=5)
+def test_statistics_over_the_same_episodes_share_their_draws():
+    tasks = np.arange(25) // 5
+    draws = resample_episodes(tasks, 200, seed=3)
+    assert resample_episodes([f"task {task}" for task in tasks], 200, seed=3) is draws
+    assert resample_episodes(tasks + 10, 200, seed=3) is draws
+    assert resample_episodes(tasks, 200, seed=4) is not draws
+    assert resample_episodes(tasks[:-1], 200, seed=3) is not draws
+    assert not draws.counts.flags.writeable
+    one_task, other_task = (resample_episodes(np.full(5, task), 200, seed=3) for task in (2, 7))
+    assert one_task is other_task
+
+
+def test_columns_of_a_row_are_values_and_ends_by_name():
+    tasks = np.arange(25) // 5
+    draws = resample_episodes(tasks, 200, seed=3)
+    statistics = {"mean": mean_over_episodes(SAMPLE), "nothing": mean_over_episodes(np.full(25, np.nan))}
+    row = values_with_intervals(statistics, draws, level=0.8)
+    interval = bootstrap_interval(statistics["mean"], tasks, 200, level=0.8, seed=3)
+    assert list(row) == ["mean", "mean_low", "mean_high", "nothing", "nothing_low", "nothing_high"]
+    expected = (statistics["mean"].value, interval.low, interval.high)
+    assert (row["mean"], row["mean_low"], row["mean_high"]) == pytest.approx(expected, rel=1e-12)
+    assert row["nothing"] is row["nothing_low"] is row["nothing_high"] is None

@@ -58,9 +58,12 @@ def test_the_whole_contrast_agrees_with_scipy_and_plain_loops():
     assert found.cliffs_delta == pytest.approx(cliffs_delta(FIRST, SECOND))
     # Our resamples draw from all episodes, scipy's from each class: the same to a few hundredths, but for our widening.
     theirs = stats.bootstrap(
-        (FIRST, SECOND), lambda x, y, axis: x.mean(axis=axis) - y.mean(axis=axis), n_resamples=20000, method="percentile",
+        (FIRST, SECOND),
+        lambda x, y, axis: x.mean(axis=axis) - y.mean(axis=axis),
+        n_resamples=20000,
+        method="percentile",
         rng=np.random.default_rng(0),
-    ).confidence_interval  # fmt: skip
+    ).confidence_interval
     factor = stats.t.ppf(0.975, 8) / stats.norm.ppf(0.975) * np.sqrt(9 / 8)
     expected = [found.difference + factor * (end - found.difference) for end in theirs]
     assert (found.difference_interval.low, found.difference_interval.high) == pytest.approx(expected, abs=0.08)
@@ -194,7 +197,9 @@ def test_the_table_of_counts_is_per_episode_and_layer():
     from vla_attention.analyze.measures.aggregate import per_replan
 
     replans = per_replan(make_steps(num_replans=20), default_grouping())
-    table = autocorrelation_table(replans, default_grouping())
+    by = ["suite", "task_id", "episode_index", "layer"]
+    table = autocorrelation_table(replans, by, "log2_ratio")
+    assert table.columns == [*by, "series", "num_replans", "autocorrelation_time", "effective_replans"]
     assert table.height == 2 * 3 * 3
     row = table.filter(task_id=1, episode_index=2, layer="25").row(0, named=True)
     series = replans.filter(task_id=1, episode_index=2, layer="25").sort("replan")["log2_ratio"].to_numpy()
