@@ -2,7 +2,7 @@
 #
 #   make capture     run a policy in simulation and record its attention (installs torch and the simulators)
 #   make analyze     masses, ratios, tables and pictures from a store (installs the laptop's small set only)
-#   make test        formatting, types and all tests
+#   make test        formatting, types, all tests, and the package as others install it
 #   make test-slurm  an array job on the SLURM that sbatch reaches from here (opt-in; installs nothing)
 #   make setup       the whole environment        make setup-analyze   the laptop's part of it
 #
@@ -33,7 +33,10 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 SOURCES := vla_attention schemas capture analyze tests benchmarks scripts docs
 
-.PHONY: capture analyze test test-slurm check unit setup setup-analyze schemas clean
+# Processes that share the tests; WORKERS=0 runs them in one, which a debugger needs.
+WORKERS ?= 2
+
+.PHONY: capture analyze test test-slurm test-thorough check unit package setup setup-analyze schemas clean
 
 capture: .venv/capture-installed
 	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --seed $(SEED) --store $(STORE) \
@@ -42,7 +45,7 @@ capture: .venv/capture-installed
 analyze: .venv/analyze-installed
 	$(BIN)/vla-analyze $(STORE) --grouping $(GROUPING) --output $(OUTPUT) $(if $(LAYERS),--layers $(LAYERS)) $(ARGS)
 
-test: check unit
+test: check unit package
 
 check: .venv/capture-installed
 	$(BIN)/ruff check $(SOURCES)
@@ -50,7 +53,15 @@ check: .venv/capture-installed
 	$(BIN)/mypy
 
 unit: .venv/capture-installed
-	$(BIN)/pytest $(ARGS)
+	$(BIN)/pytest -n $(WORKERS) $(ARGS)
+
+# Ten times as many random examples. Takes an hour; for changes of formulas, file formats and readers.
+test-thorough: .venv/capture-installed
+	$(BIN)/pytest -n $(WORKERS) --hypothesis-profile thorough -m "not simulator" $(ARGS)
+
+# Source distribution, wheel, and their use from environments outside the checkout.
+package: .venv/capture-installed
+	$(BIN)/python scripts/check_package.py
 
 # Takes about ten minutes, most of it waiting: SLURM holds a requeued job back for two. Works with any environment that is active.
 test-slurm:

@@ -1,0 +1,176 @@
+"""Build the source distribution and from it the wheel, install the wheel outside the checkout, and use it there.
+
+Usage: python scripts/check_package.py [--folder FOLDER]
+
+Two environments are made in a temporary folder (or in FOLDER, which is then kept). "laptop" is clean: the wheel and what
+it depends on. "node" is the wheel on top of the libraries of the environment that runs this script, so that a policy can
+run without a second copy of torch. A store is captured in "node" and analysed in "laptop". Exit code 1: a check failed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import tempfile
+import tomllib
+import zipfile
+from pathlib import Path, PurePosixPath
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = "vla_attention"
+#: Folders of the checkout that are no part of its source.
+LEFT_OUT = shutil.ignore_patterns(".*", "build", "dist", "*.egg-info", "__pycache__", "runs", "results")
+#: What stands at the top of the source distribution.
+TOP_OF_SDIST = {"LICENSE", "PKG-INFO", "README.md", "pyproject.toml", "setup.cfg", PACKAGE, f"{PACKAGE}.egg-info"}
+#: Run in an environment, outside the checkout; prints the version. Imports of the folders' own names must fail.
+CHECK_IMPORTS = """
+import importlib.util, sys
+import vla_attention as va
+heavy = [name for name in ("torch", "zarr", "polars", "numpy", "matplotlib") if name in sys.modules]
+assert not heavy, f"import vla_attention loads {heavy}"
+bare = [name for name in ("analyze", "capture", "schemas", "tests") if importlib.util.find_spec(name)]
+assert not bare, f"these names can be imported beside vla_attention: {bare}"
+assert all(hasattr(va, name) for name in va.__all__), va.__all__
+print(va.__version__, va.__file__)
+"""
+
+
+class CheckFailed(Exception):
+    """A check of the package did not hold."""
+
+
+def main() -> int:
+    """Run all checks; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--folder", type=Path, help="folder for packages and environments, kept afterwards")
+    given = parser.parse_args().folder
+    with tempfile.TemporaryDirectory(prefix="package_") as temporary:
+        folder = Path(temporary) if given is None else given.resolve()
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            wheel = build_packages(folder)
+            laptop, node = make_environments(wheel, folder)
+            use_packages(laptop, node, folder)
+        except CheckFailed as error:
+            print(f"package check failed: {error}", file=sys.stderr)
+            return 1
+    print("package check passed")
+    return 0
+
+
+def build_packages(folder: Path) -> Path:
+    """Build both packages from a copy of the checkout and check their files; returns the wheel's path."""
+    source, built = folder / "source", folder / "dist"
+    for old in (source, built):
+        shutil.rmtree(old, ignore_errors=True)
+    shutil.copytree(ROOT, source, symlinks=True, ignore=LEFT_OUT)
+    run(sys.executable, "-m", "build", "--outdir", built, source, quiet=True)
+    (sdist,), (wheel,) = built.glob("*.tar.gz"), built.glob("*.whl")
+    expected = source_files(source / PACKAGE)
+
+    with tarfile.open(sdist) as archive:
+        members = {PurePosixPath(*PurePosixPath(item.name).parts[1:]): item for item in archive if not item.isdir()}
+    links = [str(path) for path, item in members.items() if not item.isfile()]
+    check(not links, f"{sdist.name} holds links: {links}")
+    compare(f"top of {sdist.name}", {path.parts[0] for path in members}, TOP_OF_SDIST)
+    compare(f"{PACKAGE}/ in {sdist.name}", {str(path) for path in members if path.parts[0] == PACKAGE}, expected)
+
+    with zipfile.ZipFile(wheel) as archive:
+        names = {name for name in archive.namelist() if not name.endswith("/")}
+        (top_level,) = (archive.read(name).decode().split() for name in names if name.endswith("/top_level.txt"))
+    compare("top_level.txt of the wheel", set(top_level), {PACKAGE})
+    compare(wheel.name, {name for name in names if ".dist-info/" not in name}, expected)
+    print(f"built {sdist.name} and from it {wheel.name}: {len(expected)} files in {PACKAGE}/, nothing beside it")
+    return wheel
+
+
+def source_files(package: Path) -> set[str]:
+    """Every file of the package, relative to the folder above it, through the symbolic links to its sub-packages."""
+    return {
+        str(Path(folder, name).relative_to(package.parent))
+        for folder, _, names in os.walk(package, followlinks=True)
+        for name in names
+    }
+
+
+def make_environments(wheel: Path, folder: Path) -> tuple[Path, Path]:
+    """Install the wheel into two new environments; returns their folders of commands ("laptop", "node")."""
+    laptop, node = folder / "laptop", folder / "node"
+    for environment in (laptop, node):
+        run(sys.executable, "-m", "venv", "--clear", "--without-pip", environment)
+    pip = (sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check")
+    run(*pip, "--python", laptop / "bin/python", "install", "--constraint", ROOT / "constraints.txt", wheel)
+    run(*pip, "--python", node / "bin/python", "install", "--no-deps", wheel)
+    (libraries,) = node.glob("lib/python*/site-packages")
+    # A path in a .pth file is searched after the environment's own, and .pth files in it (editable installs) are not read.
+    (libraries / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    return laptop / "bin", node / "bin"
+
+
+def use_packages(laptop: Path, node: Path, folder: Path) -> None:
+    """Import, ask for help, capture and analyse, with the installed wheel and outside the checkout."""
+    with open(ROOT / "pyproject.toml", "rb") as file:
+        project = tomllib.load(file)["project"]
+    for commands in (laptop, node):
+        imported = run(commands / "python", "-I", "-c", CHECK_IMPORTS, cwd=folder, quiet=True).split()
+        check(imported[0] == project["version"], f"the version is {imported[0]}, not {project['version']}")
+        check(Path(imported[1]).is_relative_to(commands.parent), f"{imported[1]} is not the installed wheel")
+        for script in project["scripts"]:
+            run(commands / script, "--help", cwd=folder, quiet=True)
+
+    store, output = folder / "store.zarr", folder / "results"
+    for old in (store, output):
+        shutil.rmtree(old, ignore_errors=True)
+    short = "--task-id 0 --num-episodes 1 --replan-steps 4 --max-steps 8".split()
+    capture = (node / "python", "-m", f"{PACKAGE}.capture", "pi", "--checkpoint", "dummy", "--task-suite", "robosuite")
+    run(*capture, *short, "--store", store, cwd=folder, quiet=True)
+    code = json.loads((store / "zarr.json").read_text())["attributes"]["provenance"]["code"]
+    check(code == project["version"], f"the store was made by code version {code}, expected {project['version']}")
+    run(laptop / "vla-analyze", store, "--output", output, cwd=folder, quiet=True)
+    run(laptop / "python", "-m", f"{PACKAGE}.analyze", "verify", store, cwd=folder, quiet=True)
+    run(laptop / "vla-analyze", "report", store, "--output", output / "report.html", cwd=folder, quiet=True)
+    written = sorted(path.suffix for path in output.rglob("*") if path.is_file())
+    check({".json", ".parquet", ".png", ".html"} <= set(written), f"the analysis wrote only {written}")
+    results = sorted(output.rglob("attention_ratio_results*.json"))
+    check(len(results) == 1, f"expected one results file in {output}, found {results}")
+    run(laptop / "parse-attention-ratio-results", "--results", results[0], cwd=folder, quiet=True)
+    print("captured a store and analysed it with the installed wheel")
+
+
+def run(*command: object, cwd: Path | None = None, quiet: bool = False) -> str:
+    """Run a command without the checkout on Python's path; returns its standard output.
+
+    `quiet`: output is shown only when the command fails.
+
+    Raises:
+        CheckFailed: it ended with another exit code than 0.
+    """
+    words = [str(word) for word in command]
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONHOME")}
+    done = subprocess.run(words, cwd=cwd, env=environment, text=True, capture_output=quiet, check=False)
+    if done.returncode:
+        shown = f"\n{done.stdout}{done.stderr}" if quiet else ""
+        raise CheckFailed(f"exit code {done.returncode} of: {' '.join(words)}{shown}")
+    return done.stdout if quiet else ""
+
+
+def check(holds: bool, message: str) -> None:
+    """Raise `CheckFailed` with the message unless the condition holds."""
+    if not holds:
+        raise CheckFailed(message)
+
+
+def compare(what: str, found: set[str], expected: set[str]) -> None:
+    """Raise `CheckFailed` that lists what is missing and what is too much."""
+    missing, extra = sorted(expected - found), sorted(found - expected)
+    check(not missing and not extra, f"{what}: missing {missing}, not expected {extra}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
