@@ -1,11 +1,11 @@
-"""How long does an analysis of fifty episodes take on a laptop, and how much memory? Beside plain zarr-python and xarray + dask.
+"""Time and memory of an analysis of fifty episodes on a laptop, beside plain zarr-python and xarray with dask.
 
 Usage: python benchmarks/analysis_speed.py [--store PATH] [--episodes 50] [--replans 52] [--only NAME ...]
 
-Writes a store of the shape of pi0.5 in LIBERO (ten tasks; 18 layers, 8 heads, first and last denoise step, 978 keys, rows
-averaged over the queries; made-up rows with sinks and heavy tails) with the real writer, unless it is there already. Each
-measurement is a process of its own: wall time from its start to its end and peak resident memory. Whether they hold what the
-README says is for the reader to see; nothing is asserted. The comparison with xarray needs dask (`pip install dask`).
+Writes a store of the shape of pi0.5 in LIBERO with the real writer, unless it exists: ten tasks, 18 layers, 8 heads,
+first and last denoise step, 978 keys, rows averaged over the queries, made-up rows with sinks and heavy tails. Each
+measurement is a process of its own; its wall time from start to end and its peak resident memory are printed. Nothing
+is asserted. The comparison with xarray needs dask (`pip install dask`).
 """
 
 from __future__ import annotations
@@ -84,13 +84,13 @@ def measured(command: list[str]) -> tuple[float, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--store", type=Path, help="made when it is not there (default: a temporary one, deleted afterwards)"
-    )
+    parser.add_argument("--store", type=Path, help="written if it does not exist (default: a temporary one)")
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--replans", type=int, default=52)
     parser.add_argument("--only", nargs="+", metavar="NAME", help="measure only these")
-    parser.add_argument("--repeats", type=int, default=3, help="the fastest of so many runs is printed (default: 3)")
+    parser.add_argument(
+        "--repeats", type=int, default=3, help="runs of each; the fastest is printed (default: 3)"
+    )
     arguments = parser.parse_args()
     scratch = Path(tempfile.mkdtemp(prefix="analysis_speed_"))
     store = arguments.store or scratch / "fifty.zarr"
@@ -141,9 +141,9 @@ def main() -> None:
 
 
 def span_tables(store: Path) -> None:
-    """All tables with intervals of a span-level grouping, timed inside one process: of a new store, then of one that is open.
+    """Time all tables with intervals of a grouping of spans in this process: of a new store, then of an open one.
 
-    One BLAS thread, as `vla-analyze` has it: episodes are measured by threads of its own.
+    One BLAS thread, as in `vla-analyze`, which measures episodes in threads of its own.
     """
     from vla_attention.analyze.measures.question import AnalysisSettings, ask
     from vla_attention.analyze.ratios.analysis import analyse

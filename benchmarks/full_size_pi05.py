@@ -1,10 +1,12 @@
-"""Can a full-size pi0.5 be loaded and run on a machine without a GPU? Time and peak memory, per checkpoint format.
+"""Time and peak memory of loading and running a full-size pi0.5 without a GPU, per checkpoint format.
 
-Usage: python benchmarks/full_size_pi05.py [--dtype bfloat16 float32] [--formats openpi_jax openpi_torch lerobot] [--folder PATH]
+Usage: python benchmarks/full_size_pi05.py [--dtype bfloat16 float32] [--formats openpi_jax openpi_torch lerobot]
+           [--folder PATH]
 
-Writes a checkpoint of 3.35 billion random numbers, array by array, with the names and shapes of the released models; loads it
-in a process of its own, runs one replan with recording, and prints wall time and peak resident memory. Each checkpoint (6.7 or
-13.4 GB, for LeRobot a table more) is deleted before the next is written. What a checkpoint is stored in is what it runs in.
+Writes a checkpoint of 3.35 billion random numbers, array by array, with the names and shapes of the released models.
+Loads it in a process of its own, runs one replan with recording, and prints wall time and peak resident memory. Each
+checkpoint (6.7 or 13.4 GB; for LeRobot one embedding table more) is deleted before the next is written. A checkpoint
+runs in the precision that it is stored in.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ STATS = "assets/physical-intelligence/libero/norm_stats.json"
 
 
 def random_source(seed: int = 0, block: int = 1 << 24) -> Callable[[int], np.ndarray]:
-    """Return a function that gives n float32 numbers of a normal distribution: pieces of one block from changing places."""
+    """Return a function that gives n float32 numbers of a normal distribution, cut from one block at random places."""
     generator = np.random.default_rng(seed)
     numbers = generator.standard_normal(block, dtype=np.float32) * np.float32(0.02)
     twice = np.concatenate([numbers, numbers])
@@ -121,7 +123,7 @@ def load_and_run(folder: Path, checkpoint_format: str, dtype: str) -> dict[str, 
     from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan
 
     class FullSizeTokenizer(PromptTokenizer):
-        """The small tokenizer that comes along, passed off as PaliGemma's, which may not be handed on."""
+        """The embedded policy's tokenizer with the vocabulary size of PaliGemma's, which may not be distributed."""
 
         vocab_size = 257_152  # type: ignore[assignment]
 
@@ -173,9 +175,8 @@ def main() -> None:
         print(json.dumps(load_and_run(Path(folder), checkpoint_format, dtype)))
         return
     print(f"{torch.get_num_threads()} threads, torch {torch.__version__}")
-    print(
-        f"{'format':13} {'dtype':9} {'write s':>8} {'load s':>7} {'replan s':>9} {'model GB':>9} {'peak load GB':>13} {'peak GB':>8}"
-    )
+    titles = f"{'write s':>8} {'load s':>7} {'replan s':>9} {'model GB':>9} {'peak load GB':>13} {'peak GB':>8}"
+    print(f"{'format':13} {'dtype':9} {titles}")
     for dtype in arguments.dtype:
         for checkpoint_format in arguments.formats:
             with tempfile.TemporaryDirectory(dir=arguments.folder) as place:

@@ -1,16 +1,18 @@
-"""Do intervals of nominal 95 % cover the truth in 95 % of the cases? Simulated stores with a known ratio per task.
+"""Coverage of intervals of nominal 95 %, measured on simulated stores with a known ratio per task.
 
-    python benchmarks/interval_coverage.py                  # 500 simulated stores of every size, about ten minutes
-    python benchmarks/interval_coverage.py --on-disk 20     # and 20 stores written, read back and analysed through files
+    python benchmarks/interval_coverage.py                # 500 simulated stores of every size, about ten minutes
+    python benchmarks/interval_coverage.py --on-disk 20   # and 20 stores that are written to disk and read back
 
-Tasks have mean log ratios drawn from a population with standard deviation `between`, episodes differ from their task by `within`
-(both in natural logarithms: 0.3 is 30 %), and replans drift around their episode. Three truths are looked for:
+The mean log ratios of tasks are drawn from a population with standard deviation `between`. Episodes differ from their
+task by `within` (both in natural logarithms: 0.3 is 30 %), and replans drift around their episode. Coverage of three
+truths is measured:
 
     the task's ratio          by the interval of each task, over its episodes
-    the population's ratio    by the two-level interval over all tasks: what the ratio of tasks like these is
-    these tasks' ratio        by the same interval: what the mean over exactly these tasks is, with endless episodes
+    the population's ratio    by the two-level interval over all tasks: the ratio of tasks like these
+    these tasks' ratio        by the same interval: the mean over exactly these tasks, with endless episodes
 
-The numbers are those of `aggregate.tasks_table`, column `geometric_mean`, once as it is and once with plain percentile intervals.
+The intervals are those of `aggregate.tasks_table`, column `geometric_mean`, as they are and as plain percentile
+intervals.
 """
 
 from __future__ import annotations
@@ -70,7 +72,7 @@ def log_ratios(case: Case, generator: np.random.Generator) -> tuple[NDArray[np.f
     tasks = POPULATION + generator.normal(0, case.between, case.num_tasks)
     shape = (case.num_tasks, case.num_episodes, NUM_REPLANS)
     episodes = tasks[:, None] + generator.normal(0, case.within, shape[:2])
-    # A walk whose mean over the episode is zero: replans are correlated, and the episode's mean is what it was made to be.
+    # A walk whose mean over the episode is zero: replans are correlated, and the episode's mean does not change.
     walk = generator.normal(0, 0.1, shape).cumsum(axis=2)
     return tasks, episodes[:, :, None] + walk - walk.mean(axis=2, keepdims=True)
 
@@ -142,7 +144,7 @@ def simulate(case: Case, num_stores: int, seed: int) -> dict[tuple[str, str], fl
 
 
 def through_files(case: Case, num_stores: int, seed: int) -> dict[tuple[str, str], float]:
-    """The same with stores that are written by the capture side's writer, read back, and analysed whole."""
+    """The same with stores on disk: written by the real writer, read back and analysed."""
     from tests.kit.store_kit import StoreSpec, write_store
     from vla_attention.analyze.measures.question import AnalysisSettings, ask
     from vla_attention.analyze.ratios.analysis import analyse
@@ -193,12 +195,9 @@ def main() -> None:
     arguments = parser.parse_args()
     # Per-task coverage is a mean over stores and tasks; overall coverage is one hit or miss per store.
     error = 100 * np.sqrt(0.95 * 0.05 / max(1, arguments.stores))
-    print(
-        f"Coverage in % of intervals of nominal 95 %, {arguments.stores} stores of each size (standard error {error:.1f} overall)."
-    )
-    print(
-        "p: plain percentile interval, w: widened as in vla_attention.analyze.statistics.small_samples; width: mean of log(high / low), widened.\n"
-    )
+    print(f"Coverage in % of intervals of nominal 95 %, {arguments.stores} stores of each size.")
+    print(f"The standard error is {error:.1f} overall. p: plain percentile interval; w: widened as in")
+    print("vla_attention.analyze.statistics.small_samples; width: mean of log(high / low), widened.\n")
     print("                  differences of     one task       population     these tasks")
     print("tasks x episodes tasks episodes      p       w       p       w       p       w    width")
     for case in CASES if arguments.stores else ():

@@ -1,6 +1,6 @@
 """Write a checkpoint in the layout of openpi's JAX format (orbax, OCDBT) with tensorstore, leaf by leaf.
 
-Not what orbax writes byte by byte, but what a reader sees: `_METADATA` with the tree, and every leaf as a zarr array in one
+The bytes differ from orbax's, the content is the same: `_METADATA` with the tree, and every leaf as a zarr array in one
 OCDBT store. For benchmarks, and for tests of shapes and precisions that the golden checkpoints do not have.
 """
 
@@ -28,8 +28,8 @@ def write_orbax(
     Args:
         params: the folder, which is made.
         shapes: JAX path joined by "/" -> shape of the leaf.
-        layer_of: (path, index on the first axis) -> that part of the leaf; asked for in order, so that a leaf need never be in
-            memory twice.
+        layer_of: (path, index on the first axis) -> that part of the leaf. Called in order, one part at a time, so that
+            a whole leaf is in memory only once.
         dtype: float32 or bfloat16, as stored.
         value_suffix: end every path with "value", as openpi's training does.
         chunk_per_layer: one chunk for each index of the first axis; otherwise one chunk for the leaf.

@@ -2,9 +2,10 @@
 
 Usage: python scripts/check_package.py [--folder FOLDER]
 
-Two environments are made in a temporary folder (or in FOLDER, which is then kept). "laptop" is clean: the wheel and what
-it depends on. "node" is the wheel on top of the libraries of the environment that runs this script, so that a policy can
-run without a second copy of torch. A store is captured in "node" and analysed in "laptop". Exit code 1: a check failed.
+Two environments are made in a temporary folder, or in FOLDER, which is then kept. "laptop" is clean: the wheel and its
+dependencies. "node" is the wheel on top of the libraries of the environment that runs this script, so that a policy
+can run without a second copy of torch. A store is captured in "node" and analysed in "laptop". Exit code 1: a check
+failed.
 """
 
 from __future__ import annotations
@@ -108,7 +109,8 @@ def make_environments(wheel: Path, folder: Path) -> tuple[Path, Path]:
     run(*pip, "--python", laptop / "bin/python", "install", "--constraint", ROOT / "constraints.txt", wheel)
     run(*pip, "--python", node / "bin/python", "install", "--no-deps", wheel)
     (libraries,) = node.glob("lib/python*/site-packages")
-    # A path in a .pth file is searched after the environment's own, and .pth files in it (editable installs) are not read.
+    # A folder named in a .pth file is searched after the environment's own, and .pth files in it (editable installs)
+    # are not read.
     (libraries / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
     return laptop / "bin", node / "bin"
 
@@ -127,7 +129,7 @@ def use_packages(laptop: Path, node: Path, folder: Path) -> None:
     store, output = folder / "store.zarr", folder / "results"
     for old in (store, output):
         shutil.rmtree(old, ignore_errors=True)
-    short = "--task-id 0 --num-episodes 1 --replan-steps 4 --max-steps 8".split()
+    short = ("--task-id", 0, "--num-episodes", 1, "--replan-steps", 4, "--max-steps", 8)
     capture = (node / "python", "-m", f"{PACKAGE}.capture", "pi", "--checkpoint", "dummy", "--task-suite", "robosuite")
     run(*capture, *short, "--store", store, cwd=folder, quiet=True)
     code = json.loads((store / "zarr.json").read_text())["attributes"]["provenance"]["code"]

@@ -2,9 +2,9 @@
 
 Usage: python scripts/train_embedded_tokenizer.py [OUTPUT]
 
-Needs the hf-libero package for the instruction texts only; nothing of it is imported. The result is deterministic, and it
-behaves like PaliGemma's tokenizer where that matters: the same control ids, no prefix space, digits one by one, "\\n" a
-piece of its own, unknown characters as bytes.
+Needs the hf-libero package for the instruction texts only; nothing of it is imported. The result is deterministic, and
+it behaves like PaliGemma's tokenizer where that matters: the same control ids, no prefix space, digits one by one,
+"\\n" a piece of its own, unknown characters as bytes.
 """
 
 from __future__ import annotations
