@@ -11,11 +11,11 @@ from pathlib import Path
 from vla_attention.capture.environments.suites import SUITES
 from vla_attention.capture.jobs.claims import Holder, holders
 from vla_attention.capture.jobs.run_records import planned_tasks, read_records
-from vla_attention.capture.store.store_root import episode_folders, read_root
 from vla_attention.schemas.command_line import format_bytes
-from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
-from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
-from vla_attention.schemas.stores.store_format import EpisodeAttributes, StoreNotFound, parse_episode_name
+from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.stores.reader import StoredEpisode, open_store
+from vla_attention.schemas.stores.store_format import CorruptEpisode, EpisodeAttributes, parse_episode_name
 
 
 @dataclass(frozen=True)
@@ -81,21 +81,17 @@ def store_status(path: Path, expected: int | None = None) -> StoreStatus:
     """
     if expected is not None and expected < 1:
         raise BadArgument(f"Cannot use --expected {expected}; expected at least 1.")
-    if not path.exists():
-        nearby = sorted(str(found) for found in path.parent.glob("*.zarr")) if path.parent.is_dir() else []
-        raise StoreNotFound(
-            f"There is no store at {path}.{did_you_mean(str(path), nearby)} Stores in {path.parent}: {listing(nearby)}."
-        )
-    root = read_root(path)
+    store = open_store(path)
+    root = store.attributes
     records = read_records(path)
     plan = planned_tasks(records)
     writers = {commit.episode: (commit.at, record.worker) for record in records for commit in record.committed}
     episodes: dict[int, list[EpisodeStatus]] = {}
     instructions: dict[int, str] = {task.task_id: task.instruction for task in plan.values()}
-    for folder in sorted(episode_folders(path)):
-        task_id, index = parse_episode_name(folder.name)
-        at, worker = writers.get(folder.name, ("", None))
-        attributes = _attributes(folder)
+    for stored in store.episodes:
+        task_id, index = parse_episode_name(stored.name)
+        at, worker = writers.get(stored.name, ("", None))
+        attributes = _attributes(stored)
         if attributes is not None:
             instructions[task_id] = attributes.instruction
         episodes.setdefault(task_id, []).append(
@@ -103,8 +99,8 @@ def store_status(path: Path, expected: int | None = None) -> StoreStatus:
                 task_id=task_id,
                 episode=index,
                 success=None if attributes is None else attributes.success,
-                bytes=sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()),
-                at=at or _time_of(folder),
+                bytes=sum(file.stat().st_size for file in stored.folder.rglob("*") if file.is_file()),
+                at=at or _time_of(stored.folder),
                 by=worker.described() if worker else "",
             )
         )
@@ -143,10 +139,10 @@ def run_status(stores: Sequence[Path], expected: int | None, as_json: bool, chec
     return 1 if check and any(status.complete is False for status in found) else 0
 
 
-def _attributes(folder: Path) -> EpisodeAttributes | None:
+def _attributes(stored: StoredEpisode) -> EpisodeAttributes | None:
     try:
-        return from_json(EpisodeAttributes, json.loads((folder / "zarr.json").read_text())["attributes"])
-    except (OSError, ValueError, KeyError, TypeError, MalformedDocument):
+        return stored.attributes
+    except CorruptEpisode:
         return None
 
 

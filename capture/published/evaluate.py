@@ -184,7 +184,7 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], termination: T
 def _analyze(job: _Job) -> int:
     from vla_attention.capture.jobs.status import store_status
     from vla_attention.capture.recording.episode_loop import say
-    from vla_attention.capture.store.store_root import read_root
+    from vla_attention.schemas.stores.root import read_root
 
     arguments, store = job.arguments, job.settings.store
     for line in store_status(store).missing_lines():

@@ -83,15 +83,24 @@ def remove_if_empty(folder: Path) -> None:
         return  # another writer's episode is in it, or it is gone
 
 
-def flush_folder(folder: Path) -> None:
-    """Force every file and directory below `folder` to disk: a rename must not become durable before its content."""
-    for parent, _, files in os.walk(folder):
-        for file in files:
-            flush_entry(Path(parent) / file)
-        flush_entry(Path(parent))
+def publish(folder: Path, target: Path, durable: bool) -> None:
+    """Rename a complete folder to `target`.
+
+    `durable`: flush its content to disk before and the new name after it, so that a crash of the machine leaves all of it or
+    nothing. Without, only a crash of the process does.
+    """
+    if durable:
+        # The rename must not reach the disk before the content.
+        for parent, _, files in os.walk(folder):
+            for file in files:
+                _flush(Path(parent) / file)
+            _flush(Path(parent))
+    folder.rename(target)
+    if durable:
+        _flush(target.parent)
 
 
-def flush_entry(path: Path) -> None:
+def _flush(path: Path) -> None:
     """Force one file or directory to disk."""
     handle = os.open(path, os.O_RDONLY)
     try:

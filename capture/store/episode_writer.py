@@ -12,14 +12,15 @@ import zarr
 from numpy.typing import NDArray
 
 from vla_attention.capture.store.codecs import write_whole
-from vla_attention.capture.store.durable_files import file_digest, flush_entry, flush_folder, naming_the_failure
+from vla_attention.capture.store.durable_files import file_digest, naming_the_failure, publish
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.site_writer import SiteWriter
-from vla_attention.capture.store.store_root import check_same_run, read_root
+from vla_attention.capture.store.store_root import check_same_run, read_existing_root
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import Prompt
 from vla_attention.schemas.stores.digest import ArrayDigest
+from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
     SEAL_GROUP,
@@ -28,9 +29,11 @@ from vla_attention.schemas.stores.store_format import (
     EpisodeAttributes,
     EpisodeSeal,
     RootAttributes,
+    StoreError,
     StoreExists,
     episode_name,
 )
+from vla_attention.schemas.stores.verify import content_problems
 
 
 @dataclass(frozen=True)
@@ -77,12 +80,14 @@ class EpisodeWriter:
         start: EpisodeStart,
         denoise_times: NDArray[np.float64],
         max_replans: int,
+        durable: bool,
     ) -> None:
         self.store = store
         self.run = run
         self.folder = folder
         self.start = start
         self.denoise_times = denoise_times
+        self.durable = durable
         self.name = episode_name(start.task_id, start.episode_index)
         self.what = f"episode {self.name} of {store}"
         self.group = zarr.create_group(folder, zarr_format=3)
@@ -135,7 +140,6 @@ class EpisodeWriter:
             self.group.update_attributes(to_json(self._attributes(success, num_steps)))
             self._write_seal()
             self._read_back()
-            flush_folder(self.folder)
             return self._publish()
 
     def _attributes(self, success: bool, num_steps: int) -> EpisodeAttributes:
@@ -157,19 +161,20 @@ class EpisodeWriter:
         )
 
     def _check_store(self) -> None:
-        # Somebody may have overwritten the store with another run while this episode was rolled out.
-        check_same_run(self.store, read_root(self.store), self.run)
+        # Somebody may have removed the store, or replaced it by another run's, while this episode was rolled out.
+        if not self.store.exists():
+            raise StoreError(f"The store {self.store} has been removed.")
+        check_same_run(self.store, read_existing_root(self.store), self.run)
 
     def _publish(self) -> Path:
         self._check_store()
         target = self.store / EPISODES_GROUP / self.name
         try:
-            self.folder.rename(target)
+            publish(self.folder, target, self.durable)
         except OSError:
             if not target.exists():
                 raise
             raise StoreExists(f"Episode {target.name} of {self.store} was committed by another process.") from None
-        flush_entry(target.parent)
         return target
 
     def write(self, name: str, values: NDArray[np.generic], axes: tuple[str, ...]) -> None:
@@ -203,17 +208,6 @@ class EpisodeWriter:
         self.group.create_group(SEAL_GROUP, attributes=to_json(seal))
 
     def _read_back(self) -> None:
-        """Read every array from disk and hold it against what was written, block by block."""
-        written = zarr.open_group(self.folder, mode="r", use_consolidated=False)
-        for name, record in self.digests.items():
-            array = written[name]
-            assert isinstance(array, zarr.Array)
-            digest = ArrayDigest()
-            step = (array.shards or array.chunks)[0] if array.ndim else 1
-            for first in range(0, array.shape[0], max(1, step)):
-                try:
-                    digest.update(np.asarray(array[first : first + step]))
-                except ValueError as error:
-                    raise CorruptEpisode(f"Array {name} cannot be read back from {self.folder}: {error}.") from None
-            if tuple(array.shape) != record.shape or digest.hexdigest() != record.sha256:
-                raise CorruptEpisode(f"Array {name} read back from {self.folder} differs from what was written.")
+        """Read everything back from disk, with the checks of `vla-analyze verify`."""
+        for problem in content_problems(self.run, StoredEpisode(self.folder)):
+            raise CorruptEpisode(f"Episode {self.name}, read back from {self.folder}, is damaged: {problem}.")

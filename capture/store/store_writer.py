@@ -24,8 +24,9 @@ from vla_attention.capture.store.durable_files import (
     remove_if_empty,
 )
 from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter
-from vla_attention.capture.store.store_root import check_same_run, create_root, delete_store, episode_folders, read_root
+from vla_attention.capture.store.store_root import check_same_run, create_root, delete_store, read_existing_root
 from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.stores.root import episode_folders
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
     STORE_SUFFIX,
@@ -39,11 +40,16 @@ WriteMode = Literal["new", "resume", "overwrite"]
 
 
 class RunStore:
-    """A store opened for adding episodes. Any number of processes may hold one; each episode has one writer."""
+    """A store opened for adding episodes. Any number of processes may open one; each episode has one writer.
 
-    def __init__(self, path: Path, attributes: RootAttributes) -> None:
+    `durable`: an episode is flushed to disk before it appears in the store, so that it survives a crash of the machine. Tests, which
+    write many small stores and throw them away, go without.
+    """
+
+    def __init__(self, path: Path, attributes: RootAttributes, durable: bool = True) -> None:
         self.path = path
         self.attributes = attributes
+        self.durable = durable
 
     def committed(self) -> set[tuple[int, int]]:
         """(task id, episode index) of every complete episode."""
@@ -63,15 +69,17 @@ class RunStore:
         try:
             with naming_the_failure(f"episode {name} of {self.path}"):
                 make_partial(folder)
-                writer = EpisodeWriter(self.path, self.attributes, folder, start, denoise_times, max_replans)
+                writer = EpisodeWriter(
+                    self.path, self.attributes, folder, start, denoise_times, max_replans, self.durable
+                )
             yield writer
         finally:
             shutil.rmtree(folder, ignore_errors=True)
             remove_if_empty(folder.parent)
 
 
-def open_run(path: Path, attributes: RootAttributes, mode: WriteMode) -> RunStore:
-    """Create a store, continue one, or replace one.
+def open_run(path: Path, attributes: RootAttributes, mode: WriteMode, *, durable: bool = True) -> RunStore:
+    """Create a store, continue one, or replace one. `durable`: see `RunStore`.
 
     Raises:
         StoreExists: something is at `path` and the mode is `new`.
@@ -86,24 +94,24 @@ def open_run(path: Path, attributes: RootAttributes, mode: WriteMode) -> RunStor
         if path.exists():
             if mode == "new":
                 refuse_existing(path)
-            existing = read_root(path)
+            existing = read_existing_root(path)
             if mode == "overwrite":
                 delete_store(path)
-                existing = create_root(path, attributes)
+                existing = create_root(path, attributes, durable)
         else:
-            existing = create_root(path, attributes)
+            existing = create_root(path, attributes, durable)
         check_same_run(path, existing, attributes)
         remove_dead_partials(path)
     except OSError as error:
         if isinstance(error, UserError):
             raise
         raise BadArgument(f"Cannot write a store at {path}: {error.strerror or error}; give another --store.") from None
-    return RunStore(path, existing)
+    return RunStore(path, existing, durable)
 
 
 def refuse_existing(path: Path) -> NoReturn:
     """Raise `StoreExists` for a store that is in the way (or `StoreError` when what is there is no store)."""
-    read_root(path)
+    read_existing_root(path)
     count = len(episode_folders(path))
     raise StoreExists(
         f"Store {path} exists already and holds {count} episodes; add --resume to continue it, "

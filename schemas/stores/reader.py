@@ -1,4 +1,7 @@
-"""Reading stores: what episodes there are, what their keys are, and their rows. The only module that touches Zarr."""
+"""Reading stores: the run, its episodes, what their keys are, and their arrays. zarr is imported when an array is opened.
+
+Both stages read with this module: analysis, and capture before it publishes an episode.
+"""
 
 from __future__ import annotations
 
@@ -9,34 +12,34 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
-from zarr.storage import LocalStore, StorePath
 
-from vla_attention.schemas.errors import did_you_mean, listing
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
-from vla_attention.schemas.jsonable import MalformedDocument, from_json
-from vla_attention.schemas.stores.shards import ShardedLayers
+from vla_attention.schemas.jsonable import from_json
+from vla_attention.schemas.stores.root import episode_folders, group_attributes, read_root
 from vla_attention.schemas.stores.store_format import (
-    EPISODES_GROUP,
     SEAL_GROUP,
     CorruptEpisode,
     EpisodeAttributes,
     EpisodeSeal,
     RootAttributes,
     StoreError,
-    StoreNotFound,
-    check_format,
     parse_episode_name,
 )
+
+if TYPE_CHECKING:
+    import zarr
+
+    from vla_attention.schemas.stores.shards import ShardedLayers
 
 
 @dataclass(frozen=True)
 class StoredEpisode:
-    """One committed episode. Nothing is read before it is asked for."""
+    """One episode in its folder. Nothing is read before it is needed, and metadata is checked against the seal when read."""
 
     folder: Path
 
@@ -47,25 +50,24 @@ class StoredEpisode:
 
     @cached_property
     def attributes(self) -> EpisodeAttributes:
-        """What the episode says of itself."""
+        """The episode's attributes."""
+        document = self.sealed("zarr.json")
         try:
-            return from_json(EpisodeAttributes, _attributes_of(self.sealed("zarr.json")))
-        except (OSError, ValueError, KeyError) as error:
-            if isinstance(error, CorruptEpisode):
-                raise
+            return from_json(EpisodeAttributes, group_attributes(document))
+        except ValueError as error:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: its attributes are damaged ({error}).") from None
 
     @cached_property
     def seal(self) -> EpisodeSeal:
         """The digests of the episode's metadata."""
         try:
-            given = _attributes_of((self.folder / SEAL_GROUP / "zarr.json").read_bytes())
-            return from_json(EpisodeSeal, given)
-        except (OSError, ValueError, KeyError) as error:
+            document = (self.folder / SEAL_GROUP / "zarr.json").read_bytes()
+            return from_json(EpisodeSeal, group_attributes(document))
+        except (OSError, ValueError) as error:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: its seal is damaged ({error}).") from None
 
     def sealed(self, file: str) -> bytes:
-        """The bytes of one `zarr.json` of the episode; raises `CorruptEpisode` when they are not those that the seal knows."""
+        """Read one `zarr.json` of the episode; raises `CorruptEpisode` when its digest is not the one in the seal."""
         try:
             content = (self.folder / file).read_bytes()
         except OSError as error:
@@ -76,38 +78,41 @@ class StoredEpisode:
 
     @property
     def is_of_this_run(self) -> bool:
-        """Whether the store's own attributes are, to the byte, those that the episode was recorded under."""
+        """Whether the `zarr.json` of the store is, to the byte, the one under which the episode was recorded."""
         run = self.folder.parents[1] / "zarr.json"
         return hashlib.sha256(run.read_bytes()).hexdigest() == self.seal.run
 
     @cached_property
-    def _opened(self) -> dict[str, zarr.Array]:
+    def _opened(self) -> dict[str, zarr.Array[Any]]:
         return {}
 
     @cached_property
     def _layers(self) -> dict[str, ShardedLayers | None]:
         return {}
 
-    def array(self, name: str) -> zarr.Array:
-        """One array of the episode; raises `CorruptEpisode` when it lacks a file or has another shape than promised."""
+    def array(self, name: str) -> zarr.Array[Any]:
+        """Open one array; raises `CorruptEpisode` when it lacks a file or its shape is not the one in the attributes."""
         if name not in self._opened:
             self._opened[name] = self._open(name)
         return self._opened[name]
 
-    def _open(self, name: str) -> zarr.Array:
-        promised = self.attributes.arrays.get(name)
-        if promised is None:
+    def _open(self, name: str) -> zarr.Array[Any]:
+        import zarr
+        from zarr.storage import LocalStore, StorePath
+
+        recorded = self.attributes.arrays.get(name)
+        if recorded is None:
             raise CorruptEpisode(f"Episode {self.name} lacks the array {name}: its attributes do not list it.")
         document = self.sealed(f"{name}/zarr.json")
         try:
-            # Opened from the very bytes that the seal vouches for: nothing is looked up, and nothing read twice.
+            # Opened from the bytes that were checked against the seal: zarr does not read the file a second time.
             place = StorePath(LocalStore(self.folder / name, read_only=True))
-            array: zarr.Array = zarr.Array(zarr.AsyncArray(metadata=json.loads(document), store_path=place))
+            array: zarr.Array[Any] = zarr.Array(zarr.AsyncArray(metadata=json.loads(document), store_path=place))
         except (KeyError, TypeError, ValueError) as error:
             raise CorruptEpisode(f"Episode {self.name} lacks the array {name} ({error}).") from None
-        if tuple(array.shape) != promised.shape:
-            raise CorruptEpisode(f"Array {name} of episode {self.name} has not the shape that its attributes promise.")
-        # A missing file reads as the fill value, and in a picture that may be any picture's number.
+        if tuple(array.shape) != recorded.shape:
+            raise CorruptEpisode(f"Array {name} of episode {self.name} has another shape than its attributes say.")
+        # zarr reads a missing file as the fill value, which is a valid number in a picture.
         for file in _chunk_files(array):
             if not (self.folder / name / file).is_file():
                 raise CorruptEpisode(f"Array {name} of episode {self.name} has lost its file {file}.")
@@ -123,13 +128,15 @@ class StoredEpisode:
         except Exception as error:  # damaged bytes can make codecs raise anything
             problem = str(error).rstrip(".")
             raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {problem}.") from error
-        if _holds_missing(values) or (name.endswith("/key_role") and not values.all()):
-            raise CorruptEpisode(f"Array {name} of episode {self.name} has missing values: a chunk is lost.")
-        return values
+        if name.endswith("/key_role") and not values.all():
+            raise _lost_chunk(self, name)
+        return self._without_missing(name, values)
 
     def read_layer(self, name: str, layer: int, denoise: int) -> NDArray[np.float32]:
         """One layer and denoise step (positions) of an array (replan, layer, denoise, ...), without those two axes."""
         if name not in self._layers:
+            from vla_attention.schemas.stores.shards import ShardedLayers
+
             self._layers[name] = ShardedLayers.of(self.folder / name, dict(self.array(name).metadata.to_dict()))
         layers = self._layers[name]
         if layers is None:
@@ -138,8 +145,11 @@ class StoredEpisode:
             values = layers.read(layer, denoise)
         except CorruptEpisode as error:
             raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {error}") from None
+        return self._without_missing(name, values)
+
+    def _without_missing(self, name: str, values: NDArray[Any]) -> NDArray[Any]:
         if _holds_missing(values):
-            raise CorruptEpisode(f"Array {name} of episode {self.name} has missing values: a chunk is lost.")
+            raise _lost_chunk(self, name)
         return values
 
     def tokens(self, root: RootAttributes, site: str) -> EpisodeTokens:
@@ -196,33 +206,23 @@ class Store:
 
 
 def open_store(path: Path) -> Store:
-    """Open a store for reading.
+    """Open a store for reading; its episodes are in the order of task id and episode index.
 
     Raises:
-        StoreNotFound: nothing is there; stores nearby are named.
+        StoreNotFound: nothing is there; the error lists the stores nearby.
         StoreError: something else is there, or its attributes cannot be read.
         FormatTooNew: a later version wrote it.
     """
-    if not path.exists():
-        nearby = sorted(str(found) for found in path.parent.glob("*.zarr")) if path.parent.is_dir() else []
-        raise StoreNotFound(
-            f"There is no store at {path}.{did_you_mean(str(path), nearby)} Stores in {path.parent}: {listing(nearby)}. "
-            "Make one with vla-capture."
-        )
+    root = read_root(path)
     try:
-        attributes = _read_attributes(path)
-    except (FileNotFoundError, NotADirectoryError):
-        raise StoreError(f"{path} is not a store: it has no zarr.json.") from None
-    except (OSError, ValueError, KeyError) as error:
-        raise StoreError(f"The store {path} cannot be read: {error}.") from None
-    check_format(attributes, path)
-    try:
-        root = from_json(RootAttributes, attributes)
-        names = sorted(entry.name for entry in (path / EPISODES_GROUP).iterdir() if entry.is_dir())
-        keyed = sorted((parse_episode_name(name), name) for name in names)
-    except (MalformedDocument, OSError, ValueError) as error:
+        folders = sorted(episode_folders(path), key=lambda folder: parse_episode_name(folder.name))
+    except BadArgument as error:
         raise StoreError(f"The store {path} cannot be read: {error}") from None
-    return Store(path, root, tuple(StoredEpisode(path / EPISODES_GROUP / name) for _, name in keyed))
+    return Store(path, root, tuple(StoredEpisode(folder) for folder in folders))
+
+
+def _lost_chunk(episode: StoredEpisode, name: str) -> CorruptEpisode:
+    return CorruptEpisode(f"Array {name} of episode {episode.name} has missing values: a chunk is lost.")
 
 
 def _holds_missing(values: NDArray[Any]) -> bool:
@@ -234,22 +234,8 @@ def _holds_missing(values: NDArray[Any]) -> bool:
     return bool(np.isnan(values).any())
 
 
-def _chunk_files(array: zarr.Array) -> Iterator[str]:
+def _chunk_files(array: zarr.Array[Any]) -> Iterator[str]:
     """Paths of the files that hold an array, relative to it."""
     extents = zip(array.shape, array.shards or array.chunks, strict=True)
     for coordinates in itertools.product(*(range(-(-size // extent)) for size, extent in extents)):
         yield array.metadata.encode_chunk_key(coordinates)
-
-
-def _read_attributes(folder: Path) -> dict[str, Any]:
-    return _attributes_of((folder / "zarr.json").read_bytes())
-
-
-def _attributes_of(group_document: bytes) -> dict[str, Any]:
-    document = json.loads(group_document)
-    if not isinstance(document, dict) or (document.get("zarr_format"), document.get("node_type")) != (3, "group"):
-        raise ValueError("zarr.json does not describe a group of Zarr format 3")
-    attributes = document.get("attributes", {})
-    if not isinstance(attributes, dict):
-        raise ValueError("zarr.json has no attributes")
-    return attributes

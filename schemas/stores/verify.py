@@ -1,4 +1,7 @@
-"""Verification: read everything back and hold it against what the episodes promise of themselves."""
+"""Verification: read everything back and compare it with the attributes, digests and row sums of each episode.
+
+`verify_store` checks a store; capture checks an episode with `content_problems` before it publishes it.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +43,7 @@ def verify_store(store: Store, progress: Callable[[int], object] | None = None) 
 
 def episode_faults(store: Store, episode: StoredEpisode) -> list[Fault]:
     """Everything that is wrong with one episode of a store; reads all of it."""
-    problems = dict.fromkeys(_problems(store.attributes, episode))  # several checks may stumble over one fault
+    problems = dict.fromkeys(_problems(store.attributes, episode))  # several checks may find the same fault
     return [Fault(episode.name, problem) for problem in problems]
 
 
@@ -54,6 +57,16 @@ def _problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
         return
     if parse_episode_name(episode.name) != (attributes.task_id, attributes.episode_index):
         yield f"its attributes are those of {episode_name(attributes.task_id, attributes.episode_index)}"
+    yield from content_problems(root, episode)
+
+
+def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
+    """What is wrong inside an episode, wherever its folder is: metadata, shapes, values, row sums. Reads all of it.
+
+    Raises:
+        CorruptEpisode: the episode's attributes or its seal cannot be read.
+    """
+    attributes = episode.attributes
     for file in episode.seal.files:
         yield from _guarded(_metadata_problems(episode, file))
     shapes = _expected_shapes(root, attributes)
@@ -69,6 +82,7 @@ def _problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
 
 
 def _guarded(check: Iterator[str]) -> Iterator[str]:
+    """The problems that a check finds; an array or file that it cannot read is one more."""
     try:
         yield from check
     except CorruptEpisode as error:
@@ -120,11 +134,13 @@ def _array_problems(episode: StoredEpisode, name: str, sha256: str, mantissa_bit
     if negative:
         yield f"{name} holds negative numbers"
     if worst > bound:
-        yield f"{name} does not add up to the row sums: they differ by up to {worst:.2g} of them, allowed is {bound:.2g}"
+        yield (
+            f"{name} does not add up to the row sums: they differ by up to {worst:.2g} of them, allowed is {bound:.2g}"
+        )
 
 
 def _row_sums(episode: StoredEpisode, name: str, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
-    """The exact sums that belong to rows or atoms; None when they are damaged, which is a fault of their own."""
+    """The exact sums that belong to rows or atoms; None when they are damaged (reported by their own check)."""
     try:
         sums: NDArray[np.float64] = episode.read(f"{name.rpartition('/')[0]}/row_sum").astype(np.float64)
     except CorruptEpisode:

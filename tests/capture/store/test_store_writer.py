@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from tests.kit.store_kit import StoreSpec, denoise_times, episode_records, root_attributes, write_episode, write_store
 from tests.kit.strategies import episode_tokens
-from vla_attention.capture.store import codecs as store_arrays
+from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.capture.store.codecs import replans_per_block, write_whole
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.store_writer import open_run
@@ -117,7 +117,7 @@ def test_random_layouts_are_read_back(tmp_path_factory, tokens, bits):
 
 @pytest.mark.parametrize("replans", [7, 8, 9, 15, 16, 17, 24, 30])
 def test_episodes_around_the_size_of_a_block(tmp_path, monkeypatch, replans):
-    monkeypatch.setattr(store_arrays, "TARGET_CHUNK_BYTES", 1)
+    monkeypatch.setattr(store_codecs, "TARGET_CHUNK_BYTES", 1)
     spec = StoreSpec(replans=replans, tasks=(0,), episodes=1, heads=(0,), layers=(0, 1))
     path = write_store(tmp_path / "a.zarr", spec=spec)
     array = open_store(path).episodes[0].array("joint/rows")
@@ -148,13 +148,13 @@ def test_replans_per_block(numbers, replans):
     assert block * numbers % 8 == 0
     assert 1 <= block <= 8 * math.ceil(replans / 8)
     chunk = 4 * numbers * block
-    assert chunk <= max(store_arrays.TARGET_CHUNK_BYTES + 8 * 4 * numbers, 8 * 4 * numbers)
-    if 8 * math.ceil(replans / 8) * 4 * numbers <= store_arrays.TARGET_CHUNK_BYTES:
+    assert chunk <= max(store_codecs.TARGET_CHUNK_BYTES + 8 * 4 * numbers, 8 * 4 * numbers)
+    if 8 * math.ceil(replans / 8) * 4 * numbers <= store_codecs.TARGET_CHUNK_BYTES:
         assert block >= replans  # what fits into one chunk is one chunk
 
 
 def test_long_side_arrays_are_cut_into_chunks_of_one_file(tmp_path, monkeypatch):
-    monkeypatch.setattr(store_arrays, "TARGET_CHUNK_BYTES", 500)
+    monkeypatch.setattr(store_codecs, "TARGET_CHUNK_BYTES", 500)
     spec = StoreSpec(replans=7, tasks=(0,), episodes=1)
     path = write_store(tmp_path / "a.zarr", spec=spec)
     episode = open_store(path).episodes[0]

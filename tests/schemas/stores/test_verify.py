@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from tests.kit.store_kit import StoreSpec, denoise_times, episode_records, root_attributes, write_store
 from vla_attention.analyze.__main__ import main
+from vla_attention.capture.store.episode_writer import EpisodeWriter
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
@@ -217,15 +218,23 @@ def test_damaged_attributes_are_not_read(path):
         episode.read("joint/rows")
 
 
-def test_rows_that_do_not_add_up_to_their_sums(tmp_path):
-    """A writer that lies consistently: checksums, digests and seal are all in order."""
-    store = open_run(tmp_path / "a.zarr", root_attributes(SPEC), "new")
+def test_rows_that_do_not_add_up_to_their_sums(tmp_path, monkeypatch):
+    """Checksums, digests and seal are all in order. The writer refuses such an episode; verification finds one from elsewhere."""
+    store = open_run(tmp_path / "a.zarr", root_attributes(SPEC), "new", durable=False)
     start, records = episode_records(SPEC, 0, 0)
-    with store.episode(start, denoise_times(SPEC), 3) as writer:
-        for record in records:
-            rows = record.rows["joint"]
-            writer.append(replace(record, rows={"joint": replace(rows, row_sum=rows.row_sum * np.float32(1.01))}))
-        writer.commit(False, 5)
+
+    def write() -> None:
+        with store.episode(start, denoise_times(SPEC), 3) as writer:
+            for record in records:
+                rows = record.rows["joint"]
+                writer.append(replace(record, rows={"joint": replace(rows, row_sum=rows.row_sum * np.float32(1.01))}))
+            writer.commit(False, 5)
+
+    with pytest.raises(CorruptEpisode, match=r"task000_episode000, read back .* does not add up to the row sums"):
+        write()
+    assert open_store(store.path).episodes == ()
+    monkeypatch.setattr(EpisodeWriter, "_read_back", lambda writer: None)
+    write()
     problems = [fault.problem for fault in faults(store.path)]
     assert len(problems) == 2
     for name, problem in zip(("joint/atoms", "joint/rows"), problems, strict=True):

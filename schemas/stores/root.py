@@ -1,0 +1,65 @@
+"""The root of a store: the run's attributes and the folders of its episodes. Read as plain JSON; zarr is not needed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from vla_attention.schemas.errors import did_you_mean, listing
+from vla_attention.schemas.jsonable import MalformedDocument, from_json
+from vla_attention.schemas.stores.store_format import (
+    EPISODES_GROUP,
+    RootAttributes,
+    StoreError,
+    StoreNotFound,
+    check_format,
+)
+
+
+def read_root(path: Path) -> RootAttributes:
+    """Read the attributes of the store at `path`.
+
+    Raises:
+        StoreNotFound: nothing is there; the error lists the stores nearby.
+        StoreError: something else is there, or its attributes cannot be read.
+        FormatTooNew: a later version wrote it.
+    """
+    if not path.exists():
+        nearby = sorted(str(found) for found in path.parent.glob("*.zarr")) if path.parent.is_dir() else []
+        raise StoreNotFound(
+            f"There is no store at {path}.{did_you_mean(str(path), nearby)} Stores in {path.parent}: {listing(nearby)}. "
+            "Make one with vla-capture."
+        )
+    try:
+        attributes = group_attributes((path / "zarr.json").read_bytes())
+    except (FileNotFoundError, NotADirectoryError):
+        raise StoreError(f"{path} is not a store: it has no zarr.json.") from None
+    except (OSError, ValueError) as error:
+        raise StoreError(f"The store {path} cannot be read: {error}.") from None
+    check_format(attributes, path)
+    try:
+        return from_json(RootAttributes, attributes)
+    except (MalformedDocument, ValueError) as error:
+        raise StoreError(f"The store {path} cannot be read: {error}") from None
+
+
+def episode_folders(path: Path) -> list[Path]:
+    """Folders of the complete episodes of the store at `path`, in no particular order."""
+    try:
+        return [entry for entry in (path / EPISODES_GROUP).iterdir() if entry.is_dir()]
+    except OSError as error:
+        raise StoreError(
+            f"The store {path} cannot be read: its group '{EPISODES_GROUP}': {error.strerror or error}."
+        ) from None
+
+
+def group_attributes(document: bytes) -> dict[str, Any]:
+    """The attributes in the `zarr.json` of a Zarr v3 group; raises `ValueError` when the bytes are anything else."""
+    content = json.loads(document)
+    if not isinstance(content, dict) or (content.get("zarr_format"), content.get("node_type")) != (3, "group"):
+        raise ValueError("zarr.json does not describe a group of Zarr format 3")
+    attributes = content.get("attributes", {})
+    if not isinstance(attributes, dict):
+        raise ValueError("zarr.json has no attributes")
+    return attributes
