@@ -120,7 +120,7 @@ def load_and_run(folder: Path, checkpoint_format: str, dtype: str) -> dict[str, 
     from vla_attention.capture.policies.pi import loading
     from vla_attention.capture.policies.pi.embedded import TOKENIZER_PATH
     from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
-    from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan
+    from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
 
     class FullSizeTokenizer(PromptTokenizer):
         """The embedded policy's tokenizer with the vocabulary size of PaliGemma's, which may not be distributed."""

@@ -24,9 +24,9 @@ def _run(argv: Sequence[str], termination: Termination) -> int:
     if arguments.policy == "parity":
         return _parity(arguments)
     if arguments.policy == "status":
-        from vla_attention.capture.jobs.status import run_status
+        from vla_attention.capture.jobs.status import print_status
 
-        return run_status(arguments.stores, arguments.expected, as_json=arguments.json, check=arguments.check)
+        return print_status(arguments.stores, arguments.expected, as_json=arguments.json, check=arguments.check)
     if arguments.policy == "tasks":
         from vla_attention.capture.task_list import print_tasks
 
@@ -48,7 +48,8 @@ def _capture(arguments: argparse.Namespace, termination: Termination) -> int:
 
     from vla_attention.capture.device import choose_device
     from vla_attention.capture.policy_choice import build_policy
-    from vla_attention.capture.run import run_capture, say
+    from vla_attention.capture.rollout.progress import say
+    from vla_attention.capture.run import run_capture
 
     device = choose_device(arguments.device)
     policy = build_policy(arguments, device)

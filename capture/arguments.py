@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vla_attention.capture.environments.base import EnvironmentSettings
-from vla_attention.capture.environments.suites import SUITES, check_task_id, find_suite
+from vla_attention.capture.environments.base import EnvironmentSettings, check_task_id
+from vla_attention.capture.environments.suites import ALL_SUITES, STANDARD_SUITES, SUITES, find_suite
 from vla_attention.capture.settings import RecordingSettings, RunSettings
 from vla_attention.schemas.command_line import OneSentenceParser
 from vla_attention.schemas.errors import BadArgument, listing
@@ -42,9 +42,6 @@ PUBLISHED_CHECKPOINTS = {
 }
 #: The layers that they analyse unless told otherwise.
 PUBLISHED_LAYERS = (25, 26, 27)
-#: `--task-suite all`: the standard suites of LIBERO.
-ALL_SUITES = "all"
-STANDARD_SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10")
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -10,8 +10,9 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from vla_attention.capture.jobs.job import ask_for_requeue, this_worker
+from vla_attention.capture.jobs.slurm import ask_for_requeue
 from vla_attention.capture.jobs.termination import EXIT_TERMINATED, Terminated, Termination, listening_for_sigterm
+from vla_attention.capture.jobs.worker import this_worker
 from vla_attention.schemas.command_line import run_command
 from vla_attention.schemas.errors import BadArgument
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from vla_attention.capture.policies.base import Policy
+from vla_attention.capture.policies.policy import Policy
 
 
 def build_policy(arguments: argparse.Namespace, device: str) -> Policy:

@@ -5,15 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal, cast
 
+from vla_attention.capture.environments.base import check_initial_state_index
 from vla_attention.capture.environments.protocol import WAIT_STEPS
-from vla_attention.capture.environments.suites import check_initial_state_index, list_tasks
-from vla_attention.capture.jobs.job import this_worker
-from vla_attention.capture.jobs.run_records import PlannedTask, RecordKeeper, forget_runs, planned_tasks, read_records
+from vla_attention.capture.environments.suites import list_tasks
 from vla_attention.capture.jobs.termination import Termination
+from vla_attention.capture.jobs.worker import this_worker
+from vla_attention.capture.jobs.worker_records import (
+    PlannedTask,
+    RecordWriter,
+    delete_jobs_folder,
+    planned_tasks,
+    read_records,
+)
 from vla_attention.capture.policies.policy import Policy, camera_grid
 from vla_attention.capture.provenance import describe_machine
-from vla_attention.capture.recording.episode_loop import EpisodeLoop, say
-from vla_attention.capture.recording.rollout import EpisodeResult, check_protocol, max_replans
+from vla_attention.capture.rollout.episode import EpisodeResult, check_protocol, max_replans
+from vla_attention.capture.rollout.episode_loop import EpisodeLoop
+from vla_attention.capture.rollout.progress import say
 from vla_attention.capture.settings import RecordingSettings, RunSettings
 from vla_attention.capture.store.disk_estimate import describe, estimate_disk
 from vla_attention.capture.store.store_writer import RunStore, open_run
@@ -83,7 +91,7 @@ def run_capture(
     )
     check_protocol(protocol, policy)
     recording, note = plan_recording(settings.recording, policy)
-    tasks = list_tasks(settings.suite, settings.environment)
+    tasks = list_tasks(settings.suite)
     wanted = tasks if settings.task_id is None else (tasks[settings.task_id],)
     for task in wanted:
         check_initial_state_index(task, settings.num_episodes - 1)
@@ -101,7 +109,7 @@ def run_capture(
         say(note)
     store = open_run(settings.store, attributes, settings.mode)
     if settings.mode == "overwrite":
-        forget_runs(store.path)
+        delete_jobs_folder(store.path)
     done = store.committed()
     todo = [
         (task, episode)
@@ -120,7 +128,7 @@ def run_capture(
     if not todo and all(task.task_id in known and known[task.task_id].episodes >= task.episodes for task in plan):
         return []
     worker = this_worker()
-    record = RecordKeeper(store.path, worker, plan)
+    record = RecordWriter(store.path, worker, plan)
     loop = EpisodeLoop(
         suite=settings.suite,
         environment_settings=settings.environment,
@@ -131,7 +139,7 @@ def run_capture(
         machine=machine,
         termination=termination or Termination(),
     )
-    return loop.run(todo)
+    return loop.record_all(todo)
 
 
 def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int) -> None:

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vla_attention.capture.environments.base import EnvironmentSettings
-from vla_attention.capture.environments.suites import Suite
+from vla_attention.capture.environments.base import EnvironmentSettings, Suite
 
 if TYPE_CHECKING:
     from vla_attention.capture.store.store_writer import WriteMode

@@ -1,7 +1,7 @@
-"""What every simulation environment offers the rollout: a task, named objects, pictures and their segmentation.
+"""The interface of a simulation environment, and the data that crosses it: suites, tasks, observations.
 
-The rollout knows nothing about MuJoCo. An environment waits and steps like the published evaluation protocol does, but
-draws pictures only when asked: a policy looks at every fifth step or so, and drawing is most of what a step costs.
+Code outside this folder needs neither MuJoCo nor robosuite. An environment draws pictures only on request: a policy
+needs a picture about every fifth step, and drawing takes most of the time of a step.
 """
 
 from __future__ import annotations
@@ -9,38 +9,42 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.capture.environments.protocol import IMAGE_SIZE
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 
+#: Name of the scene object that stands for the arm, its gripper and its mount.
 ROBOT = "robot"
-"""Name of the one scene object that is the arm, its gripper and its mount."""
-
+#: Name of the scene object that stands for everything without a name of its own: table, floor, walls, sky.
 BACKGROUND = "background"
-"""Name of the one scene object that is everything unnamed: table, floor, walls, sky."""
 
 
 @dataclass(frozen=True)
-class EnvironmentSettings:
-    """What a user may choose about an environment.
+class Suite:
+    """A set of tasks and the limits of their evaluation. `suites.py` lists all suites.
 
-    image_size: height and width of every camera picture in pixels; published results use 256.
-    libero_assets: the LIBERO asset folder; without it the places named in `libero_installation` are tried.
+    kind: the simulator. "libero" needs the LIBERO package and its assets; "robosuite" needs no download.
+    max_steps: policy steps after which an episode counts as failed, as in the published evaluations.
     """
 
-    image_size: int = 256
-    libero_assets: Path | None = None
+    name: str
+    kind: Literal["libero", "robosuite"]
+    num_tasks: int
+    max_steps: int
+    initial_states_per_task: int
 
 
 @dataclass(frozen=True)
 class Task:
     """One task of a suite.
 
-    instruction: the sentence given to the policy.
-    num_initial_states: how many stored starting states there are; an episode names one by its index.
+    instruction: the sentence that the policy gets.
+    num_initial_states: number of stored initial states; an episode selects one by its index.
     """
 
     suite: str
@@ -51,17 +55,28 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Observation:
-    """What the robot perceives at one moment; pictures and numbers are sampled at the same physics substep.
+class EnvironmentSettings:
+    """The choices of a user about an environment.
 
-    images: camera name -> (height, width, 3) uint8, exactly as robosuite and LIBERO deliver it, which is OpenGL's
-        order: row 0 is the BOTTOM edge of what the camera sees, column 0 its LEFT edge. The picture is therefore upside
-        down but not mirrored by a second axis. Reversing the rows alone would show the scene as a person sees it;
-        policies trained on LIBERO reverse rows and columns (a rotation by 180 degrees), so that what they see is
+    image_size: height and width of every camera picture in pixels.
+    libero_assets: the folder of LIBERO's assets; None searches the places that `libero_installation.find_assets` lists.
+    """
+
+    image_size: int = IMAGE_SIZE
+    libero_assets: Path | None = None
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the robot perceives at one moment. Pictures and numbers come from the same physics substep.
+
+    images: camera name -> (height, width, 3) uint8, as robosuite and LIBERO return it, which is OpenGL's order: row 0
+        is the BOTTOM edge of the camera's view, column 0 its LEFT edge. Reversing the rows alone shows the scene as a
+        person sees it. Policies trained on LIBERO reverse rows and columns (a rotation by 180 degrees): their input is
         upright with left and right exchanged.
     eef_pos: (3,) float64, position of the gripper site in metres, world frame.
     eef_quat: (4,) float64, orientation of the hand as a quaternion in the order x, y, z, w.
-    gripper_qpos: (2,) float64, positions of the two finger joints.
+    gripper_qpos: (2,) float64, positions of the two finger joints in metres.
     """
 
     images: Mapping[str, NDArray[np.uint8]]
@@ -72,7 +87,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class StepResult:
-    """What one step led to: whether the task is solved now, and the observation if one was asked for."""
+    """The result of one step: whether the task is solved now, and the observation if it was requested."""
 
     success: bool
     observation: Observation | None
@@ -81,33 +96,46 @@ class StepResult:
 class Environment(Protocol):
     """One task in one simulator.
 
-    An episode is `reset`, then `wait_steps` steps with `wait_action` (things fall into place), then at most `max_steps`
-    steps of the policy. There is no observation before the first step: the protocol's first picture is the one after
-    the last waiting step, so ask for it there with `observe=True`.
+    An episode is one `reset`, the waiting steps of `protocol.py`, and then the steps of the policy. No observation
+    exists before the first step: the first picture of the protocol is the one after the last waiting step, so request
+    it there with `observe=True`.
+
+    objects: the scene objects, in the order of the indices that `segmentation` returns.
     """
 
-    task: Task
-    cameras: tuple[str, ...]
     objects: tuple[SceneObject, ...]
-    max_steps: int
-    wait_action: NDArray[np.float64]
-    wait_steps: int
 
     def reset(self, initial_state_index: int, seed: int) -> None:
-        """Begin an episode from a stored initial state; what ran before has no influence on it."""
+        """Begin an episode from a stored initial state. Earlier episodes have no influence on it."""
 
     @property
     def initial_state_digest(self) -> str:
-        """SHA-256 (hex) of the float64 bytes (time, qpos, qvel) of the state the current episode began with."""
+        """SHA-256 (hex) of the float64 bytes (time, qpos, qvel) of the initial state of the current episode."""
 
     def step(self, action: NDArray[np.floating], observe: bool) -> StepResult:
-        """Advance by one control step with a (7,) action: six pose deltas and the gripper.
+        """Advance by one control step with an action of shape (7,): six pose deltas and the gripper.
 
-        Pictures are drawn only with `observe=True`; they are bit-identical to those that drawing at every step gives.
+        Pictures are drawn only with `observe=True`. They are bit-identical to the pictures that drawing at every step
+        gives.
         """
 
     def segmentation(self, camera: str) -> NDArray[np.int32]:
-        """Return (height, width) indices into `objects` for the LAST observed picture of `camera`, pixel for pixel."""
+        """Return (height, width) indices into `objects` for the LAST observed picture of `camera`, pixel by pixel."""
 
     def close(self) -> None:
-        """Free the simulator and its drawing context. Closing twice is fine."""
+        """Free the simulator and its drawing context. A second call does nothing."""
+
+
+def check_task_id(suite: Suite, task_id: int) -> None:
+    """Raise `BadArgument` unless the suite has a task of that number."""
+    if not 0 <= task_id < suite.num_tasks:
+        raise BadArgument(f"Task {task_id} does not exist in {suite.name}; its tasks are 0 to {suite.num_tasks - 1}.")
+
+
+def check_initial_state_index(task: Task, index: int) -> None:
+    """Raise `BadArgument` unless the task has an initial state of that number."""
+    if not 0 <= index < task.num_initial_states:
+        raise BadArgument(
+            f"Initial state {index} does not exist for task {task.task_id} of {task.suite}; "
+            f"its initial states are 0 to {task.num_initial_states - 1}."
+        )

@@ -1,4 +1,4 @@
-"""How much of every image patch each object covers. Pure numpy: segmentation in, area fractions out."""
+"""The share of every image patch that each object covers, computed from a segmentation with numpy only."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from vla_attention.schemas.errors import BadArgument
 
 
 def overlap_lengths(pixels: int, cells: int, visible: float = 1.0) -> NDArray[np.float64]:
-    """Return (cells, pixels): which share of a cell's length each pixel fills, cells dividing the visible middle evenly.
+    """Return (cell, pixel), the share of each cell's length that each pixel fills. The cells divide the visible middle
+    evenly.
 
-    A pixel on a border between two cells counts in both, by the part that lies in each. Rows sum to 1.
+    A pixel on the border of two cells counts in both, by its part in each. Rows sum to 1.
     """
-    # In units of a cell, so that with everything visible borders that should coincide are the same number.
+    # Lengths are in units of a cell: if everything is visible, borders that coincide are then the same number.
     cell = np.arange(cells, dtype=np.float64)[:, None]
     border = (np.arange(pixels + 1) / pixels - (1.0 - visible) / 2.0) * cells / visible
     border = np.where(np.abs(border - np.round(border)) < 1e-9, np.round(border), border)
@@ -31,15 +32,15 @@ def patch_coverage(
     flip_columns: bool,
     visible: float = 1.0,
 ) -> NDArray[np.float32]:
-    """Return the area fraction of every object in every patch of the image as the model sees it.
+    """Return the area fraction of every object in every patch of the model's image.
 
     segmentation: (height, width) object index per pixel, in 0..num_objects-1, in the environment's orientation.
-    flip_rows, flip_columns: whether the model sees the picture with its rows, its columns reversed (both: turned by 180°).
-    visible: side of what the model sees, as a share of the picture's side, around its middle.
+    flip_rows, flip_columns: whether the model's image has the rows, the columns reversed (both: turned by 180°).
+    visible: side of the part that the model sees, as a share of the picture's side, around the middle.
     returns: (grid_rows * grid_columns, num_objects) float32, patches row by row; every row sums to 1.
 
-    The patches divide the picture evenly whether or not its sides are multiples of the grid: a resize to the model's
-    input size scales both alike, so fractions of the original picture are the fractions of what the model sees.
+    The patches divide the picture evenly even if its sides are no multiples of the grid. A resize to the model's input
+    size scales picture and patches alike, so the fractions of the original picture hold for the model's image.
     """
     if segmentation.ndim != 2 or not segmentation.size:
         raise BadArgument(f"A segmentation has two axes (height, width) and pixels; got shape {segmentation.shape}.")
@@ -47,8 +48,9 @@ def patch_coverage(
         raise BadArgument(f"A patch grid needs at least one row and one column; got {grid_rows} x {grid_columns}.")
     low, high = int(segmentation.min()), int(segmentation.max())
     if low < 0 or high >= num_objects:
-        raise BadArgument(f"The segmentation holds indices {low} to {high}; with {num_objects} objects 0 to "
-                          f"{num_objects - 1} are valid.")  # fmt: skip
+        raise BadArgument(
+            f"The segmentation holds indices {low} to {high}; with {num_objects} objects 0 to {num_objects - 1} are valid."
+        )
     if not 0.0 < visible <= 1.0:
         raise BadArgument(f"The visible share of a picture's side is {visible}; it must be above 0 and at most 1.")
     seen = segmentation[:: -1 if flip_rows else 1, :: -1 if flip_columns else 1]

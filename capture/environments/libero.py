@@ -1,4 +1,4 @@
-"""LIBERO tasks, run the way the published evaluations of pi0, pi0.5 and Cosmos Policy run them."""
+"""LIBERO tasks, simulated as in the published evaluations of pi0, pi0.5 and Cosmos Policy."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.environments.base import ROBOT, EnvironmentSettings, SceneObject, Task
+from vla_attention.capture.environments.base import ROBOT, EnvironmentSettings, Task
 from vla_attention.capture.environments.libero_installation import find_assets, load_libero, package_folder
 from vla_attention.capture.environments.simulator import SimulatedEnvironment
-from vla_attention.capture.environments.suites import Suite
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.groupings.vocabulary import SceneObject
 
 
 def load_initial_states(path: Path) -> NDArray[np.float64]:
-    """Read the stored initial states of a task: (states, 1 + positions + velocities), MuJoCo states made flat.
+    """Read the stored initial states of a task, (state, 1 + position + velocity) float64: flattened MuJoCo states.
 
-    They are pickles written by torch.save with a numpy array inside. torch's restricted reader opens them once the few
-    numpy functions that rebuild an array are allowed by the names numpy 1 gave them, so nothing else can run.
+    The files are pickles, written by torch.save, of a numpy array. torch's restricted reader opens them if the few
+    numpy functions that rebuild an array are allowed, by their names in numpy 1. No other code in a file can run.
     """
     import torch
 
@@ -38,33 +38,32 @@ def load_initial_states(path: Path) -> NDArray[np.float64]:
 
 
 def parent_of_region(name: str, known: Sequence[str]) -> str | None:
-    """Return the object or fixture that `name` is or is a region of (`wine_rack_1_top_region`), None for the table."""
+    """Return the object or fixture of which `name` is a region (`wine_rack_1_top_region`) or the name; None for the table."""
     owners = [candidate for candidate in known if name == candidate or name.startswith(f"{candidate}_")]
     return max(owners, key=len, default=None)
 
 
 class LiberoEnvironment(SimulatedEnvironment):
-    """One LIBERO task. An initial state is one of the 50 stored with the task; `seed` is the protocol's (7).
+    """One LIBERO task. An initial state is one of the 50 that are stored with the task; the protocol's `seed` is 7.
 
-    What the seed decides: a stored state holds joint positions and velocities, but cabinets, stoves and racks stand on
-    no joint; every reset places them at random in small regions of the table (measured: up to 15 mm and 3 degrees
-    apart). The protocol seeds once per task, so there they stand elsewhere in every episode, depending on how many ran
-    before in that process. Here every reset is seeded: they always stand where the protocol has them in its first
-    episode, and an episode is the same whether it runs alone, in a job array, or after others. The first episode of a
-    task is the protocol's bit for bit; later ones are those that the protocol would have after seeding anew.
+    Effect of the seed: a stored state holds joint positions and velocities, but cabinets, stoves and racks have no
+    joint. Every reset places them at random in small regions of the table (measured: up to 15 mm and 3 degrees apart).
+    The protocol seeds once per task, so there the places differ between episodes and depend on the number of earlier
+    episodes in the process. Here every reset is seeded. The furniture always stands as in the first episode of the
+    protocol, and an episode is the same alone, in a job array, or after other episodes. The first episode of a task
+    equals the protocol's bit for bit; a later one equals the episode that the protocol gives after new seeding.
     """
 
-    def __init__(self, suite: Suite, task: Task, settings: EnvironmentSettings) -> None:
+    def __init__(self, task: Task, settings: EnvironmentSettings) -> None:
         self._assets = find_assets(settings.libero_assets)
-        self._initial_states = load_initial_states(
-            package_folder() / "init_files" / suite.name / f"{task.name}.pruned_init"
-        )
+        stored = package_folder() / "init_files" / task.suite / f"{task.name}.pruned_init"
+        self._initial_states = load_initial_states(stored)
         if len(self._initial_states) != task.num_initial_states:
             raise BadArgument(
                 f"The installed LIBERO stores {len(self._initial_states)} initial states for '{task.name}' "
                 f"instead of {task.num_initial_states}; run 'make setup'."
             )
-        super().__init__(suite, task, settings)
+        super().__init__(task, settings)
 
     def _build(self, options: dict[str, Any]) -> Any:
         classes = load_libero(self._assets)
@@ -72,7 +71,7 @@ class LiberoEnvironment(SimulatedEnvironment):
 
         task_file = str(package_folder() / "bddl_files" / self.task.suite / f"{self.task.name}.bddl")
         problem = get_problem_info(task_file)["problem_name"]
-        # No noise on the robot's joints: the stored state sets them.
+        # The stored state sets the robot's joints, so they need no noise.
         return self._construct(classes[problem], task_file, initialization_noise=None, **options)
 
     def _reset_seed(self, initial_state_index: int, seed: int) -> int:
@@ -89,8 +88,8 @@ class LiberoEnvironment(SimulatedEnvironment):
             )
         simulation.set_state_from_flattened(state)
         simulation.forward()
-        # From here on as the protocol does it: objects take note of the new state (a stove that is on shows it), and
-        # the forced update of the observables moves the cameras' timer.
+        # These three calls are the protocol's: objects adopt the new state (a stove that is on turns red), and the
+        # forced update of the observables advances the cameras' timer.
         self._simulator._check_success()
         self._simulator._post_process()
         self._simulator._update_observables(force=True)

@@ -1,7 +1,7 @@
-"""Finding and loading the LIBERO package and its assets: no questions, no downloads, nothing written at home.
+"""Finding and loading the LIBERO package and its assets: no questions, no downloads, no files in the home folder.
 
-The package as published asks on standard input where its files are, keeps the answer in the home folder, and downloads
-its assets when it misses them. None of this suits a batch job, so everything it would ask is told beforehand.
+The published package asks on standard input for the places of its files, saves the answer in the home folder, and
+downloads missing assets. A batch job can do none of this, so this module sets everything before the package can ask.
 """
 
 from __future__ import annotations
@@ -21,14 +21,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from vla_attention.capture.environments.base import Task
-from vla_attention.capture.environments.simulator import import_robosuite, readable_device_choice
-from vla_attention.capture.environments.suites import Suite
+from vla_attention.capture.environments.base import Suite, Task
+from vla_attention.capture.environments.robosuite_installation import import_robosuite, readable_device_choice
 from vla_attention.schemas.errors import MissingDependency, UserError
 
 ASSETS_VARIABLE = "VLA_LIBERO_ASSETS"
+#: The dataset on the Hugging Face hub that the package itself (hf-libero) downloads.
 ASSETS_SOURCE = "lerobot/libero-assets"
-"""The dataset on the Hugging Face hub that the package itself (hf-libero) would download."""
 
 ASSET_SUBFOLDERS = (
     "scenes",
@@ -41,7 +40,7 @@ ASSET_SUBFOLDERS = (
 
 
 class LiberoAssetsMissing(UserError, FileNotFoundError):
-    """The LIBERO asset folder was not found, or what was given is not one."""
+    """No folder of LIBERO assets was found, or the given folder is incomplete."""
 
 
 @functools.cache
@@ -57,7 +56,7 @@ def package_folder() -> Path:
 
 @functools.cache
 def _task_names() -> dict[str, list[str]]:
-    # The file holds one dictionary and imports nothing. Importing it by name would first import the packages above it,
+    # The file holds one dictionary and imports nothing. An import by name would first import the packages above it,
     # which ask questions and load torch.
     path = package_folder() / "benchmark" / "libero_suite_task_map.py"
     spec = importlib.util.spec_from_file_location("_libero_suite_task_map", path)
@@ -69,9 +68,9 @@ def _task_names() -> dict[str, list[str]]:
 
 
 def instruction_of(task_name: str) -> str:
-    """Return the instruction that evaluations give: the task's name in words, without the scene it begins with.
+    """Return the instruction of a task: its name in words, without the scene at the beginning.
 
-    The task files hold a sentence too, and for some tasks it differs; the published evaluations use the name.
+    The task files also hold a sentence, which differs for some tasks. The published evaluations use the name.
     """
     return re.sub(r"^[A-Z_]+SCENE\d+_", "", task_name).replace("_", " ")
 
@@ -90,7 +89,11 @@ def list_libero_tasks(suite: Suite) -> tuple[Task, ...]:
 
 
 def find_assets(configured: Path | None) -> Path:
-    """Return the asset folder: the configured one, else VLA_LIBERO_ASSETS, else the package's own or its download."""
+    """Return the folder of the assets: `configured`, else VLA_LIBERO_ASSETS, else the package's own or its download.
+
+    Raises:
+        LiberoAssetsMissing: none of these places has all asset folders.
+    """
     from_variable = os.environ.get(ASSETS_VARIABLE)
     for given, origin in ((configured, "--libero-assets"), (from_variable, ASSETS_VARIABLE)):
         if given:
@@ -114,14 +117,14 @@ def find_assets(configured: Path | None) -> Path:
 
 
 def load_libero(assets: Path) -> dict[str, Any]:
-    """Import LIBERO's environments, pointed at `assets`; return its environment classes by lower-case problem name."""
+    """Import LIBERO's environments with these assets; return its environment classes by lower-case problem name."""
     import_robosuite()
     package = _import_with_own_configuration(assets)
-    # Every asset path goes through `get_assets_path`, which answers from this variable as long as it names a folder
-    # that exists; set, it neither looks elsewhere nor downloads.
+    # LIBERO builds every asset path with `get_assets_path`. It returns this variable if the folder exists, without
+    # searching elsewhere or downloading.
     package._assets_path_cache = str(assets)  # type: ignore[attr-defined]
     try:
-        # gymnasium's import, and that of the packages above, print advice that a user here can do nothing about.
+        # The imports of gymnasium and of the packages above print advice that our users cannot follow.
         with readable_device_choice(), contextlib.redirect_stdout(io.StringIO()):
             environments = importlib.import_module("libero.libero.envs")
     except ImportError as error:
@@ -134,10 +137,10 @@ def _import_with_own_configuration(assets: Path) -> ModuleType:
         return sys.modules["libero.libero"]
     folder = package_folder()
     configuration = tempfile.TemporaryDirectory(prefix="vla-libero-")
-    atexit.register(configuration.cleanup)  # kept until exit: the package reads the file again whenever it is asked
+    atexit.register(configuration.cleanup)  # kept until exit, because the package reads the file repeatedly
     paths = {"benchmark_root": ".", "bddl_files": "bddl_files", "init_states": "init_files", "datasets": "../datasets"}
     content = {key: str(folder / relative) for key, relative in paths.items()} | {"assets": str(assets)}
-    Path(configuration.name, "config.yaml").write_text(json.dumps(content))  # JSON is YAML
+    Path(configuration.name, "config.yaml").write_text(json.dumps(content))  # JSON is valid YAML
     before = os.environ.get("LIBERO_CONFIG_PATH")
     os.environ["LIBERO_CONFIG_PATH"] = configuration.name
     try:

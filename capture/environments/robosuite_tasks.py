@@ -1,7 +1,7 @@
-"""The built-in suite: robosuite's own tabletop tasks, which need no download, driven like LIBERO's.
+"""The built-in suite: robosuite's own tabletop tasks, which need no download.
 
-Robot, controller, control rate, cameras and picture orientation are those of the LIBERO protocol, so a policy adapter
-for one runs on the other. Door is left out: its default agent camera shows only an edge of the door.
+Robot, controller, control rate, cameras and picture orientation equal those of the LIBERO protocol, so an adapter of a
+policy works for both. The task Door is left out: its default agent camera shows only an edge of the door.
 """
 
 from __future__ import annotations
@@ -11,15 +11,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from vla_attention.capture.environments.base import ROBOT, Task
+from vla_attention.capture.environments.base import ROBOT, Suite, Task
 from vla_attention.capture.environments.simulator import SimulatedEnvironment
-from vla_attention.capture.environments.suites import Suite
 from vla_attention.schemas.groupings.vocabulary import ObjectKind, SceneObject
 
 
 @dataclass(frozen=True)
 class Part:
-    """A scene object of a built-in task: its name, the simulator's bodies it consists of, and what it is."""
+    """A scene object of a built-in task: its name, its bodies in the simulator, and its kind."""
 
     name: str
     bodies: tuple[str, ...]
@@ -29,9 +28,9 @@ class Part:
 
 @dataclass(frozen=True)
 class BuiltinTask:
-    """A robosuite environment class with the sentence that describes its goal.
+    """A robosuite environment class with an instruction.
 
-    parts: what is in the scene; of a task's several objects only those that it does not put out of sight.
+    parts: the visible scene objects. Some tasks have further objects that they move out of sight.
     """
 
     environment: str
@@ -40,7 +39,7 @@ class BuiltinTask:
 
 
 def _pick_place(name: str, noun: str) -> BuiltinTask:
-    # The compartments of the target bin hold see-through images of all four objects; they are counted as the bin.
+    # The compartments of the target bin show transparent images of all four objects. They count as the bin.
     ghosts = tuple(f"Visual{kind}_main" for kind in ("Milk", "Bread", "Cereal", "Can"))
     parts = (
         Part(name, (f"{name}_main",), "object"),
@@ -85,7 +84,7 @@ def list_robosuite_tasks(suite: Suite) -> tuple[Task, ...]:
 
 
 def initial_state_seed(task_name: str, initial_state_index: int) -> int:
-    """Return the seed that makes initial state number `initial_state_index` of a task, the same on every machine."""
+    """Return the seed of one initial state of a task. It is the same on every machine."""
     digest = hashlib.sha256(f"{task_name}/{initial_state_index}".encode()).digest()
     return int.from_bytes(digest[:4], "little")
 
@@ -93,9 +92,9 @@ def initial_state_seed(task_name: str, initial_state_index: int) -> int:
 class RobosuiteEnvironment(SimulatedEnvironment):
     """One built-in task.
 
-    An initial state is fixed by task and index alone, as LIBERO's stored states are: object placement and the small
-    joint noise are drawn from a seed made of both. The `seed` of a reset is accepted and has no effect, since nothing
-    else in these scenes is random.
+    Task and index alone determine an initial state, as for LIBERO's stored states: object placement and the small joint
+    noise are drawn from a seed made of both. The `seed` of a reset has no effect, because nothing else in these scenes
+    is random.
     """
 
     def _build(self, options: dict[str, Any]) -> Any:
@@ -107,7 +106,7 @@ class RobosuiteEnvironment(SimulatedEnvironment):
         return initial_state_seed(self.task.name, initial_state_index)
 
     def _set_initial_state(self, initial_state_index: int) -> None:
-        """The seeded reset has set it."""
+        """Do nothing: the seeded reset has set the state."""
 
     def _describe_objects(self) -> tuple[tuple[SceneObject, ...], Mapping[str, Sequence[str]]]:
         parts = BUILTIN_TASKS[self.task.task_id].parts

@@ -1,8 +1,8 @@
-"""Which object every pixel shows, drawn by the same context, with the same options, as the picture itself.
+"""Which object each pixel shows, drawn by the same context and with the same options as the picture.
 
-robosuite's own segmentation sensors fail with numpy 2, and a second renderer would bring a second OpenGL context, which
-robosuite (it never makes its own context current again) would then draw into. So the picture's context is asked to
-draw the scene once more in identity colours.
+robosuite's own segmentation sensors fail with numpy 2. A second renderer would create a second OpenGL context, and
+robosuite, which never makes its own context current again, would then draw into that one. Therefore the context of the
+picture draws the scene a second time, in identity colours.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 
 def owners_of_bodies(parents: NDArray[np.integer], roots: Mapping[int, int], background: int) -> NDArray[np.int32]:
-    """Return (bodies,) the object index of every body: that of its nearest ancestor-or-self in `roots`.
+    """Return (body,) the object index of every body: that of the body itself or of its nearest ancestor in `roots`.
 
-    parents: (bodies,) parent of every body. MuJoCo numbers parents before their children, the world is its own parent.
-    roots: body -> object index. Bodies below none of them belong to `background`.
+    parents: (body,) parent of every body. In MuJoCo a parent has a lower number than its children, and the world is its
+        own parent.
+    roots: body -> object index. Bodies below none of the roots get the index `background`.
     """
     owners = np.full(len(parents), background, dtype=np.int32)
     for body, parent in enumerate(parents):
@@ -28,11 +29,11 @@ def owners_of_bodies(parents: NDArray[np.integer], roots: Mapping[int, int], bac
 
 
 def decode_identities(colours: NDArray[np.uint8], table: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Turn identity colours (height, width, 3) into `table` entries; colour k means table[k], and 0 is nothing drawn."""
+    """Map identity colours (height, width, 3) to `table` entries (height, width): colour k to table[k]; 0 means nothing drawn."""
     wide = colours.astype(np.int32)
     identity = wide[:, :, 0] + (wide[:, :, 1] << 8) + (wide[:, :, 2] << 16)
     if identity.max() >= len(table):
-        # Would mean that the driver blended colours at edges (multisampling) although identities were asked for.
+        # The driver blended colours at edges (multisampling) although identity colours were requested.
         raise RuntimeError(f"The renderer returned identity {identity.max()}; only {len(table) - 1} things were drawn.")
     return table[identity]
 
@@ -40,11 +41,12 @@ def decode_identities(colours: NDArray[np.uint8], table: NDArray[np.int32]) -> N
 def draw_object_indices(
     context: Any, data: mujoco.MjData, camera_id: int, size: int, owners: NDArray[np.int32], background: int
 ) -> NDArray[np.int32]:
-    """Draw (size, size) object indices of the state in `data` through robosuite's offscreen `context`.
+    """Draw the object indices (size, size) of the state in `data` with robosuite's offscreen `context`.
 
-    The context must be current. Its options (LIBERO and robosuite show the visual geoms, group 1, and hide the
-    collision geoms, group 0) stay as they are, so exactly what is visible in the picture is labelled. The result has
-    the picture's orientation: OpenGL's, row 0 at the bottom.
+    The context must be current. Its options do not change (LIBERO and robosuite show the visual geoms, group 1, and
+    hide the collision geoms, group 0), so the labels cover exactly what the picture shows. The result has the
+    orientation of the
+    picture: OpenGL's, row 0 at the bottom.
     """
     model, scene = context.model._model, context.scn
     context.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
@@ -70,16 +72,16 @@ def draw_object_indices(
 def identity_table(
     model: mujoco.MjModel, scene: mujoco.MjvScene, owners: NDArray[np.int32], background: int
 ) -> NDArray[np.int32]:
-    """Return the object index for every identity colour, and take what is invisible out of the scene's identities.
+    """Return the object index of every identity colour, (colour,), and remove invisible things from the scene.
 
-    robosuite switches helper sites (such as a ray below the gripper) off by making their opacity negative, which leaves
-    them in the scene. Identity colours know no transparency, so they would cover what the picture shows there.
+    robosuite hides helper sites (such as a ray below the gripper) with a negative opacity; they remain in the scene.
+    Identity colours ignore opacity, so these sites would cover objects that the picture shows.
     """
     table = np.full(scene.ngeom + 1, background, dtype=np.int32)
     bodies_of = {mujoco.mjtObj.mjOBJ_GEOM.value: model.geom_bodyid, mujoco.mjtObj.mjOBJ_SITE.value: model.site_bodyid}
     for drawn in scene.geoms[: scene.ngeom]:
         if drawn.rgba[3] <= 0:
-            drawn.segid = -1  # not drawn; the scene is made anew for every picture, so this lasts for one only
+            drawn.segid = -1  # not drawn in this picture; the scene is built again for the next one
             continue
         bodies = bodies_of.get(drawn.objtype)
         if drawn.segid >= 0 and bodies is not None:

@@ -1,9 +1,10 @@
-"""What both kinds of suite share: loading robosuite quietly, drawing on demand, stepping, segmenting, closing.
+"""What LIBERO's and robosuite's environments share: drawing on request, steps, segmentation, closing.
 
-When the protocol's picture is taken: robosuite's camera observables sample on a timer of their own that advances by one
-physics substep (2 ms) at every update and also at every forced update. LIBERO forces two (reset, then the stored
-state), so a picture shows the scene as the 24th of a step's 25 substeps begins; robosuite's own tasks force one, and
-there it is the 25th. The timers here run as ever; only the drawing inside the sensor is skipped when nobody looks.
+Which moment a picture shows: robosuite's camera observables sample by their own timer. It advances by one physics
+substep (2 ms) at every update, and also at every forced update. LIBERO forces two updates (reset, then the stored
+state), so a picture shows the scene at the beginning of the 24th of a step's 25 substeps. robosuite's own tasks force
+one update, and a picture shows the 25th. Here the timers run unchanged; only the drawing inside the sensor is skipped
+without a request.
 """
 
 from __future__ import annotations
@@ -12,10 +13,7 @@ import atexit
 import contextlib
 import functools
 import hashlib
-import importlib.util
-import os
 import random
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -27,72 +25,22 @@ from vla_attention.capture.environments.base import (
     ROBOT,
     EnvironmentSettings,
     Observation,
-    SceneObject,
     StepResult,
     Task,
+    check_initial_state_index,
 )
-from vla_attention.capture.environments.suites import Suite, check_initial_state_index
-from vla_attention.schemas.errors import BadArgument, MissingDependency, unknown_name
-
-CAMERAS = ("agentview", "robot0_eye_in_hand")
-ACTION_SIZE = 7
-
-
-def import_robosuite() -> None:
-    """Import robosuite without its log file and advice; raise `MissingDependency` where it is not installed."""
-    if "robosuite" in sys.modules:
-        return
-    spec = importlib.util.find_spec("robosuite")
-    if spec is None or not spec.submodule_search_locations:
-        raise MissingDependency("robosuite is not installed, and simulations need it; run 'make setup'.")
-    if sys.platform == "linux":
-        os.environ.setdefault("MUJOCO_GL", "egl")  # before MuJoCo's first import, which decides by it
-    # robosuite reads its settings while it is imported, and by default it opens a log file of a fixed name in the
-    # common temporary folder: on a shared node that belongs to whoever came first, and the import fails for everyone
-    # else. Its settings module imports nothing, so it can be loaded before the package and changed.
-    location = os.path.join(next(iter(spec.submodule_search_locations)), "macros.py")
-    macros_spec = importlib.util.spec_from_file_location("robosuite.macros", location)
-    assert macros_spec is not None
-    assert macros_spec.loader is not None
-    macros: Any = importlib.util.module_from_spec(macros_spec)
-    macros_spec.loader.exec_module(macros)
-    macros.FILE_LOGGING_LEVEL = None
-    macros.CONSOLE_LOGGING_LEVEL = "ERROR"
-    sys.modules["robosuite.macros"] = macros
-    try:
-        with readable_device_choice():
-            import robosuite
-    except ImportError as error:
-        sys.modules.pop("robosuite.macros", None)
-        raise MissingDependency(f"robosuite could not be loaded ({error}); run 'make setup'.") from error
-    robosuite.macros = macros
-
-
-@contextlib.contextmanager
-def readable_device_choice() -> Iterator[None]:
-    """Hide a CUDA_VISIBLE_DEVICES that robosuite's EGL code cannot read, while it reads it.
-
-    It takes the variable for a list of EGL device numbers and fails on what clusters put there (GPU or MIG identifiers,
-    an empty value), and on a MUJOCO_EGL_DEVICE_ID that is no part of it.
-    """
-    value = os.environ.get("CUDA_VISIBLE_DEVICES")
-    unreadable = value is not None and not all(part.strip().isdigit() for part in value.split(","))
-    if value is None or not (unreadable or "MUJOCO_EGL_DEVICE_ID" in os.environ):
-        yield
-        return
-    del os.environ["CUDA_VISIBLE_DEVICES"]
-    try:
-        yield
-    finally:
-        os.environ["CUDA_VISIBLE_DEVICES"] = value
+from vla_attention.capture.environments.protocol import ACTION_SIZE, CAMERAS, CONTROL_FREQUENCY_HZ
+from vla_attention.capture.environments.robosuite_installation import import_robosuite, readable_device_choice
+from vla_attention.schemas.errors import BadArgument, unknown_name
+from vla_attention.schemas.groupings.vocabulary import SceneObject
 
 
 @contextlib.contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Seed the global generators that robosuite and LIBERO draw from, and give the caller's back afterwards."""
+    """Seed the global generators of random numbers that robosuite and LIBERO use; restore the caller's state afterwards."""
     if not 0 <= seed < 2**32:
         raise BadArgument(f"The environment seed is {seed}; it must be between 0 and {2**32 - 1}.")
-    numpy_state, python_state = np.random.get_state(), random.getstate()  # noqa: NPY002 (theirs is the global one)
+    numpy_state, python_state = np.random.get_state(), random.getstate()  # noqa: NPY002 (robosuite uses it)
     np.random.seed(seed)  # noqa: NPY002
     random.seed(seed)
     try:
@@ -103,9 +51,10 @@ def seeded(seed: int) -> Iterator[None]:
 
 
 class CameraGate:
-    """Stands between the camera observables and the drawing: closed, a sensor returns a blank picture at once.
+    """Decides whether camera sensors draw. While `open` is False, a sensor returns a blank picture at once.
 
-    `before_drawing` is called when a picture is really drawn, at the very physics moment that it shows.
+    `before_drawing` is called before each real drawing, at the physics moment that the picture shows.
+    `num_drawn` counts the drawings.
     """
 
     def __init__(self, image_size: int, before_drawing: Callable[[], None]) -> None:
@@ -115,10 +64,10 @@ class CameraGate:
         self._before_drawing = before_drawing
 
     def attach(self, simulator: Any) -> None:
-        """Make `simulator` (not yet initialised) build its camera sensors behind this gate.
+        """Make the camera sensors of `simulator` (not yet initialised) obey this gate.
 
-        The instance's method is replaced rather than the class derived from: robosuite registers every derived class
-        under its name, and ours would take the place of the original for everyone in the process.
+        This replaces a method of the instance instead of deriving a class: robosuite registers every derived class
+        under its name, so a derived class would replace the original in the whole process.
         """
         create = simulator._create_camera_sensors
 
@@ -141,35 +90,31 @@ class CameraGate:
 
 
 class SimulatedEnvironment:
-    """Base of the robosuite environments; implements `Environment` (see there) apart from how an episode starts.
+    """Base class of the environments; implements `Environment` except for the beginning of an episode.
 
-    A subclass says how the simulator is built, which seed a reset uses, how the initial state is set afterwards, and
-    which scene objects there are.
+    A subclass builds the simulator, chooses the seed of a reset, sets the initial state after it, and lists the scene
+    objects.
     """
 
-    def __init__(self, suite: Suite, task: Task, settings: EnvironmentSettings) -> None:
+    def __init__(self, task: Task, settings: EnvironmentSettings) -> None:
         import_robosuite()
         self.task = task
-        self.cameras: tuple[str, ...] = CAMERAS
-        self.max_steps = suite.max_steps
-        self.wait_steps = 10
-        self.wait_action = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
         self._image_size = settings.image_size
         self._gate = CameraGate(settings.image_size, before_drawing=self._keep_moment)
         self._digest: str | None = None
-        self._moment: Any = None  # copy of the simulation data at the moment that the last pictures show
+        self._moment: Any = None  # copy of the simulation data at the moment of the last pictures
         self._moment_is_kept = False
         self._closed = False
         with readable_device_choice(), seeded(0):
             self._simulator = self._build(self._simulator_options(settings))
-        # An EGL context that outlives EGL complains at interpreter exit. atexit runs backwards, and robosuite has
-        # registered EGL's end while building, so this comes first.
+        # Freeing an EGL context after EGL's own end prints errors at interpreter exit. atexit calls the functions in
+        # reverse order, and `_build` made robosuite register EGL's end, so `close` runs before it.
         atexit.register(self.close)
         self.objects, self._roots = self._describe_objects()
 
     @staticmethod
     def _simulator_options(settings: EnvironmentSettings) -> dict[str, Any]:
-        """Options of the published LIBERO evaluation: Panda, end-effector pose deltas at 20 Hz, two cameras."""
+        """Options of the published LIBERO evaluation: a Panda arm, pose deltas of its gripper, two cameras."""
         from robosuite.controllers import load_controller_config
 
         return {
@@ -178,47 +123,50 @@ class SimulatedEnvironment:
             "use_camera_obs": True,
             "has_renderer": False,
             "has_offscreen_renderer": True,
-            "control_freq": 20,
-            "ignore_done": True,  # the rollout counts its steps itself
+            "control_freq": CONTROL_FREQUENCY_HZ,
+            "ignore_done": True,  # the rollout counts the steps
             "camera_names": list(CAMERAS),
             "camera_heights": settings.image_size,
             "camera_widths": settings.image_size,
         }
 
     def _construct(self, environment_class: Any, *arguments: Any, **options: Any) -> Any:
-        """Create an instance of a robosuite environment class with its cameras behind the gate."""
+        """Create an instance of a robosuite environment class whose cameras obey the gate."""
         simulator = environment_class.__new__(environment_class)
         self._gate.attach(simulator)
         simulator.__init__(*arguments, **options)
         return simulator
 
     def _build(self, options: dict[str, Any]) -> Any:
+        """Create the simulator with `_construct`."""
         raise NotImplementedError
 
     def _reset_seed(self, initial_state_index: int, seed: int) -> int:
+        """Return the seed of the global generators during a reset."""
         raise NotImplementedError
 
     def _set_initial_state(self, initial_state_index: int) -> None:
+        """Set the state with which the episode begins; called after the simulator's own reset."""
         raise NotImplementedError
 
     def _describe_objects(self) -> tuple[tuple[SceneObject, ...], Mapping[str, Sequence[str]]]:
-        """Return the scene objects, and for each of their names the bodies it consists of, with all below them."""
+        """Return the scene objects, and the root bodies of each by its name: it owns them and all bodies below them."""
         raise NotImplementedError
 
     def reset(self, initial_state_index: int, seed: int) -> None:
-        """Begin an episode; see `Environment.reset`. The subclass says what `seed` is used for."""
+        """Begin an episode; see `Environment.reset`. The subclass determines the use of `seed`."""
         from robosuite.utils.errors import RandomizationError
 
         check_initial_state_index(self.task, initial_state_index)
         with seeded(self._reset_seed(initial_state_index, seed)):
             while True:
-                # A reset frees the old drawing context, and OpenGL frees names in whichever context is current: if
-                # that were another environment's, the pictures of that one would break.
+                # A reset frees the old drawing context, and OpenGL frees names in the current context. If the current
+                # context were another environment's, the pictures of that environment would break.
                 self._make_context_current()
                 try:
                     self._simulator.reset()
                     break
-                except RandomizationError:  # objects did not fit; the protocol draws again, further down the stream
+                except RandomizationError:  # the objects did not fit; like the protocol, try again with further draws
                     continue
             self._set_initial_state(initial_state_index)
         import mujoco
@@ -239,12 +187,12 @@ class SimulatedEnvironment:
 
     @property
     def initial_state_digest(self) -> str:
-        """SHA-256 of the state the episode began with; see `Environment.initial_state_digest`."""
+        """SHA-256 of the initial state of the episode; see `Environment.initial_state_digest`."""
         return self._require_episode()
 
     def _require_episode(self) -> str:
         if self._digest is None or self._closed:
-            raise RuntimeError("There is no episode: reset() comes first, and nothing comes after close().")
+            raise RuntimeError("There is no episode: call reset() first, and nothing after close().")
         return self._digest
 
     def step(self, action: NDArray[np.floating], observe: bool) -> StepResult:
@@ -252,7 +200,7 @@ class SimulatedEnvironment:
         self._require_episode()
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (ACTION_SIZE,) or not np.isfinite(action).all():
-            # MuJoCo would answer numbers that are not finite by quietly starting over.
+            # On numbers that are not finite, MuJoCo resets the simulation without an error.
             raise BadArgument(f"An action is {ACTION_SIZE} finite numbers; got shape {action.shape}: {action}.")
         self._gate.open, self._gate.num_drawn = observe, 0
         if observe:
@@ -264,12 +212,12 @@ class SimulatedEnvironment:
         success = bool(self._simulator._check_success())
         if not observe:
             return StepResult(success, None)
-        if self._gate.num_drawn != len(self.cameras):
-            raise RuntimeError(f"One step drew {self._gate.num_drawn} pictures for {len(self.cameras)} cameras.")
+        if self._gate.num_drawn != len(CAMERAS):
+            raise RuntimeError(f"One step drew {self._gate.num_drawn} pictures for {len(CAMERAS)} cameras.")
         return StepResult(
             success,
             Observation(
-                images={camera: values[f"{camera}_image"] for camera in self.cameras},
+                images={camera: values[f"{camera}_image"] for camera in CAMERAS},
                 eef_pos=np.array(values["robot0_eef_pos"], dtype=np.float64),
                 eef_quat=np.array(values["robot0_eef_quat"], dtype=np.float64),
                 gripper_qpos=np.array(values["robot0_gripper_qpos"], dtype=np.float64),
@@ -277,7 +225,7 @@ class SimulatedEnvironment:
         )
 
     def _keep_moment(self) -> None:
-        """Before the first picture of a step: keep the state it shows, which is not the one the step ends with."""
+        """Before the first picture of a step, copy the state that it shows. The state at the end of the step differs."""
         self._make_context_current()
         if not self._moment_is_kept:
             import mujoco
@@ -295,11 +243,11 @@ class SimulatedEnvironment:
         """Return the object of every pixel of the last picture; see `Environment.segmentation`."""
         from vla_attention.capture.environments.segmentation import draw_object_indices
 
-        if camera not in self.cameras:
-            raise unknown_name("camera", camera, self.cameras)
+        if camera not in CAMERAS:
+            raise unknown_name("camera", camera, CAMERAS)
         self._require_episode()
         if not self._moment_is_kept:
-            raise RuntimeError("No picture was taken in this episode yet; step with observe=True first.")
+            raise RuntimeError("No picture of this episode exists yet; step with observe=True first.")
         self._make_context_current()
         simulation = self._simulator.sim
         return draw_object_indices(
@@ -312,7 +260,7 @@ class SimulatedEnvironment:
         )
 
     def close(self) -> None:
-        """Free the simulator and its drawing context. Closing twice is fine."""
+        """Free the simulator and its drawing context. A second call does nothing."""
         if self._closed:
             return
         self._closed = True

@@ -1,1 +1,1 @@
-"""Many processes, one store: claims, SLURM jobs, run records, SIGTERM, status."""
+"""Several processes that fill one store: claims on episodes, records of each process, SIGTERM, SLURM, and the status of a store."""

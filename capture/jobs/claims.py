@@ -1,20 +1,22 @@
-"""Claims: which process is rolling out which episode, so that two jobs never spend hours on the same one.
+"""Claims: which process is recording which episode, so that no two jobs spend hours on the same one.
 
-Correctness does not rest on claims. An episode is published by one `rename`, and of two writers the second gets an error
-(`vla_attention.capture.store.episode_writer`). Claims keep a second writer from starting, and must therefore survive what clusters do to processes: a
-claim whose holder was killed is taken over.
+Correctness does not depend on claims. One `rename` publishes an episode, and the second of two writers gets an error
+(`capture/store/episode_writer.py`). Claims keep a second writer from starting. Clusters kill processes, so the claim of
+a killed holder must be replaceable.
 
-A claim is a folder `NAME.zarr.jobs/claims/EPISODE.GENERATION/` with one file, `owner.json`. It is made under another name and
-**renamed into place with its content**, which is the operation that publishes episodes and creates stores: one that a folder
-already there makes fail, on local file systems as on NFS and Lustre. (`flock` does nothing on some Lustre mounts and stays on
-one machine on some NFS ones; `O_EXCL` creates a file that is still empty.)
+A claim is a folder `NAME.zarr.jobs/claims/EPISODE.GENERATION/` with one file, `owner.json`. The folder is created under
+another name and then **renamed together with its file**. Publishing an episode and creating a store use the same
+operation: the rename fails if the target folder exists, on local file systems as on NFS and Lustre. (`flock` has no
+effect on some Lustre mounts, and only within one machine on some NFS mounts. `O_EXCL` creates a file that is still
+empty.)
 
-A living holder touches `owner.json` every half minute. A holder is dead when that is known (see `job.is_known_dead`), or when
-it has not been touched for five minutes. Times are compared on the file server's clock only: a file touched just now against the
-holder's. To take over from a dead holder, the folder of the **next generation** is made. Nothing is deleted for that, so two
-processes that find the same holder dead cannot take each other's fresh claim away: one of their two renames fails. The winner
-then looks whether the dead claim is still there. If not, somebody took over, finished and cleaned up in between, and it
-begins again. Whoever holds the last generation removes all of them, the oldest first.
+A holder touches `owner.json` every half minute while it lives. It counts as dead if its end is certain
+(`worker.is_known_dead`), or if the file was not touched for five minutes. Only the clock of the file server is used:
+the time of the holder's file is compared with that of a file that was written just now. To replace a dead holder, a
+process creates the folder of the **next generation**. It deletes nothing for that, so two processes that replace the
+same dead holder cannot delete each other's new claim: one of their two renames fails. The winner then checks that the
+dead claim still exists. If not, a third process has replaced it, finished and cleaned up in the meantime, and the
+winner starts again. The holder of the last generation deletes all generations, the oldest first.
 """
 
 from __future__ import annotations
@@ -29,15 +31,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
-from vla_attention.capture.jobs.job import Worker, is_known_dead
+from vla_attention.capture.jobs.worker import Worker, is_known_dead
 from vla_attention.capture.store.durable_files import make_partial, partial_folder, remove_if_empty
 from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
 
-#: Beside the store: who plans, claims and has written what. Never needed for reading, and may be deleted when nothing runs.
+#: Ending of the folder beside the store that holds claims and records. No reader needs it, and it may be deleted while
+#: no capture runs.
 JOBS_SUFFIX = ".jobs"
 
+#: Seconds between two touches of a held claim.
 TOUCH_EVERY_S = 30.0
-#: Ten missed touches. Node-local clocks do not enter.
+#: Seconds without a touch after which a holder counts as dead: ten missed touches.
 DEAD_AFTER_S = 300.0
 _OWNER = "owner.json"
 _ATTEMPTS = 5
@@ -45,25 +49,28 @@ _ATTEMPTS = 5
 
 @dataclass(frozen=True)
 class Holder:
-    """Who holds an episode, and how many seconds ago it began and last gave a sign of life."""
+    """The process that holds an episode. `began_s` and `silent_s`: seconds since its claim began and since its last touch."""
 
     episode: str
     worker: Worker
     began_s: float
     silent_s: float
 
-    def described(self) -> str:
-        """For people."""
-        return f"{self.episode} by {self.worker.described()}, last sign of life {self.silent_s:.0f} s ago"
+    def describe(self) -> str:
+        """Return episode, worker and time of the last touch as text."""
+        return f"{self.episode} by {self.worker.describe()}, last sign of life {self.silent_s:.0f} s ago"
 
 
 def jobs_folder(store: Path) -> Path:
-    """Where processes leave notes for each other and for people: beside the store, never in it."""
+    """Return the folder of claims and records. It is beside the store, so that a copy of the store omits it."""
     return store.with_name(store.name + JOBS_SUFFIX)
 
 
 class Claims:
-    """The claims of one process on episodes of one store. Use it as a context manager: a thread touches what is held."""
+    """The claims of one process on episodes of one store.
+
+    Within its context a thread touches the held claims. Leaving the context releases them.
+    """
 
     def __init__(
         self, store: Path, worker: Worker, touch_every_s: float = TOUCH_EVERY_S, dead_after_s: float = DEAD_AFTER_S
@@ -88,7 +95,7 @@ class Claims:
             self.release(episode)
 
     def acquire(self, episode: str) -> Holder | None:
-        """Claim an episode; None when it is ours now, else who holds it."""
+        """Claim an episode. Returns None after success, else the holder of the claim."""
         holder = None
         for attempt in range(_ATTEMPTS):
             if attempt:
@@ -98,11 +105,11 @@ class Claims:
                 return None
             if holder is not None:
                 return holder
-        # Claims came and went under our eyes each time: somebody is at it.
+        # The claims changed during every attempt, so other processes are active.
         return Holder(episode, Worker("", "another machine", 0, "", ""), 0.0, 0.0)
 
     def _try(self, episode: str) -> tuple[bool, Holder | None]:
-        """One attempt: (won, the living holder). Neither: things changed meanwhile, look again."""
+        """Try once; returns (success, living holder). (False, None): the claims changed during the attempt, so try again."""
         building = self.folder / f"new-{self.worker.tag}"
         shutil.rmtree(building, ignore_errors=True)
         self.folder.parent.mkdir(exist_ok=True)
@@ -139,7 +146,7 @@ class Claims:
         try:
             building.rename(target)
         except OSError as error:
-            # A file server that lost its answer reports a failure after success; the content tells whose it is.
+            # A file server whose answer was lost reports a failure after success. The content shows whose claim it is.
             held = _owner(target)
             if held is None and error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
                 raise
@@ -147,7 +154,7 @@ class Claims:
         return True
 
     def release(self, episode: str) -> None:
-        """Give an episode back."""
+        """Release an episode."""
         last = self._held.get(episode)
         if last is None:
             return
@@ -160,7 +167,7 @@ class Claims:
     def _remove(self, episode: str, generation: int) -> None:
         if self._held.get(episode) == generation:
             del self._held[episode]
-        # Renamed first: whoever lists the claims never meets one without its owner.
+        # Rename first, so that no listing of the claims shows one without its owner file.
         doomed = self.folder / f"old-{self.worker.tag}-{_name(episode, generation)}"
         try:
             (self.folder / _name(episode, generation)).rename(doomed)
@@ -169,7 +176,7 @@ class Claims:
         shutil.rmtree(doomed, ignore_errors=True)
 
     def _remove_partials_of(self, dead: Holder) -> None:
-        """Remove the half-written episode of a holder that is gone; its machine may never come back to do so."""
+        """Remove the partial episode of a dead holder, because its machine may never run a capture again."""
         pattern = f"{dead.episode}-{dead.worker.host}-{dead.worker.process}-*"
         for folder in partial_folder(self.store).glob(pattern):
             shutil.rmtree(folder, ignore_errors=True)
@@ -181,11 +188,11 @@ class Claims:
                 try:
                     os.utime(self.folder / _name(episode, generation) / _OWNER)
                 except OSError:
-                    continue  # a file server that does not answer now may answer next time
+                    continue  # the file server may answer next time
 
 
 def holders(store: Path) -> list[Holder]:
-    """Everybody who claims an episode of the store now, dead or alive; by this machine's clock. Writes nothing."""
+    """Return the holders of all claims on the store's episodes, dead or alive, with times by this machine's clock. Writes nothing."""
     folder = _claims_folder(store)
     episodes = sorted({entry.name.rpartition(".")[0] for entry in _entries(folder) if not _is_temporary(entry.name)})
     found = []
@@ -231,10 +238,10 @@ def _owner(claim: Path) -> Worker | None:
 def _read(folder: Path, episode: str, generation: int, now: float) -> Holder | None:
     claim = folder / _name(episode, generation)
     try:
-        # The folder's own time is when its content was put there; the file's is the last touch.
+        # The time of the folder is that of its creation with its content; the time of the file is the last touch.
         began, touched = claim.stat().st_mtime, (claim / _OWNER).stat().st_mtime
     except OSError:
         return None
-    # A machine that lost its power may leave an empty file behind. Nobody touches it, so it grows old like any other.
+    # A power failure may leave an empty file. No process touches it, so the claim expires like any other.
     worker = _owner(claim) or Worker("", "an unknown machine", 0, "", "")
     return Holder(episode, worker, max(0.0, now - began), max(0.0, now - touched))

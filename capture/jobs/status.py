@@ -1,4 +1,4 @@
-"""`vla-capture status`: what a store holds, what is missing, who writes and who wrote. Reads only."""
+"""`vla-capture status`: the episodes of a store, the missing ones, and their writers. Reads only."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from vla_attention.capture.environments.suites import SUITES
 from vla_attention.capture.jobs.claims import Holder, holders
-from vla_attention.capture.jobs.run_records import planned_tasks, read_records
+from vla_attention.capture.jobs.worker_records import planned_tasks, read_records
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.jsonable import to_json
@@ -20,7 +20,7 @@ from vla_attention.schemas.stores.store_format import CorruptEpisode, EpisodeAtt
 
 @dataclass(frozen=True)
 class EpisodeStatus:
-    """One committed episode. `success` is None when its attributes cannot be read. `by` is empty when no run left a note."""
+    """One committed episode. `success` is None if its attributes cannot be read; `by` is empty if no record names its worker."""
 
     task_id: int
     episode: int
@@ -32,7 +32,12 @@ class EpisodeStatus:
 
 @dataclass(frozen=True)
 class TaskStatus:
-    """One task. `expected` is None when nobody said how many episodes are wanted; `missing` are indices of episodes."""
+    """One task.
+
+    expected: number of episodes; None if neither the user nor a record gives it.
+    missing: indices of the expected episodes that the store lacks.
+    unreadable: number of episodes whose attributes cannot be read.
+    """
 
     task_id: int
     instruction: str
@@ -48,7 +53,7 @@ class TaskStatus:
 
 @dataclass(frozen=True)
 class StoreStatus:
-    """A store. `writing`: episodes that are claimed now."""
+    """A store. `writing`: the current claims on its episodes."""
 
     store: str
     suite: str
@@ -58,13 +63,13 @@ class StoreStatus:
 
     @property
     def complete(self) -> bool | None:
-        """Whether everything expected is there; None when that is not known of every task."""
+        """Whether the store has all expected episodes; None if their number is unknown for a task."""
         if any(task.missing for task in self.tasks):
             return False
         return None if any(task.expected is None for task in self.tasks) or not self.tasks else True
 
     def missing_lines(self) -> list[str]:
-        """A line per task with missing episodes."""
+        """Return a line for every task with missing episodes."""
         return [
             f"task {task.task_id} lacks {len(task.missing)} of {task.expected} episodes: {listing(task.missing, 20)}"
             for task in self.tasks
@@ -73,11 +78,14 @@ class StoreStatus:
 
 
 def store_status(path: Path, expected: int | None = None) -> StoreStatus:
-    """Look at a store. `expected`: episodes per task, instead of what the runs planned.
+    """Return the status of a store.
+
+    expected: episodes per task; None takes the numbers that the workers planned.
 
     Raises:
-        StoreNotFound: nothing is at `path`.
-        StoreError: something else is.
+        BadArgument: `expected` is below 1.
+        StoreNotFound: nothing exists at `path`.
+        StoreError: something other than a store exists there.
     """
     if expected is not None and expected < 1:
         raise BadArgument(f"Cannot use --expected {expected}; expected at least 1.")
@@ -101,7 +109,7 @@ def store_status(path: Path, expected: int | None = None) -> StoreStatus:
                 success=None if attributes is None else attributes.success,
                 bytes=sum(file.stat().st_size for file in stored.folder.rglob("*") if file.is_file()),
                 at=at or _time_of(stored.folder),
-                by=worker.described() if worker else "",
+                by=worker.describe() if worker else "",
             )
         )
     ids = set(plan) | set(episodes)
@@ -129,8 +137,8 @@ def store_status(path: Path, expected: int | None = None) -> StoreStatus:
     return StoreStatus(str(path), root.protocol.suite, root.policy.name, tuple(tasks), tuple(holders(path)))
 
 
-def run_status(stores: Sequence[Path], expected: int | None, as_json: bool, check: bool) -> int:
-    """Print the status of stores; the exit code is 1 with `check` when an expected episode is missing, else 0."""
+def print_status(stores: Sequence[Path], expected: int | None, as_json: bool, check: bool) -> int:
+    """Print the status of stores. Returns the exit code: 1 if `check` is set and an expected episode is missing, else 0."""
     found = [store_status(store, expected) for store in stores]
     if as_json:
         print(json.dumps([to_json(status) | {"complete": status.complete} for status in found], indent=1))
@@ -179,8 +187,8 @@ def _text(status: StoreStatus) -> str:
     ]
     lines += [f"missing: {line}" for line in status.missing_lines()]
     if status.complete is None:
-        lines.append("How many episodes are expected is not known here; say it with --expected N.")
+        lines.append("The expected number of episodes is unknown; give it with --expected N.")
     elif status.complete:
-        lines.append("complete: everything that was planned is there.")
-    lines += [f"being written: {holder.described()}" for holder in status.writing]
+        lines.append("complete: the store has every expected episode.")
+    lines += [f"being written: {holder.describe()}" for holder in status.writing]
     return "\n".join(lines)

@@ -1,8 +1,8 @@
-"""Being told to stop: SIGTERM, which batch systems send before they kill (time limit, preemption, `scancel`).
+"""SIGTERM, which batch systems send before they kill a process (time limit, preemption, `scancel`).
 
-Between episodes, while a model loads for instance, there is nothing to lose and the process stops at once. Inside an episode
-it stops at the next environment step, so that nothing is written to the episode's folder while that is removed; an episode that is
-just being committed is committed. A second signal stops at once wherever the process is.
+Between episodes, for example while a model loads, the process stops at once. During an episode it stops at the next
+environment step, so that nothing writes to the episode's folder during its removal. A commit in progress is completed.
+A second signal stops the process at once, also during an episode.
 """
 
 from __future__ import annotations
@@ -13,16 +13,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-#: Exit code after SIGTERM: sysexits.h's EX_TEMPFAIL, "try again later". Nothing else of this program ends with it.
+#: Exit code after SIGTERM: EX_TEMPFAIL of sysexits.h, "try again later". The program ends with this code for no other
+#: reason.
 EXIT_TERMINATED = 75
 
 
 class Terminated(BaseException):
-    """The process was told to stop. Like KeyboardInterrupt, no handler of ordinary errors swallows it."""
+    """SIGTERM came. Like KeyboardInterrupt, this is no `Exception`, so that handlers of ordinary errors do not catch it."""
 
 
 class Termination:
-    """Remembers a SIGTERM. `begin` and `end` enclose what must not be interrupted just anywhere."""
+    """Remembers whether SIGTERM came."""
 
     def __init__(self) -> None:
         self.requested = False
@@ -35,13 +36,13 @@ class Termination:
             raise Terminated
 
     def check(self) -> None:
-        """Raise `Terminated` when the process has been told to stop."""
+        """Raise `Terminated` if SIGTERM came."""
         if self.requested:
             raise Terminated
 
     @contextmanager
     def only_at_checks(self) -> Iterator[None]:
-        """Within this block the first signal takes effect at the next `check`, and at the latest when the block ends."""
+        """Within this block the first signal raises `Terminated` at the next `check`, at the latest at the end of the block."""
         self._guarded += 1
         try:
             yield
@@ -52,7 +53,7 @@ class Termination:
 
 @contextmanager
 def listening_for_sigterm() -> Iterator[Termination]:
-    """Handle SIGTERM within the block; outside of the main thread signals cannot be handled, and nothing changes."""
+    """Handle SIGTERM within the block. Python allows this in the main thread only; in another thread nothing changes."""
     termination = Termination()
     if threading.current_thread() is not threading.main_thread():
         yield termination

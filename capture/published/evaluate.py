@@ -93,9 +93,9 @@ def _evaluate(arguments: argparse.Namespace, termination: Termination) -> int:
 
 
 def _jobs(arguments: argparse.Namespace) -> list[_Job]:
-    from vla_attention.capture.arguments import ALL_SUITES, STANDARD_SUITES, run_settings
-    from vla_attention.capture.environments.suites import SUITES
-    from vla_attention.capture.jobs.job import array_task_ids
+    from vla_attention.capture.arguments import run_settings
+    from vla_attention.capture.environments.suites import ALL_SUITES, STANDARD_SUITES, SUITES
+    from vla_attention.capture.jobs.slurm import array_task_ids
 
     existing = [*(suite.name for suite in SUITES), ALL_SUITES]
     if arguments.task_suite not in existing:
@@ -167,7 +167,8 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], termination: T
 
     from vla_attention.capture.device import choose_device
     from vla_attention.capture.policy_choice import build_policy
-    from vla_attention.capture.run import run_capture, say
+    from vla_attention.capture.rollout.progress import say
+    from vla_attention.capture.run import run_capture
 
     device = choose_device(arguments.device)
     policy = build_policy(arguments, device)
@@ -183,7 +184,7 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], termination: T
 
 def _analyze(job: _Job) -> int:
     from vla_attention.capture.jobs.status import store_status
-    from vla_attention.capture.recording.episode_loop import say
+    from vla_attention.capture.rollout.progress import say
     from vla_attention.schemas.stores.root import read_root
 
     arguments, store = job.arguments, job.settings.store
@@ -209,7 +210,7 @@ def _analyze(job: _Job) -> int:
 def _layers(arguments: argparse.Namespace, num_layers: int, family: str) -> tuple[tuple[int, ...] | None, bool]:
     """The layers to analyse (None: all), and whether the user typed them."""
     from vla_attention.capture.arguments import PUBLISHED_LAYERS
-    from vla_attention.capture.recording.episode_loop import say
+    from vla_attention.capture.rollout.progress import say
 
     if arguments.layers is not None:
         return select_layers(arguments.layers, num_layers, family).labels, True

@@ -1,1 +1,1 @@
-"""One episode: the attention function that emits rows, the rollout, and the loop over episodes."""
+"""Attention with recorded rows: the attention function of all policies, the recorder of its rows, and the contributions."""

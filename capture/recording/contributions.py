@@ -1,10 +1,10 @@
 """Contributions: what each part of the keys adds to the residual stream, as a Gram matrix.
 
-Attention weights alone overrate keys whose values are small (Kobayashi et al. 2020). The contribution of a set of keys to a
-query is the vector c = gate · W_o · concat_h(sum over its keys of p_h · v_h). Norms of parts cannot be added up later, because
-contributions are vectors that may cancel; their inner products can: for any union of parts chosen by w in {0, 1}^part,
-|sum of w_i c_i|² = wᵀ G w. The last part is the block's whole attention update, so that cancellation and what the
-recording leaves out can be checked: over all other parts, 1ᵀ G 1 is the update's own squared norm.
+Attention weights overrate keys with small values (Kobayashi et al. 2020). The contribution of a set of keys to a query
+is the vector c = gate · W_o · concat_h(sum over its keys of p_h · v_h). Contributions are vectors that may cancel, so
+the norms of parts cannot be added up later. Their inner products can: for any union of parts, given by w in {0,
+1}^part, |sum of w_i c_i|² = wᵀ G w. The last part is the whole attention update of the block. It shows cancellation,
+and what the recording leaves out: over all other parts, 1ᵀ G 1 is the squared norm of the update.
 """
 
 from __future__ import annotations
@@ -16,12 +16,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-#: Maps mixed values (any, head · dim) to the residual stream (any, width): output projection, and gate if there is one.
+#: Maps mixed values (any, head · dim) to the residual stream (any, width): the output projection, and the gate of a
+#: gated block.
 Projection = Callable[[Tensor], Tensor]
 
 
 def keys_of_parts(members: NDArray[np.bool_], device: torch.device) -> list[slice | Tensor]:
-    """Return the keys of each part, for indexing a key axis; members is (key, part) bool. Most parts are one run of keys."""
+    """Return the keys of each part, as indices of a key axis; `members` is (key, part) bool.
+
+    Most parts are consecutive keys. A slice selects those without a copy.
+    """
     parts: list[slice | Tensor] = []
     for part in range(members.shape[1]):
         keys = np.flatnonzero(members[:, part])
@@ -37,17 +41,18 @@ def part_contributions(rows: Tensor, values: Tensor, parts: Sequence[slice | Ten
 
     Args:
         rows: (head, query, key) float32 probabilities, all heads.
-        values: (kv_head, key, dim); head h reads the key/value head h // (heads / kv_heads).
+        values: (kv_head, key, dim); head h uses the key/value head h // (heads / kv_heads).
         parts: the keys of each part, from `keys_of_parts`; parts are disjoint.
         project: applied to (query · part, head · dim) float32.
     """
     heads, queries, keys = rows.shape
     kv_heads, _, dim = values.shape
-    # The heads that share a key/value head become further queries of it: values are never repeated.
+    # Heads that share a key/value head become extra queries of that head, so the values need no copies.
     shared = rows.reshape(kv_heads, heads // kv_heads * queries, keys)
     values = values.float()
     mixed = torch.stack([torch.matmul(shared[:, :, part], values[:, part]) for part in parts])
-    # (part, kv_head, shared head · query, dim) to (query, part, head · dim), so that one product projects everything.
+    # (part, kv_head, shared head · query, dim) becomes (query, part, head · dim), so that one product projects all
+    # parts.
     mixed = mixed.view(len(parts), heads, queries, dim).permute(2, 0, 1, 3).reshape(queries * len(parts), heads * dim)
     return project(mixed).float().view(queries, len(parts), -1)
 
@@ -55,7 +60,7 @@ def part_contributions(rows: Tensor, values: Tensor, parts: Sequence[slice | Ten
 def gram_matrix(contributions: Tensor, update: Tensor) -> Tensor:
     """Return the mean over queries of the inner products of all parts and the update, (part + 1, part + 1) float32.
 
-    contributions: (query, part, width); update: (query, width), what the block really added to the residual stream.
+    contributions: (query, part, width); update: (query, width), the block's whole addition to the residual stream.
     """
     vectors = torch.cat([contributions, update.float()[:, None]], dim=1)
     return torch.matmul(vectors, vectors.transpose(1, 2)).mean(dim=0)

@@ -274,7 +274,7 @@ def test_capture_is_interrupted_cleanly(monkeypatch, tmp_path, capsys):
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("vla_attention.capture.recording.episode_loop.run_episode", interrupt)
+    monkeypatch.setattr("vla_attention.capture.rollout.episode_loop.record_episode", interrupt)
     code = capture(
         ["pi", "--checkpoint", "dummy", "--replan-steps", "4", "--task-id", "0", "--store", str(tmp_path / "a.zarr")]
     )

@@ -18,7 +18,6 @@ import zarr
 
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.capture.environments.base import EnvironmentSettings
 from vla_attention.capture.environments.suites import find_suite, list_tasks
 from vla_attention.capture.policies.cosmos.config import CosmosConfig, DitConfig, VaeConfig
 from vla_attention.capture.policies.cosmos.dummy_folder import WEIGHTS_NAME, write_dummy_folder
@@ -63,7 +62,7 @@ def alone() -> Iterator[None]:
 def libero_run(libero_assets: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder that `--output-dir` named: the store, and the results of the proxy that was asked for."""
     folder = tmp_path_factory.mktemp("published")
-    task = list_tasks(find_suite("libero_10"), EnvironmentSettings())[0]
+    task = list_tasks(find_suite("libero_10"))[0]
     checkpoint = write_dummy_folder(
         folder / "checkpoint", PUBLISHED_SHAPE, [task.instruction], dtype=torch.float32, with_tokenizer=True
     )
@@ -240,7 +239,7 @@ def test_an_instruction_without_embedding_names_the_near_ones(folder, capsys):
 
 @pytest.mark.simulator
 def test_without_t5s_tokenizer_words_cannot_be_selected_and_the_text_as_a_whole_can(tmp_path, capsys):
-    task = list_tasks(find_suite("robosuite"), EnvironmentSettings())[1]
+    task = list_tasks(find_suite("robosuite"))[1]
     folder = write_dummy_folder(tmp_path / "checkpoint", DUMMY_CONFIG, [task.instruction], dtype=torch.float32)
     store = str(tmp_path / "a.zarr")
     assert capture(["cosmos", "--ckpt-path", str(folder), *SHORT, "--store", store]) == 0

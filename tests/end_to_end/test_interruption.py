@@ -16,9 +16,9 @@ import pytest
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.jobs.claims import Claims, holders
-from vla_attention.capture.jobs.job import Worker
 from vla_attention.capture.jobs.status import store_status
 from vla_attention.capture.jobs.termination import EXIT_TERMINATED, Terminated, Termination
+from vla_attention.capture.jobs.worker import Worker
 from vla_attention.capture.published.evaluate import main_pi
 
 pytestmark = pytest.mark.simulator
@@ -69,7 +69,7 @@ def test_an_episode_of_another_process_is_waited_for_and_left_to_it(tmp_path, mo
     assert capture([*arguments, "--num-episodes", "1"]) == 0
     other = Claims(store, NODE)
     assert other.acquire("task000_episode001") is None
-    monkeypatch.setattr("vla_attention.capture.recording.episode_loop._LOOK_EVERY_S", 0.05)
+    monkeypatch.setattr("vla_attention.capture.rollout.episode_loop._LOOK_EVERY_S", 0.05)
     seen: list[bool] = []
 
     def release_when_the_rest_is_done() -> None:
@@ -86,7 +86,9 @@ def test_an_episode_of_another_process_is_waited_for_and_left_to_it(tmp_path, mo
     thread.join()
     assert seen == [False]
     said = capsys.readouterr().out
-    assert said.count("Waiting for what others are writing: task000_episode001 by node7 (job 98_2)") == 1
+    assert (
+        said.count("Waiting for episodes that other processes are writing: task000_episode001 by node7 (job 98_2)") == 1
+    )
     assert sorted(folder.name for folder in (store / "episodes").glob("task*")) == [
         f"task000_episode00{episode}" for episode in range(3)
     ]
@@ -147,7 +149,7 @@ def test_within_an_episode_a_signal_waits_for_a_check():
 
 def test_a_job_that_slurm_still_wants_to_run_is_requeued(tmp_path, monkeypatch):
     """With a scontrol of our own that notes what it is asked for."""
-    from vla_attention.capture.jobs.job import ask_for_requeue
+    from vla_attention.capture.jobs.slurm import ask_for_requeue
 
     notes, state = tmp_path / "notes", tmp_path / "state"
     script = tmp_path / "scontrol"

@@ -8,7 +8,7 @@ import numpy as np
 
 from vla_attention.capture.environments.base import Observation
 from vla_attention.capture.recording.attention import RowCollector
-from vla_attention.capture.recording.rollout import make_recorders
+from vla_attention.capture.recording.recorder import make_recorders
 from vla_attention.schemas.stores.store_format import Recording
 
 ROOT = Path(__file__).resolve().parents[2]

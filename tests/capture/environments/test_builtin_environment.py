@@ -1,4 +1,4 @@
-"""The built-in robosuite tasks, drawn on demand and segmented."""
+"""The built-in robosuite tasks: pictures on request, and their segmentation."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("robosuite")
 
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Observation
+from vla_attention.capture.environments.protocol import CAMERAS, WAIT_ACTION
 from vla_attention.capture.environments.robosuite_tasks import BUILTIN_TASKS, initial_state_seed
 from vla_attention.capture.environments.suites import find_suite, make_environment
 
@@ -22,7 +23,7 @@ STACK = 1
 ACTIONS = np.random.default_rng(1).uniform(-1, 1, (6, 7))
 
 
-def run(environment: Environment, index: int, seed: int = 7) -> Observation:
+def act(environment: Environment, index: int, seed: int = 7) -> Observation:
     environment.reset(index, seed)
     for action in ACTIONS[:-1]:
         assert environment.step(action, observe=False).observation is None
@@ -47,7 +48,7 @@ def test_pictures_are_those_of_the_untouched_simulator(environment: Environment)
         "Stack",
         robots="Panda",
         controller_configs=load_controller_config(default_controller="OSC_POSE"),
-        camera_names=list(environment.cameras),
+        camera_names=list(CAMERAS),
         camera_heights=256,
         camera_widths=256,
     )
@@ -55,12 +56,12 @@ def test_pictures_are_those_of_the_untouched_simulator(environment: Environment)
     untouched.reset()
     values = [untouched.step(action)[0] for action in ACTIONS]
     untouched.close()
-    on_demand = run(environment, 4)
+    on_demand = act(environment, 4)
     environment.reset(4, 7)
     drawn = [environment.step(action, observe=True).observation for action in ACTIONS]
     for observation, value in zip([*drawn, on_demand], [*values, values[-1]], strict=True):
         assert observation is not None
-        for camera in environment.cameras:
+        for camera in CAMERAS:
             np.testing.assert_array_equal(observation.images[camera], value[f"{camera}_image"])
         np.testing.assert_array_equal(observation.eef_pos, value["robot0_eef_pos"])
         np.testing.assert_array_equal(observation.eef_quat, value["robot0_eef_quat"])
@@ -69,20 +70,20 @@ def test_pictures_are_those_of_the_untouched_simulator(environment: Environment)
 
 @pytest.mark.simulator
 def test_initial_states_are_fixed_by_their_index_alone(environment: Environment) -> None:
-    first = run(environment, 0, seed=7)
+    first = act(environment, 0, seed=7)
     digest = environment.initial_state_digest
-    run(environment, 1)
+    act(environment, 1)
     assert environment.initial_state_digest != digest
-    again = run(environment, 0, seed=8)
+    again = act(environment, 0, seed=8)
     assert environment.initial_state_digest == digest
-    for camera in environment.cameras:
+    for camera in CAMERAS:
         np.testing.assert_array_equal(first.images[camera], again.images[camera])
 
 
 @pytest.mark.simulator
 def test_two_environments_in_one_process_do_not_disturb_each_other(environment: Environment) -> None:
-    """Each frees and draws in its own context; robosuite alone would mix them up."""
-    alone = run(environment, 2)
+    """Each frees and draws in its own OpenGL context; robosuite alone uses whichever is current."""
+    alone = act(environment, 2)
     other = make_environment(SUITE, 0, EnvironmentSettings(image_size=64))
     other.reset(0, 7)
     environment.reset(2, 7)
@@ -94,15 +95,15 @@ def test_two_environments_in_one_process_do_not_disturb_each_other(environment: 
     other.close()
     segmentation = environment.segmentation("agentview")
     assert together is not None
-    for camera in environment.cameras:
+    for camera in CAMERAS:
         np.testing.assert_array_equal(alone.images[camera], together.images[camera])
-    run(environment, 2)
+    act(environment, 2)
     np.testing.assert_array_equal(environment.segmentation("agentview"), segmentation)
 
 
 @pytest.mark.simulator
 def test_the_cubes_are_where_the_colours_are(environment: Environment) -> None:
-    observation = run(environment, 3)
+    observation = act(environment, 3)
     image = observation.images["agentview"].astype(int)
     segmentation = environment.segmentation("agentview")
     names = [thing.name for thing in environment.objects]
@@ -119,7 +120,7 @@ def test_the_cubes_are_where_the_colours_are(environment: Environment) -> None:
 def test_every_task_runs_and_shows_its_target(task_id: int) -> None:
     environment = make_environment(SUITE, task_id, SETTINGS)
     environment.reset(0, 7)
-    result = environment.step(environment.wait_action, observe=True)
+    result = environment.step(np.array(WAIT_ACTION), observe=True)
     segmentation = environment.segmentation("agentview")
     wanted = {thing.name for thing in environment.objects if thing.of_interest}
     seen = {environment.objects[index].name for index in np.unique(segmentation)}
@@ -134,12 +135,12 @@ def test_every_task_runs_and_shows_its_target(task_id: int) -> None:
 def test_success_is_the_simulators_own_judgement() -> None:
     environment = make_environment(SUITE, 0, EnvironmentSettings(image_size=32))
     environment.reset(0, 7)
-    assert not environment.step(environment.wait_action, observe=False).success
+    assert not environment.step(np.array(WAIT_ACTION), observe=False).success
     simulator = environment._simulator  # type: ignore[attr-defined]
     position = simulator.sim.data.get_joint_qpos("cube_joint0")
     position[2] += 0.2  # in the air
     simulator.sim.data.set_joint_qpos("cube_joint0", position)
-    assert environment.step(environment.wait_action, observe=False).success
+    assert environment.step(np.array(WAIT_ACTION), observe=False).success
     environment.close()
 
 
@@ -147,14 +148,16 @@ def test_success_is_the_simulators_own_judgement() -> None:
 def test_an_environment_left_open_ends_without_noise_or_log_file() -> None:
     code = (
         "import logging\n"
-        "from vla_attention.capture.environments import EnvironmentSettings, find_suite, make_environment\n"
+        "from vla_attention.capture.environments.base import EnvironmentSettings\n"
+        "from vla_attention.capture.environments.protocol import WAIT_ACTION\n"
+        "from vla_attention.capture.environments.suites import find_suite, make_environment\n"
         "environment = make_environment(find_suite('robosuite'), 0, EnvironmentSettings(image_size=32))\n"
         "environment.reset(0, 7)\n"
-        "environment.step(environment.wait_action, observe=True)\n"
+        "environment.step(WAIT_ACTION, observe=True)\n"
         "handlers = logging.getLogger('robosuite_logs').handlers\n"
         "assert not any(isinstance(handler, logging.FileHandler) for handler in handlers)\n"
     )
-    # What a cluster with partitioned GPUs sets; robosuite alone takes it for a number and fails.
+    # A cluster with partitioned GPUs sets this; robosuite alone parses it as a number and fails.
     setting = os.environ | {"CUDA_VISIBLE_DEVICES": "MIG-0a1b2c3d"}
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=setting)
     assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
@@ -164,7 +167,7 @@ def test_an_environment_left_open_ends_without_noise_or_log_file() -> None:
 def test_nothing_works_before_reset_or_after_close() -> None:
     environment = make_environment(SUITE, 0, EnvironmentSettings(image_size=32))
     with pytest.raises(RuntimeError, match="no episode"):
-        environment.step(environment.wait_action, observe=False)
+        environment.step(np.array(WAIT_ACTION), observe=False)
     with pytest.raises(RuntimeError, match="no episode"):
         _ = environment.initial_state_digest
     environment.close()

@@ -1,4 +1,4 @@
-"""The real LIBERO: same pictures as the untouched protocol, same episodes in any order, true segmentation."""
+"""The real LIBERO: the pictures of the original package, the same episodes in any order, and the segmentation."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ pytest.importorskip("robosuite")
 from vla_attention.capture.environments.base import EnvironmentSettings, Observation
 from vla_attention.capture.environments.libero import LiberoEnvironment, load_initial_states, parent_of_region
 from vla_attention.capture.environments.libero_installation import load_libero, package_folder
+from vla_attention.capture.environments.protocol import CAMERAS, WAIT_ACTION, WAIT_STEPS
 from vla_attention.capture.environments.suites import find_suite, make_environment
 from vla_attention.schemas.errors import BadArgument, UnknownName
 
 SUITE, TASK_ID, SEED, INDEX = "libero_spatial", 7, 7, 3
-CAMERAS = ("agentview", "robot0_eye_in_hand")
 ACTIONS = np.random.default_rng(0).uniform(-1, 1, (7, 7))
 OBSERVED = (0, 4, 5)
 
@@ -36,11 +36,11 @@ def identical(left: Observation, right: Observation) -> bool:
 
 
 def run_episode(environment: LiberoEnvironment, index: int, steps: int, observed: tuple[int, ...]) -> list[Observation]:
-    """Wait and act; return the observation of the last waiting step and those after the `observed` actions."""
+    """Wait and act; return the observations after the last waiting step and after the `observed` actions."""
     environment.reset(index, SEED)
     observations = [
-        environment.step(environment.wait_action, observe=step == environment.wait_steps - 1).observation
-        for step in range(environment.wait_steps)
+        environment.step(np.array(WAIT_ACTION), observe=step == WAIT_STEPS - 1).observation
+        for step in range(WAIT_STEPS)
     ]
     observations += [environment.step(ACTIONS[step], observe=step in observed).observation for step in range(steps)]
     return [observation for observation in observations if observation is not None]
@@ -48,7 +48,7 @@ def run_episode(environment: LiberoEnvironment, index: int, steps: int, observed
 
 @pytest.fixture(scope="module")
 def protocol(libero_assets: Path) -> list[dict[str, np.ndarray]]:
-    """What the untouched environment of the package returns in the same episode, drawing at every step."""
+    """The observations of the package's own environment in the same episode; it draws at every step."""
     load_libero(libero_assets)
     from libero.libero.envs import OffScreenRenderEnv
 
@@ -66,7 +66,8 @@ def protocol(libero_assets: Path) -> list[dict[str, np.ndarray]]:
 
 @pytest.fixture(scope="module")
 def environment(protocol: list[dict[str, np.ndarray]], libero_assets: Path) -> Iterator[LiberoEnvironment]:
-    # After `protocol`: the untouched environment must be gone, since it does not mind whose drawing context is current.
+    # After `protocol`: the package's own environment must be closed first, because it draws in whichever context is
+    # current.
     made = make_environment(find_suite(SUITE), TASK_ID, EnvironmentSettings(libero_assets=libero_assets))
     assert isinstance(made, LiberoEnvironment)
     yield made
@@ -125,7 +126,7 @@ def test_the_segmentation_shows_the_moment_of_the_picture(
     context.data = original
     np.testing.assert_array_equal(kept, last.images["agentview"])
     assert not np.array_equal(end_of_step, last.images["agentview"])
-    environment.step(environment.wait_action, observe=False)  # the segmentation stays with the picture
+    environment.step(np.array(WAIT_ACTION), observe=False)  # the segmentation stays with the picture
     np.testing.assert_array_equal(environment.segmentation("agentview"), segmented)
 
 
@@ -171,7 +172,7 @@ def test_objects_and_their_pixels(environment: LiberoEnvironment, episode: list[
 @pytest.mark.simulator
 @pytest.mark.libero
 def test_the_seed_places_the_fixtures(environment: LiberoEnvironment) -> None:
-    """They are in the model and not in the stored state; equal seeds put them in the same place in every episode."""
+    """Fixtures are in the model and not in the stored state; equal seeds put them in the same place in every episode."""
     placed = []
     for index, seed in ((0, SEED), (1, SEED), (0, SEED + 1)):
         environment.reset(index, seed)

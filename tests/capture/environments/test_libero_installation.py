@@ -1,4 +1,4 @@
-"""Finding LIBERO and its assets without questions, downloads or traces at home."""
+"""Finding LIBERO and its assets without questions, downloads or files in the home folder."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from vla_attention.capture.environments import libero_installation
-from vla_attention.capture.environments.base import EnvironmentSettings
 from vla_attention.capture.environments.libero_installation import (
     ASSET_SUBFOLDERS,
     ASSETS_SOURCE,
@@ -31,7 +30,7 @@ except MissingDependency:
 
 @pytest.fixture
 def no_assets(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A machine without assets anywhere: no variable, an empty home, a package without its own."""
+    """A machine without assets: no variable, an empty home folder, and a package without assets."""
     monkeypatch.delenv(ASSETS_VARIABLE, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setattr(libero_installation, "package_folder", lambda: tmp_path / "libero")
@@ -66,7 +65,7 @@ def test_assets_are_looked_for_in_order(no_assets: Path, monkeypatch: pytest.Mon
 
 
 def test_a_given_folder_must_be_one(no_assets: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asset_folder(no_assets / "libero" / "assets")  # would be found, but what is given is never passed over
+    asset_folder(no_assets / "libero" / "assets")  # exists, but must not replace the given folder
     with pytest.raises(LiberoAssetsMissing, match="does not exist"):
         find_assets(no_assets / "nowhere")
     (no_assets / "other" / "scenes").mkdir(parents=True)
@@ -83,7 +82,7 @@ def test_a_missing_package_says_how_to_install_it(monkeypatch: pytest.MonkeyPatc
 
 def test_every_suite_lists_its_tasks() -> None:
     for suite in SUITES:
-        tasks = list_tasks(suite, EnvironmentSettings())
+        tasks = list_tasks(suite)
         assert [task.task_id for task in tasks] == list(range(suite.num_tasks))
     first = list_libero_tasks(find_suite("libero_spatial"))[0]
     assert first.instruction == "pick up the black bowl between the plate and the ramekin and place it on the plate"

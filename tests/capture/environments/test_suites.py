@@ -7,11 +7,9 @@ import sys
 
 import pytest
 
-from vla_attention.capture.environments.base import EnvironmentSettings
+from vla_attention.capture.environments.base import EnvironmentSettings, check_initial_state_index, check_task_id
 from vla_attention.capture.environments.suites import (
     SUITES,
-    check_initial_state_index,
-    check_task_id,
     find_suite,
     list_tasks,
     make_environment,
@@ -48,7 +46,7 @@ def test_task_id_out_of_range_states_the_range() -> None:
 
 
 def test_initial_state_out_of_range_states_the_range() -> None:
-    task = list_tasks(find_suite("robosuite"), SETTINGS)[1]
+    task = list_tasks(find_suite("robosuite"))[1]
     check_initial_state_index(task, 49)
     for index in (-1, 50):
         with pytest.raises(BadArgument, match=f"Initial state {index} does not exist .* are 0 to 49"):
@@ -62,7 +60,7 @@ def test_image_size_must_be_positive() -> None:
 
 def test_builtin_tasks_are_numbered_and_described() -> None:
     suite = find_suite("robosuite")
-    tasks = list_tasks(suite, SETTINGS)
+    tasks = list_tasks(suite)
     assert [task.task_id for task in tasks] == list(range(suite.num_tasks))
     assert len({task.name for task in tasks}) == len({task.instruction for task in tasks}) == suite.num_tasks
     assert all(task.num_initial_states == 50 for task in tasks)
@@ -72,9 +70,8 @@ def test_the_registry_imports_no_simulator() -> None:
     code = (
         "import sys\n"
         "from vla_attention.capture.environments.suites import SUITES, list_tasks\n"
-        "from vla_attention.capture.environments.base import EnvironmentSettings\n"
         "for suite in SUITES:\n"
-        "    if suite.kind == 'robosuite': list_tasks(suite, EnvironmentSettings())\n"
+        "    if suite.kind == 'robosuite': list_tasks(suite)\n"
         "print({'torch', 'mujoco', 'robosuite', 'libero'} & set(sys.modules))\n"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -12,9 +12,15 @@ import pytest
 from tests.kit.store_kit import INSTRUCTIONS, StoreSpec, write_store
 from vla_attention.capture.__main__ import main
 from vla_attention.capture.jobs.claims import Claims, jobs_folder
-from vla_attention.capture.jobs.job import Worker
-from vla_attention.capture.jobs.run_records import PlannedTask, RecordKeeper, forget_runs, planned_tasks, read_records
 from vla_attention.capture.jobs.status import store_status
+from vla_attention.capture.jobs.worker import Worker
+from vla_attention.capture.jobs.worker_records import (
+    PlannedTask,
+    RecordWriter,
+    delete_jobs_folder,
+    planned_tasks,
+    read_records,
+)
 
 SPEC = StoreSpec(tasks=(0, 2), episodes=2, replans=1, layers=(0,), heads=(0,), frames=False)
 NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2", 0)
@@ -44,7 +50,7 @@ def test_without_notes_it_says_what_it_cannot_know(store, capsys):
     assert main(["status", str(store), "--check"]) == 0
     said = capsys.readouterr().out
     assert "2 of ?" in said
-    assert "say it with --expected N" in said
+    assert "give it with --expected N" in said
 
 
 def test_expected_may_be_given(store, capsys):
@@ -58,10 +64,10 @@ def test_expected_may_be_given(store, capsys):
 
 
 def test_plans_of_several_processes_add_up(store, capsys):
-    first = RecordKeeper(store, NODE, (planned(0, 2), planned(1, 2)))
-    first.committed("task000_episode001")
-    first.ended("stopped")
-    RecordKeeper(store, replace(NODE, tag="node8-5-cd", host="node8", job_name="98_0"), (planned(0, 4),))
+    first = RecordWriter(store, NODE, (planned(0, 2), planned(1, 2)))
+    first.add_commit("task000_episode001")
+    first.end("stopped")
+    RecordWriter(store, replace(NODE, tag="node8-5-cd", host="node8", job_name="98_0"), (planned(0, 4),))
     assert {task: plan.episodes for task, plan in planned_tasks(read_records(store)).items()} == {0: 4, 1: 2}
     status = store_status(store)
     by_id = {task.task_id: task for task in status.tasks}
@@ -90,17 +96,17 @@ def test_episodes_in_flight_and_json(store, capsys):
 
 
 def test_notes_of_an_earlier_store_of_the_same_name_do_not_count(store):
-    RecordKeeper(store, NODE, (planned(0, 50),))
+    RecordWriter(store, NODE, (planned(0, 50),))
     assert store_status(store).complete is False
     os.utime(store / "zarr.json", (1, 1))
     assert read_records(store) == []
     assert store_status(store).complete is None
-    forget_runs(store)
+    delete_jobs_folder(store)
     assert not jobs_folder(store).exists()
 
 
 def test_damaged_episodes_and_notes_are_said_or_passed_over(store, capsys):
-    RecordKeeper(store, NODE, (planned(0, 2), planned(2, 2)))
+    RecordWriter(store, NODE, (planned(0, 2), planned(2, 2)))
     (jobs_folder(store) / "runs" / "x.json").write_text("{")
     (store / "episodes/task002_episode000/zarr.json").write_text("{")
     assert main(["status", str(store)]) == 0

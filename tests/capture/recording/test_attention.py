@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan, SiteNotRecorded, attend
+from vla_attention.capture.recording.attention import attend
+from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan, SiteNotRecorded
 from vla_attention.schemas.errors import BadArgument
 
 

@@ -8,9 +8,9 @@ import torch
 
 from vla_attention.capture.policies.pi.config import GemmaConfig
 from vla_attention.capture.policies.pi.gemma import GemmaBlock, Rotation
-from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan, SiteNotRecorded, attend
+from vla_attention.capture.recording.attention import attend
 from vla_attention.capture.recording.contributions import gram_matrix, keys_of_parts, part_contributions
-from vla_attention.capture.recording.rollout import make_recorders
+from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan, SiteNotRecorded, make_recorders
 from vla_attention.schemas.segments import segments_of
 from vla_attention.schemas.stores.store_format import Recording
 

@@ -17,7 +17,7 @@ from vla_attention.capture.policies.cosmos.config import LIBERO_FRAMES, CosmosCo
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, random_policy
 from vla_attention.capture.policies.cosmos.layout import cross_layout, self_layout
 from vla_attention.capture.policies.policy import camera_grid
-from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan
+from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
 from vla_attention.schemas.errors import BadArgument, MissingDependency, UnknownName
 from vla_attention.schemas.jsonable import from_json, to_json
 from vla_attention.schemas.layout import Role

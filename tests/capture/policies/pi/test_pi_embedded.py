@@ -10,7 +10,7 @@ from tests.kit.pi_golden import make_observation
 from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, build_random_model, builtin_stats
 from vla_attention.capture.policies.pi.policy import site_layout
 from vla_attention.capture.policies.weights import weights_digest
-from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan
+from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
 from vla_attention.schemas.layout import Role
 
 INSTRUCTION = "put the black bowl on the plate"

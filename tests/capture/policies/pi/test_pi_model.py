@@ -11,7 +11,7 @@ from vla_attention.capture.policies.pi.config import find_config
 from vla_attention.capture.policies.pi.flow_time import denoise_times, embed_times
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.strict import expected_shapes, model_from_state
-from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan
+from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
 
 LIMIT = 5e-5
 _JUNK = "paligemma_with_expert.gemma_expert.lm_head.weight"

@@ -21,7 +21,7 @@ from vla_attention.capture.policies.pi.processing import OpenpiProcessing
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, TokenizerNotFound, check_vocabulary
 from vla_attention.capture.policies.policy import Policy
 from vla_attention.capture.policies.weights import weights_digest
-from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan
+from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
 from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.jsonable import from_json, to_json
 from vla_attention.schemas.layout import Role

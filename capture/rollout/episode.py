@@ -1,9 +1,9 @@
-"""Running a policy in an environment, episode by episode, and handing every replan to the store."""
+"""One episode: the policy acts in the environment, and every replan is stored."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,24 +12,23 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import Environment, Observation, Task
 from vla_attention.capture.environments.coverage import patch_coverage
+from vla_attention.capture.environments.protocol import WAIT_ACTION
 from vla_attention.capture.policies.policy import Policy, camera_grid
-from vla_attention.capture.recording.attention import AttentionRecorder, RecordingPlan
+from vla_attention.capture.recording.recorder import make_recorders
 from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.schemas.layout import SiteLayout
-from vla_attention.schemas.segments import segment_members, segments_of
-from vla_attention.schemas.stores.store_format import Protocol, Recording
+from vla_attention.schemas.stores.store_format import Protocol
 
-#: Called after each replan's actions with (environment steps done, replans done).
+#: Called after the actions of each replan with (environment steps done, replans done).
 StepReport = Callable[[int, int], None]
-#: Called before every environment step and policy call; raises to drop the episode.
+#: Called before every environment step and policy call. An exception that it raises drops the episode.
 StopCheck = Callable[[], None]
 
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """How an episode ended and where it was stored."""
+    """How an episode ended, and its folder in the store."""
 
     task_id: int
     episode_index: int
@@ -40,12 +39,12 @@ class EpisodeResult:
 
 
 def max_replans(protocol: Protocol) -> int:
-    """Largest number of policy calls that one episode can have."""
+    """Return the largest possible number of policy calls of one episode."""
     return math.ceil(protocol.max_steps / protocol.replan_steps)
 
 
 def check_protocol(protocol: Protocol, policy: Policy) -> None:
-    """Raise `BadArgument` when the policy cannot follow the protocol."""
+    """Raise `BadArgument` if the policy cannot follow the protocol."""
     if protocol.max_steps < 1:
         raise BadArgument(f"Cannot use --max-steps {protocol.max_steps}; expected at least 1.")
     if not 1 <= protocol.replan_steps <= policy.action_horizon:
@@ -55,7 +54,7 @@ def check_protocol(protocol: Protocol, policy: Policy) -> None:
         )
 
 
-def run_episode(
+def record_episode(
     environment: Environment,
     policy: Policy,
     store: RunStore,
@@ -65,10 +64,11 @@ def run_episode(
     report: StepReport | None = None,
     check: StopCheck = lambda: None,
 ) -> EpisodeResult:
-    """Run one episode from the stored initial state of the same index, and commit it.
+    """Run one episode from the stored initial state of the same index, and commit it to the store.
 
-    The protocol of the published evaluations: waiting steps, then a policy call every `replan_steps` executed actions until
-    the task is solved or `max_steps` actions have been executed. What `check` raises drops the episode without a trace.
+    The protocol of the published evaluations: waiting steps, then one policy call for every `replan_steps` executed
+    actions, until the task is solved or `max_steps` actions have been executed. An exception, also one from `check`,
+    drops the episode: nothing of it remains in or beside the store.
     """
     protocol = store.attributes.protocol
     environment.reset(episode_index, protocol.seed)
@@ -92,10 +92,10 @@ def run_episode(
             replans += 1
             chunk = min(protocol.replan_steps, protocol.max_steps - step)
             for i in range(chunk):
-                # Pictures are drawn only where the policy will look: before the next replan.
+                # Only the picture before the next replan is drawn, because the policy sees no other.
                 check()
-                look = i == chunk - 1 and step + 1 < protocol.max_steps
-                result = environment.step(actions[i], observe=look)
+                observe = i == chunk - 1 and step + 1 < protocol.max_steps
+                result = environment.step(actions[i], observe=observe)
                 step += 1
                 success = result.success
                 if success:
@@ -108,29 +108,15 @@ def run_episode(
     return EpisodeResult(task.task_id, episode_index, success, step, replans, folder)
 
 
-def make_recorders(
-    recording: Recording,
-    sites: Sequence[SiteLayout],
-    key_role: Mapping[str, NDArray[np.uint8]],
-    pools: NDArray[np.float64] | None = None,
-) -> dict[str, AttentionRecorder]:
-    """Fresh recorders for one replan, one per site; contributions are those of the replan's own segments."""
-    recorders: dict[str, AttentionRecorder] = {}
-    for site in sites:
-        plan = RecordingPlan(recording.layers, recording.denoise_steps, recording.heads, recording.queries, site.name)
-        roles = key_role[site.name]
-        parts = segment_members(site, roles[None], segments_of(site, roles))[0] if recording.contributions else None
-        recorders[site.name] = AttentionRecorder(plan, site.num_keys, parts, pools)
-    return recorders
-
-
 def _wait(environment: Environment, steps: int, check: StopCheck) -> Observation:
-    observation = None
+    action, observation = np.array(WAIT_ACTION), None
     for i in range(steps):
         check()
-        observation = environment.step(environment.wait_action, observe=i == steps - 1).observation
+        observation = environment.step(action, observe=i == steps - 1).observation
     if observation is None:
-        raise ValueError("an episode needs at least one waiting step: the first picture is the one after it")
+        raise ValueError(
+            "an episode needs at least one waiting step: the first picture is the one after the last of them"
+        )
     return observation
 
 

@@ -1,0 +1,120 @@
+"""The record of each worker: the episodes that it plans and has committed, in a small file beside the store.
+
+The files are `NAME.zarr.jobs/runs/*.json`. Each worker writes only its own file, and always the whole file.
+`vla-capture status` reads from them how many episodes are expected, and who committed each. No reader of a store needs
+them. They name machines and jobs, so a copy of a store omits them. Deleting them loses nothing else.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+from vla_attention.capture.jobs.claims import jobs_folder
+from vla_attention.capture.jobs.worker import Worker
+from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
+
+
+@dataclass(frozen=True)
+class PlannedTask:
+    """A task and its planned number of episodes: those with the indices 0 to `episodes` - 1."""
+
+    task_id: int
+    name: str
+    instruction: str
+    episodes: int
+
+
+@dataclass(frozen=True)
+class Commit:
+    """An episode that the worker committed, and the time (ISO 8601, UTC)."""
+
+    episode: str
+    at: str
+
+
+@dataclass(frozen=True)
+class WorkerRecord:
+    """The record of one worker. `store` distinguishes its store from a later one with the same name (`store_identity`)."""
+
+    store: str
+    worker: Worker
+    plan: tuple[PlannedTask, ...]
+    began: str
+    state: Literal["running", "finished", "stopped", "failed"]
+    committed: tuple[Commit, ...] = ()
+
+
+class RecordWriter:
+    """Writes the record of this worker after every change."""
+
+    def __init__(self, store: Path, worker: Worker, plan: tuple[PlannedTask, ...]) -> None:
+        self.file = records_folder(store) / f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{worker.tag}.json"
+        self.record = WorkerRecord(store_identity(store), worker, plan, now(), "running")
+        self._write()
+
+    def add_commit(self, episode: str) -> None:
+        """Record that the worker has committed an episode."""
+        self.record = replace(self.record, committed=(*self.record.committed, Commit(episode, now())))
+        self._write()
+
+    def end(self, state: Literal["finished", "stopped", "failed"]) -> None:
+        """Record how the worker ended."""
+        self.record = replace(self.record, state=state)
+        self._write()
+
+    def _write(self) -> None:
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        temporary = self.file.with_name(f".{self.file.name}.partial")
+        temporary.write_text(json.dumps(to_json(self.record), indent=1), encoding="utf-8")
+        os.replace(temporary, self.file)
+
+
+def records_folder(store: Path) -> Path:
+    """Return the folder of the records."""
+    return jobs_folder(store) / "runs"
+
+
+def read_records(store: Path) -> list[WorkerRecord]:
+    """Return the records of this store, oldest first; without those of an earlier store with the same name."""
+    identity, records = store_identity(store), []
+    for file in sorted(records_folder(store).glob("*.json")):
+        try:
+            record = from_json(WorkerRecord, json.loads(file.read_text(encoding="utf-8")))
+        except (OSError, ValueError, MalformedDocument):
+            continue  # an unreadable record is no damage of the store
+        if record.store == identity:
+            records.append(record)
+    return records
+
+
+def planned_tasks(records: list[WorkerRecord]) -> dict[int, PlannedTask]:
+    """Return every planned task by its id, with the largest number of episodes that a worker planned."""
+    plan: dict[int, PlannedTask] = {}
+    for task in (task for record in records for task in record.plan):
+        known = plan.get(task.task_id)
+        if known is None or task.episodes > known.episodes:
+            plan[task.task_id] = task
+    return plan
+
+
+def delete_jobs_folder(store: Path) -> None:
+    """Delete all records and claims of a store that will be replaced."""
+    shutil.rmtree(jobs_folder(store), ignore_errors=True)
+
+
+def store_identity(store: Path) -> str:
+    """Return a string that differs from that of any later store with the same name: when the root of the store was written."""
+    # The root is written once, and moving or copying a store with its times keeps the time. Some file systems store
+    # only microseconds.
+    return str((store / "zarr.json").stat().st_mtime_ns // 1000)
+
+
+def now() -> str:
+    """Return the time, ISO 8601 in UTC."""
+    return datetime.now(UTC).isoformat(timespec="seconds")

@@ -1,0 +1,1 @@
+"""Running a policy in an environment: one episode, the loop over episodes, and their progress on the terminal."""
