@@ -88,9 +88,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--replans", type=int, default=52)
     parser.add_argument("--only", nargs="+", metavar="NAME", help="measure only these")
-    parser.add_argument(
-        "--repeats", type=int, default=3, help="runs of each; the fastest is printed (default: 3)"
-    )
+    parser.add_argument("--repeats", type=int, default=3, help="runs of each; the fastest is printed (default: 3)")
     arguments = parser.parse_args()
     scratch = Path(tempfile.mkdtemp(prefix="analysis_speed_"))
     store = arguments.store or scratch / "fifty.zarr"

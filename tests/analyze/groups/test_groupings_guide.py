@@ -81,12 +81,12 @@ def check_and_resolve(selector: str, tokens: EpisodeTokens) -> None:
 
 def test_every_error_reads_as_described():
     tokens = episode_tokens()
-    rows = re.findall(r"^\| `(.*?)` \| (.*?) \|$", GUIDE.split("| given | said |")[1], re.MULTILINE)
+    rows = re.findall(r"^\| `(.*?)` \| (.*?) \|$", GUIDE.split("| given | message |")[1], re.MULTILINE)
     assert len(rows) >= 6
-    for selector, said in rows:
+    for selector, message in rows:
         with pytest.raises(SelectorError) as caught:
             check_and_resolve(selector, tokens)
-        assert said in str(caught.value)
+        assert message in str(caught.value)
 
 
 def test_every_command_runs(tmp_path, monkeypatch, capsys):
