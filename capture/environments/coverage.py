@@ -19,7 +19,8 @@ def overlap_lengths(pixels: int, cells: int, visible: float = 1.0) -> NDArray[np
     border = (np.arange(pixels + 1) / pixels - (1.0 - visible) / 2.0) * cells / visible
     border = np.where(np.abs(border - np.round(border)) < 1e-9, np.round(border), border)
     overlap = np.minimum(cell + 1, border[None, 1:]) - np.maximum(cell, border[None, :-1])
-    return np.clip(overlap, 0.0, None)
+    clipped: NDArray[np.float64] = np.clip(overlap, 0.0, None)
+    return clipped
 
 
 def patch_coverage(
@@ -49,7 +50,8 @@ def patch_coverage(
     low, high = int(segmentation.min()), int(segmentation.max())
     if low < 0 or high >= num_objects:
         raise BadArgument(
-            f"The segmentation holds indices {low} to {high}; with {num_objects} objects 0 to {num_objects - 1} are valid."
+            f"The segmentation holds indices {low} to {high}; with {num_objects} objects, 0 to {num_objects - 1} "
+            "are valid."
         )
     if not 0.0 < visible <= 1.0:
         raise BadArgument(f"The visible share of a picture's side is {visible}; it must be above 0 and at most 1.")

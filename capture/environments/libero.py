@@ -38,7 +38,10 @@ def load_initial_states(path: Path) -> NDArray[np.float64]:
 
 
 def parent_of_region(name: str, known: Sequence[str]) -> str | None:
-    """Return the object or fixture of which `name` is a region (`wine_rack_1_top_region`) or the name; None for the table."""
+    """Return the object or fixture to which `name` belongs, None for the table.
+
+    `name` is a name in `known`, or that of a region (`wine_rack_1_top_region` belongs to `wine_rack_1`).
+    """
     owners = [candidate for candidate in known if name == candidate or name.startswith(f"{candidate}_")]
     return max(owners, key=len, default=None)
 
@@ -83,8 +86,8 @@ class LiberoEnvironment(SimulatedEnvironment):
         expected = 1 + simulation.model.nq + simulation.model.nv
         if state.size != expected:
             raise BadArgument(
-                f"The stored initial states of '{self.task.name}' have {state.size} numbers and its scene has {expected}; "
-                f"the LIBERO package and the assets in '{self._assets}' do not belong together."
+                f"The stored initial states of '{self.task.name}' have {state.size} numbers, but its scene has "
+                f"{expected}; the LIBERO package and the assets in '{self._assets}' do not belong together."
             )
         simulation.set_state_from_flattened(state)
         simulation.forward()

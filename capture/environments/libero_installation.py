@@ -64,7 +64,8 @@ def _task_names() -> dict[str, list[str]]:
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return module.libero_task_map
+    names: dict[str, list[str]] = module.libero_task_map
+    return names
 
 
 def instruction_of(task_name: str) -> str:
@@ -80,7 +81,8 @@ def list_libero_tasks(suite: Suite) -> tuple[Task, ...]:
     names = _task_names()[suite.name]
     if len(names) != suite.num_tasks:
         raise MissingDependency(
-            f"The installed LIBERO has {len(names)} tasks in {suite.name} instead of {suite.num_tasks}; run 'make setup'."
+            f"The installed LIBERO has {len(names)} tasks in {suite.name} instead of {suite.num_tasks}; "
+            "run 'make setup'."
         )
     return tuple(
         Task(suite.name, task_id, name, instruction_of(name), suite.initial_states_per_task)
@@ -129,7 +131,8 @@ def load_libero(assets: Path) -> dict[str, Any]:
             environments = importlib.import_module("libero.libero.envs")
     except ImportError as error:
         raise MissingDependency(f"LIBERO could not be loaded ({error}); run 'make setup'.") from error
-    return environments.TASK_MAPPING
+    classes: dict[str, Any] = environments.TASK_MAPPING
+    return classes
 
 
 def _import_with_own_configuration(assets: Path) -> ModuleType:

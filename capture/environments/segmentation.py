@@ -29,13 +29,17 @@ def owners_of_bodies(parents: NDArray[np.integer], roots: Mapping[int, int], bac
 
 
 def decode_identities(colours: NDArray[np.uint8], table: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Map identity colours (height, width, 3) to `table` entries (height, width): colour k to table[k]; 0 means nothing drawn."""
+    """Map identity colours (height, width, 3) to entries of `table`, (height, width): colour k to table[k].
+
+    Colour 0 means that nothing was drawn.
+    """
     wide = colours.astype(np.int32)
     identity = wide[:, :, 0] + (wide[:, :, 1] << 8) + (wide[:, :, 2] << 16)
     if identity.max() >= len(table):
         # The driver blended colours at edges (multisampling) although identity colours were requested.
         raise RuntimeError(f"The renderer returned identity {identity.max()}; only {len(table) - 1} things were drawn.")
-    return table[identity]
+    entries: NDArray[np.int32] = table[identity]
+    return entries
 
 
 def draw_object_indices(

@@ -37,7 +37,7 @@ from vla_attention.schemas.groupings.vocabulary import SceneObject
 
 @contextlib.contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Seed the global generators of random numbers that robosuite and LIBERO use; restore the caller's state afterwards."""
+    """Seed the global random generators, which robosuite and LIBERO use; restore the caller's state afterwards."""
     if not 0 <= seed < 2**32:
         raise BadArgument(f"The environment seed is {seed}; it must be between 0 and {2**32 - 1}.")
     numpy_state, python_state = np.random.get_state(), random.getstate()  # noqa: NPY002 (robosuite uses it)
@@ -225,7 +225,7 @@ class SimulatedEnvironment:
         )
 
     def _keep_moment(self) -> None:
-        """Before the first picture of a step, copy the state that it shows. The state at the end of the step differs."""
+        """Before the first picture of a step, copy the state that it shows; the step ends with another state."""
         self._make_context_current()
         if not self._moment_is_kept:
             import mujoco

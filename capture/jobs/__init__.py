@@ -1,1 +1,1 @@
-"""Several processes that fill one store: claims on episodes, records of each process, SIGTERM, SLURM, and the status of a store."""
+"""Several processes that fill one store: their claims on episodes and their records, SIGTERM, SLURM, and the status."""

@@ -49,7 +49,10 @@ _ATTEMPTS = 5
 
 @dataclass(frozen=True)
 class Holder:
-    """The process that holds an episode. `began_s` and `silent_s`: seconds since its claim began and since its last touch."""
+    """The process that holds an episode.
+
+    began_s, silent_s: seconds since the claim began, and since its last touch.
+    """
 
     episode: str
     worker: Worker
@@ -58,7 +61,7 @@ class Holder:
 
     def describe(self) -> str:
         """Return episode, worker and time of the last touch as text."""
-        return f"{self.episode} by {self.worker.describe()}, last sign of life {self.silent_s:.0f} s ago"
+        return f"{self.episode} by {self.worker.describe()}, last active {self.silent_s:.0f} s ago"
 
 
 def jobs_folder(store: Path) -> Path:
@@ -109,7 +112,7 @@ class Claims:
         return Holder(episode, Worker("", "another machine", 0, "", ""), 0.0, 0.0)
 
     def _try(self, episode: str) -> tuple[bool, Holder | None]:
-        """Try once; returns (success, living holder). (False, None): the claims changed during the attempt, so try again."""
+        """Try once; returns (success, living holder). (False, None): the claims changed meanwhile, so try again."""
         building = self.folder / f"new-{self.worker.tag}"
         shutil.rmtree(building, ignore_errors=True)
         self.folder.parent.mkdir(exist_ok=True)
@@ -192,7 +195,7 @@ class Claims:
 
 
 def holders(store: Path) -> list[Holder]:
-    """Return the holders of all claims on the store's episodes, dead or alive, with times by this machine's clock. Writes nothing."""
+    """Return the holders of all claims on the store's episodes, dead or alive. Times are by this machine's clock."""
     folder = _claims_folder(store)
     episodes = sorted({entry.name.rpartition(".")[0] for entry in _entries(folder) if not _is_temporary(entry.name)})
     found = []

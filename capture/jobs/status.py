@@ -20,7 +20,12 @@ from vla_attention.schemas.stores.store_format import CorruptEpisode, EpisodeAtt
 
 @dataclass(frozen=True)
 class EpisodeStatus:
-    """One committed episode. `success` is None if its attributes cannot be read; `by` is empty if no record names its worker."""
+    """One committed episode.
+
+    success: None if the attributes cannot be read.
+    at: time of the commit (ISO 8601, UTC).
+    by: the worker; empty if no record names it.
+    """
 
     task_id: int
     episode: int
@@ -138,7 +143,11 @@ def store_status(path: Path, expected: int | None = None) -> StoreStatus:
 
 
 def print_status(stores: Sequence[Path], expected: int | None, as_json: bool, check: bool) -> int:
-    """Print the status of stores. Returns the exit code: 1 if `check` is set and an expected episode is missing, else 0."""
+    """Print the status of stores, as text or as JSON.
+
+    Returns:
+        The exit code: 1 if `check` is set and an expected episode is missing, else 0.
+    """
     found = [store_status(store, expected) for store in stores]
     if as_json:
         print(json.dumps([to_json(status) | {"complete": status.complete} for status in found], indent=1))
@@ -174,8 +183,8 @@ def _text(status: StoreStatus) -> str:
     tasks = status.tasks
     committed = sum(task.committed for task in tasks)
     lines = [
-        f"{status.store}: {status.suite}, policy {status.policy}, {committed} episodes of {sum(t.committed > 0 for t in tasks)} "
-        f"tasks, {format_bytes(sum(task.bytes for task in tasks))}"
+        f"{status.store}: {status.suite}, policy {status.policy}, {committed} episodes of "
+        f"{sum(task.committed > 0 for task in tasks)} tasks, {format_bytes(sum(task.bytes for task in tasks))}"
     ]
     rows = [("task", "episodes", "solved", "size", "last written (UTC)", "by", "instruction"), *map(_cells, tasks)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]

@@ -19,7 +19,7 @@ EXIT_TERMINATED = 75
 
 
 class Terminated(BaseException):
-    """SIGTERM came. Like KeyboardInterrupt, this is no `Exception`, so that handlers of ordinary errors do not catch it."""
+    """SIGTERM came. Like KeyboardInterrupt this is no `Exception`: handlers of ordinary errors do not catch it."""
 
 
 class Termination:
@@ -42,7 +42,7 @@ class Termination:
 
     @contextmanager
     def only_at_checks(self) -> Iterator[None]:
-        """Within this block the first signal raises `Terminated` at the next `check`, at the latest at the end of the block."""
+        """Within this block the first signal raises `Terminated` at the next `check` or at the end of the block."""
         self._guarded += 1
         try:
             yield
@@ -53,7 +53,7 @@ class Termination:
 
 @contextmanager
 def listening_for_sigterm() -> Iterator[Termination]:
-    """Handle SIGTERM within the block. Python allows this in the main thread only; in another thread nothing changes."""
+    """Handle SIGTERM within the block. Python allows this in the main thread only; elsewhere nothing changes."""
     termination = Termination()
     if threading.current_thread() is not threading.main_thread():
         yield termination

@@ -40,7 +40,10 @@ class Commit:
 
 @dataclass(frozen=True)
 class WorkerRecord:
-    """The record of one worker. `store` distinguishes its store from a later one with the same name (`store_identity`)."""
+    """The record of one worker.
+
+    store: `store_identity` of its store, which differs from that of a later store with the same name.
+    """
 
     store: str
     worker: Worker
@@ -109,7 +112,7 @@ def delete_jobs_folder(store: Path) -> None:
 
 
 def store_identity(store: Path) -> str:
-    """Return a string that differs from that of any later store with the same name: when the root of the store was written."""
+    """Return the time at which the root of the store was written. A later store with the same name has another."""
     # The root is written once, and moving or copying a store with its times keeps the time. Some file systems store
     # only microseconds.
     return str((store / "zarr.json").stat().st_mtime_ns // 1000)

@@ -1,1 +1,1 @@
-"""Attention with recorded rows: the attention function of all policies, the recorder of its rows, and the contributions."""
+"""The attention function of all policies, the recorder of its rows, and the contributions of the keys."""

@@ -49,8 +49,8 @@ def check_protocol(protocol: Protocol, policy: Policy) -> None:
         raise BadArgument(f"Cannot use --max-steps {protocol.max_steps}; expected at least 1.")
     if not 1 <= protocol.replan_steps <= policy.action_horizon:
         raise BadArgument(
-            f"Cannot use --replan-steps {protocol.replan_steps}: the policy gives {policy.action_horizon} actions a call; "
-            f"expected 1 to {policy.action_horizon}."
+            f"Cannot use --replan-steps {protocol.replan_steps}: the policy gives {policy.action_horizon} actions a "
+            f"call; expected 1 to {policy.action_horizon}."
         )
 
 

@@ -1,4 +1,4 @@
-"""The loop over episodes: it claims, records and commits one after another, and drops the unfinished one after SIGTERM."""
+"""The loop over episodes: it claims, records and commits one after another. SIGTERM drops the unfinished one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The whole way through the real command lines: simulator, policy, store, tables, results, pictures."""
+"""Capture and analysis through their command lines: simulator, policy, store, tables, results files, pictures."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from vla_attention.capture.__main__ import main as capture
 pytestmark = pytest.mark.simulator
 
 
-def test_capture_makes_a_whole_store_and_resume_adds_what_is_missing(captured_store, capsys):
+def test_capture_makes_a_complete_store_and_resume_adds_the_missing_episodes(captured_store, capsys):
     assert analyze(["verify", str(captured_store)]) == 0
     assert "4 episodes, all whole" in capsys.readouterr().out
     names = sorted(path.name for path in (captured_store / "episodes").iterdir() if path.is_dir())
@@ -28,7 +28,7 @@ def test_capture_makes_a_whole_store_and_resume_adds_what_is_missing(captured_st
     assert not captured_store.with_name("robosuite.zarr.partial").exists()
 
 
-def test_resuming_a_complete_run_changes_nothing(captured_store, run_capture, capsys):
+def test_resuming_a_complete_store_changes_nothing(captured_store, run_capture, capsys):
     before = {path: path.read_bytes() for path in captured_store.rglob("*") if path.is_file()}
     run_capture("--task-id", 0, "--num-episodes", 2, "--store", captured_store, "--resume")
     assert "2 of 2 episodes are complete already; 0 to run" in capsys.readouterr().out
@@ -46,7 +46,7 @@ def test_two_runs_give_the_same_bytes_whatever_ran_before(captured_store, run_ca
             assert (first / file).read_bytes() == (second / file).read_bytes(), file
 
 
-def test_recorded_episodes_hold_what_the_policy_saw(captured_store):
+def test_episodes_hold_the_inputs_of_the_policy(captured_store):
     episode = zarr.open_group(captured_store / "episodes/task001_episode000", mode="r")
     attributes = dict(episode.attrs)
     assert attributes["instruction"] == "stack the red cube on top of the green cube"
@@ -62,7 +62,7 @@ def test_recorded_episodes_hold_what_the_policy_saw(captured_store):
     assert coverage[:, :, names.index("robot")].sum() > 0
 
 
-def test_default_analysis_writes_everything_it_promises(captured_store, tmp_path, capsys):
+def test_default_analysis_writes_every_documented_file(captured_store, tmp_path, capsys):
     folder = tmp_path / "results"
     assert analyze([str(captured_store), "--output", str(folder), "--save-viz", "--layers", "0", "2"]) == 0
     printed = capsys.readouterr().out
@@ -122,8 +122,8 @@ def test_a_block_named_both_ways_is_stored_once_and_reported_twice(run_capture, 
 
 
 def test_three_groupings_of_one_store_need_no_model(captured_store, tmp_path, monkeypatch):
-    # Stage two must work where torch and the simulators are not installed.
-    for module in ("torch", "mujoco", "robosuite", "capture"):
+    # The analysis must work without torch and without the simulators.
+    for module in ("torch", "mujoco", "robosuite", "vla_attention.capture"):
         monkeypatch.setitem(sys.modules, module, None)
     toml = tmp_path / "things.toml"
     toml.write_text(
@@ -173,7 +173,7 @@ def test_masses_equal_a_computation_by_hand_from_the_raw_arrays(captured_store, 
 def test_list_names_layout_words_objects_and_layers(captured_store, capsys):
     assert analyze([str(captured_store), "--list"]) == 0
     printed = capsys.readouterr().out
-    for said in (
+    for text in (
         "base_0_rgb",
         "masked_image 4",
         "words      lift, the, red, cube",
@@ -181,7 +181,7 @@ def test_list_names_layout_words_objects_and_layers(captured_store, capsys):
         "layers     0, 1, 2 of 3",
         "steps 0, 2",
     ):
-        assert said in printed
+        assert text in printed
 
 
 def test_store_opens_with_xarray_alone(captured_store):

@@ -1,4 +1,4 @@
-"""Captures that are told to stop, and captures that share a store: a real process and real simulators."""
+"""SIGTERM during a capture, and captures that share a store: a real process and real simulators."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
 import pytest
 
@@ -17,7 +16,7 @@ from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.jobs.claims import Claims, holders
 from vla_attention.capture.jobs.status import store_status
-from vla_attention.capture.jobs.termination import EXIT_TERMINATED, Terminated, Termination
+from vla_attention.capture.jobs.termination import EXIT_TERMINATED
 from vla_attention.capture.jobs.worker import Worker
 from vla_attention.capture.published.evaluate import main_pi
 
@@ -62,8 +61,8 @@ def test_sigterm_drops_the_episode_in_flight_and_resuming_completes_the_store(tm
     assert store_status(store).complete
 
 
-def test_an_episode_of_another_process_is_waited_for_and_left_to_it(tmp_path, monkeypatch, capsys):
-    """When it returns, everything is there: a dependent analysis is complete."""
+def test_a_capture_waits_for_an_episode_that_another_process_has_claimed(tmp_path, monkeypatch, capsys):
+    """After the capture the store is complete, so a dependent analysis is complete, too."""
     store = tmp_path / "a.zarr"
     arguments = [*DUMMY, "--max-steps", "4", "--store", str(store)]
     assert capture([*arguments, "--num-episodes", "1"]) == 0
@@ -99,22 +98,22 @@ def test_array_tasks_fill_one_store_and_the_analysis_comes_last(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     for name, value in {"MIN": "0", "MAX": "1", "STEP": "1", "COUNT": "2"}.items():
         monkeypatch.setenv(f"SLURM_ARRAY_TASK_{name}", value)
-    words = ["--checkpoint", "dummy", "--task-suite", "robosuite", "--num-episodes", "1"]
-    run = ["--replan-steps", "4", "--max-steps", "8"]
+    arguments = ["--checkpoint", "dummy", "--task-suite", "robosuite", "--num-episodes", "1"]
+    short = ["--replan-steps", "4", "--max-steps", "8"]
     folder = tmp_path / "results/attention_ratio_robosuite"
     store = folder / "robosuite.zarr"
-    assert main_pi([*words, *run, "--array-index", "0"]) == 0
+    assert main_pi([*arguments, *short, "--array-index", "0"]) == 0
     assert not list(folder.glob("*.json"))
     assert [(task.task_id, task.committed, task.expected) for task in store_status(store).tasks] == [
         (0, 1, 1),
-        (1, 0, 1),  # of an array task that has not begun
+        (1, 0, 1),  # belongs to an array task that has not started
     ]
-    assert main_pi([*words, "--stage", "analyze"]) == 0
+    assert main_pi([*arguments, "--stage", "analyze"]) == 0
     assert "task 1 lacks 1 of 1 episodes: 0" in capsys.readouterr().out
-    assert main_pi([*words, *run, "--array-index", "1"]) == 0
+    assert main_pi([*arguments, *short, "--array-index", "1"]) == 0
     assert store_status(store).complete
     for layers in (("0",), ("1", "5")):
-        assert main_pi([*words, "--stage", "analyze", "--layers", *layers]) == 0
+        assert main_pi([*arguments, "--stage", "analyze", "--layers", *layers]) == 0
         name = "attention_ratio_results_robosuite.json"
         results = json.loads((folder / name).read_text())
         assert [item["task_id"] for item in results] == [0, 1]
@@ -122,50 +121,3 @@ def test_array_tasks_fill_one_store_and_the_analysis_comes_last(tmp_path, monkey
         assert results == json.loads((folder / f"layers_{'_'.join(layers)}" / name).read_text())
     # All layers were recorded, so neither question needed another capture.
     assert json.loads((store / "zarr.json").read_text())["attributes"]["recording"]["layers"] == [0, 1, 2]
-
-
-def test_within_an_episode_a_signal_waits_for_a_check():
-    termination = Termination()
-    steps = []
-
-    def episode() -> None:
-        with termination.only_at_checks():
-            steps.append("begun")
-            termination.on_signal(signal.SIGTERM, None)
-            steps.append("still here")
-            termination.check()
-            steps.append("never")
-
-    with pytest.raises(Terminated):
-        episode()
-    assert steps == ["begun", "still here"]
-    with pytest.raises(Terminated):  # nothing to lose outside
-        Termination().on_signal(signal.SIGTERM, None)
-    impatient = Termination()
-    with pytest.raises(Terminated), impatient.only_at_checks():  # noqa: PT012
-        impatient.on_signal(signal.SIGTERM, None)
-        impatient.on_signal(signal.SIGTERM, None)
-
-
-def test_a_job_that_slurm_still_wants_to_run_is_requeued(tmp_path, monkeypatch):
-    """With a scontrol of our own that notes what it is asked for."""
-    from vla_attention.capture.jobs.slurm import ask_for_requeue
-
-    notes, state = tmp_path / "notes", tmp_path / "state"
-    script = tmp_path / "scontrol"
-    script.write_text(
-        f'#!/bin/sh\necho "$@" >> {notes}\n[ "$1" = show ] && echo "JobId=9 JobState=$(cat {state}) X=1"\nexit 0\n'
-    )
-    script.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    state.write_text("RUNNING")
-    assert "is back in the queue" in ask_for_requeue(NODE, 1)
-    assert Path(notes).read_text().splitlines() == ["show job 98_2", "requeue 98_2"]
-    notes.unlink()
-    state.write_text("CANCELLED")
-    assert "whether it comes back is decided there" in ask_for_requeue(NODE, 1)
-    assert notes.read_text().splitlines() == ["show job 98_2"]
-    assert "has been requeued 0 times" in ask_for_requeue(NODE, 0)
-    script.write_text("#!/bin/sh\necho no such job >&2\nexit 1\n")
-    assert "no such job" in ask_for_requeue(NODE, 1)
-    assert ask_for_requeue(Worker("t", "h", 1, "1", ""), 5) == ""

@@ -1,4 +1,7 @@
-"""A real array job on a real SLURM: cancelled in mid-episode, requeued, analysed. Opt-in: `make test-slurm`, where sbatch works."""
+"""An array job on a real SLURM: interrupted during an episode, requeued, analysed.
+
+It runs only with `make test-slurm`, on a machine where sbatch works.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,8 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +33,7 @@ pytestmark = [
 ROOT = Path(__file__).resolve().parents[2]
 TASKS, EPISODES = (0, 1, 2), 3
 ARGS = "--max-steps 80 --replan-steps 4"
-#: SLURM holds a requeued job back for two minutes.
+#: Longest wait for one condition. SLURM starts a requeued job only after two minutes.
 PATIENCE_S = 900
 
 
@@ -45,11 +49,30 @@ def state_of(job: str) -> str:
 def wait_until(what: str, condition: Callable[[], object], log: Callable[[], str], every_s: float = 0.2) -> None:
     until = time.monotonic() + PATIENCE_S
     while not condition():
-        assert time.monotonic() < until, f"never happened: {what}\n{slurm('squeue')}\n{log()}"
+        assert time.monotonic() < until, f"did not happen: {what}\n{slurm('squeue')}\n{log()}"
         time.sleep(every_s)
 
 
-def test_an_array_cancelled_in_mid_episode_equals_a_single_process(tmp_path, monkeypatch):
+@contextmanager
+def signalling(job: str) -> Iterator[None]:
+    """Send SIGTERM to the batch script of a job; the block waits for the effect.
+
+    The exit code of scancel shows nothing. SLURM delivers the signal at once, and on an idle machine the job has
+    requeued itself before scancel gets its answer. scancel then fails, because the job cannot be altered now, or
+    repeats the request for a minute. At the end of the block it is stopped, so that no repeated signal reaches the
+    restarted job.
+    """
+    process = subprocess.Popen(
+        ["scancel", "--signal=TERM", "--batch", job], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_an_array_interrupted_in_episodes_equals_a_single_process(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     output = tmp_path / "array"
     store = output / "robosuite.zarr"
@@ -62,14 +85,14 @@ def test_an_array_cancelled_in_mid_episode_equals_a_single_process(tmp_path, mon
         "OUTPUT_DIR": str(output),
         "SETUP": f"export PATH={Path(sys.executable).parent}:$PATH",
     }
-    said = subprocess.run(
+    printed = subprocess.run(
         [ROOT / "scripts/submit_attention_ratio.sh", f"--array={TASKS[0]}-{TASKS[-1]}", "--ntasks=1"],
         env=os.environ | variables,
         capture_output=True,
         text=True,
         check=True,
     ).stdout
-    array, analysis = re.search(r"Job (\d+) captures .* job (\d+) analyses", said).groups()
+    array, analysis = re.search(r"Job (\d+) captures .* job (\d+) analyses", printed).groups()
 
     def log_of(task: int) -> str:
         file = tmp_path / f"slurm-{array}_{task}.out"
@@ -78,24 +101,22 @@ def test_an_array_cancelled_in_mid_episode_equals_a_single_process(tmp_path, mon
     def logs() -> str:
         return "\n".join(file.read_text() for file in sorted(tmp_path.glob("slurm-*.out")))
 
-    def in_mid_episode(task: int) -> bool:
-        """Some replans of an episode are on their way to disk."""
-        beginnings = store.with_name(store.name + PARTIAL_SUFFIX).glob(f"task{task:03d}_episode*")
-        claimed = (
-            any(holder.episode.startswith(f"task{task:03d}") for holder in holders(store)) if store.exists() else 0
-        )
-        return bool(claimed) and any(True for _ in beginnings)
+    def in_an_episode(task: int) -> bool:
+        """A process has claimed an episode of the task, and its partial folder exists."""
+        partial = store.with_name(store.name + PARTIAL_SUFFIX).glob(f"task{task:03d}_episode*")
+        name = f"task{task:03d}_episode"
+        return any(holder.episode.startswith(name) for holder in holders(store)) and any(True for _ in partial)
 
     try:
-        # One task is told that its time is nearly over, as --signal does, and requeues itself ...
-        wait_until("task 0 is in mid-episode", lambda: in_mid_episode(0), logs, 0.05)
-        slurm("scancel", "--signal=TERM", "--batch", f"{array}_0")
-        wait_until("task 0 is requeued", lambda: "is back in the queue" in log_of(0), logs)
+        # One task gets SIGTERM, as --signal sends it before the time limit, and requeues itself.
+        wait_until("task 0 is in an episode", lambda: in_an_episode(0), logs, 0.05)
+        with signalling(f"{array}_0"):
+            wait_until("task 0 is requeued", lambda: "is back in the queue" in log_of(0), logs, 0.05)
         assert re.search(r"Stopped by SIGTERM: dropped task000_episode\d+ at step \d+; committed \d", log_of(0))
-        # ... and one is cancelled and requeued by SLURM, as preemption and `scontrol requeue` do.
-        wait_until("task 1 is in mid-episode", lambda: in_mid_episode(1), logs, 0.05)
+        # Another task is requeued by SLURM, as after a preemption.
+        wait_until("task 1 is in an episode", lambda: in_an_episode(1), logs, 0.05)
         slurm("scontrol", "requeue", f"{array}_1")
-        wait_until("task 1 says what it dropped", lambda: "Stopped by SIGTERM: dropped task001" in log_of(1), logs)
+        wait_until("task 1 has dropped its episode", lambda: "Stopped by SIGTERM: dropped task001" in log_of(1), logs)
         assert not any(holder.episode.startswith("task000") for holder in holders(store))
         wait_until("the analysis is done", lambda: state_of(analysis) not in ("PENDING", "RUNNING", "COMPLETING"), logs)
         assert state_of(analysis) == "COMPLETED", logs()
@@ -114,11 +135,11 @@ def test_an_array_cancelled_in_mid_episode_equals_a_single_process(tmp_path, mon
 
     single = tmp_path / "single"
     for task in TASKS:
-        words = ["--checkpoint", "dummy", "--task-suite", "robosuite", "--task-id", str(task)]
-        words += ["--num-episodes", str(EPISODES), "--layers", "0", "2", "--output-dir", str(single), *ARGS.split()]
-        assert main_pi([*words, "--stage", "capture"]) == 0
-    words = ["--task-suite", "robosuite", "--checkpoint", "dummy", "--layers", "0", "2", "--output-dir", str(single)]
-    assert main_pi([*words, "--stage", "analyze"]) == 0
+        arguments = ["--checkpoint", "dummy", "--task-suite", "robosuite", "--task-id", str(task)]
+        arguments += ["--num-episodes", str(EPISODES), "--layers", "0", "2", "--output-dir", str(single), *ARGS.split()]
+        assert main_pi([*arguments, "--stage", "capture"]) == 0
+    arguments = ["--task-suite", "robosuite", "--checkpoint", "dummy", "--layers", "0", "2"]
+    assert main_pi([*arguments, "--output-dir", str(single), "--stage", "analyze"]) == 0
     assert_same(store, single / "robosuite.zarr")
     name = "attention_ratio_results_robosuite.json"
     results = json.loads((output / name).read_text())
@@ -128,7 +149,7 @@ def test_an_array_cancelled_in_mid_episode_equals_a_single_process(tmp_path, mon
 
 
 def assert_same(one: Path, other: Path) -> None:
-    """The same episodes, and every array the same bit for bit; only the provenance may differ."""
+    """Assert equal episodes and bit-identical arrays; only the provenance may differ."""
     first, second = open_store(one), open_store(other)
     assert [episode.name for episode in first.episodes] == [episode.name for episode in second.episodes]
     for left, right in zip(first.episodes, second.episodes, strict=True):

@@ -172,7 +172,7 @@ def test_objects_and_their_pixels(environment: LiberoEnvironment, episode: list[
 @pytest.mark.simulator
 @pytest.mark.libero
 def test_the_seed_places_the_fixtures(environment: LiberoEnvironment) -> None:
-    """Fixtures are in the model and not in the stored state; equal seeds put them in the same place in every episode."""
+    """Fixtures are in the model, not in the stored state; equal seeds put them in the same place every time."""
     placed = []
     for index, seed in ((0, SEED), (1, SEED), (0, SEED + 1)):
         environment.reset(index, seed)

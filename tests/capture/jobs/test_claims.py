@@ -43,7 +43,7 @@ def test_the_second_is_told_who_holds_it(tmp_path):
     holder = second.acquire(NAME)
     assert isinstance(holder, Holder)
     assert holder.worker == first.worker
-    assert holder.describe() == f"{NAME} by node1 (job 5_2), last sign of life 0 s ago"
+    assert holder.describe() == f"{NAME} by node1 (job 5_2), last active 0 s ago"
     assert second.acquire("task000_episode004") is None
     assert [found.episode for found in holders(tmp_path / "a.zarr")] == [NAME, "task000_episode004"]
     first.release(NAME)

@@ -1,0 +1,71 @@
+"""Requests to SLURM, answered by a script in place of scontrol."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from vla_attention.capture.jobs.slurm import array_task_ids, ask_for_requeue
+from vla_attention.capture.jobs.worker import Worker
+
+NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2")
+
+
+@pytest.fixture
+def scontrol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A program `scontrol` that appends its arguments to the file `calls` and prints the state in the file `state`."""
+    script = tmp_path / "scontrol"
+    script.write_text(
+        f'#!/bin/sh\necho "$@" >> {tmp_path}/calls\n'
+        f'[ "$1" = show ] && echo "JobId=9 JobState=$(cat {tmp_path}/state) X=1"\nexit 0\n'
+    )
+    script.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    return script
+
+
+def calls_of(script: Path) -> list[str]:
+    return script.with_name("calls").read_text().splitlines()
+
+
+def test_a_running_job_is_requeued(scontrol: Path) -> None:
+    scontrol.with_name("state").write_text("RUNNING")
+    assert "is back in the queue" in ask_for_requeue(NODE, 1)
+    assert calls_of(scontrol) == ["show job 98_2", "requeue 98_2"]
+
+
+def test_a_cancelled_job_is_not_requeued(scontrol: Path) -> None:
+    scontrol.with_name("state").write_text("CANCELLED")
+    assert ask_for_requeue(NODE, 1).startswith("Not requeued: SLURM lists job 98_2 as CANCELLED")
+    assert calls_of(scontrol) == ["show job 98_2"]
+
+
+def test_requeues_are_limited(scontrol: Path) -> None:
+    assert "has been requeued 0 times" in ask_for_requeue(NODE, 0)
+    assert not scontrol.with_name("calls").exists()
+
+
+def test_the_message_contains_slurms_error(scontrol: Path) -> None:
+    scontrol.write_text("#!/bin/sh\necho no such job >&2\nexit 1\n")
+    assert "no such job" in ask_for_requeue(NODE, 1)
+
+
+def test_without_slurm_there_is_no_message() -> None:
+    assert ask_for_requeue(Worker("t", "h", 1, "1", ""), 5) == ""
+
+
+@pytest.mark.parametrize(
+    ("variables", "indices"),
+    [
+        (("0", "3", "1", "4"), (0, 1, 2, 3)),
+        (("2", "8", "3", "3"), (2, 5, 8)),
+        (("0", "7", "1", "3"), ()),  # a list such as 0,3,7, which these four numbers do not determine
+        (("", "", "", ""), ()),
+    ],
+)
+def test_array_indices(monkeypatch: pytest.MonkeyPatch, variables: tuple[str, ...], indices: tuple[int, ...]) -> None:
+    for name, value in zip(("MIN", "MAX", "STEP", "COUNT"), variables, strict=True):
+        monkeypatch.setenv(f"SLURM_ARRAY_TASK_{name}", value)
+    assert array_task_ids() == indices
