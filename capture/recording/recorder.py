@@ -73,8 +73,8 @@ class AttentionRecorder(RowCollector):
 
     plan: RecordingPlan
     num_keys: int
-    parts: np.ndarray | None = None
-    pools: np.ndarray | None = None
+    parts: NDArray[np.bool_] | None = None
+    pools: NDArray[np.float64] | None = None
     _rows: dict[tuple[int, int], list[Tensor]] = field(default_factory=dict, init=False, repr=False)
     _grams: dict[tuple[int, int], list[Tensor]] = field(default_factory=dict, init=False, repr=False)
     _keys_of_parts: list[slice | Tensor] | None = field(default=None, init=False, repr=False)
@@ -103,7 +103,7 @@ class AttentionRecorder(RowCollector):
 
         def take(values: Tensor, project: Projection, update: Tensor) -> None:
             if self._awaited is None:
-                raise SiteNotRecorded(f"Layer {layer} gave an update before its rows.")
+                raise SiteNotRecorded(f"Layer {layer} passed on its update before its rows.")
             if self._keys_of_parts is None:
                 self._keys_of_parts = keys_of_parts(members, values.device)
             each = part_contributions(self._awaited, values[0], self._keys_of_parts, project)
@@ -131,7 +131,7 @@ class AttentionRecorder(RowCollector):
         elif self.plan.queries == "steps":
             if self.pools is None:
                 raise BadArgument(
-                    f"The queries of site '{self.plan.site}' do not stand for action steps; record their mean."
+                    f"The queries of site '{self.plan.site}' have no weights per action step; record their mean."
                 )
             chosen = torch.matmul(torch.from_numpy(self.pools).to(chosen), chosen)
         if chosen.numel() > _LARGE_COPY:
@@ -144,20 +144,21 @@ class AttentionRecorder(RowCollector):
         contribution = None if self.parts is None else self._stacked(self._grams, "updates")
         return RecordedRows(rows, rows.sum(axis=-1, dtype=np.float64).astype(np.float32), contribution)
 
-    def _stacked(self, collected: dict[tuple[int, int], list[Tensor]], what: str) -> np.ndarray:
+    def _stacked(self, collected: dict[tuple[int, int], list[Tensor]], what: str) -> NDArray[np.float32]:
         """Stack the tensors of all calls into (layer, denoise, ...), and move them off the device in one transfer."""
         cells = [(layer, step) for layer in self.plan.layers for step in self.plan.denoise_steps]
         faults = []
         for layer, step in cells:
             times = len(collected.get((layer, step), ()))
             if times != 1:
-                faults.append(f"layer {layer} at denoise step {step} {'never' if not times else f'{times} times'}")
+                faults.append(f"layer {layer} at denoise step {step} {f'{times} times' if times else 'never'}")
         if faults:
             raise SiteNotRecorded(
-                f"Site '{self.plan.site}' should have given {what} once for each of {len(cells)} pairs of layer and "
-                f"denoise step, but came: {'; '.join(faults[:6])}{' ...' if len(faults) > 6 else ''}."
+                f"The model must pass on the {what} of site '{self.plan.site}' exactly once for each of {len(cells)} "
+                f"pairs of layer and denoise step, but passed on {'; '.join(faults[:6])}"
+                f"{' ...' if len(faults) > 6 else ''}."
             )
-        stacked = torch.stack([collected[cell][0] for cell in cells]).cpu().numpy()
+        stacked: NDArray[np.float32] = torch.stack([collected[cell][0] for cell in cells]).cpu().numpy()
         return stacked.reshape(len(self.plan.layers), len(self.plan.denoise_steps), *stacked.shape[1:])
 
 

@@ -45,11 +45,11 @@ def test_sigterm_drops_the_episode_in_flight_and_resuming_completes_the_store(tm
         assert [holder.episode for holder in holders(store)] == ["task000_episode001"]
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == EXIT_TERMINATED, log.read_text()
-    said = log.read_text()
-    assert "Stopped by SIGTERM: dropped task000_episode001 at step" in said
-    assert "committed 1 episodes (task000_episode000); 1 of this process's 2 are missing" in said
-    assert "Traceback" not in said
-    assert "\r" not in said  # no progress bar in a file
+    printed = log.read_text()
+    assert "Stopped by SIGTERM: dropped task000_episode001 at step" in printed
+    assert "committed 1 episodes (task000_episode000); 1 of this process's 2 are missing" in printed
+    assert "Traceback" not in printed
+    assert "\r" not in printed  # no progress bar in a file
     assert not (tmp_path / "a.zarr.partial").exists()
     assert holders(store) == []
     (task,) = store_status(store).tasks
@@ -84,9 +84,10 @@ def test_a_capture_waits_for_an_episode_that_another_process_has_claimed(tmp_pat
     assert capture([*arguments, "--num-episodes", "3", "--resume"]) == 0
     thread.join()
     assert seen == [False]
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     assert (
-        said.count("Waiting for episodes that other processes are writing: task000_episode001 by node7 (job 98_2)") == 1
+        printed.count("Waiting for episodes that other processes are writing: task000_episode001 by node7 (job 98_2)")
+        == 1
     )
     assert sorted(folder.name for folder in (store / "episodes").glob("task*")) == [
         f"task000_episode00{episode}" for episode in range(3)

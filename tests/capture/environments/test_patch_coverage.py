@@ -21,7 +21,7 @@ grids = st.tuples(st.integers(1, 9), st.integers(1, 9))
 
 
 def fine_grained(segmentation: np.ndarray, grid_rows: int, grid_columns: int) -> np.ndarray:
-    """Reference: enlarge every pixel until patches hold whole ones, then count."""
+    """Reference: enlarge every pixel until patches hold whole pixels only, then count."""
     height, width = segmentation.shape
     large = np.repeat(np.repeat(segmentation, grid_rows, axis=0), grid_columns, axis=1)
     patches = large.reshape(grid_rows, height, grid_columns, width).transpose(0, 2, 1, 3).reshape(-1, height * width)
@@ -72,17 +72,17 @@ def test_a_pixel_on_a_border_counts_by_its_parts() -> None:
 
 
 @pytest.mark.parametrize(
-    ("segmentation", "rows", "columns", "says"),
+    ("segmentation", "rows", "columns", "message"),
     [
         (np.zeros((2, 2, 1), dtype=int), 1, 1, "two axes"),
         (np.zeros((0, 2), dtype=int), 1, 1, "two axes"),
         (np.zeros((2, 2), dtype=int), 0, 1, "at least one row"),
-        (np.array([[0, 5]]), 1, 1, "0 to 5; with 2 objects 0 to 1"),
+        (np.array([[0, 5]]), 1, 1, "0 to 5; with 2 objects, 0 to 1"),
         (np.array([[-1, 0]]), 1, 1, "-1 to 0"),
     ],
 )
-def test_wrong_input_is_refused(segmentation: np.ndarray, rows: int, columns: int, says: str) -> None:
-    with pytest.raises(BadArgument, match=says):
+def test_wrong_input_is_refused(segmentation: np.ndarray, rows: int, columns: int, message: str) -> None:
+    with pytest.raises(BadArgument, match=message):
         patch_coverage(segmentation, 2, rows, columns, **STRAIGHT)
 
 

@@ -1,4 +1,4 @@
-"""The pure parts of the segmentation: who owns a body, and what an identity colour means."""
+"""The parts of the segmentation that need no simulator: owners of bodies, and identity colours."""
 
 from __future__ import annotations
 
@@ -31,6 +31,6 @@ def test_identity_colours_use_all_three_channels() -> None:
     assert decode_identities(colours, table).tolist() == [[0, 7, 8, 9]]
 
 
-def test_a_colour_that_stands_for_nothing_is_a_defect() -> None:
+def test_an_unknown_colour_is_an_error() -> None:
     with pytest.raises(RuntimeError, match="identity 5; only 2"):
         decode_identities(np.full((1, 1, 3), [5, 0, 0], dtype=np.uint8), np.zeros(3, dtype=np.int32))

@@ -1,4 +1,4 @@
-"""The suite registry and the errors of choosing from it; no simulator is built."""
+"""The list of suites and the errors of wrong choices; no simulator is built."""
 
 from __future__ import annotations
 
@@ -8,12 +8,7 @@ import sys
 import pytest
 
 from vla_attention.capture.environments.base import EnvironmentSettings, check_initial_state_index, check_task_id
-from vla_attention.capture.environments.suites import (
-    SUITES,
-    find_suite,
-    list_tasks,
-    make_environment,
-)
+from vla_attention.capture.environments.suites import SUITES, find_suite, list_tasks, make_environment
 from vla_attention.schemas.errors import BadArgument, UnknownName
 
 SETTINGS = EnvironmentSettings()

@@ -1,4 +1,4 @@
-"""One holder per episode, whoever dies and whoever comes at the same moment."""
+"""Claims: one holder per episode, also after the death of a holder and with several processes at once."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NAME = "task000_episode003"
 
 
 def worker(number: int, **changes: object) -> Worker:
-    """A worker of another machine, whose life cannot be judged from here."""
+    """A worker of another machine. This machine cannot determine whether it lives."""
     made = Worker(f"node{number}-{number}-aa", f"node{number}", number, "1", "pid:[1]")
     return replace(made, **changes)
 
@@ -28,7 +28,7 @@ def claims(tmp_path: Path, who: Worker, **keywords: float) -> Claims:
 
 
 def age(tmp_path: Path, seconds: float) -> None:
-    """Let the holder of the episode have been silent for so long."""
+    """Set the last touch of every claim to so many seconds ago."""
     for file in jobs_folder(tmp_path / "a.zarr").rglob("owner.json"):
         os.utime(file, (time.time() - seconds,) * 2)
 
@@ -37,7 +37,7 @@ def listed(tmp_path: Path) -> list[str]:
     return sorted(entry.name for entry in (jobs_folder(tmp_path / "a.zarr") / "claims").glob("*"))
 
 
-def test_the_second_is_told_who_holds_it(tmp_path):
+def test_a_second_process_gets_the_holder(tmp_path):
     first, second = claims(tmp_path, worker(1, slurm_job="7", job_name="5_2")), claims(tmp_path, worker(2))
     assert first.acquire(NAME) is None
     holder = second.acquire(NAME)
@@ -54,7 +54,7 @@ def test_the_second_is_told_who_holds_it(tmp_path):
     assert listed(tmp_path) == []
 
 
-def test_a_silent_holder_is_succeeded_and_its_half_episode_removed(tmp_path):
+def test_a_silent_holder_is_replaced_and_its_partial_episode_removed(tmp_path):
     first, second, third = (claims(tmp_path, worker(number)) for number in (1, 2, 3))
     assert first.acquire(NAME) is None
     mine, other = f"{NAME}-node1-1-abcd", f"{NAME}-node9-1-abcd"
@@ -68,7 +68,7 @@ def test_a_silent_holder_is_succeeded_and_its_half_episode_removed(tmp_path):
     held = third.acquire(NAME)
     assert held is not None
     assert held.worker == second.worker
-    # The one that was only slow does not take its successor's claim away.
+    # The first holder was only slow. It does not delete the claim of its successor.
     first.release(NAME)
     assert third.acquire(NAME) is not None
     second.release(NAME)
@@ -76,8 +76,8 @@ def test_a_silent_holder_is_succeeded_and_its_half_episode_removed(tmp_path):
     assert third.acquire(NAME) is None
 
 
-def test_a_late_successor_of_a_claim_that_is_gone_begins_again(tmp_path, monkeypatch):
-    """Two find the same holder dead; one takes over, finishes and cleans up before the other acts on what it saw."""
+def test_a_process_starts_again_if_the_dead_claim_has_been_replaced_and_released(tmp_path, monkeypatch):
+    """Two processes find the same holder dead; the first replaces it, finishes and cleans up before the second acts."""
     dead, quick, late = (claims(tmp_path, worker(number)) for number in (1, 2, 3))
     assert dead.acquire(NAME) is None
     age(tmp_path, 1000)
@@ -96,7 +96,7 @@ def test_a_late_successor_of_a_claim_that_is_gone_begins_again(tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("silent", [False, True])
-def test_of_many_at_once_one_wins(tmp_path, silent):
+def test_of_several_processes_one_gets_the_claim(tmp_path, silent):
     if silent:
         assert claims(tmp_path, worker(99)).acquire(NAME) is None
         age(tmp_path, 1000)
@@ -120,7 +120,7 @@ def test_of_many_at_once_one_wins(tmp_path, silent):
     assert listed(tmp_path) == []
 
 
-def test_a_living_holder_is_never_silent(tmp_path):
+def test_a_living_holder_touches_its_claim(tmp_path):
     with claims(tmp_path, worker(1), touch_every_s=0.05) as first:
         assert first.acquire(NAME) is None
         age(tmp_path, 1000)
@@ -128,17 +128,17 @@ def test_a_living_holder_is_never_silent(tmp_path):
         while holders(tmp_path / "a.zarr")[0].silent_s > 10 and time.monotonic() < until:
             time.sleep(0.01)
         assert claims(tmp_path, worker(2)).acquire(NAME) is not None
-    assert holders(tmp_path / "a.zarr") == []  # leaving gives everything back
+    assert holders(tmp_path / "a.zarr") == []  # leaving the context releases all claims
 
 
-def test_a_process_of_this_machine_that_is_gone_is_known_to_be(tmp_path):
+def test_a_process_of_this_machine_that_has_ended_is_known_to_be_dead(tmp_path):
     me = this_worker()
     assert not is_known_dead(me, me)
     child = subprocess.Popen(["sleep", "60"])
     start = Path(f"/proc/{child.pid}/stat").read_text().rpartition(")")[2].split()[19]
     other = replace(me, tag="x", process=child.pid, process_start=start)
     assert not is_known_dead(other, me)
-    assert is_known_dead(replace(other, process_start="1"), me)  # its number has gone to another process
+    assert is_known_dead(replace(other, process_start="1"), me)  # another process has its number now
     assert not is_known_dead(replace(other, process_start="1", process_space="pid:[0]"), me)
     assert not is_known_dead(replace(other, process_start="1", host="elsewhere"), me)
     child.kill()
@@ -148,7 +148,7 @@ def test_a_process_of_this_machine_that_is_gone_is_known_to_be(tmp_path):
     assert claims(tmp_path, me).acquire(NAME) is None
 
 
-def test_a_requeued_job_takes_over_from_itself_at_once(tmp_path):
+def test_a_requeued_job_replaces_its_own_claim_at_once(tmp_path):
     before = worker(1, slurm_job="7")
     assert claims(tmp_path, before).acquire(NAME) is None
     assert claims(tmp_path, worker(2, slurm_job="8")).acquire(NAME) is not None
@@ -156,7 +156,7 @@ def test_a_requeued_job_takes_over_from_itself_at_once(tmp_path):
     assert claims(tmp_path, worker(3, slurm_job="7", restarts=1)).acquire(NAME) is None
 
 
-def test_an_unreadable_claim_grows_old_like_any_other(tmp_path):
+def test_an_unreadable_claim_expires_like_any_other(tmp_path):
     claim = jobs_folder(tmp_path / "a.zarr") / "claims" / f"{NAME}.0"
     claim.mkdir(parents=True)
     (claim / "owner.json").write_text("")

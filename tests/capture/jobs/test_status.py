@@ -1,4 +1,4 @@
-"""What `vla-capture status` says of a store: counts, what is missing, who wrote and who writes."""
+"""The output of `vla-capture status`: counts, missing episodes, and their writers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def store(tmp_path) -> Path:
     return write_store(tmp_path / "a.zarr", spec=SPEC)
 
 
-def test_without_notes_it_says_what_it_cannot_know(store, capsys):
+def test_without_records_the_expected_number_is_unknown(store, capsys):
     status = store_status(store)
     assert [(task.task_id, task.committed, task.success, task.expected) for task in status.tasks] == [
         (0, 2, 1, None),
@@ -48,12 +48,12 @@ def test_without_notes_it_says_what_it_cannot_know(store, capsys):
             file.stat().st_size for folder in folders for file in folder.rglob("*") if file.is_file()
         )
     assert main(["status", str(store), "--check"]) == 0
-    said = capsys.readouterr().out
-    assert "2 of ?" in said
-    assert "give it with --expected N" in said
+    printed = capsys.readouterr().out
+    assert "2 of ?" in printed
+    assert "give it with --expected N" in printed
 
 
-def test_expected_may_be_given(store, capsys):
+def test_the_expected_number_can_be_given(store, capsys):
     status = store_status(store, expected=3)
     assert [task.missing for task in status.tasks] == [(2,), (2,)]
     assert main(["status", str(store), "--expected", "3", "--check"]) == 1
@@ -74,14 +74,14 @@ def test_plans_of_several_processes_add_up(store, capsys):
     assert by_id[0].missing == (2, 3)
     assert by_id[1].missing == (0, 1)
     assert (by_id[1].instruction, by_id[1].committed, by_id[1].last_by) == (INSTRUCTIONS[1], 0, "")
-    assert by_id[2].expected is None  # nobody planned it, and it is there
+    assert by_id[2].expected is None  # in the store, but in no plan
     os.utime(store / "episodes/task000_episode000", (0, 0))
     assert store_status(store).tasks[0].last_by == "node7 (job 98_2)"
     assert main(["status", str(store)]) == 0
     assert "node7 (job 98_2)" in capsys.readouterr().out
 
 
-def test_episodes_in_flight_and_json(store, capsys):
+def test_claimed_episodes_and_json(store, capsys):
     claims = Claims(store, NODE)
     assert claims.acquire("task000_episode002") is None
     assert main(["status", str(store), "--json", "--expected", "3"]) == 0
@@ -95,7 +95,7 @@ def test_episodes_in_flight_and_json(store, capsys):
     assert "being written: task000_episode002 by node7 (job 98_2)" in capsys.readouterr().out
 
 
-def test_notes_of_an_earlier_store_of_the_same_name_do_not_count(store):
+def test_records_of_an_earlier_store_with_the_same_name_are_ignored(store):
     RecordWriter(store, NODE, (planned(0, 50),))
     assert store_status(store).complete is False
     os.utime(store / "zarr.json", (1, 1))
@@ -105,7 +105,7 @@ def test_notes_of_an_earlier_store_of_the_same_name_do_not_count(store):
     assert not jobs_folder(store).exists()
 
 
-def test_damaged_episodes_and_notes_are_said_or_passed_over(store, capsys):
+def test_damaged_episodes_are_listed_and_damaged_records_ignored(store, capsys):
     RecordWriter(store, NODE, (planned(0, 2), planned(2, 2)))
     (jobs_folder(store) / "runs" / "x.json").write_text("{")
     (store / "episodes/task002_episode000/zarr.json").write_text("{")
@@ -120,6 +120,6 @@ def test_damaged_episodes_and_notes_are_said_or_passed_over(store, capsys):
 def test_mistakes(store, monkeypatch, capsys, words, expected):
     monkeypatch.chdir(store.parent)
     assert main(["status", *words]) == 2
-    said = capsys.readouterr().err
-    assert expected in said
-    assert said.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert expected in printed
+    assert printed.count("\n") == 1

@@ -1,4 +1,4 @@
-"""The shared attention function against a direct computation, and what the recorder keeps and refuses."""
+"""The attention function against a direct computation, and the recorder: what it records and what it refuses."""
 
 import numpy as np
 import pytest

@@ -72,7 +72,7 @@ def test_norms_of_unions_of_parts_follow_from_the_gram_matrix():
 
 
 @pytest.mark.parametrize("condition_width", [None, 6])
-def test_a_block_tells_the_recorder_what_it_really_added(condition_width):
+def test_a_block_passes_its_whole_update_to_the_recorder(condition_width):
     torch.manual_seed(0)
     config = GemmaConfig(width=8, depth=1, mlp_dim=16, num_heads=4, num_kv_heads=1, head_dim=4)
     block = GemmaBlock(config, condition_width)
@@ -116,17 +116,17 @@ def test_masked_keys_contribute_nothing():
     assert not each[:, 1].any()
 
 
-def test_an_update_that_never_came_is_an_error():
+def test_a_missing_update_is_an_error():
     plan = RecordingPlan(layers=(0,), denoise_steps=(0,), heads=(0,), queries="mean", site="joint")
     recorder = AttentionRecorder(plan, 4, np.ones((4, 1), dtype=bool))
     take = recorder.sink(0, 0, slice(0, 2))
     assert take is not None
     take(torch.full((1, 1, 2, 4), 0.25))
-    with pytest.raises(SiteNotRecorded, match="given updates once"):
+    with pytest.raises(SiteNotRecorded, match="must pass on the updates"):
         recorder.finish()
 
 
-def test_recorders_of_a_rollout_take_the_segments_of_the_replan():
+def test_contributions_are_those_of_the_segments_of_the_replan():
     from tests.kit.store_kit import make_tokens
 
     tokens = make_tokens(2, 0, [0], changing=True)
