@@ -1,1 +1,1 @@
-"""The policies whose attention can be recorded, and what they all offer the rollout."""
+"""The policies whose attention can be recorded: one folder per family, registered in `families.py`."""

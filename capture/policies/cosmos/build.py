@@ -9,9 +9,9 @@ from vla_attention.capture.policies.cosmos.checkpoint import CosmosOptions, load
 from vla_attention.capture.policies.cosmos.config import DEFAULT_CONFIG_NAME, find_config
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, random_policy
 from vla_attention.capture.policies.cosmos.policy import ACTION_FRAME, CosmosPolicy
-from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.capture.policies.precision import find_dtype
+from vla_attention.schemas.errors import BadArgument
 
-DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _UNTRAINED = {"embedded": EMBEDDED_CONFIG, "dummy": DUMMY_CONFIG}
 
 
@@ -40,9 +40,7 @@ def build_cosmos_policy(
     `checkpoint` is a folder, a file of weights, a name on the hub, or one of the untrained policies that come with the
     package: `embedded`, `dummy`. Frames and calls that do not exist are errors here, before anything runs.
     """
-    if dtype is not None and dtype not in DTYPES:
-        raise BadArgument(f"Cannot use --dtype '{dtype}'; expected {listing(DTYPES)}.")
-    find_config(config_name)
+    find_config(config_name)  # checked first, so that the error comes before any download
     options = CosmosOptions(
         config_name=config_name,
         num_denoising_steps=num_denoising_steps_action,
@@ -54,7 +52,7 @@ def build_cosmos_policy(
         t5_tokenizer=t5_tokenizer,
         t5_encoder=t5_encoder,
         query_frame=query_frame,
-        dtype=DTYPES[dtype] if dtype else None,
+        dtype=find_dtype(dtype) if dtype is not None else None,
     )
     if checkpoint in _UNTRAINED:
         policy = _untrained(checkpoint, options, device)

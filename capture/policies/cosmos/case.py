@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -24,9 +22,9 @@ from vla_attention.capture.policies.cosmos.dit_weights import build_dit, dit_ten
 from vla_attention.capture.policies.cosmos.model import CosmosModel
 from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
 from vla_attention.capture.policies.cosmos.vae import build_encoder
-from vla_attention.schemas.errors import UserError, listing
+from vla_attention.capture.policies.parity_case import CASE_FILE, UnusableCase, read_arrays, read_case_file
+from vla_attention.schemas.errors import listing
 
-CASE_FILE = "case.json"
 CaseKind = Literal["dit_forward", "policy_sample"]
 KINDS: tuple[CaseKind, ...] = ("dit_forward", "policy_sample")
 
@@ -43,10 +41,6 @@ _FIXED = {
 _DIT_INPUTS = ("latents", "timesteps", "condition_mask", "padding_mask", "text_embeddings")
 _RANGES = ("actions_min", "actions_max", "proprio_min", "proprio_max")
 _POLICY_INPUTS = ("primary_image", "wrist_image", "proprio", "text_embedding", *_RANGES)
-
-
-class UnusableCase(UserError, ValueError):
-    """The case folder lacks a file, or a file does not hold what a case needs."""
 
 
 @dataclass(frozen=True)
@@ -139,22 +133,10 @@ class CosmosCase:
         return frames
 
 
-def case_kind(folder: str | Path) -> str | None:
-    """Return the `kind` that a folder's case.json states, or None: how to tell these cases from other policies'."""
-    path = Path(folder) / CASE_FILE
-    if not path.is_file():
-        return None
-    kind = _read_json(path).get("kind")
-    return kind if isinstance(kind, str) else None
-
-
 def read_case(folder: str | Path) -> CosmosCase:
     """Read a case folder; `UnusableCase` says which file or array is missing or does not fit."""
     folder = Path(folder)
-    if not (folder / CASE_FILE).is_file():
-        found = listing(sorted(path.name for path in folder.iterdir())) if folder.is_dir() else "no such folder"
-        raise UnusableCase(f"'{folder}' is no case: it has no {CASE_FILE}, but {found}.")
-    facts = _read_json(folder / CASE_FILE)
+    facts = read_case_file(folder)
     kind = facts.get("kind")
     if kind not in KINDS:
         raise UnusableCase(f"'{folder / CASE_FILE}' is of kind '{kind}'; expected {listing(KINDS)}.")
@@ -166,29 +148,9 @@ def read_case(folder: str | Path) -> CosmosCase:
             raise UnusableCase(
                 f"'{folder / CASE_FILE}' asks for {name} {stated[name]}; the transformer here has {name} {value}."
             )
-    inputs, expected = _arrays(folder / "inputs.npz"), _arrays(folder / "expected.npz")
+    inputs, expected = read_arrays(folder / "inputs.npz"), read_arrays(folder / "expected.npz")
     needed = _DIT_INPUTS if kind == "dit_forward" else _POLICY_INPUTS
     missing = [name for name in needed if name not in inputs]
     if missing:
         raise UnusableCase(f"'{folder / 'inputs.npz'}' has no {listing(missing)}; it has {listing(sorted(inputs))}.")
     return CosmosCase(folder.name, folder, kind, facts, inputs, expected)
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text())
-    except (ValueError, OSError) as error:
-        raise UnusableCase(f"'{path}' cannot be read as JSON ({error}).") from error
-    if not isinstance(content, dict):
-        raise UnusableCase(f"'{path}' does not describe a case.")
-    return content
-
-
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            return dict(stored)
-    except FileNotFoundError:
-        raise UnusableCase(f"There is no '{path}', which a case needs.") from None
-    except (ValueError, OSError, EOFError, BadZipFile) as error:
-        raise UnusableCase(f"'{path}' cannot be read as arrays ({error}).") from error

@@ -8,12 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from vla_attention.capture.policies.checkpoints import CheckpointMismatch
 from vla_attention.capture.policies.cosmos.config import DitConfig
 from vla_attention.capture.policies.cosmos.dit import Dit
 from vla_attention.capture.policies.cosmos.tensor_files import UnreadableTensors
-from vla_attention.schemas.errors import UserError, listing
-
-Shapes = dict[str, tuple[int, ...]]
+from vla_attention.capture.policies.strict_loading import Shapes, check_shapes, fill, make_empty, shapes_of
+from vla_attention.schemas.errors import listing
 
 PREFIX = "net."
 #: Training counters: no weights.
@@ -23,10 +23,6 @@ EXTRA_STATE = "_extra_state"
 #: What activation checkpointing leaves in names.
 _WRAPPED = "_checkpoint_wrapped_module."
 _ROTARY_PREFIX = "pos_embedder."
-
-
-class CheckpointMismatch(UserError, ValueError):
-    """The checkpoint's tensors are not those of the model: names or shapes differ."""
 
 
 def dit_tensors(stored: Mapping[str, Any]) -> dict[str, Tensor]:
@@ -84,29 +80,7 @@ def infer_dit_config(weights: Mapping[str, Tensor], base: DitConfig | None = Non
 
 def expected_shapes(config: DitConfig) -> Shapes:
     """Return name -> shape of every tensor of `Dit(config)`, rotary buffers too, without allocating any."""
-    with torch.device("meta"):
-        state = Dit(config).state_dict()
-    return {name: tuple(tensor.shape) for name, tensor in state.items()}
-
-
-def check_shapes(found: Shapes, expected: Shapes, what: str) -> None:
-    """Raise `CheckpointMismatch` that lists missing, extra and misshapen tensors, if there are any."""
-    misshapen = [
-        f"{name} is {found[name]} instead of {expected[name]}"
-        for name in sorted(expected.keys() & found.keys())
-        if found[name] != expected[name]
-    ]
-    parts = [
-        f"{len(items)} {fault}: {listing(items)}"
-        for fault, items in (
-            ("missing", sorted(expected.keys() - found.keys())),
-            ("extra", sorted(found.keys() - expected.keys())),
-            ("of the wrong shape", misshapen),
-        )
-        if items
-    ]
-    if parts:
-        raise CheckpointMismatch(f"The checkpoint's tensors are not those of {what}; {'; '.join(parts)}.")
+    return shapes_of(make_empty(lambda: Dit(config)).state_dict())
 
 
 def build_dit(
@@ -120,13 +94,9 @@ def build_dit(
 
     The rotary buffers are rounded to `dtype`, as the reference's are, but kept in float32: frequencies are computed there.
     """
-    shapes = {name: tuple(tensor.shape) for name, tensor in weights.items()}
-    check_shapes(shapes, expected_shapes(config), "the Cosmos transformer")
-    with torch.device("meta"):
-        model = Dit(config)
+    check_shapes(shapes_of(weights), expected_shapes(config), "the Cosmos transformer")
     filled = {}
     for name, tensor in weights.items():
         cast = tensor.to(device=device, dtype=dtype)
         filled[name] = cast.float() if name.startswith(_ROTARY_PREFIX) else cast
-    model.load_state_dict(filled, strict=True, assign=True)
-    return model.requires_grad_(False).eval()
+    return fill(make_empty(lambda: Dit(config)), filled).eval()

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnsupportedCheckpoint
 from vla_attention.capture.policies.hub import HUB_NAME, fetch_from_hub, snapshots_folder
-from vla_attention.schemas.errors import BadArgument, UserError, listing
+from vla_attention.schemas.errors import BadArgument, listing
 
 POLICY_REPOSITORY = "nvidia/Cosmos-Policy-LIBERO-Predict2-2B"
 #: Where the image encoder is published; the policy's own repository does not have it.
@@ -16,14 +17,6 @@ EMBEDDINGS_NAME = "libero_t5_embeddings.pkl"
 #: T5's vocabulary is the same in all sizes.
 T5_REPOSITORIES = ("google-t5/t5-11b", "google-t5/t5-small", "google-t5/t5-base", "google-t5/t5-large")
 T5_TOKENIZER = "spiece.model"
-
-
-class CheckpointNotFound(UserError, FileNotFoundError):
-    """There is no checkpoint, or not all of it."""
-
-
-class UnsupportedCheckpoint(UserError, ValueError):
-    """The checkpoint is in a form that is not read."""
 
 
 def in_hub_cache(repository: str, file: str) -> Path | None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,13 +11,14 @@ import PIL
 import torch
 from torch import Tensor
 
-from vla_attention.capture.policies.cosmos.case import CosmosCase, UnusableCase, read_case
+from vla_attention.capture.policies.cosmos.case import CosmosCase, read_case
 from vla_attention.capture.policies.cosmos.dit import Attention
 from vla_attention.capture.policies.cosmos.latents import condition_mask, read_actions, read_value
 from vla_attention.capture.policies.cosmos.model import CallTrace, CosmosModel
 from vla_attention.capture.policies.cosmos.observer import projection
 from vla_attention.capture.policies.cosmos.preprocess import make_statistics, model_picture
 from vla_attention.capture.policies.cosmos.sampler import sample, seeded_noise
+from vla_attention.capture.policies.parity_case import UnusableCase, json_number, print_results
 from vla_attention.capture.recording.attention import RowSink
 from vla_attention.capture.recording.contributions import part_contributions
 
@@ -92,9 +91,6 @@ class ParityReport:
     def as_json(self) -> dict[str, Any]:
         """Return the report as plain JSON values; what is not a number is null."""
 
-        def number(x: float) -> float | None:
-            return x if np.isfinite(x) else None
-
         return {
             "case": self.case,
             "kind": self.kind,
@@ -103,8 +99,8 @@ class ParityReport:
             "stages": [
                 {
                     "stage": stage.stage,
-                    "largest": number(stage.largest),
-                    "share_of_allowed": number(stage.share),
+                    "largest": json_number(stage.largest),
+                    "share_of_allowed": json_number(stage.share),
                     "rtol": stage.tolerance.rtol,
                     "atol": stage.tolerance.atol,
                     "passed": stage.passed,
@@ -285,13 +281,6 @@ def describe(report: ParityReport) -> str:
     return "\n".join(lines)
 
 
-def run_cosmos_parity(folders: Iterable[str | Path], *, as_json: bool = False, device: str = "cpu") -> int:
-    """Run cases, print the reports and return 0 when all pass, else 1."""
-    reports = []
-    for folder in folders:
-        reports.append(run_case(folder, device=device))
-        if not as_json:
-            print(describe(reports[-1]), flush=True)
-    if as_json:
-        print(json.dumps([report.as_json() for report in reports], indent=2))
-    return 0 if all(report.passed for report in reports) else 1
+def run_parity(folder: str | Path, *, as_json: bool = False, device: str = "cpu") -> int:
+    """Run a case, print its report and return 0 when every stage is within its tolerance, else 1."""
+    return print_results([run_case(folder, device=device)], describe, as_json=as_json)

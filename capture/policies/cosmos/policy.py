@@ -20,6 +20,7 @@ from vla_attention.capture.policies.cosmos.sampler import flow_time
 from vla_attention.capture.policies.cosmos.text import TextSource
 from vla_attention.capture.policies.identity import PolicySource, describe_policy
 from vla_attention.capture.policies.policy import PolicyInput, camera_frame
+from vla_attention.capture.policies.precision import dtype_name
 from vla_attention.capture.policies.weights import weights_digest
 from vla_attention.capture.recording.attention import RowCollector
 from vla_attention.schemas.errors import BadArgument
@@ -111,7 +112,7 @@ class CosmosPolicy:
         """Return the policy's description for the store. Slow the first time, because it reads all weights."""
         facts = {
             "config": json.loads(json.dumps(asdict(self.config))),
-            "dtype": str(self.model.dtype).removeprefix("torch."),
+            "dtype": dtype_name(self.model.dtype),
             "normalisation": "min-max",
             "statistics": self.statistics.as_json(),
             "query_frame": self.query_frame,

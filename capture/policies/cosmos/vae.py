@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from vla_attention.capture.policies.cosmos.config import VaeConfig
-from vla_attention.capture.policies.cosmos.dit_weights import Shapes, check_shapes
+from vla_attention.capture.policies.strict_loading import Shapes, check_shapes, fill, make_empty, shapes_of
 from vla_attention.schemas.errors import MissingDependency
 
 #: Pixel frames of every latent frame but the first, which has one.
@@ -87,8 +87,7 @@ def original_name(name: str, num_res_blocks: int = 2) -> str:
 
 def vae_names(config: VaeConfig) -> dict[str, tuple[str, tuple[int, ...]]]:
     """Return published name -> (diffusers' name, shape) of every tensor, decoder included, without allocating any."""
-    with torch.device("meta"):
-        state = _build_wan(config).state_dict()
+    state = make_empty(lambda: _build_wan(config)).state_dict()
     return {original_name(name, config.num_res_blocks): (name, tuple(tensor.shape)) for name, tensor in state.items()}
 
 
@@ -179,14 +178,7 @@ def build_encoder(
     """Build the encoder from a VAE's tensors by their published names, strictly (the decoder's too)."""
     names = vae_names(config)
     tensors = {name: value for name, value in state.items() if isinstance(value, Tensor)}
-    found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-    check_shapes(found, {name: shape for name, (_, shape) in names.items()}, "the image encoder")
-    with torch.device("meta"):
-        wan = _build_wan(config)
-    wan.load_state_dict(
-        {names[name][0]: tensor.to(device=device, dtype=dtype) for name, tensor in tensors.items()},
-        strict=True,
-        assign=True,
-    )
-    encoder = CausalEncoder(wan).requires_grad_(False).eval()
-    return encoder.to(device)
+    check_shapes(shapes_of(tensors), {name: shape for name, (_, shape) in names.items()}, "the image encoder")
+    filled = {names[name][0]: tensor.to(device=device, dtype=dtype) for name, tensor in tensors.items()}
+    wan = fill(make_empty(lambda: _build_wan(config)), filled)
+    return CausalEncoder(wan).eval().to(device)

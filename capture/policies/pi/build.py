@@ -13,9 +13,9 @@ from vla_attention.capture.policies.pi.formats import detect_format, find_format
 from vla_attention.capture.policies.pi.loading import CheckpointOptions, load_pi_policy
 from vla_attention.capture.policies.pi.locate import find_checkpoint, find_tokenizer
 from vla_attention.capture.policies.pi.policy import PiPolicy
+from vla_attention.capture.policies.precision import find_dtype
 from vla_attention.schemas.errors import BadArgument, listing
 
-DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _UNTRAINED = {"embedded": embedded_policy, "dummy": dummy_policy}
 
 
@@ -78,13 +78,6 @@ def build_pi_policy(
             f"{config.siglip.num_tokens} keys; leave the option out."
         )
     return policy
-
-
-def find_dtype(name: str) -> torch.dtype:
-    """Return the precision of that name."""
-    if name not in DTYPES:
-        raise BadArgument(f"Cannot use --dtype '{name}'; expected {listing(DTYPES)}.")
-    return DTYPES[name]
 
 
 def _sizes(config: GemmaConfig) -> str:

@@ -9,14 +9,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
 
+from vla_attention.capture.policies.checkpoints import read_json_object
+from vla_attention.capture.policies.parity_case import CASE_FILE, UnusableCase, read_arrays, read_case_file
 from vla_attention.capture.policies.pi.config import CAMERA_SLOTS, GemmaConfig, PiConfig, SiglipConfig
-from vla_attention.capture.policies.pi.formats import CheckpointFormat, read_json_object
-from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
+from vla_attention.capture.policies.pi.formats import CheckpointFormat
+from vla_attention.capture.policies.precision import DTYPES
+from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 
 CaseFormat = Literal["orbax", "openpi", "lerobot"]
 
@@ -26,11 +28,6 @@ CHECKPOINT_FOLDERS: dict[CaseFormat, tuple[str, CheckpointFormat]] = {
     "openpi": ("checkpoint_openpi_torch", "openpi_torch"),
     "lerobot": ("checkpoint_lerobot", "lerobot"),
 }
-CASE_FILE = "case.json"
-
-
-class UnusableCase(UserError, ValueError):
-    """The case folder lacks a file, or a file does not hold what a case needs."""
 
 
 @dataclass(frozen=True)
@@ -115,31 +112,15 @@ def _config(content: Mapping[str, Any]) -> PiConfig:
 def read_case(folder: str | Path) -> Case:
     """Read a case folder; `UnusableCase` says which file or array is missing or of the wrong shape."""
     folder = Path(folder)
-    if not folder.is_dir():
-        raise UnusableCase(f"There is no case folder at '{folder}'.")
-    if not (folder / CASE_FILE).is_file():
-        found = listing(sorted(path.name for path in folder.iterdir()))
-        raise UnusableCase(f"'{folder}' is no case: it has no {CASE_FILE}, but {found}.")
+    content = read_case_file(folder)
     config = read_config(folder / CASE_FILE)
-    content = read_json_object(folder / CASE_FILE)
     computed = str(content.get("compute_dtype", "float32"))
-    if computed not in ("float32", "bfloat16"):
+    if computed not in DTYPES:
         raise UnusableCase(f"'{folder / CASE_FILE}' says compute_dtype '{computed}'; expected float32 or bfloat16.")
-    inputs, expected = _arrays(folder / "inputs.npz"), _arrays(folder / "expected.npz")
+    inputs, expected = read_arrays(folder / "inputs.npz"), read_arrays(folder / "expected.npz")
     _check_shapes(folder / "inputs.npz", inputs, _input_shapes(config, inputs))
     _check_shapes(folder / "expected.npz", expected, _expected_shapes(config, inputs))
-    dtype = torch.bfloat16 if computed == "bfloat16" else torch.float32
-    return Case(str(content.get("name", folder.name)), folder, config, dtype, inputs, expected)
-
-
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            return dict(stored)
-    except FileNotFoundError:
-        raise UnusableCase(f"There is no '{path}', which a case needs.") from None
-    except (ValueError, OSError, EOFError, BadZipFile) as error:
-        raise UnusableCase(f"'{path}' cannot be read as arrays ({error}).") from error
+    return Case(str(content.get("name", folder.name)), folder, config, DTYPES[computed], inputs, expected)
 
 
 Wanted = dict[str, tuple[int, ...]]

@@ -12,11 +12,13 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint, read_json_object
 from vla_attention.capture.policies.pi.config import PiConfig
-from vla_attention.capture.policies.pi.formats import UnreadableCheckpoint, detect_format, read_json_object
+from vla_attention.capture.policies.pi.formats import detect_format
 from vla_attention.capture.policies.pi.model import PiModel
+from vla_attention.capture.policies.pi.model_weights import build_model, expected_shapes
 from vla_attention.capture.policies.pi.sizes import PALIGEMMA, TABLE, infer_config
-from vla_attention.capture.policies.pi.strict import Shapes, build_model, check_shapes, expected_shapes
+from vla_attention.capture.policies.strict_loading import Shapes, check_shapes
 
 #: The text table is tied to the language model's output layer, and safetensors keeps one name of tied tensors: this one.
 TIED_TABLE = PALIGEMMA + "lm_head.weight"

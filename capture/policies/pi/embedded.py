@@ -15,11 +15,12 @@ from torch import Tensor
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.pi.config import GemmaConfig, PiConfig, SiglipConfig, find_variant
 from vla_attention.capture.policies.pi.model import PiModel
+from vla_attention.capture.policies.pi.model_weights import expected_shapes, model_from_state
 from vla_attention.capture.policies.pi.policy import PiPolicy
 from vla_attention.capture.policies.pi.preprocess import NormStats, Statistics
 from vla_attention.capture.policies.pi.processing import OPENPI_REPLAN_STEPS, OpenpiProcessing
-from vla_attention.capture.policies.pi.strict import Shapes, expected_shapes, model_from_state
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
+from vla_attention.capture.policies.strict_loading import Shapes
 from vla_attention.capture.policies.weights import random_tensor
 
 TOKENIZER_PATH = Path(__file__).parent / "embedded" / "tokenizer.model"

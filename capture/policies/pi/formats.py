@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from vla_attention.schemas.errors import UserError, listing, unknown_name
+from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnsupportedCheckpoint, read_json_object
+from vla_attention.schemas.errors import listing, unknown_name
 
 CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot"]
 CHECKPOINT_FORMATS: tuple[CheckpointFormat, ...] = get_args(CheckpointFormat)
@@ -29,18 +29,6 @@ _OTHER_FAMILIES = {
     "gemma": "Gemma (the language model alone)",
     "siglip": "SigLIP (the image encoder alone)",
 }
-
-
-class CheckpointNotFound(UserError, FileNotFoundError):
-    """The checkpoint folder does not exist."""
-
-
-class UnsupportedCheckpoint(UserError, ValueError):
-    """The folder is no checkpoint, or one of another kind."""
-
-
-class UnreadableCheckpoint(UserError, ValueError):
-    """The folder has the right files, but one of them is damaged."""
 
 
 def find_format(name: str) -> CheckpointFormat:
@@ -122,16 +110,3 @@ def _what_it_is(folder: Path) -> str:
         f"'{folder}' is not a pi checkpoint: expected {SPOKEN['openpi_torch']}, {SPOKEN['openpi_jax']} or "
         f"{SPOKEN['lerobot']}, found {listing(names)}."
     )
-
-
-def read_json_object(path: Path) -> dict[str, Any]:
-    """Read a JSON file that holds an object."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UnreadableCheckpoint(f"There is no '{path}', which the checkpoint needs.") from None
-    except (ValueError, OSError) as error:
-        raise UnreadableCheckpoint(f"'{path}' is not valid JSON ({error}).") from error
-    if not isinstance(content, dict):
-        raise UnreadableCheckpoint(f"'{path}' should hold a JSON object, but holds a {type(content).__name__}.")
-    return content

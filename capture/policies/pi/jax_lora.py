@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vla_attention.capture.policies.pi.strict import CheckpointMismatch
+from vla_attention.capture.policies.checkpoints import CheckpointMismatch
 
 _LORA = re.compile(r"(.*[/_])lora_([ab])$")
 

@@ -14,9 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vla_attention.capture.policies.checkpoints import CheckpointMismatch
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.jax_lora import LoraPair, find_lora_pairs, merge_lora
-from vla_attention.capture.policies.pi.strict import CheckpointMismatch, Shapes, check_shapes, expected_shapes
+from vla_attention.capture.policies.pi.model_weights import expected_shapes
+from vla_attention.capture.policies.strict_loading import Shapes, check_shapes, shapes_of
 
 VISION = "paligemma_with_expert.paligemma.model.vision_tower.vision_model."
 PROJECTOR = "paligemma_with_expert.paligemma.model.multi_modal_projector.linear."
@@ -224,5 +226,5 @@ def from_jax_flat(leaves: Mapping[str, np.ndarray], config: PiConfig) -> dict[st
                 [merge_lora(path, w, *ab) for w, *ab in zip(leaf, leaves[pair.a], leaves[pair.b], strict=True)]
             )
         state |= {name: torch.from_numpy(np.array(array, order="C")) for name, array in plan.whole(leaf).items()}
-    check_shapes({name: tuple(tensor.shape) for name, tensor in state.items()}, expected_shapes(config))
+    check_shapes(shapes_of(state), expected_shapes(config))
     return state

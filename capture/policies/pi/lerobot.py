@@ -11,6 +11,7 @@ from pathlib import Path
 
 import torch
 
+from vla_attention.capture.policies.checkpoints import CheckpointMismatch
 from vla_attention.capture.policies.pi.checkpoint import TensorFile, open_tensors
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.formats import detect_format
@@ -19,9 +20,7 @@ from vla_attention.capture.policies.pi.lerobot_pipeline import read_lerobot_pipe
 from vla_attention.capture.policies.pi.lerobot_processing import LerobotProcessing, slots
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.sizes import infer_config, is_pi05
-from vla_attention.capture.policies.pi.strict import CheckpointMismatch
-
-DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+from vla_attention.capture.policies.precision import DTYPES
 
 
 def load_lerobot_weights(

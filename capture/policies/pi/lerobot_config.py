@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from vla_attention.capture.policies.checkpoints import UnsupportedCheckpoint, read_json_object
 from vla_attention.capture.policies.pi.flow_time import MAX_PERIOD, MIN_PERIOD
-from vla_attention.capture.policies.pi.formats import UnsupportedCheckpoint, read_json_object
 from vla_attention.capture.policies.pi.sizes import MAX_TOKEN_LEN
 from vla_attention.schemas.errors import listing
 

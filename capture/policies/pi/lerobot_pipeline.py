@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
-from vla_attention.capture.policies.pi.formats import UnreadableCheckpoint, UnsupportedCheckpoint, read_json_object
+from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint, UnsupportedCheckpoint, read_json_object
 from vla_attention.capture.policies.pi.lerobot_config import (
     ACTION_FEATURE,
     STATE_FEATURE,

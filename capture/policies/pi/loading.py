@@ -8,7 +8,8 @@ from pathlib import Path
 import torch
 
 from vla_attention.capture.policies.identity import PolicySource
-from vla_attention.capture.policies.pi.case import CASE_FILE, read_config
+from vla_attention.capture.policies.parity_case import CASE_FILE
+from vla_attention.capture.policies.pi.case import read_config
 from vla_attention.capture.policies.pi.checkpoint import load_openpi_torch
 from vla_attention.capture.policies.pi.config import PiConfig, find_config
 from vla_attention.capture.policies.pi.formats import CheckpointFormat, detect_format

@@ -17,18 +17,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint, read_json_object
 from vla_attention.capture.policies.pi.config import PiConfig, find_config
-from vla_attention.capture.policies.pi.formats import UnreadableCheckpoint, detect_format, read_json_object
+from vla_attention.capture.policies.pi.formats import detect_format
 from vla_attention.capture.policies.pi.jax_lora import merge_lora
 from vla_attention.capture.policies.pi.jax_weights import plan_leaves
 from vla_attention.capture.policies.pi.model import PiModel
-from vla_attention.capture.policies.pi.strict import (
-    Shapes,
-    build_model,
-    check_shapes,
-    expected_shapes,
-    expected_tensors,
-)
+from vla_attention.capture.policies.pi.model_weights import build_model, expected_shapes, expected_tensors
+from vla_attention.capture.policies.strict_loading import Shapes, check_shapes
 from vla_attention.schemas.errors import MissingDependency
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,16 +11,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vla_attention.capture.policies.parity_case import UnusableCase, json_number, print_results
 from vla_attention.capture.policies.pi.case import (
     CHECKPOINT_FOLDERS,
     Case,
     CaseFormat,
-    UnusableCase,
     find_case_format,
     read_case,
 )
 from vla_attention.capture.policies.pi.loading import load_pi_model
 from vla_attention.capture.policies.pi.model import PiModel
+from vla_attention.capture.policies.precision import dtype_name
 from vla_attention.capture.recording.attention import RowCollector
 from vla_attention.schemas.errors import BadArgument, listing
 
@@ -52,14 +52,10 @@ class Parity:
             "format": self.case_format,
             "limit": self.limit,
             "passed": self.passed,
-            "actions_max": _json_number(self.actions),
-            "attention_max": _json_number(self.attention.max()),
-            "attention_max_per_layer_and_step": [[_json_number(x) for x in layer] for layer in self.attention],
+            "actions_max": json_number(self.actions),
+            "attention_max": json_number(self.attention.max()),
+            "attention_max_per_layer_and_step": [[json_number(x) for x in layer] for layer in self.attention],
         }
-
-
-def _json_number(x: float) -> float | None:
-    return float(x) if np.isfinite(x) else None
 
 
 class AllRows(RowCollector):
@@ -139,7 +135,7 @@ def describe(case: Case, result: Parity) -> str:
     layers, steps = result.attention.shape
     verdict = {True: "within the limit", False: "BEYOND THE LIMIT"}
     lines = [
-        f"{result.case} ({'pi0.5' if config.pi05 else 'pi0'}, {str(case.dtype).removeprefix('torch.')}, batch "
+        f"{result.case} ({'pi0.5' if config.pi05 else 'pi0'}, {dtype_name(case.dtype)}, batch "
         f"{len(case.inputs['noise'])}, {layers} layers, {steps} denoise steps), format {result.case_format}, "
         f"limit {result.limit:.1e}",
         f"  actions    {result.actions:.1e}  {verdict[bool(result.actions <= result.limit)]}",
@@ -166,11 +162,5 @@ def run_parity(
     if not formats:
         wanted = listing(name for name, _ in CHECKPOINT_FOLDERS.values())
         raise UnusableCase(f"The case '{folder}' carries no checkpoint: it should have a folder of {wanted}.")
-    results = []
-    for chosen in formats:
-        results.append(measure(case, chosen, limit=limit, device=device))
-        if not as_json:
-            print(describe(case, results[-1]), flush=True)
-    if as_json:
-        print(json.dumps([result.as_json() for result in results], indent=2))
-    return 0 if all(result.passed for result in results) else 1
+    results = (measure(case, chosen, limit=limit, device=device) for chosen in formats)
+    return print_results(results, lambda result: describe(case, result), as_json=as_json)

@@ -22,6 +22,7 @@ from vla_attention.capture.policies.pi.preprocess import libero_state, pad_to
 from vla_attention.capture.policies.pi.processing import Processing
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, TokenizedPrompt, check_vocabulary
 from vla_attention.capture.policies.policy import PolicyInput, camera_frame
+from vla_attention.capture.policies.precision import dtype_name
 from vla_attention.capture.policies.weights import weights_digest
 from vla_attention.capture.recording.attention import RowCollector
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, roles_from_spans
@@ -104,7 +105,7 @@ class PiPolicy:
         config = self.model.config
         facts = {
             "config": {**asdict(config), "cameras": list(config.cameras)},
-            "dtype": str(self.model.dtype).removeprefix("torch."),
+            "dtype": dtype_name(self.model.dtype),
             **self.processing.provenance(),
             "prompt_format": self.processing.prompt_format,
             "long_prompts": "cut" if self.processing.cut_long_prompts else "refused",

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from vla_attention.capture.policies.checkpoints import CheckpointMismatch
 from vla_attention.capture.policies.pi.config import GEMMA_VARIANTS, GemmaConfig, PiConfig, SiglipConfig
-from vla_attention.capture.policies.pi.strict import CheckpointMismatch, Shapes
+from vla_attention.capture.policies.strict_loading import Shapes
 
 PALIGEMMA = "paligemma_with_expert.paligemma."
 VISION = PALIGEMMA + "model.vision_tower.vision_model."

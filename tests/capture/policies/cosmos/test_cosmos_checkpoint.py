@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, make_observation
+from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnsupportedCheckpoint
 from vla_attention.capture.policies.cosmos.build import build_cosmos_policy
 from vla_attention.capture.policies.cosmos.checkpoint import CosmosOptions, load_cosmos_policy
-from vla_attention.capture.policies.cosmos.dummy_folder import WEIGHTS_NAME
+from tests.kit.cosmos_checkpoint import WEIGHTS_NAME
 from vla_attention.capture.policies.cosmos.embedded import TOKENIZER_PATH, random_policy
 from vla_attention.capture.policies.cosmos.locate import (
     EMBEDDINGS_NAME,
@@ -19,8 +20,6 @@ from vla_attention.capture.policies.cosmos.locate import (
     STATISTICS_NAME,
     VAE_NAME,
     VAE_REPOSITORY,
-    CheckpointNotFound,
-    UnsupportedCheckpoint,
 )
 from vla_attention.capture.policies.cosmos.preprocess import StatisticsNotFound
 from vla_attention.capture.policies.cosmos.t5_pickle import EmbeddingsNotFound

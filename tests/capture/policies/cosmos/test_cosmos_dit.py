@@ -12,19 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.kit.cosmos_helpers import GOLDEN
+from vla_attention.capture.policies.checkpoints import CheckpointMismatch
 from vla_attention.capture.policies.cosmos.config import DitConfig, VaeConfig
 from vla_attention.capture.policies.cosmos.dit import Dit, rotate
-from vla_attention.capture.policies.cosmos.dit_weights import (
-    CheckpointMismatch,
-    build_dit,
-    check_shapes,
-    dit_tensors,
-    expected_shapes,
-    infer_dit_config,
-)
+from vla_attention.capture.policies.cosmos.dit_weights import build_dit, dit_tensors, expected_shapes, infer_dit_config
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, random_dit_weights
 from vla_attention.capture.policies.cosmos.parity import EverythingObserver
 from vla_attention.capture.policies.cosmos.vae import expected_vae_shapes, infer_vae_config
+from vla_attention.capture.policies.strict_loading import check_shapes
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from tests.kit.cosmos_helpers import GOLDEN, LARGE_GOLDEN
-from vla_attention.capture.policies.cosmos.case import UnusableCase, case_kind, read_case
-from vla_attention.capture.policies.cosmos.parity import describe, run_case, run_cosmos_parity
+from vla_attention.capture.policies.cosmos.case import read_case
+from vla_attention.capture.policies.cosmos.parity import describe, run_case, run_parity
+from vla_attention.capture.policies.parity_case import UnusableCase
 
 CASES = [path.name for path in sorted(GOLDEN.iterdir()) if path.is_dir()]
 LARGE_CASES = ["dit_libero_T9", "policy_T9_64px", "policy_T9_224px_slim"]
@@ -51,9 +52,9 @@ def test_a_difference_is_reported_where_it_begins(case_copy, capsys):
     report = run_case(case_copy)
     assert report.begins == "cross_attn_probs_01"
     assert [stage.stage for stage in report.stages if not stage.passed] == ["cross_attn_probs_01", "output"]
-    assert run_cosmos_parity([case_copy]) == 1
+    assert run_parity(case_copy) == 1
     assert "BEYOND THE LIMITS, first at 'cross_attn_probs_01'" in capsys.readouterr().out
-    assert run_cosmos_parity([case_copy], as_json=True) == 1
+    assert run_parity(case_copy, as_json=True) == 1
     (found,) = json.loads(capsys.readouterr().out)
     assert found["begins"] == "cross_attn_probs_01"
 
@@ -73,9 +74,7 @@ def change_facts(folder, **changes):
     (folder / "case.json").write_text(json.dumps({**facts, **changes}))
 
 
-def test_kind_tells_cases_apart(case_copy):
-    assert case_kind(case_copy) == "dit_forward"
-    assert case_kind(case_copy.parent) is None
+def test_a_kind_that_does_not_exist_is_refused(case_copy):
     change_facts(case_copy, kind="sample")
     with pytest.raises(UnusableCase, match=r"kind 'sample'; expected dit_forward, policy_sample"):
         read_case(case_copy)

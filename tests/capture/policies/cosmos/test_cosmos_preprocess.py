@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from vla_attention.capture.policies.checkpoints import CheckpointMismatch
 from vla_attention.capture.policies.cosmos.config import VaeConfig
-from vla_attention.capture.policies.cosmos.dit_weights import CheckpointMismatch
 from vla_attention.capture.policies.cosmos.embedded import BUILTIN_RANGES, builtin_statistics, random_vae_weights
 from vla_attention.capture.policies.cosmos.preprocess import (
     BadStatistics,

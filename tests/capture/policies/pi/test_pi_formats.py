@@ -5,12 +5,8 @@ import json
 import pytest
 
 from tests.kit.pi_golden import GOLDEN
-from vla_attention.capture.policies.pi.formats import (
-    UnreadableCheckpoint,
-    UnsupportedCheckpoint,
-    detect_format,
-    find_format,
-)
+from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint, UnsupportedCheckpoint
+from vla_attention.capture.policies.pi.formats import detect_format, find_format
 from vla_attention.schemas.errors import UnknownName
 
 

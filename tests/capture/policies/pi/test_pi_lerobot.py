@@ -10,13 +10,12 @@ from safetensors.torch import load_file, save_file
 
 from tests.kit.pi_golden import GOLDEN, make_observation
 from tests.kit.small_tokenizer import train_small_tokenizer
-from vla_attention.capture.policies.pi.formats import UnreadableCheckpoint, UnsupportedCheckpoint
+from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint, UnsupportedCheckpoint
 from vla_attention.capture.policies.pi.lerobot_config import UnsupportedLerobotFeature, read_lerobot_config
 from vla_attention.capture.policies.pi.lerobot_pipeline import LerobotNormaliser, read_lerobot_pipeline
 from vla_attention.capture.policies.pi.lerobot_processing import lerobot_image
 from vla_attention.capture.policies.pi.loading import CheckpointOptions, load_pi_policy
 from vla_attention.capture.policies.pi.preprocess import UnusableNormStats, libero_state
-from vla_attention.capture.policies.pi.strict import CheckpointMismatch
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, digitise_state
 from vla_attention.capture.policies.policy import Policy
 from vla_attention.schemas.errors import BadArgument, UserError

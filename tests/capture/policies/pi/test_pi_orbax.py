@@ -11,15 +11,14 @@ import torch
 from benchmarks.orbax_writer import write_leaves
 from tests.kit.jax_leaves import to_jax_leaves
 from tests.kit.pi_golden import GOLDEN, LARGE_GOLDEN, load_case
+from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint, UnsupportedCheckpoint
 from vla_attention.capture.policies.pi.config import GemmaConfig
 from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, random_weights
-from vla_attention.capture.policies.pi.formats import UnreadableCheckpoint, UnsupportedCheckpoint
 from vla_attention.capture.policies.pi.jax_lora import merge_lora
 from vla_attention.capture.policies.pi.jax_weights import from_jax_flat
 from vla_attention.capture.policies.pi.loading import load_pi_model
 from vla_attention.capture.policies.pi.orbax import OpenLeaf, list_leaves, load_openpi_jax, read_leaf
 from vla_attention.capture.policies.pi.preprocess import read_norm_stats
-from vla_attention.capture.policies.pi.strict import CheckpointMismatch
 
 pytest.importorskip("tensorstore")
 STORED = GOLDEN / "pi0_batch2" / "checkpoint"

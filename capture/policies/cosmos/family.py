@@ -1,0 +1,128 @@
+"""The Cosmos family for the command line: Cosmos Policy."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedScript
+from vla_attention.capture.policies.model_arguments import UNTRAINED, add_model_arguments
+from vla_attention.schemas.errors import BadArgument
+
+if TYPE_CHECKING:
+    from vla_attention.capture.policies.cosmos.policy import CosmosPolicy
+
+_CHECKPOINT = "nvidia/Cosmos-Policy-LIBERO-Predict2-2B"
+_EXAMPLES = f"""\
+  vla-capture cosmos                                         embedded untrained policy, built-in tasks
+  vla-capture cosmos --ckpt-path {_CHECKPOINT} --task-suite libero_10
+"""
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    model = add_model_arguments(
+        parser,
+        checkpoint_options=("--ckpt-path", "--checkpoint"),
+        checkpoint="checkpoint folder, ORG/NAME on the Hugging Face hub, or a file of weights",
+        config_name="the reference's name",
+        dtype_default="bfloat16 on a GPU, float32 on a CPU",
+    )
+    model.add_argument("--dataset-stats-path", metavar="PATH", help="statistics (default: the checkpoint's own)")
+    model.add_argument(
+        "--t5-text-embeddings-path", metavar="PATH", help="precomputed embeddings (default: the checkpoint's own)"
+    )
+    model.add_argument(
+        "--t5-tokenizer", metavar="PATH", help="T5's spiece.model: makes words of the instruction selectable"
+    )
+    model.add_argument(
+        "--t5-encoder", metavar="PATH", help="T5 model folder, for instructions without a precomputed embedding"
+    )
+    model.add_argument("--vae-path", metavar="PATH", help="image encoder's weights (default: the checkpoint's own)")
+    model.add_argument("--num-denoising-steps-action", type=int, metavar="N", help="denoise steps (default: 5)")
+    model.add_argument("--chunk-size", type=int, metavar="N", help="actions of a call (default: 16)")
+    model.add_argument(
+        "--num-open-loop-steps", type=int, metavar="N", help="actions executed per call (default: the chunk)"
+    )
+    frames = parser.add_argument_group("frames of the published proxy (the store keeps all of them)")
+    frames.add_argument(
+        "--query-frame", default="action", metavar="NAME", help="whose queries are recorded (default: action)"
+    )
+    frames.add_argument(
+        "--visual-frame", default="curr_last", metavar="NAME", help="numerator frame (default: curr_last)"
+    )
+    frames.add_argument(
+        "--text-frame", default="frame0", metavar="NAME", help="denominator frame (default: frame0, a blank one)"
+    )
+    frames.add_argument(
+        "--prefer-S", dest="prefer_s", type=int, metavar="N", help="length that the analysed call must have"
+    )
+    frames.add_argument("--prefer-call", default="last", metavar="NAME", help="last (default) or first of those calls")
+
+
+def _build(arguments: argparse.Namespace, device: str) -> CosmosPolicy:
+    from vla_attention.capture.policies.cosmos.build import build_cosmos_policy
+    from vla_attention.capture.policies.cosmos.config import DEFAULT_CONFIG_NAME
+
+    return build_cosmos_policy(
+        arguments.checkpoint,
+        device=device,
+        config_name=arguments.config_name or DEFAULT_CONFIG_NAME,
+        num_denoising_steps_action=arguments.num_denoising_steps_action,
+        chunk_size=arguments.chunk_size,
+        num_open_loop_steps=arguments.num_open_loop_steps,
+        dataset_stats_path=arguments.dataset_stats_path,
+        t5_text_embeddings_path=arguments.t5_text_embeddings_path,
+        t5_tokenizer=arguments.t5_tokenizer,
+        t5_encoder=arguments.t5_encoder,
+        vae_path=arguments.vae_path,
+        dtype=arguments.dtype,
+        query_frame=arguments.query_frame,
+        visual_frame=arguments.visual_frame,
+        text_frame=arguments.text_frame,
+        prefer_s=arguments.prefer_s,
+        prefer_call=arguments.prefer_call,
+    )
+
+
+def _analysis_arguments(arguments: argparse.Namespace) -> list[str]:
+    """The published scripts' proxy: the mass of one latent frame over that of another, both of self-attention.
+
+    The groups carry the frames' names, because the denominator's default frame is a blank picture and holds no language.
+    """
+    above, below = arguments.visual_frame, arguments.text_frame
+    groups = ["--group", f"{above}=frame:{above}", "--group", f"{below}=frame:{below}"]
+    return ["--site", "self", *groups, "--ratio", f"{above}/{below}", "--denoise", arguments.prefer_call]
+
+
+def _is_cosmos_case(content: Mapping[str, Any]) -> bool:
+    return isinstance(content.get("kind"), str)
+
+
+def _run_parity(arguments: argparse.Namespace, device: str) -> int:
+    from vla_attention.capture.policies.cosmos.parity import run_parity
+
+    if arguments.format is not None or arguments.limit is not None:
+        raise BadArgument("Cosmos cases have one format and their own limits; leave out --format and --limit.")
+    return run_parity(arguments.case, as_json=arguments.json, device=device)
+
+
+FAMILY = PolicyFamily(
+    name="cosmos",
+    title="Cosmos Policy",
+    description="Record a Cosmos Policy: self-attention over latent frames, cross-attention over text.",
+    examples=_EXAMPLES,
+    add_arguments=_add_arguments,
+    build=_build,
+    store_prefix="cosmos_",
+    replan_default="--num-open-loop-steps",
+    untrained=UNTRAINED,
+    analysis_arguments=_analysis_arguments,
+    parity=ParityCases(recognises=_is_cosmos_case, run=_run_parity),
+    published=PublishedScript(
+        program="evaluate-attention-ratio-cosmos",
+        checkpoint=_CHECKPOINT,
+        layers=(25, 26, 27),
+        variables={"QUERY_FRAME": "--query-frame", "VISUAL_FRAME": "--visual-frame", "TEXT_FRAME": "--text-frame"},
+    ),
+)

@@ -1,0 +1,25 @@
+"""The registry of policy families. A new family is a folder beside this file and one line in `FAMILY_MODULES`."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+from vla_attention.capture.policies.family import PolicyFamily
+
+#: Modules with a `FAMILY`. They are imported for `--help`, and must therefore import neither torch nor numpy at the top.
+FAMILY_MODULES = (
+    "vla_attention.capture.policies.cosmos.family",
+    "vla_attention.capture.policies.pi.family",
+)
+
+
+def policy_families() -> tuple[PolicyFamily, ...]:
+    """Return every registered family, in the order of the help text."""
+    return tuple(_load(module) for module in FAMILY_MODULES)
+
+
+def _load(module: str) -> PolicyFamily:
+    family = import_module(module).FAMILY
+    if not isinstance(family, PolicyFamily):
+        raise TypeError(f"FAMILY of {module} is a {type(family).__name__}, not a PolicyFamily")
+    return family

@@ -1,0 +1,37 @@
+"""The options of the `model` group that every family has."""
+
+from __future__ import annotations
+
+import argparse
+
+#: The two untrained policies that come with the program: a small one, and a smaller one for tests.
+EMBEDDED = "embedded"
+DUMMY = "dummy"
+UNTRAINED = (EMBEDDED, DUMMY)
+
+
+def add_model_arguments(
+    parser: argparse.ArgumentParser,
+    *,
+    checkpoint: str,
+    config_name: str,
+    dtype_default: str,
+    checkpoint_options: tuple[str, ...] = ("--checkpoint",),
+) -> argparse._ArgumentGroup:
+    """Add the group `model` with checkpoint, configuration, precision and device; returns it for the family's own options.
+
+    checkpoint: the checkpoints that are accepted, as text. config_name: whose name `--config-name` takes.
+    """
+    group = parser.add_argument_group("model")
+    group.add_argument(
+        *checkpoint_options,
+        dest="checkpoint",
+        default=EMBEDDED,
+        metavar="PATH",
+        help=f"{checkpoint}; '{EMBEDDED}' is a small untrained policy that comes with the tool, '{DUMMY}' a smaller one "
+        "(default: %(default)s)",
+    )
+    group.add_argument("--config-name", metavar="NAME", help=f"{config_name} for the configuration")
+    group.add_argument("--dtype", metavar="NAME", help=f"float32 or bfloat16 (default: {dtype_default})")
+    group.add_argument("--device", default="auto", help="auto (default: a GPU if there is one), cpu, cuda, cuda:1 ...")
+    return group

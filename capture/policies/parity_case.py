@@ -1,0 +1,72 @@
+"""Parity cases of any family: a folder with case.json, inputs.npz, and expected.npz as a reference implementation computed it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+from zipfile import BadZipFile
+
+import numpy as np
+
+from vla_attention.capture.policies.checkpoints import read_json_object
+from vla_attention.schemas.errors import UserError, listing
+
+CASE_FILE = "case.json"
+
+
+class UnusableCase(UserError, ValueError):
+    """The case folder lacks a file, or a file does not hold what a case needs."""
+
+
+class ParityResult(Protocol):
+    """The outcome of one case."""
+
+    @property
+    def passed(self) -> bool:
+        """Whether every difference is within its limit."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the differences as plain JSON values."""
+
+
+Result = TypeVar("Result", bound=ParityResult)
+
+
+def read_case_file(folder: Path) -> dict[str, Any]:
+    """Return the content of a folder's case.json; `UnusableCase` when there is none."""
+    if not folder.is_dir():
+        raise UnusableCase(f"There is no case folder at '{folder}'.")
+    if not (folder / CASE_FILE).is_file():
+        found = listing(sorted(path.name for path in folder.iterdir()))
+        raise UnusableCase(f"'{folder}' is no case: it has no {CASE_FILE}, but {found}.")
+    return read_json_object(folder / CASE_FILE)
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an npz file by their names; `UnusableCase` when it is missing or damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return dict(stored)
+    except FileNotFoundError:
+        raise UnusableCase(f"There is no '{path}', which a case needs.") from None
+    except (ValueError, OSError, EOFError, BadZipFile) as error:
+        raise UnusableCase(f"'{path}' cannot be read as arrays ({error}).") from error
+
+
+def json_number(x: float) -> float | None:
+    """Return a number for JSON, which has no NaN and no infinity: None stands for these."""
+    return float(x) if np.isfinite(x) else None
+
+
+def print_results(results: Iterable[Result], as_text: Callable[[Result], str], *, as_json: bool) -> int:
+    """Print each result as soon as it is computed, or all of them as one JSON list; returns 0 when all passed, else 1."""
+    done = []
+    for result in results:
+        done.append(result)
+        if not as_json:
+            print(as_text(result), flush=True)
+    if as_json:
+        print(json.dumps([result.as_json() for result in done], indent=2))
+    return 0 if all(result.passed for result in done) else 1

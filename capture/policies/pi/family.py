@@ -1,0 +1,99 @@
+"""The pi family for the command line: pi0 and pi0.5, from openpi and from LeRobot."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedScript
+from vla_attention.capture.policies.model_arguments import UNTRAINED, add_model_arguments
+
+if TYPE_CHECKING:
+    from vla_attention.capture.policies.pi.policy import PiPolicy
+
+_EXAMPLES = """\
+  vla-capture pi                                             embedded untrained policy, built-in tasks
+  vla-capture pi --checkpoint ~/.cache/openpi/openpi-assets/checkpoints/pi05_libero \\
+      --task-suite libero_10 --num-episodes 5 --output-dir results/attention_ratio
+  vla-capture pi --checkpoint lerobot/pi05_libero_finetuned --tokenizer PATH --task-suite libero_10
+  vla-capture pi --task-suite libero_10 --task-id 0 --num-episodes 1 --max-steps 40 --libero-assets PATH
+"""
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    model = add_model_arguments(
+        parser,
+        checkpoint="checkpoint folder of openpi (JAX or PyTorch) or LeRobot, ORG/NAME on the Hugging Face hub, or gs://...",
+        config_name="openpi's name (pi05_libero, pi0_libero ...)",
+        dtype_default="what a LeRobot checkpoint states, else float32",
+    )
+    model.add_argument(
+        "--checkpoint-format",
+        metavar="NAME",
+        help="openpi_torch, openpi_jax or lerobot (default: recognised from the files)",
+    )
+    model.add_argument(
+        "--model-config",
+        type=Path,
+        metavar="PATH",
+        help="JSON file with the sizes that a checkpoint does not state (default: a case.json beside it, if any)",
+    )
+    model.add_argument(
+        "--discrete-state-input", action="store_true", help="openpi's pi0.5 trained with the state in its prompt"
+    )
+    model.add_argument("--tokenizer", metavar="PATH", help="sentencepiece model of the policy's language model")
+    model.add_argument("--paligemma-variant", metavar="NAME", help="checked against the checkpoint (gemma_2b ...)")
+    model.add_argument(
+        "--action-expert-variant", metavar="NAME", help="checked against the checkpoint (gemma_300m ...)"
+    )
+    model.add_argument("--num-image-tokens", type=int, metavar="N", help="checked against the policy's layout")
+
+
+def _build(arguments: argparse.Namespace, device: str) -> PiPolicy:
+    from vla_attention.capture.policies.pi.build import build_pi_policy
+
+    return build_pi_policy(
+        arguments.checkpoint,
+        tokenizer=arguments.tokenizer,
+        device=device,
+        checkpoint_format=arguments.checkpoint_format,
+        config_name=arguments.config_name,
+        model_config=arguments.model_config,
+        discrete_state_input=arguments.discrete_state_input,
+        dtype=arguments.dtype,
+        paligemma_variant=arguments.paligemma_variant,
+        action_expert_variant=arguments.action_expert_variant,
+        num_image_tokens=arguments.num_image_tokens,
+    )
+
+
+def _is_pi_case(content: Mapping[str, Any]) -> bool:
+    return "model" in content or "config" in content
+
+
+def _run_parity(arguments: argparse.Namespace, device: str) -> int:
+    from vla_attention.capture.policies.pi.parity import run_parity
+
+    return run_parity(arguments.case, arguments.format, limit=arguments.limit, as_json=arguments.json, device=device)
+
+
+FAMILY = PolicyFamily(
+    name="pi",
+    title="pi0 or pi0.5",
+    description="Record a pi0 or pi0.5 policy.",
+    examples=_EXAMPLES,
+    add_arguments=_add_arguments,
+    build=_build,
+    store_prefix="",
+    replan_default="5 for openpi, n_action_steps for LeRobot",
+    layers_note="; also the published scripts' numbers 18..35 (25 = block 7)",
+    untrained=UNTRAINED,
+    parity=ParityCases(recognises=_is_pi_case, run=_run_parity, formats=("orbax", "openpi", "lerobot")),
+    published=PublishedScript(
+        program="evaluate-attention-ratio",
+        checkpoint="~/.cache/openpi/openpi-assets/checkpoints/pi05_libero",
+        layers=(25, 26, 27),
+    ),
+)
