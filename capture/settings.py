@@ -1,12 +1,21 @@
-"""What a user asks a capture to do. Imports nothing heavy: command lines are read before torch is."""
+"""Settings of a capture, and their making from command-line arguments.
+
+Imports nothing heavy, because a mistake in the arguments is reported before torch is loaded.
+"""
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vla_attention.capture.environments.base import EnvironmentSettings, Suite
+from vla_attention.capture.environments.base import EnvironmentSettings, Suite, check_task_id
+from vla_attention.capture.environments.suites import find_suite
+from vla_attention.capture.policies.family import PolicyFamily
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.precision import parse_precision
+from vla_attention.schemas.stores.store_format import STORE_SUFFIX
 
 if TYPE_CHECKING:
     from vla_attention.capture.store.store_writer import WriteMode
@@ -14,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RecordingSettings:
-    """What a user asks to be recorded; None and empty mean the default."""
+    """What is recorded of each policy call; None means everything."""
 
     layers: tuple[int, ...] | None = None
     denoise_steps: tuple[str, ...] = ("first", "last")
@@ -27,18 +36,60 @@ class RecordingSettings:
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What a user asks to be run."""
+    """Which episodes are run, and into which store.
+
+    task_id: None runs all tasks of the suite. replan_steps: None takes the number of the policy's own published evaluation.
+    array_task_ids: tasks that other processes of the same array job run; the store is expected to hold these too.
+    """
 
     suite: Suite
     task_id: int | None
     num_episodes: int
     seed: int
-    #: None: what the policy's own evaluation does
     replan_steps: int | None
     max_steps: int
     store: Path
     mode: WriteMode
     environment: EnvironmentSettings
     recording: RecordingSettings
-    #: tasks that other processes of the same array job run; they belong to what is expected of the store
     array_task_ids: tuple[int, ...] = ()
+
+
+def run_settings(arguments: argparse.Namespace) -> RunSettings:
+    """Check the arguments that need no policy and turn them into settings."""
+    suite = find_suite(arguments.task_suite)
+    if arguments.task_id is not None:
+        check_task_id(suite, arguments.task_id)
+    if arguments.num_episodes < 1:
+        raise BadArgument(f"Cannot use --num-episodes {arguments.num_episodes}; expected at least 1.")
+    if arguments.seed < 0:
+        raise BadArgument(f"Cannot use --seed {arguments.seed}; expected 0 or more.")
+    return RunSettings(
+        suite=suite,
+        task_id=arguments.task_id,
+        num_episodes=arguments.num_episodes,
+        seed=arguments.seed,
+        replan_steps=arguments.replan_steps,
+        max_steps=suite.max_steps if arguments.max_steps is None else arguments.max_steps,
+        store=store_path(arguments),
+        mode="overwrite" if arguments.overwrite else "resume" if arguments.resume else "new",
+        environment=EnvironmentSettings(libero_assets=arguments.libero_assets),
+        recording=RecordingSettings(
+            layers=None if arguments.layers is None else tuple(arguments.layers),
+            denoise_steps=tuple(arguments.denoise_steps),
+            heads=None if arguments.heads is None else tuple(arguments.heads),
+            queries=arguments.queries,
+            mantissa_bits=parse_precision(arguments.precision),
+            frames=not arguments.no_frames,
+            contributions=arguments.contributions,
+        ),
+    )
+
+
+def store_path(arguments: argparse.Namespace) -> Path:
+    """The store to write: --store, else a name made of policy family and suite, in --output-dir or `runs`."""
+    if arguments.store is not None:
+        return Path(arguments.store)
+    family: PolicyFamily = arguments.family
+    name = f"{family.store_prefix}{arguments.task_suite}{STORE_SUFFIX}"
+    return (arguments.output_dir or Path("runs")) / name

@@ -20,12 +20,14 @@ class ParityCases:
     """The cases of a family that `vla-capture parity CASE` runs.
 
     recognises: tells from the content of a case.json whether the case is of this family. run: takes the parsed arguments and the
-    device, prints the differences, and returns the exit code. formats: the names that `--format` takes, if there are several.
+    device, prints the differences, and returns the exit code. formats: the names that `--format` takes; empty when it is refused.
+    default_limit: the largest difference that passes, for the help text of `--limit`; empty when that option is refused.
     """
 
     recognises: Callable[[Mapping[str, Any]], bool]
     run: Callable[[argparse.Namespace, str], int]
     formats: tuple[str, ...] = ()
+    default_limit: str = ""
 
 
 @dataclass(frozen=True)

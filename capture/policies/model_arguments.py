@@ -20,7 +20,7 @@ def add_model_arguments(
 ) -> argparse._ArgumentGroup:
     """Add the group `model` with checkpoint, configuration, precision and device; returns it for the family's own options.
 
-    checkpoint: the checkpoints that are accepted, as text. config_name: whose name `--config-name` takes.
+    checkpoint, config_name: help texts of these options. checkpoint_options: the spellings of the first one.
     """
     group = parser.add_argument_group("model")
     group.add_argument(
@@ -31,7 +31,7 @@ def add_model_arguments(
         help=f"{checkpoint}; '{EMBEDDED}' is a small untrained policy that comes with the tool, '{DUMMY}' a smaller one "
         "(default: %(default)s)",
     )
-    group.add_argument("--config-name", metavar="NAME", help=f"{config_name} for the configuration")
+    group.add_argument("--config-name", metavar="NAME", help=config_name)
     group.add_argument("--dtype", metavar="NAME", help=f"float32 or bfloat16 (default: {dtype_default})")
     group.add_argument("--device", default="auto", help="auto (default: a GPU if there is one), cpu, cuda, cuda:1 ...")
     return group

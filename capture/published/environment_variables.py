@@ -1,6 +1,7 @@
 """The batch scripts' environment variables as arguments: `evaluate-attention-ratio --from-environment`.
 
-The heads of `scripts/run_attention_ratio.sh` and `scripts/run_attention_ratio_cosmos.sh` document them; here is what they mean.
+The heads of the batch scripts, `scripts/run_attention_ratio*.sh`, document the variables. Those of a single policy family stand in
+the family's `PublishedScript`.
 """
 
 from __future__ import annotations
@@ -8,9 +9,11 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping
 
+from vla_attention.capture.policies.families import policy_families
+from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.schemas.errors import BadArgument
 
-#: Variable -> option, for those that are passed on as they are.
+#: Variable -> option, for variables that are passed on unchanged.
 _OPTIONS = {
     "CONFIG_NAME": "--config-name",
     "TASK_SUITE": "--task-suite",
@@ -25,17 +28,14 @@ _WHOLE_NUMBERS = {
     "REPLAN_STEPS": "--replan-steps",
     "MAX_REQUEUES": "--max-requeues",
 }
-_FRAMES = {"QUERY_FRAME": "--query-frame", "VISUAL_FRAME": "--visual-frame", "TEXT_FRAME": "--text-frame"}
 _SWITCH = {"1": True, "true": True, "yes": True, "": False, "0": False, "false": False, "no": False}
-#: Policies that come with the tool and run anywhere.
-_SMALL = ("embedded", "dummy")
 
 
-def arguments_from_environment(environment: Mapping[str, str], family: str, default_checkpoint: str) -> list[str]:
-    """Arguments that say what the variables say; an empty variable is one that is not set.
+def arguments_from_environment(environment: Mapping[str, str], family: PolicyFamily) -> list[str]:
+    """Return the arguments that the variables stand for. A variable that is empty counts as not set.
 
     Raises:
-        BadArgument: a variable has a value that it cannot have. The sentence names it.
+        BadArgument: a variable has a value that it cannot have, or belongs to another family's script.
     """
     given = {name: value.strip() for name, value in environment.items()}
     get = given.get
@@ -55,13 +55,7 @@ def arguments_from_environment(environment: Mapping[str, str], family: str, defa
                 f"LAYERS is '{given['LAYERS']}'; expected layer numbers separated by spaces, as in LAYERS=\"25 26 27\"."
             )
         arguments += ["--layers", *layers]
-    for name, option in _FRAMES.items():
-        if get(name):
-            if family == "pi":
-                raise BadArgument(
-                    f"{name} is for Cosmos policies (scripts/run_attention_ratio_cosmos.sh); a pi policy has no frames."
-                )
-            arguments += [option, given[name]]
+    arguments += _family_arguments(given, family)
     save_viz = _SWITCH.get(get("SAVE_VIZ", "").lower())
     if save_viz is None:
         raise BadArgument(f"SAVE_VIZ is '{given['SAVE_VIZ']}'; expected 1 or 0.")
@@ -75,8 +69,8 @@ def arguments_from_environment(environment: Mapping[str, str], family: str, defa
         arguments += ["--array-index", given["SLURM_ARRAY_TASK_ID"]]
     if get("DEVICE"):
         arguments += ["--device", given["DEVICE"]]
-    elif in_slurm and stage != "analyze" and (checkpoint or default_checkpoint) not in _SMALL:
-        # A job that got no GPU shall say so at once, instead of crawling on the CPU until its time is over.
+    elif in_slurm and stage != "analyze" and (not checkpoint or checkpoint not in family.untrained):
+        # A job without a GPU fails at once, instead of running on the CPU until its time is over.
         arguments += ["--device", "cuda"]
     try:
         return [*arguments, *shlex.split(get("ARGS", ""))]
@@ -93,6 +87,16 @@ def describe_job(environment: Mapping[str, str], host: str) -> str:
     name = f"{array}_{index}" if array and index else job
     restarts = environment.get("SLURM_RESTART_COUNT", "0")
     return f"Job {name} on {host}" + (f", requeued {restarts} times." if restarts != "0" else ".")
+
+
+def _family_arguments(given: Mapping[str, str], family: PolicyFamily) -> list[str]:
+    """The options of the variables that not every family has; `BadArgument` when one is another family's."""
+    own = family.published.variables if family.published else {}
+    for other in policy_families():
+        for name in other.published.variables if other.published else {}:
+            if given.get(name) and name not in own:
+                raise BadArgument(f"{name} is for {other.title}, and means nothing to {family.title}; unset it.")
+    return [word for name, option in own.items() if given.get(name) for word in (option, given[name])]
 
 
 def _checkpoint(given: Mapping[str, str]) -> str:

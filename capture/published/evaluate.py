@@ -1,8 +1,8 @@
-"""`evaluate-attention-ratio` and `evaluate-attention-ratio-cosmos`: the published scripts' commands, as capture and then analysis.
+"""The published scripts' commands, `evaluate-attention-ratio` and `evaluate-attention-ratio-cosmos`: capture, then analysis.
 
-They are `vla-capture pi` and `vla-capture cosmos` with the published defaults, and differ in three ways. `--layers` says what is
-*analysed*: all layers are recorded, so that asking about others needs no second capture. An existing store is continued.
-And one command may run several suites, or one task of an array job.
+Each is `vla-capture FAMILY` with the published defaults, and differs in three ways. `--layers` are the layers to *analyse*: all
+layers are recorded, so that an analysis of others needs no second capture. An existing store is continued. One command may run
+several suites, or one task of an array job.
 """
 
 from __future__ import annotations
@@ -18,8 +18,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vla_attention.capture.command import check_writable, run_analysis, run_capture_command
+from vla_attention.capture.analysis_process import run_analysis
+from vla_attention.capture.command_line import check_writable, run_capture_command
 from vla_attention.capture.jobs.termination import Termination
+from vla_attention.capture.policies.families import policy_families
+from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
 from vla_attention.schemas.errors import BadArgument, unknown_name
 from vla_attention.schemas.layers import select_layers
 
@@ -27,45 +30,51 @@ if TYPE_CHECKING:
     from vla_attention.capture.settings import RunSettings
 
 _FROM_ENVIRONMENT = "--from-environment"
-_PROGRAMS = {"pi": "evaluate-attention-ratio", "cosmos": "evaluate-attention-ratio-cosmos"}
 
 
-def main_pi(argv: Sequence[str] | None = None) -> int:
-    """Run `evaluate-attention-ratio`."""
-    return _main("pi", argv)
+def evaluate_attention_ratio(argv: Sequence[str] | None = None) -> int:
+    """Run the console script `evaluate-attention-ratio`; returns the exit code."""
+    return _main("evaluate-attention-ratio", argv)
 
 
-def main_cosmos(argv: Sequence[str] | None = None) -> int:
-    """Run `evaluate-attention-ratio-cosmos`."""
-    return _main("cosmos", argv)
+def evaluate_attention_ratio_cosmos(argv: Sequence[str] | None = None) -> int:
+    """Run the console script `evaluate-attention-ratio-cosmos`; returns the exit code."""
+    return _main("evaluate-attention-ratio-cosmos", argv)
 
 
-def _main(family: str, argv: Sequence[str] | None) -> int:
-    words = sys.argv[1:] if argv is None else list(argv)
-    program, requeues = _PROGRAMS[family], [0]
+def _main(program: str, argv: Sequence[str] | None) -> int:
+    given = sys.argv[1:] if argv is None else list(argv)
+    family, script = _find_script(program)
+    requeues = [0]
 
     def command(termination: Termination) -> int:
         from vla_attention.capture.arguments import build_evaluate_parser
 
-        arguments = build_evaluate_parser(program, family).parse_args(_with_environment(words, family))
+        arguments = build_evaluate_parser(family, script).parse_args(_with_environment(given, family))
         requeues[0] = arguments.max_requeues
-        return _evaluate(arguments, termination)
+        return _evaluate(arguments, script, termination)
 
     return run_capture_command(program, command, lambda: requeues[0])
 
 
-def _with_environment(words: Sequence[str], family: str) -> list[str]:
-    """The arguments; `--from-environment` stands for what the batch scripts' variables say."""
-    if _FROM_ENVIRONMENT not in words:
-        return list(words)
-    from vla_attention.capture.arguments import PUBLISHED_CHECKPOINTS
+def _find_script(program: str) -> tuple[PolicyFamily, PublishedScript]:
+    for family in policy_families():
+        if family.published is not None and family.published.program == program:
+            return family, family.published
+    raise LookupError(f"no policy family has the published script {program}")
+
+
+def _with_environment(given: Sequence[str], family: PolicyFamily) -> list[str]:
+    """The arguments; `--from-environment` is replaced by the arguments that the batch scripts' variables stand for."""
+    if _FROM_ENVIRONMENT not in given:
+        return list(given)
     from vla_attention.capture.published.environment_variables import arguments_from_environment, describe_job
 
     line = describe_job(os.environ, socket.gethostname())
     if line:
         print(line, flush=True)
-    first = arguments_from_environment(os.environ, family, PUBLISHED_CHECKPOINTS[family])
-    return [*first, *(word for word in words if word != _FROM_ENVIRONMENT)]
+    first = arguments_from_environment(os.environ, family)
+    return [*first, *(argument for argument in given if argument != _FROM_ENVIRONMENT)]
 
 
 @dataclass(frozen=True)
@@ -78,7 +87,7 @@ class _Job:
     default_output: bool
 
 
-def _evaluate(arguments: argparse.Namespace, termination: Termination) -> int:
+def _evaluate(arguments: argparse.Namespace, script: PublishedScript, termination: Termination) -> int:
     jobs = _jobs(arguments)
     stage = arguments.stage or ("both" if arguments.array_index is None else "capture")
     if stage != "capture":
@@ -88,14 +97,14 @@ def _evaluate(arguments: argparse.Namespace, termination: Termination) -> int:
         _capture(arguments, jobs, termination)
     if stage == "capture":
         return 0
-    codes = [_analyze(job) for job in jobs]
+    codes = [_analyze(job, script) for job in jobs]
     return next((code for code in codes if code), 0)
 
 
 def _jobs(arguments: argparse.Namespace) -> list[_Job]:
-    from vla_attention.capture.arguments import run_settings
     from vla_attention.capture.environments.suites import ALL_SUITES, STANDARD_SUITES, SUITES
     from vla_attention.capture.jobs.slurm import array_task_ids
+    from vla_attention.capture.settings import run_settings
 
     existing = [*(suite.name for suite in SUITES), ALL_SUITES]
     if arguments.task_suite not in existing:
@@ -117,9 +126,11 @@ def _jobs(arguments: argparse.Namespace) -> list[_Job]:
     for suite in suites:
         one = copy.copy(arguments)
         one.task_suite, one.task_id = suite, task_id
-        folder = "attention_ratio_" if arguments.policy == "pi" else f"attention_ratio_{arguments.policy}_"
         given = arguments.output_dir
-        one.output_dir = Path("results") / f"{folder}{suite}" if given is None else given / suite if several else given
+        if given is None:
+            one.output_dir = Path("results") / f"attention_ratio_{arguments.family.store_prefix}{suite}"
+        elif several:
+            one.output_dir = given / suite
         settings = run_settings(one)
         settings = replace(
             settings,
@@ -165,13 +176,12 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], termination: T
     for job in jobs:
         check_writable(job.settings.store.parent, "--output-dir" if arguments.store is None else "--store")
 
+    from vla_attention.capture.capture_run import run_capture
     from vla_attention.capture.device import choose_device
-    from vla_attention.capture.policy_choice import build_policy
     from vla_attention.capture.rollout.progress import say
-    from vla_attention.capture.run import run_capture
 
     device = choose_device(arguments.device)
-    policy = build_policy(arguments, device)
+    policy = arguments.family.build(arguments, device)
     # A layer that does not exist is found before the capture, not after it.
     select_layers(arguments.layers, policy.num_layers, policy.family)
     for job in jobs:
@@ -182,7 +192,7 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], termination: T
         say(f"{len(results)} episodes added, {solved} solved. Store: {job.settings.store}")
 
 
-def _analyze(job: _Job) -> int:
+def _analyze(job: _Job, script: PublishedScript) -> int:
     from vla_attention.capture.jobs.status import store_status
     from vla_attention.capture.rollout.progress import say
     from vla_attention.schemas.stores.root import read_root
@@ -191,7 +201,7 @@ def _analyze(job: _Job) -> int:
     for line in store_status(store).missing_lines():
         say(f"{store}: {line}")
     root = read_root(store)
-    layers, typed = _layers(arguments, root.policy.num_layers, root.policy.family)
+    layers, typed = _layers(arguments.layers, script.layers, root.policy.num_layers, root.policy.family)
     more = [] if layers is None else ["--layers", *map(str, layers)]
     if arguments.task_id is not None:
         more += ["--tasks", str(arguments.task_id)]
@@ -207,17 +217,19 @@ def _analyze(job: _Job) -> int:
     return code
 
 
-def _layers(arguments: argparse.Namespace, num_layers: int, family: str) -> tuple[tuple[int, ...] | None, bool]:
+def _layers(
+    typed: Sequence[int] | None, published: Sequence[int], num_layers: int, model_family: str
+) -> tuple[tuple[int, ...] | None, bool]:
     """The layers to analyse (None: all), and whether the user typed them."""
-    from vla_attention.capture.arguments import PUBLISHED_LAYERS
     from vla_attention.capture.rollout.progress import say
 
-    if arguments.layers is not None:
-        return select_layers(arguments.layers, num_layers, family).labels, True
+    if typed is not None:
+        return select_layers(typed, num_layers, model_family).labels, True
     try:
-        return select_layers(PUBLISHED_LAYERS, num_layers, family).labels, False
+        return select_layers(published, num_layers, model_family).labels, False
     except BadArgument:
-        say(f"This policy has {num_layers} layers, and not the published default 25 26 27: analysing all of them.")
+        default = " ".join(map(str, published))
+        say(f"This policy has {num_layers} layers, and not the published default {default}: analysing all of them.")
         return None, False
 
 

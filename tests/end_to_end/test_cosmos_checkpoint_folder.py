@@ -16,11 +16,11 @@ import pytest
 import torch
 import zarr
 
+from tests.kit.cosmos_checkpoint import WEIGHTS_NAME, write_dummy_folder
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.environments.suites import find_suite, list_tasks
 from vla_attention.capture.policies.cosmos.config import CosmosConfig, DitConfig, VaeConfig
-from tests.kit.cosmos_checkpoint import WEIGHTS_NAME, write_dummy_folder
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG
 from vla_attention.capture.policies.cosmos.locate import EMBEDDINGS_NAME, STATISTICS_NAME
 

@@ -21,7 +21,7 @@ import pytest
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.jobs.claims import holders
 from vla_attention.capture.jobs.status import store_status
-from vla_attention.capture.published.evaluate import main_pi
+from vla_attention.capture.published.evaluate import evaluate_attention_ratio
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import PARTIAL_SUFFIX
 
@@ -137,9 +137,9 @@ def test_an_array_interrupted_in_episodes_equals_a_single_process(tmp_path, monk
     for task in TASKS:
         arguments = ["--checkpoint", "dummy", "--task-suite", "robosuite", "--task-id", str(task)]
         arguments += ["--num-episodes", str(EPISODES), "--layers", "0", "2", "--output-dir", str(single), *ARGS.split()]
-        assert main_pi([*arguments, "--stage", "capture"]) == 0
+        assert evaluate_attention_ratio([*arguments, "--stage", "capture"]) == 0
     arguments = ["--task-suite", "robosuite", "--checkpoint", "dummy", "--layers", "0", "2"]
-    assert main_pi([*arguments, "--output-dir", str(single), "--stage", "analyze"]) == 0
+    assert evaluate_attention_ratio([*arguments, "--output-dir", str(single), "--stage", "analyze"]) == 0
     assert_same(store, single / "robosuite.zarr")
     name = "attention_ratio_results_robosuite.json"
     results = json.loads((output / name).read_text())

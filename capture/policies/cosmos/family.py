@@ -1,4 +1,4 @@
-"""The Cosmos family for the command line: Cosmos Policy."""
+"""The entry of the Cosmos family: Cosmos Policy."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         parser,
         checkpoint_options=("--ckpt-path", "--checkpoint"),
         checkpoint="checkpoint folder, ORG/NAME on the Hugging Face hub, or a file of weights",
-        config_name="the reference's name",
+        config_name="the reference's name for the configuration",
         dtype_default="bfloat16 on a GPU, float32 on a CPU",
     )
     model.add_argument("--dataset-stats-path", metavar="PATH", help="statistics (default: the checkpoint's own)")

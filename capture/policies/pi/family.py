@@ -1,4 +1,4 @@
-"""The pi family for the command line: pi0 and pi0.5, from openpi and from LeRobot."""
+"""The entry of the pi family: pi0 and pi0.5, from openpi and from LeRobot."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     model = add_model_arguments(
         parser,
         checkpoint="checkpoint folder of openpi (JAX or PyTorch) or LeRobot, ORG/NAME on the Hugging Face hub, or gs://...",
-        config_name="openpi's name (pi05_libero, pi0_libero ...)",
+        config_name="openpi's name for the configuration (pi05_libero, pi0_libero ...)",
         dtype_default="what a LeRobot checkpoint states, else float32",
     )
     model.add_argument(
@@ -90,7 +90,12 @@ FAMILY = PolicyFamily(
     replan_default="5 for openpi, n_action_steps for LeRobot",
     layers_note="; also the published scripts' numbers 18..35 (25 = block 7)",
     untrained=UNTRAINED,
-    parity=ParityCases(recognises=_is_pi_case, run=_run_parity, formats=("orbax", "openpi", "lerobot")),
+    parity=ParityCases(
+        recognises=_is_pi_case,
+        run=_run_parity,
+        formats=("orbax", "openpi", "lerobot"),
+        default_limit="5e-5; 0.1 for bfloat16 cases",
+    ),
     published=PublishedScript(
         program="evaluate-attention-ratio",
         checkpoint="~/.cache/openpi/openpi-assets/checkpoints/pi05_libero",

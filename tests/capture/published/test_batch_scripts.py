@@ -9,8 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from vla_attention.capture.policies.cosmos.family import FAMILY as COSMOS
+from vla_attention.capture.policies.family import PolicyFamily
+from vla_attention.capture.policies.pi.family import FAMILY as PI
 from vla_attention.capture.published.environment_variables import arguments_from_environment, describe_job
-from vla_attention.capture.published.evaluate import main_cosmos, main_pi
+from vla_attention.capture.published.evaluate import evaluate_attention_ratio, evaluate_attention_ratio_cosmos
 from vla_attention.schemas.errors import BadArgument
 
 SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
@@ -107,8 +110,8 @@ def test_every_variable_is_documented_in_the_heads():
             assert any(name in line.replace(",", " ").split()[1:4] for line in head), (script, name)
 
 
-def arguments(family: str = "pi", **variables: str) -> list[str]:
-    return arguments_from_environment(variables, family, "~/default")
+def arguments(family: PolicyFamily = PI, **variables: str) -> list[str]:
+    return arguments_from_environment(variables, family)
 
 
 def test_variables_become_the_options_that_they_name():
@@ -120,7 +123,7 @@ def test_variables_become_the_options_that_they_name():
         *("--max-steps", "10"),
     ]
     assert arguments(CKPT_PATH="a b") == ["--checkpoint", "a b"]
-    assert arguments("cosmos", TEXT_FRAME="frame0") == ["--text-frame", "frame0"]
+    assert arguments(COSMOS, TEXT_FRAME="frame0") == ["--text-frame", "frame0"]
 
 
 def test_a_job_with_a_real_checkpoint_wants_a_gpu():
@@ -166,7 +169,7 @@ def test_the_log_begins_with_the_job():
         (["--stage", "plot"], "invalid choice"),
     ],
 )
-@pytest.mark.parametrize("main", [main_pi, main_cosmos])
+@pytest.mark.parametrize("main", [evaluate_attention_ratio, evaluate_attention_ratio_cosmos])
 def test_mistakes_in_the_commands(tmp_path, monkeypatch, capsys, main, words, expected):
     monkeypatch.chdir(tmp_path)
     try:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, make_observation
 from tests.kit.cosmos_checkpoint import write_dummy_folder
+from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, make_observation
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, dummy_policy
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from tests.kit.cosmos_checkpoint import WEIGHTS_NAME
 from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, make_observation
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnsupportedCheckpoint
 from vla_attention.capture.policies.cosmos.build import build_cosmos_policy
 from vla_attention.capture.policies.cosmos.checkpoint import CosmosOptions, load_cosmos_policy
-from tests.kit.cosmos_checkpoint import WEIGHTS_NAME
 from vla_attention.capture.policies.cosmos.embedded import TOKENIZER_PATH, random_policy
 from vla_attention.capture.policies.cosmos.locate import (
     EMBEDDINGS_NAME,

@@ -1,4 +1,4 @@
-"""One capture run: from settings to a filled store, with progress and a summary."""
+"""One capture run: fill a store with the episodes that the settings ask for."""
 
 from __future__ import annotations
 

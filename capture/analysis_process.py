@@ -1,0 +1,25 @@
+"""Stage two as a process of its own: the two stages share a store, not code."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from vla_attention.capture.policies.family import PolicyFamily
+
+
+def run_analysis(arguments: argparse.Namespace, store: Path, output: Path | None, more: Sequence[str] = ()) -> int:
+    """Analyse a store as its policy family wants it by default; returns the exit code of `vla-analyze`.
+
+    arguments: the parsed command line of the capture. more: further arguments for `vla-analyze`.
+    """
+    family: PolicyFamily = arguments.family
+    command = [sys.executable, "-m", "vla_attention.analyze", str(store)]
+    if output is not None:
+        command += ["--output", str(output)]
+    if arguments.save_viz:
+        command += ["--save-viz"]
+    return subprocess.run([*command, *family.analysis_arguments(arguments), *more], check=False).returncode

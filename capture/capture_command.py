@@ -1,0 +1,39 @@
+"""`vla-capture FAMILY`: record a policy into a store, and analyse the store if that was asked for."""
+
+from __future__ import annotations
+
+import argparse
+
+from vla_attention.capture.analysis_process import run_analysis
+from vla_attention.capture.command_line import check_writable
+from vla_attention.capture.jobs.termination import Termination
+from vla_attention.capture.policies.family import PolicyFamily
+
+
+def run_capture_of_family(arguments: argparse.Namespace, termination: Termination) -> int:
+    """Run `vla-capture FAMILY` on parsed arguments; returns the exit code."""
+    from vla_attention.capture.settings import run_settings
+    from vla_attention.capture.store.store_writer import refuse_existing
+
+    settings = run_settings(arguments)
+    # An existing store, or a place that cannot be written to, is found before minutes are spent on loading a model.
+    if settings.mode == "new" and settings.store.exists():
+        refuse_existing(settings.store)
+    check_writable(settings.store.parent, "--store")
+    if arguments.output_dir is not None:
+        check_writable(arguments.output_dir, "--output-dir")
+
+    from vla_attention.capture.capture_run import run_capture
+    from vla_attention.capture.device import choose_device
+    from vla_attention.capture.rollout.progress import say
+
+    device = choose_device(arguments.device)
+    family: PolicyFamily = arguments.family
+    policy = family.build(arguments, device)
+    results = run_capture(settings, policy, device, termination)
+    solved = sum(result.success for result in results)
+    say(f"{len(results)} episodes added, {solved} solved. Store: {settings.store}")
+    if arguments.output_dir is None and not arguments.save_viz:
+        say(f"Next: vla-analyze {settings.store}")
+        return 0
+    return run_analysis(arguments, settings.store, arguments.output_dir)

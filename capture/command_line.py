@@ -1,0 +1,45 @@
+"""Running a command that captures: SIGTERM, exit codes, and an early check of the places that it writes to."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from vla_attention.capture.jobs.slurm import ask_for_requeue
+from vla_attention.capture.jobs.termination import EXIT_TERMINATED, Terminated, Termination, listening_for_sigterm
+from vla_attention.capture.jobs.worker import this_worker
+from vla_attention.schemas.command_line import run_command
+from vla_attention.schemas.errors import BadArgument
+
+
+def run_capture_command(program: str, command: Callable[[Termination], int], max_requeues: Callable[[], int]) -> int:
+    """Run a command that captures; returns the exit code: 2 after a mistake, 130 after Ctrl-C, 75 after SIGTERM.
+
+    After SIGTERM a SLURM job is put back into the queue, unless that has happened `max_requeues()` times (0: never).
+    """
+    # Set before MuJoCo is imported, because GPU nodes and CI have no display.
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    with listening_for_sigterm() as termination:
+        try:
+            return run_command(
+                program, lambda: command(termination), "complete episodes are kept, continue with --resume."
+            )
+        except Terminated:
+            # SLURM sends the signal again to a job that is being requeued.
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            requeued = ask_for_requeue(this_worker(), max_requeues()) if max_requeues() else ""
+            what_next = requeued or "Complete episodes are kept; the same command with --resume goes on."
+            print(f"{program}: stopped by SIGTERM. {what_next}", file=sys.stderr, flush=True)
+            return EXIT_TERMINATED
+
+
+def check_writable(path: Path, option: str) -> None:
+    """Raise `BadArgument` when nothing can be created at `path`. Called before a model is loaded; creates nothing."""
+    nearest = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
+    if not nearest.is_dir():
+        raise BadArgument(f"Cannot write to {path}: {nearest} is a file; give another {option}.")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise BadArgument(f"Cannot write to {path}: no permission to write in {nearest}; give another {option}.")
