@@ -1,0 +1,192 @@
+"""One episode with a made-up environment, policy and store: which steps are taken, observed and stored."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from vla_attention.capture.environments.base import Observation, StepResult, Task
+from vla_attention.capture.environments.protocol import WAIT_ACTION, WAIT_STEPS
+from vla_attention.capture.policies.policy import PolicyInput
+from vla_attention.capture.rollout.episode import check_protocol, max_replans, record_episode
+from vla_attention.capture.store.episode_writer import ReplanRecord
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.layout import PatchGrid, Prompt, Role, SiteLayout, Span
+from vla_attention.schemas.stores.store_format import PolicyCameraView, Protocol, Recording
+
+LAYOUT = SiteLayout(
+    "joint",
+    (
+        Span("base", "image", 0, 2, camera="base", grid=PatchGrid(2, 1, 4, 2)),
+        Span("prompt", "text", 2, 4),
+    ),
+)
+ROLES = np.array([Role.IMAGE, Role.IMAGE, Role.INSTRUCTION, Role.INSTRUCTION], dtype=np.uint8)
+TASK = Task("made_up", 3, "lift", "lift the cube", 50)
+
+
+class FakeEnvironment:
+    """Counts steps; an observation's eef_pos is the number of the step after which it was made."""
+
+    objects = (SceneObject("cube", "object", True), SceneObject("background", "background", False))
+    initial_state_digest = "d" * 64
+
+    def __init__(self, solved_after: int | None = None) -> None:
+        self.solved_after = solved_after
+        self.actions: list[np.ndarray] = []
+        self.observed: list[int] = []
+
+    def reset(self, initial_state_index: int, seed: int) -> None:
+        self.start = (initial_state_index, seed)
+
+    def step(self, action: np.ndarray, observe: bool) -> StepResult:
+        self.actions.append(np.asarray(action))
+        number = len(self.actions)
+        observation = None
+        if observe:
+            self.observed.append(number)
+            images = {"agentview": np.zeros((4, 2, 3), dtype=np.uint8)}
+            observation = Observation(images, np.full(3, float(number)), np.zeros(4), np.zeros(2))
+        return StepResult(number == self.solved_after, observation)
+
+    def segmentation(self, camera: str) -> np.ndarray:
+        assert camera == "agentview"
+        return np.array([[0, 0], [0, 0], [1, 1], [1, 1]], dtype=np.int32)
+
+
+class FakePolicy:
+    """Gives chunks of four actions; action k of call r is filled with 10 r + k. Its rows are uniform."""
+
+    sites = (LAYOUT,)
+    action_horizon = 4
+    cameras = (PolicyCameraView("base", "agentview", True, False),)
+
+    def __init__(self) -> None:
+        self.inputs: list[float] = []
+
+    def denoise_times(self) -> np.ndarray:
+        return np.array([1.0, 0.5])
+
+    def replan_noise_seed(self, run_seed: int, task_id: int, episode_index: int, replan: int) -> int:
+        return 1000 * run_seed + 100 * task_id + 10 * episode_index + replan
+
+    def prepare(self, observation: Observation, instruction: str) -> PolicyInput:
+        self.inputs.append(observation.eef_pos[0])
+        prompt = Prompt(instruction, (), (0, len(instruction)))
+        frames = {"base": np.zeros((4, 2, 3), dtype=np.uint8)}
+        return PolicyInput(frames, {"joint": ROLES}, prompt, np.zeros(8), {})
+
+    def act(self, policy_input: PolicyInput, noise_seed: int, recorders: dict[str, Any]) -> np.ndarray:
+        for step in range(2):
+            take = recorders["joint"].sink(0, step, slice(0, 1))
+            if take is not None:
+                take(torch.full((1, 2, 1, 4), 0.25))
+        return (10.0 * (len(self.inputs) - 1) + np.arange(4.0))[:, None].repeat(7, axis=1)
+
+
+class FakeStore:
+    """Keeps the replans of its one episode."""
+
+    def __init__(self, **changes: int) -> None:
+        values = {"seed": 7, "wait_steps": WAIT_STEPS, "replan_steps": 3, "max_steps": 8} | changes
+        self.attributes = SimpleNamespace(
+            protocol=Protocol(suite="made_up", **values),
+            recording=Recording((0,), (0,), (1,), (0, 1), "mean", 1, 10, frames=False),
+        )
+        self.records: list[ReplanRecord] = []
+        self.ending: tuple[bool, int] | None = None
+        self.dropped = False
+
+    @contextmanager
+    def episode(self, start: Any, denoise_times: np.ndarray, most_replans: int) -> Iterator[FakeStore]:
+        self.start, self.denoise_times, self.most_replans = start, denoise_times, most_replans
+        try:
+            yield self
+        except BaseException:
+            self.dropped = True
+            raise
+
+    def append(self, record: ReplanRecord) -> None:
+        self.records.append(record)
+
+    def commit(self, success: bool, num_steps: int) -> Path:
+        self.ending = (success, num_steps)
+        return Path("task003_episode002")
+
+
+def test_waiting_steps_then_a_policy_call_for_every_chunk() -> None:
+    environment, policy, store = FakeEnvironment(), FakePolicy(), FakeStore()
+    reports: list[tuple[int, int]] = []
+    result = record_episode(
+        environment, policy, store, TASK, 2, {"host": "x"}, lambda step, replans: reports.append((step, replans))
+    )
+    assert environment.start == (2, 7)
+    np.testing.assert_array_equal(environment.actions[:WAIT_STEPS], [WAIT_ACTION] * WAIT_STEPS)
+    # Three of the four actions of each chunk are executed, and only two of the last: max_steps is 8.
+    assert [action[0] for action in environment.actions[WAIT_STEPS:]] == [0, 1, 2, 10, 11, 12, 20, 21]
+    # Pictures are drawn only before a policy call, and the policy gets the newest.
+    assert environment.observed == [WAIT_STEPS, WAIT_STEPS + 3, WAIT_STEPS + 6]
+    assert policy.inputs == environment.observed
+    assert [record.env_step for record in store.records] == [WAIT_STEPS, WAIT_STEPS + 3, WAIT_STEPS + 6]
+    assert [record.noise_seed for record in store.records] == [7320, 7321, 7322]
+    assert reports == [(3, 1), (6, 2), (8, 3)]
+    assert (result.success, result.num_steps, result.num_replans) == (False, 8, 3)
+    assert store.ending == (False, 8)
+    assert store.most_replans == 3
+    assert store.denoise_times.tolist() == [0.5]
+    assert (store.start.initial_state_index, store.start.initial_state_digest) == (2, "d" * 64)
+
+
+def test_a_solved_task_ends_the_episode() -> None:
+    environment, store = FakeEnvironment(solved_after=WAIT_STEPS + 2), FakeStore()
+    result = record_episode(environment, FakePolicy(), store, TASK, 0, {})
+    assert (result.success, result.num_steps, result.num_replans) == (True, 2, 1)
+    assert store.ending == (True, 2)
+
+
+def test_a_replan_is_stored_with_its_rows_and_coverage() -> None:
+    store = FakeStore(max_steps=1)
+    record_episode(FakeEnvironment(), FakePolicy(), store, TASK, 0, {})
+    (record,) = store.records
+    rows = record.rows["joint"]
+    assert rows.rows.shape == (1, 1, 2, 1, 4)
+    assert (rows.rows == 0.25).all()
+    assert (rows.row_sum == 1).all()
+    assert rows.contribution is None
+    # The camera is upright: the model's first patch is the last one of the raw picture, which shows the background.
+    assert record.coverage["base"].tolist() == [[0, 1], [1, 0]]
+    assert record.frames == {}
+    assert record.actions.shape == (4, 7)
+
+
+def test_an_error_of_the_check_drops_the_episode() -> None:
+    environment, store = FakeEnvironment(), FakeStore()
+
+    def stop_after_twelve_steps() -> None:
+        if len(environment.actions) == 12:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        record_episode(environment, FakePolicy(), store, TASK, 0, {}, check=stop_after_twelve_steps)
+    assert store.dropped
+    assert store.ending is None
+
+
+@pytest.mark.parametrize(("replan_steps", "max_steps", "message"), [(5, 8, "expected 1 to 4"), (4, 0, "at least 1")])
+def test_a_policy_must_be_able_to_follow_the_protocol(replan_steps: int, max_steps: int, message: str) -> None:
+    protocol = Protocol("made_up", seed=7, wait_steps=10, replan_steps=replan_steps, max_steps=max_steps)
+    with pytest.raises(BadArgument, match=message):
+        check_protocol(protocol, FakePolicy())
+
+
+def test_the_largest_number_of_replans() -> None:
+    protocol = Protocol("made_up", seed=7, wait_steps=10, replan_steps=5, max_steps=520)
+    assert max_replans(protocol) == 104
