@@ -52,8 +52,8 @@ print(sum(part.size for part in out))
 
 def make_store(path: Path, episodes: int, replans: int) -> None:
     """Write the store; fifty episodes take a minute or two."""
-    from tests.kit.libero_tokens import libero_tokens
-    from tests.kit.store_kit import StoreSpec, write_store
+    from vla_attention.testing.stores import StoreSpec, write_store
+    from vla_attention.testing.tokens import libero_tokens
 
     spec = StoreSpec(
         suite="libero_10",

@@ -145,11 +145,11 @@ def simulate(case: Case, num_stores: int, seed: int) -> dict[tuple[str, str], fl
 
 def through_files(case: Case, num_stores: int, seed: int) -> dict[tuple[str, str], float]:
     """The same with stores on disk: written by the real writer, read back and analysed."""
-    from tests.kit.store_kit import StoreSpec, write_store
     from vla_attention.analyze.measures.question import AnalysisSettings, ask
     from vla_attention.analyze.ratios.analysis import analyse
     from vla_attention.schemas.layout import Role
     from vla_attention.schemas.stores.reader import open_store
+    from vla_attention.testing.stores import StoreSpec, write_store
 
     generator = np.random.default_rng([seed, 1])
     found: dict[tuple[str, str], list[float]] = {}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import zarr
@@ -33,7 +34,9 @@ def replans_per_block(bytes_per_replan: int, max_replans: int) -> int:
     return step * math.ceil(wanted / step)
 
 
-def create_blocked(group: zarr.Group, name: str, shape: tuple[int, ...], block: int, axes: Sequence[str]) -> zarr.Array:
+def create_blocked(
+    group: zarr.Group, name: str, shape: tuple[int, ...], block: int, axes: Sequence[str]
+) -> zarr.Array[Any]:
     """Create a float32 array (replan, layer, denoise, ...) that grows along replans by whole shards of `block` replans.
 
     A chunk holds one layer and one denoise step, so that an analysis of three layers does not read the others. A missing
@@ -56,7 +59,7 @@ def create_blocked(group: zarr.Group, name: str, shape: tuple[int, ...], block: 
     )
 
 
-def write_whole(group: zarr.Group, name: str, values: NDArray[np.generic], axes: Sequence[str]) -> zarr.Array:
+def write_whole(group: zarr.Group, name: str, values: NDArray[np.generic], axes: Sequence[str]) -> zarr.Array[Any]:
     """Write a complete array in one go and as one file: one chunk when it is small, else a shard of chunks along its first axis."""
     length = values.shape[0]
     chunk_length = max(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import zarr
@@ -34,7 +35,7 @@ class SiteWriter:
         self.shape = (len(recording.layers), len(recording.denoise_steps), len(recording.heads), recording.num_queries)
         self.bytes_per_replan = 4 * self.shape[2] * self.shape[3] * layout.num_keys
         self.block = replans_per_block(self.bytes_per_replan, max_replans)
-        self.rows_array: zarr.Array | None = None
+        self.rows_array: zarr.Array[Any] | None = None
         self.rows_digest = ArrayDigest()
         self.pending: list[NDArray[np.float32]] = []
         self.num_written = 0

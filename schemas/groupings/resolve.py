@@ -150,7 +150,8 @@ def _weights(member: Membership, cells: NDArray[np.float32] | None) -> NDArray[n
     if member.shape[2] == 1 or cells is None:
         return member[:, :, 0].astype(np.float32)
     # A sum of area fractions may exceed 1 by rounding; a weight may not.
-    return np.minimum((cells * member).sum(axis=2, dtype=np.float32), np.float32(1.0))
+    area: NDArray[np.float32] = (cells * member).sum(axis=2, dtype=np.float32)
+    return np.minimum(area, np.float32(1.0))
 
 
 def _evaluate(selector: Selector, tokens: EpisodeTokens) -> Membership:

@@ -100,7 +100,8 @@ def _frame_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) ->
 
 
 def _role_keys(argument: str, tokens: EpisodeTokens) -> Membership:
-    return (tokens.static_roles == int(find_role(argument)))[:, :, None]
+    member: Membership = (tokens.static_roles == int(find_role(argument)))[:, :, None]
+    return member
 
 
 def _role_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:

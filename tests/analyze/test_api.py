@@ -17,7 +17,6 @@ import vla_attention as va
 import vla_attention.analyze.api
 import vla_attention.analyze.measures.settings
 import vla_attention.analyze.opened
-from tests.kit.store_kit import small_layout, write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.api import OpenStores
 from vla_attention.analyze.measures.question import AnalysisSettings
@@ -25,6 +24,8 @@ from vla_attention.analyze.measures.settings import Settings, analysis_settings
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.precision import mass_error_bound
 from vla_attention.schemas.stores.store_format import StoreError, StoreNotFound
+from vla_attention.testing.stores import write_store
+from vla_attention.testing.tokens import small_layout
 
 MODULES = (va, vla_attention.analyze.api, vla_attention.analyze.opened, vla_attention.analyze.measures.settings)
 

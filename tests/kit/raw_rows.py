@@ -10,12 +10,13 @@ import numpy as np
 import zarr
 from hypothesis import HealthCheck, Phase, settings
 
-from tests.kit.store_kit import StoreSpec, valid_keys
 from vla_attention.analyze.measures.question import AnalysisSettings, Question, ask
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import resolve
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.stores.reader import open_store
+from vla_attention.testing.stores import StoreSpec
+from vla_attention.testing.tokens import valid_keys
 
 #: Every example writes a store: shrinking one would take minutes.
 FEW = settings(

@@ -7,7 +7,6 @@ import polars as pl
 import pytest
 from scipy import stats
 
-from tests.kit.store_kit import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.compare import runs as runs_module
 from vla_attention.analyze.compare.comparison import compare
@@ -23,6 +22,7 @@ from vla_attention.analyze.compare.text import comparison_text
 from vla_attention.analyze.measures.question import AnalysisSettings
 from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.layout import Role
+from vla_attention.testing.stores import StoreSpec, write_store
 
 TASKS, EPISODES = (0, 1, 2, 5), 4
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.kit.store_kit import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.copy.copying import PARTS, check_parts, copy_store, part_sizes
 from vla_attention.schemas.errors import UnknownName
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode, RunMismatch
 from vla_attention.schemas.stores.verify import verify_store
+from vla_attention.testing.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0,), episodes=2, replans=2, layers=(0,), heads=(0,), contributions=True)
 

@@ -16,8 +16,6 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
-from tests.kit.store_kit import small_layout, write_store
-from tests.kit.strategies import episode_tokens, groupings
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.export.labelled_arrays import masses_array, rows_array, rows_size, write_netcdf
 from vla_attention.analyze.measures.question import AnalysisSettings, ask
@@ -27,6 +25,9 @@ from vla_attention.schemas.groupings.resolve import resolve
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.precision import mass_error_bound
 from vla_attention.schemas.stores.reader import open_store
+from vla_attention.testing.stores import write_store
+from vla_attention.testing.strategies import episode_tokens, groupings
+from vla_attention.testing.tokens import small_layout
 
 GROUPS = ("bowl=word:bowl", "wrist=camera:left_wrist_0_rgb", "rest=*")
 

@@ -6,18 +6,18 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tests.kit.group_stores import coverage_of, write
-from tests.kit.store_kit import write_store
+from tests.kit.bowl_scene import bowl_coverage, write_bowl_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.groups.group_preview import UNTAKEN, GroupPreview, groups_table, preview_groups
 from vla_attention.analyze.measures.question import AnalysisSettings, Question, ask
 from vla_attention.schemas.groupings.grouping import GroupingError
 from vla_attention.schemas.stores.reader import open_store
+from vla_attention.testing.stores import write_store
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
-    return write(tmp_path_factory.mktemp("groups") / "a.zarr")
+    return write_bowl_store(tmp_path_factory.mktemp("groups") / "a.zarr")
 
 
 def question_of(path, **settings) -> Question:
@@ -35,7 +35,7 @@ def totals(preview: GroupPreview) -> dict[str, tuple[float, float]]:
 
 def test_keys_are_the_lowest_and_highest_numbers_over_replans(store):
     preview = preview_of(store, groups=("bowl=object:akita_black_bowl_1", "state=role:state", "noun=word:bowl"))
-    bowl = sum(area[:, :, 0].sum(axis=1) for area in coverage_of(4, 16).values())
+    bowl = sum(area[:, :, 0].sum(axis=1) for area in bowl_coverage(4, 16).values())
     assert totals(preview)["bowl"] == (bowl.min(), bowl.max()) == (6.5, 6.5)
     assert totals(preview)["state"] == (1, 3)
     assert totals(preview)["noun"] == (2, 2)
@@ -95,7 +95,7 @@ def test_the_picture_shows_the_chosen_replan(store, tmp_path):
         assert main(["groups", str(store), "--group", "bowl=object:akita_black_bowl_1", *arguments]) == 0
         data = pl.read_csv(folder / "group_patches.csv")
         bowl = data.filter((pl.col("group") == "bowl") & (pl.col("span") == "base_0_rgb"))
-        area = coverage_of(4, 16)["base_0_rgb"][replan, :, 0].reshape(16, 16)
+        area = bowl_coverage(4, 16)["base_0_rgb"][replan, :, 0].reshape(16, 16)
         assert {(row, column): weight for row, column, weight in bowl.select("row", "column", "weight").rows()} == {
             (int(row), int(column)): area[row, column] for row, column in zip(*np.nonzero(area), strict=True)
         }
@@ -104,7 +104,7 @@ def test_the_picture_shows_the_chosen_replan(store, tmp_path):
 
 
 def test_a_store_without_frames_is_drawn_too(tmp_path):
-    path = write(tmp_path / "bare.zarr", frames=False, tasks=(0,), episodes=1)
+    path = write_bowl_store(tmp_path / "bare.zarr", frames=False, tasks=(0,), episodes=1)
     assert main(["groups", str(path), "--grouping", "objects", "--output", str(tmp_path / "out")]) == 0
     assert (tmp_path / "out" / "group_patches.png").stat().st_size > 10_000
 

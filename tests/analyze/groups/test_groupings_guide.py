@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.kit.group_stores import episode_tokens, write
+from tests.kit.bowl_scene import bowl_tokens, write_bowl_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.schemas.groupings.builtin_groupings import BUILTIN_GROUPINGS
 from vla_attention.schemas.groupings.grouping import Grouping, read_grouping_file
@@ -46,7 +46,7 @@ def latent_tokens() -> EpisodeTokens:
 def test_every_file_takes_keys_with_every_group(text, tmp_path):
     assert tomllib.loads(text)["groups"]
     (tmp_path / "example.toml").write_text(text)
-    grouping, tokens = read_grouping_file(tmp_path / "example.toml"), episode_tokens()
+    grouping, tokens = read_grouping_file(tmp_path / "example.toml"), bowl_tokens()
     check_names(grouping, collect_vocabulary([tokens]), tokens.layout)
     resolved = resolve(grouping, tokens)
     assert (resolved.num_keys > 0).all(axis=0).all()
@@ -54,7 +54,7 @@ def test_every_file_takes_keys_with_every_group(text, tmp_path):
 
 @pytest.mark.parametrize("selector", first_column("selector | takes"))
 def test_every_selector_takes_keys(selector):
-    tokens = episode_tokens()
+    tokens = bowl_tokens()
     grouping = Grouping("g", {"g": (selector,)})
     check_names(grouping, collect_vocabulary([tokens]), tokens.layout)
     assert resolve(grouping, tokens).num_keys.min() > 0
@@ -80,7 +80,7 @@ def check_and_resolve(selector: str, tokens: EpisodeTokens) -> None:
 
 
 def test_every_error_reads_as_described():
-    tokens = episode_tokens()
+    tokens = bowl_tokens()
     rows = re.findall(r"^\| `(.*?)` \| (.*?) \|$", GUIDE.split("| given | message |")[1], re.MULTILINE)
     assert len(rows) >= 6
     for selector, message in rows:
@@ -90,7 +90,7 @@ def test_every_error_reads_as_described():
 
 
 def test_every_command_runs(tmp_path, monkeypatch, capsys):
-    write(tmp_path / "runs" / "libero_10.zarr", tasks=(0,), episodes=1, layers=(0,), denoise_steps=(0,))
+    write_bowl_store(tmp_path / "runs" / "libero_10.zarr", tasks=(0,), episodes=1, layers=(0,), denoise_steps=(0,))
     monkeypatch.chdir(tmp_path)
     commands = [line for block in blocks("bash") for line in block.splitlines() if line.startswith("vla-analyze")]
     assert len(commands) >= 5

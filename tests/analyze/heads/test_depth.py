@@ -13,8 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.raw_rows import FEW, question_about, raw_episodes, weights_of
-from tests.kit.store_kit import StoreSpec, contribution_vectors, make_tokens, write_store
-from tests.kit.strategies import episode_tokens, groupings
 from tests.kit.synthetic import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps
 from vla_attention.analyze.heads.denoise import denoise_table
 from vla_attention.analyze.heads.depth import depth_table
@@ -23,6 +21,9 @@ from vla_attention.analyze.heads.layer_time import MOST_BINS, layer_time_table
 from vla_attention.analyze.measures.aggregate import add_layers_avg, per_replan
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.segments import segments_of
+from vla_attention.testing.stores import StoreSpec, contribution_vectors, write_store
+from vla_attention.testing.strategies import episode_tokens, groupings
+from vla_attention.testing.tokens import small_tokens
 
 
 def plant_depth(task, episode, tokens, rows):
@@ -78,7 +79,7 @@ def test_centres_of_contributions_are_those_of_the_vectors(tmp_path):
     centres = []
     for task, episode in spec.names:
         seed = [spec.seed, task, episode]
-        tokens = make_tokens(spec.replans, task, seed)
+        tokens = small_tokens(spec.replans, task, seed)
         norms = []
         for replan in range(spec.replans):
             chosen = [segment.role == "image" for segment in segments_of(tokens.layout, tokens.key_role[replan])]

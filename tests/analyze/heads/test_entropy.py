@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from scipy.stats import entropy as entropy_of_scipy
 
 from tests.kit.raw_rows import FEW, leaky, question_about, raw_episodes, weights_of
-from tests.kit.store_kit import StoreSpec, write_store
-from tests.kit.strategies import episode_tokens, groupings
 from vla_attention.analyze.heads.entropy import effective_keys, entropies, top_mass
 from vla_attention.analyze.heads.row_metrics import RowOptions, groups_with_valid_keys, row_metrics_table
 from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.schemas.groupings.grouping import Grouping
+from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.strategies import episode_tokens, groupings
 
 
 def by_hand(row: np.ndarray, weights: np.ndarray) -> float:

@@ -13,13 +13,14 @@ from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
 from tests.kit.raw_rows import FEW, leaky, question_about, raw_episodes, weights_of
-from tests.kit.store_kit import StoreSpec, small_layout, write_store
-from tests.kit.strategies import episode_tokens, groupings
 from vla_attention.analyze.heads.head_measures import ranked_heads
 from vla_attention.analyze.heads.head_study import HeadStudy, study_heads
 from vla_attention.analyze.heads.row_metrics import RowOptions
 from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
+from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.strategies import episode_tokens, groupings
+from vla_attention.testing.tokens import small_layout
 
 LAYOUT = small_layout()
 BOS = LAYOUT.span("prompt").start

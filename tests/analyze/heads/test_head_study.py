@@ -16,8 +16,6 @@ from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 from scipy import stats
 
-from tests.kit.store_kit import StoreSpec, valid_keys, write_store
-from tests.kit.strategies import episode_tokens
 from vla_attention.analyze.heads import command as heads_command
 from vla_attention.analyze.heads.head_measures import ranked_heads
 from vla_attention.analyze.heads.head_study import study_heads
@@ -29,6 +27,9 @@ from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.groupings.resolve import resolve
 from vla_attention.schemas.precision import mass_error_bound
 from vla_attention.schemas.stores.reader import open_store
+from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.strategies import episode_tokens
+from vla_attention.testing.tokens import valid_keys
 
 QUICK = settings(
     max_examples=12,

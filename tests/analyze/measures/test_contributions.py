@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.kit.store_kit import StoreSpec, contribution_vectors, make_tokens, write_store
 from vla_attention.analyze.measures.contributions import (
     LINGUISTIC_ROLES,
     VISUAL_ROLES,
@@ -21,6 +20,8 @@ from vla_attention.analyze.stores.selection import select
 from vla_attention.schemas.segments import segments_of
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
+from vla_attention.testing.stores import StoreSpec, contribution_vectors, write_store
+from vla_attention.testing.tokens import small_tokens
 
 SPEC = StoreSpec(contributions=True, replans=3, tasks=(0, 1), episodes=2)
 
@@ -42,7 +43,7 @@ def test_both_sides_and_their_ratio_equal_a_direct_computation(tmp_path):
     assert table.height == 4 * SPEC.replans * len(SPEC.denoise_steps)
     for row in table.iter_rows(named=True):
         seed = [SPEC.seed, row["task_id"], row["episode_index"]]
-        tokens = make_tokens(SPEC.replans, row["task_id"], seed, changing=True)
+        tokens = small_tokens(SPEC.replans, row["task_id"], seed, changing=True)
         vectors = contribution_vectors(SPEC, tokens, seed, row["replan"])[
             1, SPEC.denoise_steps.index(row["denoise_step"])
         ]

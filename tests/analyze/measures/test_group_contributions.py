@@ -10,7 +10,6 @@ import polars as pl
 import pytest
 
 from tests.kit.raw_rows import question_about
-from tests.kit.store_kit import StoreSpec, contribution_vectors, make_tokens, write_store
 from vla_attention.analyze.measures.group_contributions import (
     group_contribution_table,
     summarise_group_contributions,
@@ -21,6 +20,8 @@ from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 from vla_attention.schemas.segments import Segment, segments_of
+from vla_attention.testing.stores import StoreSpec, contribution_vectors, write_store
+from vla_attention.testing.tokens import small_tokens
 
 SPEC = StoreSpec(contributions=True, layers=(0, 2, 3), denoise_steps=(0, 4, 9), queries="all")
 GROUPS = {
@@ -55,7 +56,7 @@ def table_of(question: Question) -> pl.DataFrame | None:
 def norm_by_hand(spec: StoreSpec, row: dict, chosen, layer: int, denoise: int) -> float:
     """Root mean square over the queries of the length of the chosen segments' summed vectors."""
     seed = [spec.seed, row["task_id"], row["episode_index"]]
-    tokens = make_tokens(spec.replans, row["task_id"], seed, changing=spec.prompts == "changing")
+    tokens = small_tokens(spec.replans, row["task_id"], seed, changing=spec.prompts == "changing")
     segments: tuple[Segment, ...] = segments_of(tokens.layout, tokens.key_role[row["replan"]])
     vectors = contribution_vectors(spec, tokens, seed, row["replan"])[layer, denoise]
     summed = vectors[:, [bool(chosen(segment)) for segment in segments]].sum(axis=1)

@@ -8,12 +8,12 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from tests.kit.store_kit import write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.measures.question import AnalysisSettings, ask
 from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.store_format import StoreError
+from vla_attention.testing.stores import write_store
 
 
 def damage_rows(store: Path, episode: str) -> None:

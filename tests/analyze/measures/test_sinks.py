@@ -13,14 +13,15 @@ from hypothesis import strategies as st
 from scipy.stats import entropy as entropy_of_scipy
 
 from tests.kit.raw_rows import FEW, RawEpisode, leaky, question_about, raw_episodes, weights_of
-from tests.kit.store_kit import StoreSpec, make_tokens, small_layout, write_store
-from tests.kit.strategies import episode_tokens, groupings
 from vla_attention.analyze.heads.head_study import study_heads
 from vla_attention.analyze.heads.row_metrics import RowOptions, row_metrics_table
 from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.analyze.measures.sinks import SinkRule, describe_sinks, key_sums, sinks_table, without_sinks
 from vla_attention.analyze.measures.steps import steps_table
 from vla_attention.schemas.layout import Role
+from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.strategies import episode_tokens, groupings
+from vla_attention.testing.tokens import small_layout, small_tokens
 
 BOS = small_layout().span("prompt").start
 
@@ -110,7 +111,7 @@ def test_a_sink_has_the_role_that_it_has_where_it_is_one(tmp_path):
     """Whether a late key of a changing prompt is a digit or padding depends on the replan, and on the episode."""
     spec = StoreSpec(tasks=(0,), episodes=6, replans=3, plant_rows=plant_late_sink)
     path = write_store(tmp_path / "a.zarr", spec=spec)
-    roles = np.stack([make_tokens(3, 0, [0, 0, i]).key_role[:, BOS + 10] for i in range(6)])
+    roles = np.stack([small_tokens(3, 0, [0, 0, i]).key_role[:, BOS + 10] for i in range(6)])
     seen = roles != Role.PADDING
     key = BOS + 10
     assert 0 < seen.sum() < seen.size

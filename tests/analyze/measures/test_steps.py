@@ -13,8 +13,6 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
-from tests.kit.store_kit import StoreSpec, root_attributes, write_store
-from tests.kit.strategies import episode_tokens, groupings
 from vla_attention.analyze.measures.question import AnalysisSettings, ask
 from vla_attention.analyze.measures.selected import load_tokens, vocabulary_of
 from vla_attention.analyze.measures.steps import steps_table
@@ -27,6 +25,8 @@ from vla_attention.schemas.groupings.resolve import EmptyGroup, resolve
 from vla_attention.schemas.precision import mass_error_bound
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import StoreError
+from vla_attention.testing.stores import StoreSpec, root_attributes, write_store
+from vla_attention.testing.strategies import episode_tokens, groupings
 
 #: Every example writes a store (and flushes it to disk): shrinking one would take minutes.
 QUICK = settings(

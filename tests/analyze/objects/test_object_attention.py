@@ -16,8 +16,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
-from tests.kit.group_stores import CAMERAS, coverage_of, episode_tokens, random_rows, write
-from tests.kit.store_kit import OBJECTS, StoreSpec, root_attributes, write_store
+from tests.kit.bowl_scene import CAMERAS, bowl_coverage, bowl_tokens, write_bowl_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.measures.question import AnalysisSettings, ask
 from vla_attention.analyze.objects.object_attention import ObjectTables, object_tables
@@ -28,6 +27,8 @@ from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import SiteLayout, Span
 from vla_attention.schemas.stores.reader import open_store
+from vla_attention.testing.stores import StoreSpec, root_attributes, write_store
+from vla_attention.testing.tokens import OBJECTS, random_rows
 
 QUICK = settings(
     max_examples=6, phases=[Phase.explicit, Phase.generate], deadline=None,
@@ -42,7 +43,7 @@ def measured(path: Path, wanted: ObjectSettings | None = None, keep_steps: bool 
 
 def follow_bowl(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
     """Head 1 of the middle layer gives the bowl's patches thirty times their weight, wherever the bowl is."""
-    rows = random_rows(tokens, rows.shape[1:-1], seed=10 * task + episode)
+    rows = random_rows(tokens, rows.shape[1:-1], seed=10 * task + episode, spread=0.5)
     assert tokens.coverage is not None
     for camera in CAMERAS:
         span = tokens.layout.camera_span(camera)
@@ -57,7 +58,7 @@ def attend_uniformly(task: int, episode: int, tokens: EpisodeTokens, rows: np.nd
 
 @pytest.fixture(scope="module")
 def follower_store(tmp_path_factory) -> Path:
-    return write(tmp_path_factory.mktemp("objects") / "follower.zarr", plant_rows=follow_bowl)
+    return write_bowl_store(tmp_path_factory.mktemp("objects") / "follower.zarr", plant_rows=follow_bowl)
 
 
 def members_of(kind: str, name: str) -> list[int]:
@@ -107,7 +108,7 @@ def test_shares_and_lifts_equal_sums_over_raw_rows(follower_store):
 def test_spatial_metrics_equal_loops_over_raw_maps(data):
     """On random rows and coverage, per replan, layer, denoise step and head."""
     size, seed = data.draw(st.integers(7, 9)), data.draw(st.integers(0, 2**16))
-    tokens = episode_tokens(replans=2, size=size)
+    tokens = bowl_tokens(replans=2, size=size)
     percentile = data.draw(st.sampled_from([75.0, 90.0]))
     least, tolerance = data.draw(st.sampled_from([0.3, 0.7])), data.draw(st.sampled_from([0.0, 1.0, 1.5]))
 
@@ -116,7 +117,9 @@ def test_spatial_metrics_equal_loops_over_raw_maps(data):
         return rows / rows.sum(axis=-1, keepdims=True)
 
     with tempfile.TemporaryDirectory() as folder:
-        path = write(Path(folder) / "a.zarr", tokens=tokens, tasks=(0,), episodes=1, layers=(0, 1), plant_rows=plant)
+        path = write_bowl_store(
+            Path(folder) / "a.zarr", tokens=tokens, tasks=(0,), episodes=1, layers=(0, 1), plant_rows=plant
+        )
         chosen = ObjectSettings(percentiles=(percentile,), mask_coverage=least, tolerance=tolerance)
         tables = measured(path, chosen, keep_steps=True, per_head=True)
         rows, coverage, spans = raw_episode(path, "task000_episode000")
@@ -158,7 +161,7 @@ def test_spatial_metrics_equal_loops_over_raw_maps(data):
 
 
 def test_uniform_attention_scores_exactly_what_chance_does(tmp_path):
-    path = write(tmp_path / "uniform.zarr", plant_rows=attend_uniformly, tasks=(0,), episodes=1)
+    path = write_bowl_store(tmp_path / "uniform.zarr", plant_rows=attend_uniformly, tasks=(0,), episodes=1)
     tables = measured(path)
     assert tables.iou is not None
     np.testing.assert_allclose(tables.objects["lift"].drop_nulls(), 1.0, rtol=1e-5)
@@ -211,12 +214,12 @@ def test_classes_follow_the_task_and_add_up(follower_store):
 
 
 def test_an_object_out_of_sight_has_no_lift_and_no_mask(tmp_path):
-    tokens = episode_tokens(replans=2)
-    coverage = coverage_of(2, 16)
+    tokens = bowl_tokens(replans=2)
+    coverage = bowl_coverage(2, 16)
     coverage[CAMERAS[1]][:, :, 4] += coverage[CAMERAS[1]][:, :, 1]
     coverage[CAMERAS[1]][:, :, 1] = 0.0
     hidden = EpisodeTokens(tokens.layout, tokens.key_role, tokens.prompts, tokens.prompt_index, OBJECTS, coverage)
-    tables = measured(write(tmp_path / "hidden.zarr", tokens=hidden, tasks=(0,), episodes=1))
+    tables = measured(write_bowl_store(tmp_path / "hidden.zarr", tokens=hidden, tasks=(0,), episodes=1))
     plate = (pl.col("item") == "plate_1") & (pl.col("camera") == CAMERAS[1])
     assert tables.objects.filter(plate)["lift"].is_null().all()
     assert tables.iou is not None

@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 import zarr
 
-import tests.kit.store_kit as kit
+import vla_attention.testing.stores as kit
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.measures.question import AnalysisSettings, ask
 from vla_attention.analyze.overlay.overlay_data import camera_names, draw, episode_overlay, ratios_of
@@ -20,6 +20,7 @@ from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role, SiteLayout, Span
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import PolicyCameraView
+from vla_attention.testing.tokens import INSTRUCTIONS, OBJECTS, small_prompt
 
 CAMERA = "base_0_rgb"
 
@@ -169,9 +170,9 @@ def test_bad_input_is_one_sentence(
 
 def test_a_site_without_pictures_is_refused(tmp_path: Path) -> None:
     layout = SiteLayout("joint", (Span("prompt", "text", 0, 14), Span("actions", "action", 14, 19)))
-    prompt, roles = kit.make_prompt(layout, kit.INSTRUCTIONS[0], "1 2")
+    prompt, roles = small_prompt(layout, INSTRUCTIONS[0], "1 2")
     key_role = np.tile(np.concatenate([roles, np.full(5, Role.ACTION, dtype=np.uint8)]), (2, 1))
-    tokens = EpisodeTokens(layout, key_role, (prompt,), np.zeros(2, dtype=np.int64), kit.OBJECTS, {})
+    tokens = EpisodeTokens(layout, key_role, (prompt,), np.zeros(2, dtype=np.int64), OBJECTS, {})
     store = kit.write_store(tmp_path / "blind.zarr", tasks=(0,), episodes=1, tokens=tokens)
     question = ask([open_store(store)], AnalysisSettings())
     with pytest.raises(BadArgument, match="no patches of pictures"):

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-import tests.kit.store_kit as kit
+import vla_attention.testing.stores as kit
 from vla_attention.analyze.__main__ import main
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import tests.kit.store_kit as kit
+import vla_attention.testing.stores as kit
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.measures.question import AnalysisSettings, ask
 from vla_attention.analyze.ratios.analysis import Analysis, analyse

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from tests.kit.store_kit import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.measures.question import AnalysisSettings, ask
 from vla_attention.analyze.time.phases import (
@@ -25,6 +24,7 @@ from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import StoreError
+from vla_attention.testing.stores import StoreSpec, write_store
 
 REPLANS = 9
 

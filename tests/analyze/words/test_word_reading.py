@@ -9,14 +9,15 @@ import polars as pl
 import pytest
 import zarr
 
-from tests.kit.group_stores import episode_tokens, random_rows, write
-from tests.kit.store_kit import write_store
+from tests.kit.bowl_scene import bowl_tokens, write_bowl_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.measures.question import AnalysisSettings, Question, ask
 from vla_attention.analyze.words.word_reading import strongest_readers, words_summary, words_table
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import open_store
+from vla_attention.testing.stores import write_store
+from vla_attention.testing.tokens import random_rows
 
 
 def question_of(path: Path, **settings) -> Question:
@@ -25,7 +26,7 @@ def question_of(path: Path, **settings) -> Question:
 
 def read_bowl(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
     """Head 1 of the last layer reads 'bowl', twenty times as much as anything else."""
-    rows = random_rows(tokens, rows.shape[1:-1], seed=10 * task + episode)
+    rows = random_rows(tokens, rows.shape[1:-1], seed=10 * task + episode, spread=0.5)
     for replan, which in enumerate(tokens.prompt_index):
         keys = next(word.keys for word in tokens.words[which] if word.text == "bowl")
         rows[replan, -1, :, 1][..., list(keys)] *= 20
@@ -34,7 +35,7 @@ def read_bowl(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) 
 
 @pytest.fixture(scope="module")
 def reader_store(tmp_path_factory) -> Path:
-    return write(tmp_path_factory.mktemp("words") / "reader.zarr", plant_rows=read_bowl)
+    return write_bowl_store(tmp_path_factory.mktemp("words") / "reader.zarr", plant_rows=read_bowl)
 
 
 def raw_measures(path: Path, name: str, layer: int) -> dict[tuple[str, int], tuple[float, float, float, float]]:
@@ -172,7 +173,7 @@ def test_mistakes_are_said_in_one_sentence(reader_store, tmp_path, capsys):
 
 
 def test_a_single_episode_has_no_interval_and_is_drawn_all_the_same(tmp_path, capsys):
-    path = write(tmp_path / "one.zarr", tasks=(0,), episodes=1, layers=(1,), tokens=episode_tokens(replans=1))
+    path = write_bowl_store(tmp_path / "one.zarr", tasks=(0,), episodes=1, layers=(1,), tokens=bowl_tokens(replans=1))
     assert main(["words", str(path), "--output", str(tmp_path / "out")]) == 0
     assert "layer 1; 1 episode of 1 task" in capsys.readouterr().out
     summary = pl.read_parquet(tmp_path / "out" / "words_summary.parquet")

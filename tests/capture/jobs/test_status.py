@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.kit.store_kit import INSTRUCTIONS, StoreSpec, write_store
 from vla_attention.capture.__main__ import main
 from vla_attention.capture.jobs.claims import Claims, jobs_folder
 from vla_attention.capture.jobs.status import store_status
@@ -21,6 +20,8 @@ from vla_attention.capture.jobs.worker_records import (
     planned_tasks,
     read_records,
 )
+from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.tokens import INSTRUCTIONS
 
 SPEC = StoreSpec(tasks=(0, 2), episodes=2, replans=1, layers=(0,), heads=(0,), frames=False)
 NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2", 0)

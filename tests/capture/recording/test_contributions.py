@@ -127,9 +127,9 @@ def test_a_missing_update_is_an_error():
 
 
 def test_contributions_are_those_of_the_segments_of_the_replan():
-    from tests.kit.store_kit import make_tokens
+    from vla_attention.testing.tokens import small_tokens
 
-    tokens = make_tokens(2, 0, [0], changing=True)
+    tokens = small_tokens(2, 0, [0], changing=True)
     recording = Recording((0,), (0,), (0,), (0,), "mean", 3, 10, contributions=True)
     recorders = make_recorders(recording, (tokens.layout,), {"joint": tokens.key_role[1]})
     parts = recorders["joint"].parts

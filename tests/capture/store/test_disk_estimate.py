@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.kit.store_kit import StoreSpec, make_prompt, root_attributes, write_store
 from vla_attention.capture.store.disk_estimate import (
     EPISODE_OVERHEAD,
     DiskEstimate,
@@ -20,6 +19,8 @@ from vla_attention.capture.store.disk_estimate import (
 )
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import PatchGrid, SiteLayout, Span
+from vla_attention.testing.stores import StoreSpec, root_attributes, write_store
+from vla_attention.testing.tokens import small_prompt
 
 
 def large_tokens(replans: int, pixels: int = 56) -> EpisodeTokens:
@@ -39,7 +40,7 @@ def large_tokens(replans: int, pixels: int = 56) -> EpisodeTokens:
     prompts = []
     for replan in range(replans):
         digits = " ".join(str(1000 * replan + i) for i in range(60))
-        prompt, roles[replan, 680:750] = make_prompt(layout, "put the bowl on the plate", digits)
+        prompt, roles[replan, 680:750] = small_prompt(layout, "put the bowl on the plate", digits)
         prompts.append(prompt)
     edges = np.zeros((replans, 340, 5), dtype=np.float32)
     edges[:, np.arange(340), np.arange(340) // 70] = 1

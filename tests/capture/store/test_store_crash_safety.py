@@ -6,6 +6,7 @@ Failures are injected from here, into the calls that reach the disk: the product
 from __future__ import annotations
 
 import errno
+import functools
 import multiprocessing
 import os
 import shutil
@@ -25,26 +26,28 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 from zarr.storage import LocalStore
 
-from tests.kit.store_kit import (
-    StoreSpec,
-    commit,
-    denoise_times,
-    episode_records,
-    root_attributes,
-    write_episode,
-    write_store,
-)
 from vla_attention.capture.store.durable_files import StoreWriteFailed
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import FormatTooNew, RunMismatch, StoreError, StoreExists, episode_name
 from vla_attention.schemas.stores.verify import verify_store
+from vla_attention.testing.stores import (
+    StoreSpec,
+    commit,
+    denoise_times,
+    episode_records,
+    root_attributes,
+    write_episode,
+)
+from vla_attention.testing.stores import write_store as write_made_up_store
 
+#: Everything here is about durability.
+write_store = functools.partial(write_made_up_store, durable=True)
 SPEC = StoreSpec(tasks=(0,), episodes=2, replans=9, layers=(0,), heads=(0,), frames=False)
 #: Processes that have imported everything and started no thread yet, so that a child is there at once.
 PROCESSES = multiprocessing.get_context("forkserver")
-PROCESSES.set_forkserver_preload(["tests.kit.store_kit"])
+PROCESSES.set_forkserver_preload(["vla_attention.testing.stores"])
 
 
 def store_bytes(path: Path) -> dict[str, bytes]:

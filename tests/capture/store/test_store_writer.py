@@ -17,8 +17,6 @@ import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.kit.store_kit import StoreSpec, denoise_times, episode_records, root_attributes, write_episode, write_store
-from tests.kit.strategies import episode_tokens
 from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.capture.store.codecs import replans_per_block, write_whole
 from vla_attention.capture.store.recorded_rows import RecordedRows
@@ -30,6 +28,15 @@ from vla_attention.schemas.segments import segment_members
 from vla_attention.schemas.stores import store_format as contract
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
+from vla_attention.testing.stores import (
+    StoreSpec,
+    denoise_times,
+    episode_records,
+    root_attributes,
+    write_episode,
+    write_store,
+)
+from vla_attention.testing.strategies import episode_tokens
 
 CORE_CODECS = {"bytes", "blosc", "crc32c", "sharding_indexed"}
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.kit.store_kit import make_tokens
 from vla_attention.schemas.groupings.builtin_groupings import BUILTIN_GROUPINGS, find_grouping
 from vla_attention.schemas.groupings.grouping import Grouping, GroupingError, Ratio, with_groups
 from vla_attention.schemas.groupings.resolve import check_names, resolve
 from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vocabulary
 from vla_attention.schemas.layout import Piece, Prompt, Role, SiteLayout, Span
+from vla_attention.testing.tokens import small_tokens
 
 INSTRUCTION = "put the bowl on the plate"
 CROSS = SiteLayout("cross", (Span("text", "text", 0, 10),))
@@ -43,7 +43,7 @@ def test_null_keys_are_a_group_of_their_own_where_there_are_any(name):
     assert weights["null"].tolist() == [0] * 7 + [1] * 3
     assert not weights["padding"].any()
     assert sum(weights.values()).tolist() == [1] * 10
-    masked = make_tokens(2, 0, [0])
+    masked = small_tokens(2, 0, [0])
     assert "null" not in BUILTIN_GROUPINGS[name](collect_vocabulary([masked])).names
 
 
@@ -88,7 +88,7 @@ def test_labels_of_the_published_scripts_are_no_modalities():
         (Span("blank", "latent", 0, 1), Span("primary", "latent", 1, 2, camera="primary")),
     )
     latent = EpisodeTokens(frames, np.array([[Role.BLANK, Role.IMAGE]], dtype=np.uint8))
-    for tokens in (make_tokens(2, 0, [0]), latent):
+    for tokens in (small_tokens(2, 0, [0]), latent):
         reference = find_grouping("reference", collect_vocabulary([tokens]))
         assert reference.ratio == Ratio(("visual",), ("linguistic",))
         assert not reference.compares_modalities
@@ -98,4 +98,4 @@ def test_labels_of_the_published_scripts_are_no_modalities():
         "own", {"visual": ("frame:primary",), "linguistic": ("frame:blank",)}, Ratio(("visual",), ("linguistic",))
     )
     assert not own.compares_modalities
-    assert find_grouping("default", collect_vocabulary([make_tokens(2, 0, [0])])).compares_modalities
+    assert find_grouping("default", collect_vocabulary([small_tokens(2, 0, [0])])).compares_modalities

@@ -7,9 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.kit.group_stores import episode_tokens
-from tests.kit.strategies import episode_tokens as random_tokens
-from tests.kit.strategies import groupings
+from tests.kit.bowl_scene import bowl_tokens
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import check_names, memberships, resolve, shared_keys
 from vla_attention.schemas.groupings.selector_parser import Atom, parse_selector
@@ -17,6 +15,8 @@ from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vocabulary
 from vla_attention.schemas.groupings.words import split_words, stop_words, word_class
 from vla_attention.schemas.layout import SiteLayout, Span
+from vla_attention.testing.strategies import episode_tokens as random_tokens
+from vla_attention.testing.strategies import groupings
 
 
 def keys(tokens: EpisodeTokens, selector: str, replan: int) -> list[int]:
@@ -50,7 +50,7 @@ def test_the_stop_list_has_closed_classes_and_not_the_words_it_says_it_lacks():
 
 
 def test_word_classes_take_every_piece_at_every_replan():
-    tokens = episode_tokens(replans=3)  # one, two, three state digits: the instruction's keys move
+    tokens = bowl_tokens(replans=3)  # one, two, three state digits: the instruction's keys move
     for replan in range(3):
         first = 512 + 1 + 1 + replan  # bos and digits come first
         # put the black bo wl on the plate
@@ -96,7 +96,7 @@ def test_shared_keys_are_the_sums_of_what_both_groups_take(data):
     ],
 )
 def test_what_exists_nowhere_is_said(selector, said):
-    tokens = episode_tokens(replans=1)
+    tokens = bowl_tokens(replans=1)
     with pytest.raises(SelectorError) as caught:
         check_names(Grouping("g", {"g": (selector,)}), collect_vocabulary([tokens]), tokens.layout)
     assert said in str(caught.value)
@@ -120,7 +120,7 @@ def test_a_site_without_words_or_coverage_says_what_to_do(selector, said):
 
 def test_a_word_class_that_is_resolved_unchecked_is_an_error_too():
     with pytest.raises(SelectorError, match="There is no word class 'Verbs'"):
-        resolve(Grouping("g", {"g": ("words:Verbs",)}), episode_tokens(replans=1))
+        resolve(Grouping("g", {"g": ("words:Verbs",)}), bowl_tokens(replans=1))
 
 
 def test_single_quotes_and_apostrophes():

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.kit.store_kit import StoreSpec, episode_records, root_attributes, write_store
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode, FormatTooNew, StoreError, StoreNotFound
+from vla_attention.testing.stores import StoreSpec, episode_records, root_attributes, write_store
 
 SPEC = StoreSpec(tasks=(1, 12), episodes=2, replans=2)
 

@@ -10,10 +10,10 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from tests.kit.store_kit import write_store
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.shards import ShardedLayers
 from vla_attention.schemas.stores.store_format import CorruptEpisode
+from vla_attention.testing.stores import write_store
 
 AXES = ["replan", "layer", "denoise", "head", "query", "key"]
 

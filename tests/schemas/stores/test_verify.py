@@ -13,13 +13,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.kit.store_kit import StoreSpec, denoise_times, episode_records, root_attributes, write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.capture.store.episode_writer import EpisodeWriter
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 from vla_attention.schemas.stores.verify import Fault, verify_store
+from vla_attention.testing.stores import StoreSpec, denoise_times, episode_records, root_attributes, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=1, replans=3, heads=(0,))
 EPISODE = "task000_episode000"

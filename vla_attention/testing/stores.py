@@ -1,6 +1,9 @@
-"""Small stores with known content, written by the real writer: `write_store(tmp_path / "a.zarr", tasks=(0, 2), episodes=3)`.
+"""Small stores with known content, written by the writer that capture uses.
 
-What a store must contain is recomputed from its `StoreSpec` with `episode_records`; nothing is random but by the spec's seed.
+    path = write_store(tmp_path / "a.zarr", tasks=(0, 2), episodes=3)
+    expected_arrays(StoreSpec(tasks=(0, 2), episodes=3), task=2, episode=0)["joint/rows"]
+
+A `StoreSpec` decides every number in its store, so that what a reader must find is computed from the spec alone.
 """
 
 from __future__ import annotations
@@ -11,14 +14,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tests.kit.strategies import random_rows
 from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run
-from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, SceneObject
-from vla_attention.schemas.layout import INVALID_ROLES, PatchGrid, Piece, Prompt, Role, SiteLayout, Span
-from vla_attention.schemas.segments import segments_of
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
+from vla_attention.schemas.layout import SiteLayout
+from vla_attention.schemas.precision import round_mantissa
+from vla_attention.schemas.segments import segment_members, segments_of
 from vla_attention.schemas.stores.store_format import (
     FORMAT_NAME,
     FORMAT_VERSION,
@@ -28,24 +32,25 @@ from vla_attention.schemas.stores.store_format import (
     Recording,
     RootAttributes,
 )
+from vla_attention.testing.tokens import INSTRUCTIONS, random_rows, small_layout, small_tokens
 
-#: One for each task, in turn.
-INSTRUCTIONS = ("put the bowl on the plate", "open the top drawer", "turn on the stove")
-OBJECTS = (
-    SceneObject("akita_black_bowl_1", "object", True),
-    SceneObject("plate_1", "object", True),
-    SceneObject("wooden_cabinet_1", "fixture", False),
-    SceneObject("robot", "robot", False),
-    SceneObject("background", "background", False),
-)
+#: Task, episode, the episode's tokens and random rows (replan, layer, denoise, head, query, key) to the rows to store.
+PlantRows = Callable[[int, int, EpisodeTokens, NDArray[np.float32]], NDArray[np.floating]]
+#: Task, episode and number of replans to actions (replan, horizon, action_dim).
+PlantActions = Callable[[int, int, int], NDArray[np.float64]]
+#: Task and episode to the outcome.
+PlantSuccess = Callable[[int, int], bool]
 
 
 @dataclass(frozen=True)
 class StoreSpec:
     """What a made-up store holds.
 
-    Every episode has `replans` replans. `tokens`, when given, are the tokens of every episode (and decide the number of
-    replans); otherwise each episode has those of `make_tokens`. `prompts`: "changing" (state digits, as in pi0.5) or "same".
+    Every episode has `replans` replans. `tokens`, when given, are the tokens of every episode (and decide the number
+    of replans); otherwise each episode has those of `small_tokens`. `prompts`: "changing" (state digits, as in pi0.5)
+    or "same". `seed` decides all random numbers. `layers` are blocks of `num_layers`; the other fields of the recording
+    are as in `Recording`. The three `plant_` functions replace rows, actions and outcomes; without them rows are random
+    and episodes of odd numbers are solved.
     """
 
     suite: str = "made_up"
@@ -67,34 +72,42 @@ class StoreSpec:
     prompts: Literal["changing", "same"] = "changing"
     policy: str = "made-up"
     tokens: EpisodeTokens | None = None
-    plant_rows: Callable[[int, int, EpisodeTokens, np.ndarray], np.ndarray] | None = None
-    plant_actions: Callable[[int, int, int], np.ndarray] | None = None
-    plant_success: Callable[[int, int], bool] | None = None
+    plant_rows: PlantRows | None = None
+    plant_actions: PlantActions | None = None
+    plant_success: PlantSuccess | None = None
 
     @property
     def layout(self) -> SiteLayout:
+        """The spans of the store's only site, `joint`."""
         return small_layout() if self.tokens is None else self.tokens.layout
 
     @property
     def num_replans(self) -> int:
+        """Replans of every episode."""
         return self.replans if self.tokens is None else self.tokens.num_replans
 
     @property
     def cells(self) -> tuple[int, int, int, int]:
-        """(layer, denoise, head, query)."""
+        """Lengths of the axes (layer, denoise, head, query)."""
         queries = 1 if self.queries == "mean" else self.num_action_queries
         return (len(self.layers), len(self.denoise_steps), len(self.heads), queries)
 
     @property
     def names(self) -> list[tuple[int, int]]:
-        """(task, episode) of every episode."""
+        """(task, episode) of every episode, in order."""
         return [(task, episode) for task in self.tasks for episode in range(self.episodes)]
 
 
-def write_store(path: Path, *, mode: WriteMode = "new", spec: StoreSpec | None = None, **changes: Any) -> Path:
-    """Write a store with every episode of a spec, or of the default one with some fields changed; returns its path."""
+def write_store(
+    path: Path, *, mode: WriteMode = "new", durable: bool = False, spec: StoreSpec | None = None, **changes: Any
+) -> Path:
+    """Write a store with every episode of a spec, or of the default one with some fields changed; returns its path.
+
+    `mode`: "resume" adds what is missing, "overwrite" replaces the store. `durable`: flush every file to disk, which
+    takes long and is of use only in tests of crashes.
+    """
     spec = replace(spec or StoreSpec(), **changes)
-    store = open_run(path, root_attributes(spec), mode)
+    store = open_run(path, root_attributes(spec), mode, durable=durable)
     for task, episode in spec.names:
         if (task, episode) not in store.committed():
             write_episode(store, spec, task, episode)
@@ -111,17 +124,18 @@ def write_episode(store: RunStore, spec: StoreSpec, task: int, episode: int) -> 
 
 
 def commit(writer: EpisodeWriter, spec: StoreSpec, task: int, episode: int) -> Path:
-    """Commit with the outcome that belongs to the episode: unless planted, those of odd numbers are solved."""
+    """Commit with the outcome of the episode: unless planted, episodes of odd numbers are solved."""
     success = spec.plant_success(task, episode) if spec.plant_success else episode % 2 == 1
     return writer.commit(success=success, num_steps=5 * spec.num_replans - episode % 2)
 
 
-def denoise_times(spec: StoreSpec) -> np.ndarray:
+def denoise_times(spec: StoreSpec) -> NDArray[np.float64]:
+    """Flow time of each recorded denoise step, shape (denoise,)."""
     return 1.0 - np.array(spec.denoise_steps) / 10
 
 
 def root_attributes(spec: StoreSpec) -> RootAttributes:
-    cameras = tuple(PolicyCameraView(name, f"{name}_image", True, False) for name in spec.layout.cameras)
+    """The attributes of the store's root group."""
     return RootAttributes(
         format=FORMAT_NAME,
         format_version=FORMAT_VERSION,
@@ -136,7 +150,7 @@ def root_attributes(spec: StoreSpec) -> RootAttributes:
             num_heads=max(spec.heads) + 1,
             num_denoise_steps=max(spec.denoise_steps) + 1,
             action_horizon=5,
-            cameras=cameras,
+            cameras=tuple(PolicyCameraView(name, f"{name}_image", True, False) for name in spec.layout.cameras),
             config={"width": 8, "scale": 0.5},
         ),
         protocol=Protocol(
@@ -159,26 +173,24 @@ def root_attributes(spec: StoreSpec) -> RootAttributes:
 
 
 def episode_records(spec: StoreSpec, task: int, episode: int) -> tuple[EpisodeStart, list[ReplanRecord]]:
-    """What the spec's episode consists of."""
+    """What the writer is given for one episode: its start and one record per replan."""
     seed = [spec.seed, task, episode]
-    tokens = spec.tokens or make_tokens(spec.replans, task, seed, changing=spec.prompts == "changing")
+    tokens = spec.tokens or small_tokens(spec.replans, task, seed, changing=spec.prompts == "changing")
     generator = np.random.default_rng(seed)
     rows = random_rows(tokens, spec.cells, int(generator.integers(2**31)))
     if spec.plant_rows is not None:
         rows = spec.plant_rows(task, episode, tokens, rows).astype(np.float32)
     actions = None if spec.plant_actions is None else spec.plant_actions(task, episode, tokens.num_replans)
     assert tokens.prompt_index is not None
-    seen = [span for span in tokens.layout.spans if span.camera in (tokens.coverage or {})]
+    covered = tokens.coverage or {}
     records = []
     for replan in range(tokens.num_replans):
         frames, coverage = {}, {}
-        for span in seen:
-            assert span.camera is not None
-            assert span.grid is not None
-            assert tokens.coverage is not None
-            size = (span.grid.image_height, span.grid.image_width, 3)
-            frames[span.camera] = generator.integers(0, 256, size, dtype=np.uint8)
-            coverage[span.camera] = tokens.coverage[span.camera][replan]
+        for span in tokens.layout.spans:
+            if span.camera is not None and span.grid is not None and span.camera in covered:
+                size = (span.grid.image_height, span.grid.image_width, 3)
+                frames[span.camera] = generator.integers(0, 256, size, dtype=np.uint8)
+                coverage[span.camera] = covered[span.camera][replan]
         records.append(
             ReplanRecord(
                 env_step=10 + 5 * replan,
@@ -211,77 +223,53 @@ def episode_records(spec: StoreSpec, task: int, episode: int) -> tuple[EpisodeSt
     return start, records
 
 
-def contribution_vectors(spec: StoreSpec, tokens: EpisodeTokens, seed: list[int], replan: int) -> np.ndarray:
+def expected_arrays(spec: StoreSpec, task: int, episode: int) -> dict[str, NDArray[Any]]:
+    """Name to values of the arrays that a reader must find in one episode, to the bit.
+
+    Left out is `joint/contribution`. Rows are rounded to the spec's mantissa bits; `joint/atoms` has the segments of
+    `segments_of` on its last axis.
+    """
+    _, records = episode_records(spec, task, episode)
+    rows = np.stack([record.rows["joint"].rows for record in records])
+    roles = np.stack([record.key_role["joint"] for record in records])
+    members = segment_members(spec.layout, roles, segments_of(spec.layout, roles))
+    prompts = list(dict.fromkeys(record.prompt for record in records))
+    arrays: dict[str, NDArray[Any]] = {
+        "joint/rows": round_mantissa(rows, spec.mantissa_bits),
+        "joint/row_sum": np.stack([record.rows["joint"].row_sum for record in records]),
+        "joint/atoms": np.stack(
+            [
+                (row.astype(np.float64) @ of.astype(np.float64)).astype(np.float32)
+                for row, of in zip(rows, members, strict=True)
+            ]
+        ),
+        "joint/key_role": roles,
+        "joint/layer": np.array(spec.layers, dtype=np.int32),
+        "joint/denoise": np.array(spec.denoise_steps, dtype=np.int32),
+        "joint/head": np.array(spec.heads, dtype=np.int32),
+        "env_step": np.array([record.env_step for record in records], dtype=np.int32),
+        "noise_seed": np.array([record.noise_seed for record in records], dtype=np.int64),
+        "prompt_index": np.array([prompts.index(record.prompt) for record in records], dtype=np.int32),
+        "denoise_time": denoise_times(spec).astype(np.float32),
+        "state": np.stack([record.state for record in records]),
+        "actions": np.stack([record.actions for record in records]),
+    }
+    for camera in records[0].frames:
+        arrays[f"frames/{camera}"] = np.stack([record.frames[camera] for record in records])
+    for camera in records[0].coverage:
+        arrays[f"objects/{camera}"] = np.stack([record.coverage[camera] for record in records])
+    return arrays
+
+
+def contribution_vectors(spec: StoreSpec, tokens: EpisodeTokens, seed: list[int], replan: int) -> NDArray[np.float64]:
     """Made-up contributions (layer, denoise, query, segment, width) of a replan's segments."""
     segments = segments_of(tokens.layout, tokens.key_role[replan])
     shape = (*spec.cells[:2], spec.num_action_queries, len(segments), 4)
     return np.random.default_rng([*seed, replan, 1]).normal(size=shape)
 
 
-def gram_of(vectors: np.ndarray) -> np.ndarray:
+def gram_of(vectors: NDArray[np.float64]) -> NDArray[np.float32]:
     """Gram matrix (layer, denoise, part, part) of segments and their sum, mean over queries."""
     parts = np.concatenate([vectors, vectors.sum(axis=3, keepdims=True)], axis=3)
-    return np.einsum("ldqaw,ldqbw->ldab", parts, parts).astype(np.float32) / vectors.shape[2]
-
-
-def small_layout(text_keys: int = 14) -> SiteLayout:
-    """Two cameras that see something and a masked one, a prompt, actions: 3 x 4 + 2 x 2 + 2 x 2 + 14 + 5 = 39 keys."""
-    spans: list[Span] = []
-    grids = {"base_0_rgb": (3, 4), "left_wrist_0_rgb": (2, 2), "right_wrist_0_rgb": (2, 2)}
-    for name, (rows, columns) in grids.items():
-        start = spans[-1].stop if spans else 0
-        grid = PatchGrid(rows, columns, rows * 4, columns * 4)
-        spans.append(Span(name, "image", start, start + rows * columns, camera=name, grid=grid))
-    spans.append(Span("prompt", "text", spans[-1].stop, spans[-1].stop + text_keys))
-    spans.append(Span("actions", "action", spans[-1].stop, spans[-1].stop + 5))
-    return SiteLayout("joint", tuple(spans))
-
-
-def make_prompt(layout: SiteLayout, instruction: str, digits: str) -> tuple[Prompt, np.ndarray]:
-    """A prompt "instruction; digits", one piece a word, after bos, and the roles (key,) of the prompt's span."""
-    span = layout.span("prompt")
-    roles = np.full(span.num_keys, Role.PADDING, dtype=np.uint8)
-    roles[0] = Role.BOS
-    pieces: list[Piece] = []
-    position, key = 0, span.start + 1
-    for word, role in [
-        *((word, Role.INSTRUCTION) for word in instruction.split()),
-        (";", Role.TEMPLATE),
-        *((digit, Role.STATE) for digit in digits.split()),
-    ]:
-        text = word if not pieces or word == ";" else f" {word}"
-        pieces.append(Piece(key, text, position, position + len(text)))
-        roles[key - span.start] = role
-        position, key = position + len(text), key + 1
-    prompt = Prompt("".join(piece.text for piece in pieces), tuple(pieces), (0, len(instruction)))
-    return prompt, roles
-
-
-def make_tokens(replans: int, task: int, seed: Any, changing: bool = True) -> EpisodeTokens:
-    """Tokens of an episode of `small_layout`; the state digits of a changing prompt differ in value and number."""
-    layout = small_layout()
-    generator = np.random.default_rng(seed)
-    roles = np.zeros((replans, layout.num_keys), dtype=np.uint8)
-    of_kind = {"image": Role.IMAGE, "text": Role.PADDING, "action": Role.ACTION}
-    prompts: dict[Prompt, int] = {}
-    index = []
-    for replan in range(replans):
-        for span in layout.spans:
-            masked = span.name == "right_wrist_0_rgb"
-            roles[replan, span.start : span.stop] = Role.MASKED_IMAGE if masked else of_kind[span.kind]
-        digits = " ".join(str(generator.integers(256)) for _ in range(generator.integers(1, 4) if changing else 2))
-        digits = digits if changing else "12 250"
-        prompt, text_roles = make_prompt(layout, INSTRUCTIONS[task % len(INSTRUCTIONS)], digits)
-        span = layout.span("prompt")
-        roles[replan, span.start : span.stop] = text_roles
-        index.append(prompts.setdefault(prompt, len(prompts)))
-    coverage = {}
-    for camera in layout.cameras[:2]:
-        share = generator.dirichlet(np.full(len(OBJECTS), 0.3), (replans, layout.camera_span(camera).num_keys))
-        coverage[camera] = share.astype(np.float32)
-    return EpisodeTokens(layout, roles, tuple(prompts), np.array(index), OBJECTS, coverage)
-
-
-def valid_keys(key_role: np.ndarray) -> np.ndarray:
-    """Which keys can hold information."""
-    return ~np.isin(key_role, [int(role) for role in INVALID_ROLES])
+    gram: NDArray[np.float32] = np.einsum("ldqaw,ldqbw->ldab", parts, parts).astype(np.float32) / vectors.shape[2]
+    return gram

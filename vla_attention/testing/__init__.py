@@ -1,0 +1,43 @@
+"""Make small stores with known content, for tests of readers and recorders of your own. Imports no torch.
+
+    from vla_attention.testing import StoreSpec, expected_arrays, write_store
+
+    spec = StoreSpec(tasks=(0, 2), episodes=3)
+    path = write_store(tmp_path / "a.zarr", spec=spec)
+    expected_arrays(spec, task=2, episode=0)["joint/rows"]    # what your reader must find, to the bit
+
+- `StoreSpec`, `write_store`: a store whose episodes have 39 keys (two cameras and a masked one, a prompt that changes,
+  actions), or other tokens.
+- `expected_arrays`, `root_attributes`: what the store must contain.
+- `episode_records`: what a recorder gives to the writer, replan by replan (`vla_attention.capture.store.store_writer`).
+- `small_tokens`, `libero_tokens`, `random_rows`: tokens of an episode, and attention-like rows for them.
+- `assert_whole`: read a store back and fail on everything that `vla-analyze verify` would report.
+- `vla_attention.testing.strategies`: random layouts, tokens and groupings for hypothesis (to be installed beside it).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.verify import verify_store
+from vla_attention.testing.stores import StoreSpec, episode_records, expected_arrays, root_attributes, write_store
+from vla_attention.testing.tokens import libero_tokens, random_rows, small_tokens
+
+__all__ = [
+    "StoreSpec",
+    "assert_whole",
+    "episode_records",
+    "expected_arrays",
+    "libero_tokens",
+    "random_rows",
+    "root_attributes",
+    "small_tokens",
+    "write_store",
+]
+
+
+def assert_whole(path: Path) -> None:
+    """Raise `AssertionError` with every fault of the store at `path`."""
+    faults = verify_store(open_store(path))
+    assert not faults, "; ".join(f"{fault.episode}: {fault.problem}" for fault in faults)

@@ -1,0 +1,95 @@
+"""Hypothesis strategies: random layouts, tokens and groupings, all of them valid.
+
+Importing this module needs hypothesis, which vla-attention does not install.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vla_attention.schemas.errors import MissingDependency
+from vla_attention.schemas.groupings.grouping import Grouping
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, ObjectKind, SceneObject
+from vla_attention.schemas.layout import Role, SiteLayout
+from vla_attention.testing.tokens import SpelledPrompt, site_layout, spell_prompt, tokens_of
+
+try:
+    from hypothesis import strategies as st
+except ImportError:
+    raise MissingDependency("vla_attention.testing.strategies needs hypothesis: pip install hypothesis.") from None
+
+NOUNS = ("bowl", "plate", "drawer", "stove", "mug")
+OBJECTS: dict[str, ObjectKind] = {
+    "bowl_1": "object",
+    "plate_1": "object",
+    "robot": "robot",
+    "background": "background",
+}
+
+
+@st.composite
+def layouts(draw: st.DrawFn) -> SiteLayout:
+    """One to three cameras of different grids, a prompt, perhaps a state token, actions."""
+    size = st.integers(1, 4)
+    grids = {f"camera{i}": (draw(size), draw(size)) for i in range(draw(st.integers(1, 3)))}
+    text_keys, state_keys, action_keys = draw(st.integers(8, 14)), draw(st.integers(0, 1)), draw(st.integers(1, 4))
+    return site_layout(grids, 14, text_keys, action_keys, state_keys)
+
+
+@st.composite
+def episode_tokens(draw: st.DrawFn) -> EpisodeTokens:
+    """Tokens of an episode: a masked camera perhaps, prompts that may change between replans, objects on patches."""
+    layout = draw(layouts())
+    replans = draw(st.integers(1, 4))
+    choices = [draw(prompts_for(layout)) for _ in range(draw(st.integers(1, min(2, replans))))]
+    prompts = [draw(st.sampled_from(choices)) for _ in range(replans)]
+    masked = ("camera1",) if draw(st.booleans()) else ()
+    objects = tuple(SceneObject(name, kind, name == "bowl_1") for name, kind in OBJECTS.items())
+    coverage = {}
+    for camera in layout.cameras:
+        if camera not in masked:
+            seed = draw(st.integers(0, 2**16))
+            patches = layout.camera_span(camera).num_keys
+            share = np.random.default_rng(seed).dirichlet(np.full(len(objects), 0.4), size=(replans, patches))
+            coverage[camera] = share.astype(np.float32)
+    return tokens_of(layout, prompts, objects, coverage, masked)
+
+
+@st.composite
+def prompts_for(draw: st.DrawFn, layout: SiteLayout) -> SpelledPrompt:
+    """An instruction of two to four words, one or two pieces a word, between bos and a line end."""
+    words = draw(st.lists(st.sampled_from(NOUNS), min_size=2, max_size=4))
+    texts: list[str] = []
+    for i, word in enumerate(words):
+        text = " " * (i > 0) + word  # a piece carries the space before its word
+        cut = draw(st.sampled_from([len(text), 2 + (i > 0)])) if len(texts) < 3 else len(text)
+        texts += [part for part in (text[:cut], text[cut:]) if part]
+    pieces = [*((text, Role.INSTRUCTION) for text in texts), ("\n", Role.TEMPLATE)]
+    return spell_prompt(layout, pieces, " ".join(words))
+
+
+@st.composite
+def groupings(draw: st.DrawFn, tokens: EpisodeTokens) -> Grouping:
+    """A disjoint, complete grouping: later groups give up what earlier ones took; the last one is the rest."""
+    cameras = tokens.layout.cameras
+    grid = tokens.layout.camera_span(cameras[0]).grid
+    assert grid is not None
+    assert tokens.prompt_index is not None
+    choices = [
+        *(f"camera:{camera}" for camera in cameras),
+        *(f"role:{role}" for role in ("image", "instruction", "template", "action", "padding", "state")),
+        *(f"span:{span.name}" for span in tokens.layout.spans),
+        *(f"word:{word}" for word in sorted({word.text for i in set(tokens.prompt_index) for word in tokens.words[i]})),
+        *(f"object:{name}" for name in (*OBJECTS, "@interest", "@robot", "@background")),
+        f"patch:{cameras[0]}[0:{draw(st.integers(1, grid.rows))},0:{draw(st.integers(1, grid.columns))}]",
+        f"keys:0-{draw(st.integers(0, tokens.layout.num_keys - 1))}",
+    ]
+    atoms = draw(st.lists(st.sampled_from(choices), min_size=1, max_size=4, unique=True))
+    groups: dict[str, tuple[str, ...]] = {}
+    for i, atom in enumerate(atoms):
+        operand = draw(st.sampled_from(choices))
+        wanted = draw(st.sampled_from([atom, f"{atom} | {operand}", f"{atom} & {operand}", f"({atom} | {operand})"]))
+        earlier = " | ".join(f"({selector})" for (selector,) in groups.values())
+        groups[f"g{i}"] = (f"({wanted}) - ({earlier})" if earlier else wanted,)
+    groups["rest"] = ("*",)
+    return Grouping("random", groups, allow_empty=tuple(groups))
