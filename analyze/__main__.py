@@ -13,36 +13,38 @@ from vla_attention.analyze.commands import COMMANDS, DEFAULT_COMMAND
 from vla_attention.schemas.command_line import run_command
 from vla_attention.schemas.errors import UnknownName, UserError, did_you_mean, listing
 
-#: Episodes are measured by threads of our own (`vla_attention.analyze.stores.parallel`); products that each start threads only stand in their way.
+#: Episodes are measured in threads (`stores.parallel`); matrix products that start threads too make them slower.
 _ONE_THREAD_EACH = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
-#: The collector need not look for cycles after every 700 of the ten thousands of token pieces and steps, which have none.
+#: Objects made between two runs of the garbage collector. Token pieces and steps are tens of thousands, without cycles; Python's
+#: default of 700 would search them again and again.
 _OBJECTS_BETWEEN_COLLECTIONS = 5_000_000
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code (2: a mistake in what was given, said in one sentence)."""
+    """Run the command line; returns the exit code (2: an argument or a store is wrong, and one sentence says how)."""
     for name in _ONE_THREAD_EACH:  # read when numpy is imported, which is later
         os.environ.setdefault(name, "1")
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
-    words = sys.argv[1:] if argv is None else list(argv)
-    name = words[0] if words[:1] and words[0] in COMMANDS else ""
+    given = sys.argv[1:] if argv is None else list(argv)
+    name = given[0] if given[:1] and given[0] in COMMANDS else ""
     prog = f"vla-analyze {name}".strip()
-    return run_command(prog, lambda: _run(name, words[1:] if name else words), "nothing was left half written.")
+    return run_command(prog, lambda: _run(name, given[1:] if name else given), "nothing was left half written.")
 
 
-def _run(name: str, words: Sequence[str]) -> int:
+def _run(name: str, arguments: Sequence[str]) -> int:
     if not name:
-        _refuse_misspelt_command(words)
+        _refuse_misspelt_command(arguments)
     command = import_module(f"vla_attention.analyze.{name or DEFAULT_COMMAND}.command")
     parser = command.build_parser(prog=f"vla-analyze {name}") if name == DEFAULT_COMMAND else command.build_parser()
     try:
-        return command.run(parser.parse_args(words))
+        code: int = command.run(parser.parse_args(arguments))
+        return code
     except UserError as error:
         raise _with_way_out(error) from error.__cause__
 
 
 def _with_way_out(error: UserError) -> UserError:
-    """Add to the error of a damaged episode what can be done about it."""
+    """Add to the error of a damaged episode what the user can do."""
     from vla_attention.schemas.stores.store_format import CorruptEpisode
 
     if not isinstance(error, CorruptEpisode):
@@ -52,13 +54,13 @@ def _with_way_out(error: UserError) -> UserError:
     )
 
 
-def _refuse_misspelt_command(words: Sequence[str]) -> None:
-    """A first word that is like a command and is no path is a slip, not a store."""
-    if len(words) > 1 and not words[0].startswith("-") and not Path(words[0]).exists():
-        near = did_you_mean(words[0], COMMANDS)
+def _refuse_misspelt_command(arguments: Sequence[str]) -> None:
+    """Raise `UnknownName` for a first argument that resembles a command and is no path."""
+    if len(arguments) > 1 and not arguments[0].startswith("-") and not Path(arguments[0]).exists():
+        near = did_you_mean(arguments[0], COMMANDS)
         if near:
             raise UnknownName(
-                f"There is neither a command nor a store '{words[0]}'.{near} Commands: {listing(COMMANDS, 40)}."
+                f"There is neither a command nor a store '{arguments[0]}'.{near} Commands: {listing(COMMANDS, 40)}."
             )
 
 

@@ -6,13 +6,11 @@ The examples run as tests, with `store` and `other` being paths of small stores 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal, Unpack
 
 import polars as pl
 
-from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.settings import Settings, analysis_settings
 from vla_attention.analyze.opened import Opened, check_name
 from vla_attention.analyze.stores.selection import check_combinable
@@ -101,16 +99,13 @@ class OpenStores(Opened):
         >>> sorted(words.filter(kind="word")["item"].to_list())
         ['bowl', 'on', 'plate', 'put', 'the']
         """
-        from vla_attention.analyze.words.word_reading import site_of_words, words_summary, words_table
+        from vla_attention.analyze.words.word_study import study_words
 
         check_name("table", table, ("summary", "episodes"))
-        settings["site"] = site_of_words(self.attributes, settings.get("site"))
-        question = self.ask(**settings)
-        episodes = words_table(question)
-        return episodes if table == "episodes" else words_summary(episodes, seed=question.settings.seed)
+        return _frame(study_words(self.stores, analysis_settings(**settings)), table)
 
     def objects(
-        self, table: Literal["objects", "times", "iou"] = "objects", **settings: Unpack[Settings]
+        self, table: Literal["objects", "times", "pointing", "iou"] = "objects", **settings: Unpack[Settings]
     ) -> pl.DataFrame:
         """Which objects are looked at: shares and lifts, shares over time, or pointing game and IoU with their masks.
 
@@ -121,10 +116,12 @@ class OpenStores(Opened):
         Raises:
             BadArgument: the stores hold no object masks.
         """
-        from vla_attention.analyze.objects.object_attention import ObjectSettings, object_tables
+        from vla_attention.analyze.objects.object_settings import ObjectSettings
+        from vla_attention.analyze.objects.object_study import study_objects
 
-        check_name("table", table, ("objects", "times", "iou"))
-        return _frame(object_tables(self.ask(**settings), ObjectSettings(spatial=table == "iou")), table)
+        check_name("table", table, ("objects", "times", "pointing", "iou"))
+        options = ObjectSettings(spatial=table in ("pointing", "iou"))
+        return _frame(study_objects(self.stores, analysis_settings(**settings), options).tables, table)
 
     def time(
         self,
@@ -196,33 +193,22 @@ class OpenStores(Opened):
         >>> patches.height, sorted(file.suffix for file in folder.iterdir())
         (16, ['.csv', '.pdf', '.png'])
         """
-        from vla_attention.analyze.groups.group_preview import find_example
-        from vla_attention.analyze.overlay.overlay_data import (
-            camera_names,
-            check_outlines,
-            chosen_replans,
-            episode_overlay,
-            outline_grouping,
-            overlay_table,
-            ratios_of,
-        )
+        from vla_attention.analyze.overlay.overlay_study import study_overlay
 
         check_name("measure", measure, ("lift", "share"))
-        wanted = analysis_settings(**settings)
-        outlined = outline_grouping(wanted.groups)
-        question = ask(self.stores, replace(wanted, groups=()))
-        check_outlines(question, outlined)
-        named = [cameras] if isinstance(cameras, str) else cameras
-        item = find_example(question.selected, task, episode)
-        overlay = episode_overlay(question, item, camera_names(question, named), ratios_of(question, item), outlined)
-        asked = None if replans is None else [replans] if isinstance(replans, int) else list(replans)
-        shown = chosen_replans(overlay, asked, overlay.num_replans)
+        study = study_overlay(
+            self.stores,
+            analysis_settings(**settings),
+            task=task,
+            episode=episode,
+            cameras=[cameras] if isinstance(cameras, str) else cameras,
+            replans=[replans] if isinstance(replans, int) else replans,
+        )
         if folder is not None:
             from vla_attention.analyze.overlay.plot_strip import plot_overlay_strip
 
-            stem = f"overlay_{item.episode.name}"
-            plot_overlay_strip(overlay, question.grouping, shown, Path(folder), stem, measure=measure, smooth=smooth)
-        return overlay_table(overlay, shown)
+            plot_overlay_strip(study, Path(folder), measure=measure, smooth=smooth)
+        return study.table
 
     def report(
         self, path: str | Path, episodes: int | None = None, replans: int | None = None, **settings: Unpack[Settings]

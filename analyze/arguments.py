@@ -9,11 +9,19 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from vla_attention.analyze.measures.question import AnalysisSettings
     from vla_attention.analyze.measures.sinks import SinkRule
+    from vla_attention.schemas.stores.reader import Store
 
 
 def add_stores(parser: argparse.ArgumentParser) -> None:
     """STORE ..., one or several, analysed as one."""
     parser.add_argument("stores", nargs="+", type=Path, metavar="STORE", help="one or several NAME.zarr")
+
+
+def stores_of(arguments: argparse.Namespace) -> list[Store]:
+    """The stores that the arguments name, opened."""
+    from vla_attention.schemas.stores.reader import open_store
+
+    return [open_store(path) for path in arguments.stores]
 
 
 def add_grouping(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
@@ -31,18 +39,31 @@ def add_grouping(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     return grouping
 
 
-def add_selection(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
-    """--site, --layers, --denoise, --heads, --tasks and --skip-corrupt."""
-    chosen = parser.add_argument_group("selection")
+def add_site_and_tasks(chosen: argparse._ArgumentGroup) -> None:
+    """--site and --tasks."""
     chosen.add_argument(
         "--site", metavar="NAME", help="softmax family: joint (pi), self or cross (Cosmos); default: the first one"
     )
+    chosen.add_argument("--tasks", type=int, nargs="+", metavar="N", help="task ids (default: all)")
+
+
+def add_episode(parser: argparse.ArgumentParser, title: str) -> argparse._ArgumentGroup:
+    """--task and --episode, which name one episode."""
+    episode = parser.add_argument_group(title)
+    episode.add_argument("--task", type=int, metavar="N", help="its task (default: the first one)")
+    episode.add_argument("--episode", type=int, metavar="N", help="its episode (default: the task's first one)")
+    return episode
+
+
+def add_selection(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
+    """--site, --layers, --denoise, --heads, --tasks and --skip-corrupt."""
+    chosen = parser.add_argument_group("selection")
+    add_site_and_tasks(chosen)
     chosen.add_argument("--layers", type=int, nargs="+", metavar="N", help="layers (default: all recorded)")
     chosen.add_argument(
         "--denoise", nargs="+", metavar="STEP", help="denoise steps, first, last or all (default: all recorded)"
     )
     chosen.add_argument("--heads", type=int, nargs="+", metavar="N", help="heads (default: all recorded)")
-    chosen.add_argument("--tasks", type=int, nargs="+", metavar="N", help="task ids (default: all)")
     chosen.add_argument(
         "--skip-corrupt",
         action="store_true",
@@ -61,7 +82,7 @@ def add_output(parser: argparse.ArgumentParser, default: str = "results/STORE/GR
 
 
 def add_sink_rule(parser: argparse._ArgumentGroup) -> None:
-    """--sink-factor and --sink-share; their defaults are those of `metrics.sinks.SinkRule`."""
+    """--sink-factor and --sink-share; their defaults are those of `measures.sinks.SinkRule`."""
     parser.add_argument(
         "--sink-factor", type=float, metavar="X", help="a sink takes more than X times its uniform share (default: 10)"
     )
@@ -95,5 +116,6 @@ def settings_of(arguments: argparse.Namespace) -> AnalysisSettings:
 
 
 def output_folder(arguments: argparse.Namespace, name: str) -> Path:
-    """Where results go: `--output`, or results/STORE/NAME."""
-    return arguments.output or Path("results") / arguments.stores[0].stem / name
+    """The folder of results: `--output`, else results/STORE/NAME."""
+    given: Path | None = arguments.output
+    return given or Path("results") / arguments.stores[0].stem / name

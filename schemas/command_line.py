@@ -23,10 +23,11 @@ class OneSentenceParser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}. See {self.prog} --help.\n")
 
 
-def command_parser(prog: str, description: str, examples: str = "") -> OneSentenceParser:
+def command_parser(prog: str, description: str, examples: str = "", usage: str | None = None) -> OneSentenceParser:
     """A parser whose help shows the description, wrapped, and below the arguments the examples as they are."""
     return OneSentenceParser(
         prog=prog,
+        usage=usage,
         description=textwrap.fill(description, _HELP_WIDTH),
         epilog=examples or None,
         formatter_class=argparse.RawDescriptionHelpFormatter,

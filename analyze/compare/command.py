@@ -7,7 +7,7 @@ from pathlib import Path
 
 from vla_attention.analyze.arguments import add_grouping, add_output, add_selection, settings_of
 from vla_attention.analyze.show.output_files import report_files
-from vla_attention.schemas.command_line import OneSentenceParser
+from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
   vla-analyze compare runs/base.zarr runs/finetuned.zarr
@@ -23,12 +23,11 @@ layers, denoise_steps, heads, queries, depth, layout, cameras, processing, simul
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-analyze compare RUN RUN ...`."""
-    parser = OneSentenceParser(
-        prog="vla-analyze compare",
-        description="Differences of other runs to the first one, per task, layer and overall, with intervals;\n"
+    parser = command_parser(
+        "vla-analyze compare",
+        "Differences of other runs to the first one, per task, layer and overall, with intervals;\n"
         "paired where runs share initial states and seeds.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
     )
     parser.add_argument(
         "runs",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vla_attention.schemas.command_line import OneSentenceParser
+from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
   vla-analyze copy libero_10.zarr                               how large each part is
@@ -21,11 +21,10 @@ verifies, and says in its provenance what was left behind.
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-analyze copy STORE DEST`."""
-    parser = OneSentenceParser(
-        prog="vla-analyze copy",
-        description="Copy a store, for instance without its pictures; or, without DEST, say how large each part is.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = command_parser(
+        "vla-analyze copy",
+        "Copy a store, for instance without its pictures; or, without DEST, say how large each part is.",
+        _EXAMPLES,
     )
     parser.add_argument("store", type=Path, metavar="STORE", help="NAME.zarr")
     parser.add_argument("target", type=Path, nargs="?", metavar="DEST", help="where the copy goes, NAME.zarr")

@@ -13,7 +13,7 @@ from vla_attention.analyze.arguments import (
     settings_of,
 )
 from vla_attention.analyze.show.output_files import report_files
-from vla_attention.schemas.command_line import OneSentenceParser
+from vla_attention.schemas.command_line import command_parser
 from vla_attention.schemas.errors import BadArgument
 
 _TABLES = ("steps", "replans", "episodes", "tasks", "contributions")
@@ -31,11 +31,10 @@ xarray.open_dataset, or anything that reads HDF5.
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-analyze export STORE ...`."""
-    parser = OneSentenceParser(
-        prog="vla-analyze export",
-        description="Numbers for other programs: tables as CSV or Parquet; masses, and rows if wanted, as NetCDF.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = command_parser(
+        "vla-analyze export",
+        "Numbers for other programs: tables as CSV or Parquet; masses, and rows if wanted, as NetCDF.",
+        _EXAMPLES,
     )
     add_stores(parser)
     kinds = parser.add_argument_group("kinds (at least one)")

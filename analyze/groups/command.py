@@ -5,9 +5,17 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vla_attention.analyze.arguments import add_grouping, add_stores, output_folder, settings_of
-from vla_attention.analyze.show.output_files import report_files
-from vla_attention.schemas.command_line import OneSentenceParser
+from vla_attention.analyze.arguments import (
+    add_episode,
+    add_grouping,
+    add_site_and_tasks,
+    add_stores,
+    output_folder,
+    settings_of,
+    stores_of,
+)
+from vla_attention.analyze.show.output_files import report_files, write_parquet
+from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
   vla-analyze groups runs/libero_10.zarr --grouping cameras
@@ -22,23 +30,16 @@ The language of selectors is in docs/groupings.md.
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-analyze groups STORE ...`."""
-    parser = OneSentenceParser(
-        prog="vla-analyze groups",
-        description="What a grouping takes, before any number is computed: keys by span and role, words with their pieces, "
+    parser = command_parser(
+        "vla-analyze groups",
+        "What a grouping takes, before any number is computed: keys by span and role, words with their pieces, "
         "overlaps, what no group takes, and a picture of the patches. Reads no attention.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
     )
     add_stores(parser)
     add_grouping(parser)
-    selection = parser.add_argument_group("selection")
-    selection.add_argument(
-        "--site", metavar="NAME", help="softmax family: joint (pi), self or cross (Cosmos); default: the first one"
-    )
-    selection.add_argument("--tasks", type=int, nargs="+", metavar="N", help="task ids (default: all)")
-    example = parser.add_argument_group("example in the picture")
-    example.add_argument("--task", type=int, metavar="N", help="its task (default: the first one)")
-    example.add_argument("--episode", type=int, metavar="N", help="its episode (default: the task's first one)")
+    add_site_and_tasks(parser.add_argument_group("selection"))
+    example = add_episode(parser, "example in the picture")
     example.add_argument("--replan", type=int, default=0, metavar="N", help="its replan (default: 0)")
     output = parser.add_argument_group("output")
     output.add_argument("--output", type=Path, metavar="PATH", help="folder (default: results/STORE/groups)")
@@ -48,13 +49,13 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print what the groups take; write tables and the picture."""
-    from vla_attention.analyze.groups.group_preview import check_replan, find_example, preview_groups, preview_text
+    from vla_attention.analyze.groups.group_preview import preview_groups
+    from vla_attention.analyze.groups.text import preview_text
     from vla_attention.analyze.measures.question import ask
-    from vla_attention.analyze.show.output_files import write_parquet
-    from vla_attention.schemas.stores.reader import open_store
+    from vla_attention.analyze.measures.selected import check_replan, find_episode
 
-    question = ask([open_store(path) for path in arguments.stores], settings_of(arguments))
-    example = find_example(question.selected, arguments.task, arguments.episode)
+    question = ask(stores_of(arguments), settings_of(arguments))
+    example = find_episode(question.selected, arguments.task, arguments.episode)
     replan = check_replan(example, arguments.replan)
     preview = preview_groups(question)
     print(preview_text(question, preview))

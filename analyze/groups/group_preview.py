@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -12,10 +11,7 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.masses import ratio
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
-from vla_attention.analyze.show.numbers import format_number, plural
-from vla_attention.analyze.show.text_table import text_table
-from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.schemas.groupings.grouping import REST, Grouping
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping, resolve, shared_keys
 from vla_attention.schemas.groupings.words import Word
@@ -25,7 +21,6 @@ from vla_attention.schemas.segments import merge_segments, segment_members, segm
 #: Name under which tables list what no group takes.
 UNTAKEN = "(no group)"
 _UNTAKEN_GROUP = "_no_group"
-WIDTH = 100
 #: Less than this part of a key is rounding of covered areas, and is not listed.
 _NEGLIGIBLE = 1e-4
 
@@ -69,66 +64,10 @@ def preview_groups(question: Question) -> GroupPreview:
     )
 
 
-def groups_table(question: Question) -> pl.DataFrame:
-    """How many keys each group takes of which spans and roles; see `GroupPreview.groups`."""
-    return preview_groups(question).groups
-
-
-def find_example(selected: Sequence[SelectedEpisode], task: int | None, episode: int | None) -> SelectedEpisode:
-    """The first selected episode of that task and number; the error lists what there is."""
-    for item in selected:
-        attributes = item.episode.attributes
-        if task in (None, attributes.task_id) and episode in (None, attributes.episode_index):
-            return item
-    wanted = " ".join(
-        f"{what} {number}" for what, number in (("task", task), ("episode", episode)) if number is not None
-    )
-    raise BadArgument(
-        f"There is no {wanted} among the {len(selected)} selected episodes: "
-        f"{listing([item.episode.name for item in selected], 20)}."
-    )
-
-
-def check_replan(item: SelectedEpisode, replan: int) -> int:
-    """The replan's number, when the episode has it."""
-    if not 0 <= replan < item.tokens.num_replans:
-        raise BadArgument(
-            f"There is no replan {replan} in {item.episode.name}; it has replans 0 to {item.tokens.num_replans - 1}."
-        )
-    return replan
-
-
 def pieces_of(word: Word, prompt: Prompt) -> tuple[str, ...]:
     """The text of a word's tokens, without the space before them."""
     texts = {piece.key: prompt.text[piece.start : piece.stop].strip() for piece in prompt.pieces}
     return tuple(texts[key] for key in word.keys)
-
-
-def preview_text(question: Question, preview: GroupPreview) -> str:
-    """The preview as text: groups with their keys, words, what is shared and what is left over."""
-    grouping, tokens = question.grouping, question.selected[0].tokens
-    tasks = {(item.store.suite, item.episode.attributes.task_id) for item in question.selected}
-    sharing = "groups may overlap" if grouping.overlap else "no key in two groups"
-    lines = [
-        f"Grouping '{grouping.name}': {len(grouping.names)} groups, {sharing}"
-        + (f" ({grouping.description})" if grouping.description else ""),
-        f"Site '{question.site}' with {tokens.layout.num_keys} keys; "
-        f"{plural(len(question.selected), 'episode')} of {plural(len(tasks), 'task')}",
-        *question.skipped,
-        "",
-        _groups_text(preview, grouping),
-    ]
-    lines += ["", *_words_text(preview)] if preview.words.height else []
-    lines += ["", *_overlaps_text(preview)]
-    if grouping.ratio is not None and preview.uniform_ratio is not None:
-        sides = " / ".join(" + ".join(side) for side in (grouping.ratio.numerator, grouping.ratio.denominator))
-        lines.append(f"Ratio {sides}: uniform attention alone gives {_range(*preview.uniform_ratio)}.")
-    return "\n".join(wrapped for line in lines for wrapped in _wrap(line))
-
-
-def _wrap(line: str) -> list[str]:
-    """Sentences wrapped to the page; tables, which come as several lines, as they are."""
-    return [line] if "\n" in line or not line else textwrap.wrap(line, WIDTH)
 
 
 def _with_untaken(grouping: Grouping) -> Grouping:
@@ -227,59 +166,3 @@ def _uniform_ratio(grouping: Grouping, resolved: Sequence[ResolvedGrouping]) -> 
     )
     defined = values[~np.isnan(values)]
     return (float(defined.min()), float(defined.max())) if defined.size else None
-
-
-def _range(low: float, high: float) -> str:
-    first, last = format_number(low), format_number(high)
-    return first if first == last else f"{first}..{last}"
-
-
-def _groups_text(preview: GroupPreview, grouping: Grouping) -> str:
-    rows, texts = [], []
-    for name in preview.groups["group"].unique(maintain_order=True):
-        parts = preview.groups.filter(pl.col("group") == name)
-        total = parts.row(0, named=True)
-        rows.append([name, _range(total["keys_min"], total["keys_max"])])
-        taken = [
-            f"{_range(part['keys_min'], part['keys_max'])} {part['role']} of {part['span']} ({part['span_keys']})"
-            for part in parts.slice(1).iter_rows(named=True)
-        ]
-        selectors = " | ".join(grouping.groups[name]) if name in grouping.groups else ""
-        texts.append(f"{', '.join(taken) or 'nothing'}{f'   <- {selectors}' if selectors else ''}")
-    table = text_table(["group", "keys"], rows, left=(0,), last="of which (keys of the span) <- selector", texts=texts)
-    return (
-        f"{table}\nkeys: lowest..highest number over all replans; an object counts the area that it covers, in patches"
-    )
-
-
-def _words_text(preview: GroupPreview) -> list[str]:
-    lines = []
-    rows, texts = [], []
-    for name in preview.words["group"].unique(maintain_order=True):
-        words = preview.words.filter(pl.col("group") == name)
-        rows.append([name, str(words["word"].n_unique())])
-        shown = [
-            row["word"] + (f" ({row['pieces']})" if row["num_pieces"] != 1 else "")
-            for row in words.iter_rows(named=True)
-        ]
-        texts.append(listing(shown, 40))
-    lines.append(
-        text_table(["group", "words"], rows, left=(0,), last="which (pieces, where a word has several)", texts=texts)
-    )
-    return lines
-
-
-def _overlaps_text(preview: GroupPreview) -> list[str]:
-    lines = [
-        f"Groups '{row['group']}' and '{row['other']}' share {_range(row['keys_min'], row['keys_max'])} keys."
-        for row in preview.overlaps.iter_rows(named=True)
-    ]
-    untaken = preview.groups.filter(pl.col("group") == UNTAKEN)
-    if untaken.height:
-        parts = [f"{row['role']} of {row['span']}" for row in untaken.slice(1).iter_rows(named=True)]
-        total = untaken.row(0, named=True)
-        lines.append(f"No group takes {_range(total['keys_min'], total['keys_max'])} keys: {listing(parts)}.")
-        lines.append("Their masses are in no fraction; add a group '*' to have them.")
-    else:
-        lines.append("Every key is in a group.")
-    return lines

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from vla_attention.analyze.measures.patch_maps import seen_cameras
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.show.patch_pictures import NO_PICTURE, upright
+from vla_attention.analyze.show.plot_axes import hide_frame
 from vla_attention.analyze.show.plot_colours import NOTE_COLOR, group_styles
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, shortened, title
@@ -140,8 +141,7 @@ def _draw_camera(
     axes.set_yticks(np.arange(1, grid.rows) * height / grid.rows - 0.5, minor=True)
     axes.grid(which="minor", color="white", linewidth=0.25, alpha=0.6)
     _number_patches(axes, grid, (height, width), view)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
+    hide_frame(axes)
     if not stored:
         axes.set_xlabel("no pictures in the store", size=7, color=NOTE_COLOR)
 

@@ -15,7 +15,7 @@ from vla_attention.analyze.arguments import (
     sink_rule,
 )
 from vla_attention.analyze.show.output_files import report_files
-from vla_attention.schemas.command_line import OneSentenceParser
+from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
   vla-analyze heads runs/libero_10.zarr
@@ -30,13 +30,12 @@ A sink is a key that takes more than --sink-factor times its uniform share in at
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-analyze heads STORE ...`."""
-    parser = OneSentenceParser(
-        prog="vla-analyze heads",
-        description="Who looks and who reads: the most visual and most linguistic heads, how much heads differ, layers, depth and "
+    parser = command_parser(
+        "vla-analyze heads",
+        "Who looks and who reads: the most visual and most linguistic heads, how much heads differ, layers, depth and "
         "denoise steps, with intervals over tasks and episodes; and of single rows entropy, effective number of keys, mass of the "
         "largest keys and sinks.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
     )
     add_stores(parser)
     add_grouping(parser)

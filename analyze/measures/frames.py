@@ -25,7 +25,7 @@ EPISODE_KEYS = ("suite", "task_id", "instruction", "episode_index", "success", "
 LAYERS_AVG = "layers_avg"
 
 #: One axis: the columns that label it, each with a value per position.
-Axis = Mapping[str, Sequence[Any] | NDArray[Any]]
+Axis = Mapping[str, Sequence[Any] | NDArray[Any] | pl.Series]
 
 
 def long_table(
@@ -64,7 +64,9 @@ def _constant(name: str, item: SelectedEpisode, height: int) -> pl.Series:
     return _labels(name, [value]).new_from_index(0, height)
 
 
-def _labels(name: str, labels: Sequence[Any] | NDArray[Any]) -> pl.Series:
+def _labels(name: str, labels: Sequence[Any] | NDArray[Any] | pl.Series) -> pl.Series:
+    if isinstance(labels, pl.Series):  # labels that may all be null have a type of their own
+        return labels
     given = labels.tolist() if isinstance(labels, np.ndarray) else list(labels)
     known = next((label for label in given if label is not None), 0)
     kinds = {bool: pl.Boolean, int: pl.Int64, float: pl.Float64, str: pl.String}

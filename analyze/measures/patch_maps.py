@@ -1,4 +1,4 @@
-"""Where on the cameras' pictures the attention lies: mean mass of every patch over a selection, as grids."""
+"""The cameras that a policy sees, and the mean attention on every key over a selection."""
 
 from __future__ import annotations
 
@@ -20,21 +20,6 @@ def seen_cameras(item: SelectedEpisode) -> tuple[str, ...]:
         for camera, span in spans
         if span.grid is not None and (roles[:, span.start : span.stop] == Role.IMAGE).any()
     )
-
-
-def patch_maps(item: SelectedEpisode, selection: Selection, site: str) -> dict[str, NDArray[np.float64]]:
-    """Mass of every patch by camera, shape (replan, row, column): mean over the selected layers, denoise steps and heads.
-
-    Row 0, column 0 is the top left patch of the picture as the model sees it, which is the stored frame as it is. A block that
-    was named by two layer numbers counts once.
-    """
-    mean = mean_rows(item, selection, site)
-    maps = {}
-    for camera in seen_cameras(item):
-        span = item.tokens.layout.camera_span(camera)
-        assert span.grid is not None
-        maps[camera] = mean[:, span.start : span.stop].reshape(-1, span.grid.rows, span.grid.columns)
-    return maps
 
 
 def mean_rows(item: SelectedEpisode, selection: Selection, site: str) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import EmptyGroup, ResolvedGrouping, check_names, resolve
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary, collect_vocabulary
@@ -37,6 +38,34 @@ class SelectedEpisode:
 def load_tokens(chosen: Sequence[tuple[Store, StoredEpisode]], site: str) -> list[SelectedEpisode]:
     """Read the small part of every episode: what its keys are."""
     return [SelectedEpisode(store, episode, episode.tokens(store.attributes, site)) for store, episode in chosen]
+
+
+def find_episode(selected: Sequence[SelectedEpisode], task: int | None, episode: int | None) -> SelectedEpisode:
+    """The first selected episode of that task and number, None standing for any.
+
+    Raises:
+        BadArgument: no selected episode has them; the sentence lists the episodes.
+    """
+    for item in selected:
+        attributes = item.episode.attributes
+        if task in (None, attributes.task_id) and episode in (None, attributes.episode_index):
+            return item
+    wanted = " ".join(
+        f"{what} {number}" for what, number in (("task", task), ("episode", episode)) if number is not None
+    )
+    raise BadArgument(
+        f"There is no {wanted} among the {len(selected)} selected episodes: "
+        f"{listing([item.episode.name for item in selected], 20)}."
+    )
+
+
+def check_replan(item: SelectedEpisode, replan: int) -> int:
+    """The replan's number; `BadArgument` unless the episode has it."""
+    if not 0 <= replan < item.tokens.num_replans:
+        raise BadArgument(
+            f"There is no replan {replan} in {item.episode.name}; it has replans 0 to {item.tokens.num_replans - 1}."
+        )
+    return replan
 
 
 def vocabulary_of(selected: Sequence[SelectedEpisode]) -> Vocabulary:

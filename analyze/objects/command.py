@@ -5,14 +5,16 @@ from __future__ import annotations
 import argparse
 
 from vla_attention.analyze.arguments import (
+    add_episode,
     add_output,
     add_selection,
     add_stores,
     output_folder,
     settings_of,
+    stores_of,
 )
-from vla_attention.analyze.show.output_files import report_files
-from vla_attention.schemas.command_line import OneSentenceParser
+from vla_attention.analyze.show.output_files import report_files, write_parquet
+from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
   vla-analyze objects runs/libero_10.zarr
@@ -28,12 +30,11 @@ number of heads.
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-analyze objects STORE ...`."""
-    parser = OneSentenceParser(
-        prog="vla-analyze objects",
-        description="Which objects are looked at: share of the image attention and lift over covered area per object and class (of "
+    parser = command_parser(
+        "vla-analyze objects",
+        "Which objects are looked at: share of the image attention and lift over covered area per object and class (of "
         "interest, other, robot, background); centre of attention, pointing game and IoU with the objects' masks, with chance levels.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
     )
     add_stores(parser)
     selection = add_selection(parser)
@@ -60,61 +61,40 @@ def build_parser() -> argparse.ArgumentParser:
     maps.add_argument(
         "--save-steps", action="store_true", help="also a table per replan, layer, denoise step and head (large)"
     )
-    example = parser.add_argument_group("example in the picture")
-    example.add_argument("--task", type=int, metavar="N", help="its task (default: the first one)")
-    example.add_argument("--episode", type=int, metavar="N", help="its episode (default: the task's first one)")
+    add_episode(parser, "example in the picture")
     add_output(parser, "results/STORE/objects")
     return parser
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure the objects; print them, write tables and pictures."""
-    from vla_attention.analyze.groups.group_preview import find_example
-    from vla_attention.analyze.measures.aggregate import overall_layer
-    from vla_attention.analyze.measures.question import ask
-    from vla_attention.analyze.objects.object_attention import object_tables
-    from vla_attention.analyze.objects.object_summary import (
-        best_finders,
-        iou_summary,
-        objects_summary,
-        objects_text,
-        strongest_followers,
-    )
-    from vla_attention.analyze.objects.objects_in_view import ObjectSettings, site_of_pictures
-    from vla_attention.analyze.show.output_files import write_parquet
-    from vla_attention.schemas.stores.reader import open_store
+    from vla_attention.analyze.objects.object_settings import ObjectSettings
+    from vla_attention.analyze.objects.object_study import study_objects
+    from vla_attention.analyze.objects.text import objects_text
 
-    settings = ObjectSettings(
+    object_settings = ObjectSettings(
         percentiles=ObjectSettings.percentiles if arguments.percentiles is None else tuple(arguments.percentiles),
         mask_coverage=arguments.mask_coverage,
         tolerance=arguments.tolerance,
         spatial=not arguments.no_iou,
     )
-    stores = [open_store(path) for path in arguments.stores]
-    arguments.site = site_of_pictures(stores[0].attributes, arguments.site)
-    question = ask(stores, settings_of(arguments))
-    example = find_example(question.selected, arguments.task, arguments.episode)
-    tables = object_tables(question, settings, arguments.save_steps)
-    summary = objects_summary(tables.objects, arguments.seed)
-    followers = strongest_followers(tables.objects)
-    layer = overall_layer(tables.objects)
-    to_write = {"objects": tables.objects, "object_times": tables.times, "objects_summary": summary}
-    found = finders = None
-    if tables.iou is not None:
-        found = iou_summary(tables.iou, settings, arguments.seed)
-        finders = best_finders(tables.iou, settings.thresholds[min(1, len(settings.thresholds) - 1)])
-        to_write |= {"iou": tables.iou, "iou_summary": found}
-    if tables.steps is not None:
-        to_write["object_steps"] = tables.steps
-    print(objects_text(question, summary, followers, found, finders, layer, settings))
+    study = study_objects(
+        stores_of(arguments),
+        settings_of(arguments),
+        object_settings,
+        keep_steps=arguments.save_steps,
+        task=arguments.task,
+        episode=arguments.episode,
+    )
+    print(objects_text(study))
     folder = output_folder(arguments, "objects")
-    files = write_parquet(folder, **to_write)
+    files = write_parquet(folder, **study.files())
     if not arguments.no_plots:
         from vla_attention.analyze.objects.plot_object_iou import plot_object_iou
         from vla_attention.analyze.objects.plot_object_shares import plot_object_shares
 
-        files += plot_object_shares(tables.times, example, folder, arguments.seed)
-        if found is not None:
-            files += plot_object_iou(found, settings, folder, layer)
+        files += plot_object_shares(study.tables.times, study.example, folder, arguments.seed)
+        if object_settings.spatial:
+            files += plot_object_iou(study, folder)
     report_files(folder, files)
     return 0

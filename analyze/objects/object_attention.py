@@ -1,29 +1,46 @@
-"""Which objects are looked at: shares of the image attention and lifts per object and class, and how well maps find the objects."""
+"""How much attention objects get: shares and lifts per object and class, and how well attention maps find the objects."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.aggregate import EPISODE_KEYS, LAYERS_AVG
+from vla_attention.analyze.measures.frames import (
+    EPISODE_KEYS,
+    Axis,
+    LayerAxis,
+    denoise_axis,
+    head_axis,
+    layer_axis,
+    long_table,
+    replan_axis,
+)
+from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.objects.objects_in_view import (
+from vla_attention.analyze.objects.object_settings import ObjectSettings
+from vla_attention.analyze.objects.object_views import (
     ALL_CAMERAS,
-    ObjectSettings,
     View,
     cameras_of,
     distance_of_uniform,
     items_of,
-    measure_maps,
     views_of,
 )
-from vla_attention.analyze.objects.spatial import mask_sizes
+from vla_attention.analyze.objects.pointing_and_iou import (
+    centre_of_mass,
+    distance_in_pictures,
+    intersection_over_union,
+    mask_sizes,
+    otsu_regions,
+    percentile_regions,
+    pointing_hits,
+    random_iou,
+)
 from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.analyze.stores.rows import layer_rows
@@ -36,20 +53,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ObjectTables:
-    """What was measured; see `object_tables`."""
+    """Tables of objects; `object_tables` describes them. `pointing` and `iou` are None without `ObjectSettings.spatial`."""
 
     objects: pl.DataFrame
     times: pl.DataFrame
-    iou: pl.DataFrame | None
-    steps: pl.DataFrame | None
-
-
-@dataclass
-class _Measured:
-    """Arrays of one camera: `by_item` are (replan, layer, denoise, head, item), `by_map` lack the last axis."""
-
-    by_item: dict[str, Array] = field(default_factory=dict)
-    by_map: dict[str, Array] = field(default_factory=dict)
+    pointing: pl.DataFrame | None = None
+    iou: pl.DataFrame | None = None
+    steps: pl.DataFrame | None = None
+    iou_steps: pl.DataFrame | None = None
 
 
 def object_tables(question: Question, settings: ObjectSettings | None = None, keep_steps: bool = False) -> ObjectTables:
@@ -63,19 +74,21 @@ def object_tables(question: Question, settings: ObjectSettings | None = None, ke
             mass        sum over patches of row x covered area, mean over replans
             share       mass / mass of all patches of all cameras, mean over replans
             area_share  covered area / area of these cameras' pictures, mean over replans
-            lift        share of this camera's mass / area_share, of these means: 1 is what uniform attention gives. A sliver that
-                        is in sight at one replan cannot outweigh the others, as in a mean of quotients it would.
+            lift        share of this camera's mass / area_share, of these means: 1 is what uniform attention gives. A mean of
+                        quotients would give a sliver that is in sight at one replan as much weight as all other replans.
         times: one row per (episode, replan, camera, item) of the layers' and heads' mean: `share`, `area_share`, `env_step`.
-        iou: with `settings.spatial`, one row per (episode, layer or "layers_avg"[, head], camera, item): means over denoise steps and
-            over the replans at which the item has a mask (`mask_replans` of `num_replans`; null where there is none), of
+        pointing: with `settings.spatial`, one row per (episode, layer or "layers_avg"[, head], camera, item): means over denoise
+            steps and over the replans at which the item has a mask (`mask_replans` of `num_replans`; null where there is none):
             mask_patches                          number of patches of the mask
             centre_row, centre_column             centre of attention in patch units, of this camera's map
             centre_row_share, centre_column_share the same as a part of the picture's height and width
             distance, distance_uniform            from it, and from the middle of the picture, to the object's centre
             pointing, pointing_chance             pointing game, and the share of patches that would score
-            iou_T, iou_T_chance                   IoU at threshold T, and of a random region of the same size
             In "layers_avg" each is the mean of the layers' values, not the value of the layers' mean map.
-        steps: with `keep_steps`, mass and the measures of `iou` per (episode, replan, layer, denoise step, head, camera, item).
+        iou: with `settings.spatial`, the same rows once for each `threshold` (`settings.thresholds`):
+            iou, iou_chance                       IoU with the mask, and of a random region of the same size
+        steps, iou_steps: with `keep_steps`, mass and the measures of `pointing` and of `iou` per (episode, replan, layer, denoise
+            step, head, camera, item).
 
     Raises:
         BadArgument: no selected episode has object coverage at this site.
@@ -89,25 +102,40 @@ def object_tables(question: Question, settings: ObjectSettings | None = None, ke
             return _measure_episode(item, question.selection, question.site, settings, keep_steps)
 
         parts = map_episodes(measure, [item for item in question.selected if cameras_of(item)], advance)
-    return ObjectTables(
-        objects=pl.concat([part.objects for part in parts]),
-        times=pl.concat([part.times for part in parts]),
-        iou=pl.concat([part.iou for part in parts if part.iou is not None]) if settings.spatial else None,
-        steps=pl.concat([part.steps for part in parts if part.steps is not None]) if keep_steps else None,
-    )
+    tables = {}
+    for one in fields(ObjectTables):
+        frames: list[pl.DataFrame] = [frame for part in parts if (frame := getattr(part, one.name)) is not None]
+        tables[one.name] = pl.concat(frames) if frames else None
+    return ObjectTables(**tables)  # type: ignore[arg-type]  # objects and times are never None
 
 
-def objects_table(question: Question) -> pl.DataFrame:
-    """Shares and lifts per object; see `object_tables`, `objects`."""
-    return object_tables(question, ObjectSettings(spatial=False)).objects
+@dataclass
+class _Measured:
+    """Arrays of one camera.
+
+    `by_map` are (replan, layer, denoise, head), `by_item` have a further axis item, and `by_threshold` two: threshold, item.
+    """
+
+    by_map: dict[str, Array] = field(default_factory=dict)
+    by_item: dict[str, Array] = field(default_factory=dict)
+    by_threshold: dict[str, Array] = field(default_factory=dict)
 
 
-def iou_table(question: Question, settings: ObjectSettings | None = None) -> pl.DataFrame:
-    """Centre of attention, pointing game and IoU per object; see `object_tables`, `iou`."""
-    table = object_tables(question, settings).iou
-    if table is None:
-        raise BadArgument("ObjectSettings.spatial is False, and IoU was asked for.")
-    return table
+@dataclass(frozen=True)
+class _Episode:
+    """One episode with what was measured of it, by camera, and the axes of its tables."""
+
+    item: SelectedEpisode
+    selection: Selection
+    settings: ObjectSettings
+    views: Sequence[View]
+    measured: Mapping[str, _Measured]
+    layers: LayerAxis
+    items: Axis
+
+    def table(self, camera: str, axes: Sequence[Axis], values: Mapping[str, Array]) -> pl.DataFrame:
+        """Rows of one camera; the last axis of the arrays is the item."""
+        return long_table(self.item, [{"camera": (camera,)}, *axes, self.items], values, EPISODE_KEYS)
 
 
 def _measure_episode(
@@ -124,107 +152,47 @@ def _measure_episode(
             rows = rows.copy()
             rows[:, :, list(item.without)] = 0.0
         for view in views:
-            maps = rows[:, :, view.span.start : view.span.stop]
-            by_item, by_map = measure_maps(maps, view, settings)
-            store = measured[view.camera]
-            for target, values in ((store.by_item, by_item), (store.by_map, by_map)):
-                for name, value in values.items():
-                    array = target.setdefault(name, np.empty((*cells, *value.shape[2:])))
-                    array[:, part.layer, part.denoise] = value
-    layers = _layers(selection)
-    rows_of = _RowMaker(item, names, layers, selection)
+            values = _measure_maps(rows[:, :, view.span.start : view.span.stop], view, settings)
+            of_camera = measured[view.camera]
+            for one in fields(_Measured):
+                target = getattr(of_camera, one.name)
+                for name, array in getattr(values, one.name).items():
+                    whole = target.setdefault(name, np.empty((*cells, *array.shape[2:])))
+                    whole[:, part.layer, part.denoise] = array
+    items = {label: [name[i] for name in names] for i, label in enumerate(("kind", "item", "object_class"))}
+    layers = LayerAxis.of(selection, average_one=False)
+    episode = _Episode(item, selection, settings, views, measured, layers, items)
     return ObjectTables(
-        objects=_objects_part(rows_of, views, measured, layers),
-        times=_times_part(item, rows_of, views, measured, layers),
-        iou=_iou_part(rows_of, views, measured, layers) if settings.spatial else None,
-        steps=_steps_part(item, rows_of, views, measured, selection) if keep_steps else None,
+        objects=_objects_part(episode),
+        times=_times_part(episode),
+        pointing=_pointing_part(episode) if settings.spatial else None,
+        iou=_iou_part(episode) if settings.spatial else None,
+        steps=_steps_part(episode) if keep_steps else None,
+        iou_steps=_iou_steps_part(episode) if keep_steps and settings.spatial else None,
     )
 
 
-@dataclass(frozen=True)
-class _Layers:
-    """Labels of the rows' layers: the selected ones, then "layers_avg" when there are several (over `once`, each block once)."""
-
-    labels: tuple[str, ...]
-    blocks: tuple[int | None, ...]
-    once: tuple[int, ...]
-
-    @property
-    def numbers(self) -> list[int | None]:
-        """The layers' numbers, None for the average."""
-        return [None if label == LAYERS_AVG else int(label) for label in self.labels]
-
-    def with_average(self, values: Array, axis: int = 1) -> Array:
-        """Append the mean over layers along the layer axis, leaving NaN out."""
-        if len(self.labels) == values.shape[axis]:
-            return values
-        chosen = np.take(values, list(self.once), axis=axis)
-        return np.concatenate([values, np.expand_dims(_mean(chosen, axis), axis)], axis=axis)
-
-
-def _layers(selection: Selection) -> _Layers:
-    once = tuple(i for i, block in enumerate(selection.blocks) if selection.blocks.index(block) == i)
-    labels = tuple(str(label) for label in selection.layer_labels)
-    if len(labels) == 1:
-        return _Layers(labels, selection.blocks, once)
-    return _Layers((*labels, LAYERS_AVG), (*selection.blocks, None), once)
-
-
-def _mean(values: Array, axis: int | tuple[int, ...]) -> Array:
-    """Mean of the numbers along some axes; NaN where there is none."""
-    known = ~np.isnan(values)
-    count = known.sum(axis=axis)
-    return np.where(count > 0, np.where(known, values, 0.0).sum(axis=axis) / np.maximum(count, 1), np.nan)
-
-
-@dataclass(frozen=True)
-class _RowMaker:
-    """Turns arrays (layer, head, item) of one episode and camera into table rows."""
-
-    item: SelectedEpisode
-    names: Sequence[tuple[str, str, str]]
-    layers: _Layers
-    selection: Selection
-
-    def constants(self) -> dict[str, Any]:
-        """The episode's own columns."""
-        attributes = self.item.episode.attributes
-        values: dict[str, Any] = {"suite": self.item.store.suite}
-        return values | {name: getattr(attributes, name) for name in EPISODE_KEYS if name != "suite"}
-
-    def heads(self) -> list[int | None]:
-        """Numbers of the heads, or a single None when they were averaged."""
-        return list(self.selection.head_numbers) if self.selection.per_head else [None]
-
-    def table(
-        self, camera: str, axes: Mapping[str, tuple[int, Sequence[Any], Any]], columns: Mapping[str, Array]
-    ) -> pl.DataFrame:
-        """Rows of arrays of one shape (..., item); `axes`: column to (axis of the arrays, labels along it, type)."""
-        shape = next(iter(columns.values())).shape
-        height = int(np.prod(shape))
-        frame: dict[str, Any] = {
-            name: pl.repeat(value, height, eager=True)
-            for name, value in (*self.constants().items(), ("camera", camera))
-        }
-        items = (("kind", 0), ("item", 1), ("object_class", 2))
-        labelled = {name: (len(shape) - 1, [entry[i] for entry in self.names], pl.String) for name, i in items}
-        for name, (axis, labels, kind) in (*axes.items(), *labelled.items()):
-            index = np.broadcast_to(
-                np.arange(shape[axis]).reshape([-1 if i == axis else 1 for i in range(len(shape))]), shape
-            )
-            frame[name] = pl.Series(list(labels), dtype=kind).gather(index.ravel())
-        frame |= {name: np.ascontiguousarray(values).ravel() for name, values in columns.items()}
-        return pl.DataFrame(frame).with_columns(pl.col(pl.Float64).fill_nan(None), pl.col(pl.Int32).cast(pl.Int64))
-
-    def by_layer(self, camera: str, columns: Mapping[str, Array]) -> pl.DataFrame:
-        """Rows of arrays (layer, head, item)."""
-        axes = {
-            "layer": (0, self.layers.labels, pl.String),
-            "layer_number": (0, self.layers.numbers, pl.Int64),
-            "block": (0, self.layers.blocks, pl.Int64),
-            "head": (1, self.heads(), pl.Int64),
-        }
-        return self.table(camera, axes, columns)
+def _measure_maps(maps: NDArray[np.float32], view: View, settings: ObjectSettings) -> _Measured:
+    """Measures of maps (replan, head, patch) of one layer and denoise step: arrays as in `_Measured`, (replan, head, ...)."""
+    by_item = {"mass": np.matmul(maps, view.area).astype(np.float64)}
+    by_map = {"camera_mass": maps.sum(axis=-1, dtype=np.float64)}
+    if not settings.spatial:
+        return _Measured(by_map, by_item)
+    rows, columns = view.grid.rows, view.grid.columns
+    centre = centre_of_mass(maps, view.centres)
+    by_map |= {"centre_row": centre[..., 0], "centre_column": centre[..., 1]}
+    distance = distance_in_pictures(centre[:, :, None, :], view.item_centres[:, None], rows, columns)
+    by_item["distance"] = np.where(view.sizes[:, None, :] > 0, distance, np.nan)
+    by_item["pointing"] = pointing_hits(maps, view.hit_masks)
+    regions = [*(percentile_regions(maps, value) for value in settings.percentiles), otsu_regions(maps)]
+    chances = [
+        random_iou(region.sum(axis=-1)[..., None], view.sizes[:, None, :], view.grid.num_patches) for region in regions
+    ]
+    by_threshold = {
+        "iou": np.stack([intersection_over_union(region, view.masks) for region in regions], axis=2),
+        "iou_chance": np.stack(chances, axis=2),
+    }
+    return _Measured(by_map, by_item, by_threshold)
 
 
 @dataclass(frozen=True)
@@ -237,13 +205,15 @@ class _Shares:
     area_share: Array
 
 
-def _shares(views: Sequence[View], measured: Mapping[str, _Measured], layers: _Layers) -> dict[str, _Shares]:
-    """Shares by camera, and of all of them together when there are several."""
-    mass = {view.camera: layers.with_average(measured[view.camera].by_item["mass"].mean(axis=2)) for view in views}
-    of_camera = {
-        view.camera: layers.with_average(measured[view.camera].by_map["camera_mass"].mean(axis=2))[..., None]
-        for view in views
-    }
+def _shares(episode: _Episode) -> dict[str, _Shares]:
+    """Shares of all cameras together, and by camera."""
+
+    def over_denoise(values: Array) -> Array:
+        return episode.layers.with_average(values.mean(axis=2), mean=finite_mean)
+
+    measured, views = episode.measured, episode.views
+    mass = {view.camera: over_denoise(measured[view.camera].by_item["mass"]) for view in views}
+    of_camera = {view.camera: over_denoise(measured[view.camera].by_map["camera_mass"])[..., None] for view in views}
     image = np.asarray(sum(of_camera.values()))
     area = {view.camera: view.area.sum(axis=1, dtype=np.float64) for view in views}
     patches = {view.camera: view.grid.num_patches for view in views}
@@ -257,74 +227,71 @@ def _shares(views: Sequence[View], measured: Mapping[str, _Measured], layers: _L
     return result
 
 
-def _objects_part(
-    rows_of: _RowMaker, views: Sequence[View], measured: Mapping[str, _Measured], layers: _Layers
-) -> pl.DataFrame:
+def _objects_part(episode: _Episode) -> pl.DataFrame:
     parts = []
-    for camera, shares in _shares(views, measured, layers).items():
-        camera_share, area_share = _mean(shares.camera_share, 0), shares.area_share.mean(axis=0)
+    for camera, shares in _shares(episode).items():
+        camera_share, area_share = finite_mean(shares.camera_share), shares.area_share.mean(axis=0)
         with np.errstate(invalid="ignore", divide="ignore"):
             lift = np.where(area_share > 0, camera_share / area_share, np.nan)
-        columns = {
+        values = {
             "mass": shares.mass.mean(axis=0),
-            "share": _mean(shares.share, 0),
-            "area_share": np.broadcast_to(area_share, lift.shape),
+            "share": finite_mean(shares.share),
+            "area_share": area_share,
             "lift": lift,
         }
-        parts.append(rows_of.by_layer(camera, columns))
+        parts.append(episode.table(camera, [episode.layers.columns, head_axis(episode.selection)], values))
     return pl.concat(parts)
 
 
-def _times_part(
-    item: SelectedEpisode,
-    rows_of: _RowMaker,
-    views: Sequence[View],
-    measured: Mapping[str, _Measured],
-    layers: _Layers,
-) -> pl.DataFrame:
-    steps = item.episode.read("env_step").astype(np.int64)
-    axes = {
-        "replan": (0, range(len(steps)), pl.Int64),
-        "env_step": (0, steps.tolist(), pl.Int64),
-    }
+def _times_part(episode: _Episode) -> pl.DataFrame:
+    replans = replan_axis(episode.item)
     parts = []
-    for camera, shares in _shares(views, measured, layers).items():
+    for camera, shares in _shares(episode).items():
         # The last layer is "layers_avg", or the only one; heads that were kept apart are averaged.
-        columns = {"share": _mean(shares.share[:, -1], 1), "area_share": shares.area_share}
-        parts.append(rows_of.table(camera, axes, columns))
+        values = {"share": finite_mean(shares.share[:, -1], 1), "area_share": shares.area_share}
+        parts.append(episode.table(camera, [replans], values))
     return pl.concat(parts)
 
 
-def _iou_part(
-    rows_of: _RowMaker, views: Sequence[View], measured: Mapping[str, _Measured], layers: _Layers
-) -> pl.DataFrame:
+def _pointing_part(episode: _Episode) -> pl.DataFrame:
     parts = []
-    for view in views:
-        store, there = measured[view.camera], view.sizes > 0  # (replan, item)
-        shape = (len(layers.labels), len(rows_of.heads()), there.shape[1])
+    for view in episode.views:
+        measured, there = episode.measured[view.camera], view.sizes > 0  # (replan, item)
         by_replan = {
             "mask_patches": view.sizes.astype(np.float64),
             "distance_uniform": distance_of_uniform(view),
             "pointing_chance": mask_sizes(view.hit_masks) / view.grid.num_patches,
         }
-        columns = {
-            "num_replans": np.full(shape, float(len(there))),
-            "mask_replans": np.broadcast_to(there.sum(axis=0).astype(np.float64), shape),
+        values: dict[str, NDArray[np.float64] | NDArray[np.int64]] = {
+            "num_replans": np.array([len(there)]),
+            "mask_replans": there.sum(axis=0),
+            **{name: finite_mean(np.where(there, array, np.nan)) for name, array in by_replan.items()},
+            **{name: _over_steps(episode, array)[..., None] for name, array in _centres(view, measured).items()},
+            **{name: _over_steps(episode, measured.by_item[name]) for name in ("distance", "pointing")},
         }
-        for name, values in by_replan.items():
-            columns[name] = np.broadcast_to(_mean(np.where(there, values, np.nan), 0), shape)
-        for name, values in _centres(view, store).items():
-            mean = layers.with_average(_mean(values, (0, 2)), axis=0)
-            columns[name] = np.broadcast_to(mean[..., None], shape)
-        for name, values in store.by_item.items():
-            if name != "mass":
-                columns[name] = layers.with_average(_mean(values, (0, 2)), axis=0)
-        parts.append(rows_of.by_layer(view.camera, columns))
-    return pl.concat(parts).with_columns(pl.col("num_replans", "mask_replans").cast(pl.Int64))
+        axes = [episode.layers.columns, head_axis(episode.selection)]
+        parts.append(episode.table(view.camera, axes, values))  # type: ignore[arg-type]  # counts are whole numbers
+    return pl.concat(parts)
 
 
-def _centres(view: View, store: _Measured) -> dict[str, Array]:
-    row, column = store.by_map["centre_row"], store.by_map["centre_column"]
+def _iou_part(episode: _Episode) -> pl.DataFrame:
+    axes = [episode.layers.columns, head_axis(episode.selection), {"threshold": episode.settings.thresholds}]
+    parts = []
+    for view in episode.views:
+        values = {
+            name: _over_steps(episode, array) for name, array in episode.measured[view.camera].by_threshold.items()
+        }
+        parts.append(episode.table(view.camera, axes, values))
+    return pl.concat(parts)
+
+
+def _over_steps(episode: _Episode, values: Array) -> Array:
+    """Mean of (replan, layer, denoise, ...) over replans and denoise steps: (layer or "layers_avg", ...)."""
+    return episode.layers.with_average(finite_mean(values, (0, 2)), axis=0, mean=finite_mean)
+
+
+def _centres(view: View, measured: _Measured) -> dict[str, Array]:
+    row, column = measured.by_map["centre_row"], measured.by_map["centre_column"]
     return {
         "centre_row": row,
         "centre_column": column,
@@ -333,29 +300,26 @@ def _centres(view: View, store: _Measured) -> dict[str, Array]:
     }
 
 
-def _steps_part(
-    item: SelectedEpisode,
-    rows_of: _RowMaker,
-    views: Sequence[View],
-    measured: Mapping[str, _Measured],
-    selection: Selection,
-) -> pl.DataFrame:
-    steps = item.episode.read("env_step").astype(np.int64)
-    axes = {
-        "replan": (0, range(len(steps)), pl.Int64),
-        "env_step": (0, steps.tolist(), pl.Int64),
-        "layer": (1, selection.layer_labels, pl.Int64),
-        "block": (1, selection.blocks, pl.Int64),
-        "denoise_step": (2, selection.denoise_steps, pl.Int64),
-        "head": (3, rows_of.heads(), pl.Int64),
-    }
+def _step_axes(episode: _Episode) -> list[Axis]:
+    selection = episode.selection
+    return [replan_axis(episode.item), layer_axis(selection), denoise_axis(selection), head_axis(selection)]
+
+
+def _steps_part(episode: _Episode) -> pl.DataFrame:
     parts = []
-    for view in views:
-        store = measured[view.camera]
-        shape = store.by_item["mass"].shape
-        columns = {"area_share": np.broadcast_to(view.area.mean(axis=1)[:, None, None, None, :], shape)}
-        columns |= store.by_item
-        for name, values in store.by_map.items():
-            columns[name] = np.broadcast_to(values[..., None], shape)
-        parts.append(rows_of.table(view.camera, axes, columns))
+    for view in episode.views:
+        measured = episode.measured[view.camera]
+        values = {
+            "area_share": view.area.mean(axis=1)[:, None, None, None, :],
+            **measured.by_item,
+            **{name: array[..., None] for name, array in measured.by_map.items()},
+        }
+        parts.append(episode.table(view.camera, _step_axes(episode), values))
     return pl.concat(parts)
+
+
+def _iou_steps_part(episode: _Episode) -> pl.DataFrame:
+    axes = [*_step_axes(episode), {"threshold": episode.settings.thresholds}]
+    return pl.concat(
+        [episode.table(view.camera, axes, episode.measured[view.camera].by_threshold) for view in episode.views]
+    )

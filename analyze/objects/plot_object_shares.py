@@ -9,14 +9,16 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.objects.objects_in_view import ALL_CAMERAS, CLASSES
-from vla_attention.analyze.show.numbers import plural
-from vla_attention.analyze.show.plot_axes import ratio_axis, whole_numbers
-from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, FURTHER_COLORS
+from vla_attention.analyze.objects.object_views import ALL_CAMERAS, CLASSES
+from vla_attention.analyze.show.numbers import interval_name, of_tasks
+from vla_attention.analyze.show.plot_axes import ratio_axis, uniform_line, whole_numbers
+from vla_attention.analyze.show.plot_colours import FURTHER_COLORS
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import shortened, title
 from vla_attention.analyze.statistics.bootstrap import (
+    DEFAULT_LEVEL,
     DEFAULT_SEED,
     SHARE,
     EpisodeStatistic,
@@ -31,12 +33,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 STEM = "object_shares"
+#: Objects of interest, other objects, robot, background.
 CLASS_COLORS = dict(zip(CLASSES, ("#D55E00", "#0072B2", "#009E73", "#9A9A9A"), strict=True))
 _PHASES = np.linspace(0.0, 1.0, 21)
 #: Objects beside robot and background that have a colour of their own; the others are shown together.
 _MOST = 9
 _OTHERS = "other objects"
-_EPISODE = ("suite", "task_id", "episode_index")
 
 
 @drawn_in_our_style
@@ -57,13 +59,14 @@ def plot_object_shares(
         & (pl.col("episode_index") == attributes.episode_index)
     )
     figure = new_figure(14.5, 4.7)
-    num_episodes = whole.select(_EPISODE).unique().height
-    num_tasks = whole.select(_EPISODE[:2]).unique().height
+    num_episodes = whole.select(EPISODE_ID).unique().height
+    num_tasks = whole.select(EPISODE_ID[:2]).unique().height
     title(
         figure,
         "Share of the image attention by object, all cameras, mean over layers and heads",
         f"Left: {example.episode.name}, '{attributes.instruction}'. Middle and right: mean over "
-        f"{plural(num_episodes, 'episode')} of {plural(num_tasks, 'task')} with 95 % bootstrap interval at each time; dashed: what "
+        f"{of_tasks(num_episodes, num_tasks)} with "
+        f"{interval_name(DEFAULT_LEVEL, 'bootstrap')} at each time; dashed: what "
         "uniform attention gives (in the middle: the covered area).",
     )
     left, middle, right = figure.subplots(1, 3)
@@ -135,7 +138,7 @@ def _draw_classes(axes: Axes, lift_axes: Axes, whole: pl.DataFrame, seed: int) -
             [ratio_of_means_over_episodes(*columns) for columns in zip(share.T, area.T, strict=True)], resamples
         )
         covered, color = area.mean(axis=0), CLASS_COLORS[name]
-        label = name if len(tasks) == whole.select(_EPISODE).unique().height else f"{name} (n = {len(tasks)})"
+        label = name if len(tasks) == whole.select(EPISODE_ID).unique().height else f"{name} (n = {len(tasks)})"
         axes.plot(_PHASES, 100 * covered, color=color, linestyle="--", linewidth=1.0)
         for target, factor, (value, low, high) in ((axes, 100, shares), (lift_axes, 1, lifts)):
             target.plot(_PHASES, factor * value, color=color, label=label)
@@ -150,7 +153,7 @@ def _draw_classes(axes: Axes, lift_axes: Axes, whole: pl.DataFrame, seed: int) -
     top = 100 * max(data.select(pl.max_horizontal("share", "share_high", "area_share").max()).item() or 0.0, 0.01)
     axes.set_ylim(0, 1.05 * top)
     axes.set_ylabel("share of image attention (%)")
-    lift_axes.axhline(1.0, color=BASELINE_COLOR, linestyle="--", linewidth=1.0)
+    uniform_line(lift_axes)
     ratio_axis(lift_axes.yaxis, np.append(data.select("lift", "lift_low", "lift_high").to_numpy().astype(float), 1.0))
     lift_axes.set_ylabel("lift: share of attention / share of area (logarithmic)")
     for target in (axes, lift_axes):
@@ -175,7 +178,7 @@ def _with_intervals(
 def _by_phase(part: pl.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.float64], list[str]]:
     """Share and area (episode, phase) by linear interpolation over each episode's replans, and the episodes' tasks."""
     shares, areas, tasks = [], [], []
-    for key, episode in part.group_by(_EPISODE, maintain_order=True):
+    for key, episode in part.group_by(EPISODE_ID, maintain_order=True):
         ordered = episode.sort("replan")
         last = ordered.height - 1
         phase = ordered["replan"].to_numpy() / last if last else np.zeros(1)

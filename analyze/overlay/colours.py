@@ -132,7 +132,7 @@ def overlay_image(
     color = scale.colors(np.nan_to_num(values))
     opacity = np.where(np.isnan(values), 0.0, color[..., 3])[:, :, None]
     mixed = (1.0 - opacity) * picture + opacity * 255.0 * color[..., :3]
-    return np.clip(np.round(mixed), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.round(mixed), 0, 255), dtype=np.uint8)
 
 
 def outline(

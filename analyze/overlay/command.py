@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 import argparse
-import textwrap
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vla_attention.analyze.arguments import (
+    add_episode,
     add_grouping,
     add_output,
     add_selection,
     add_stores,
     output_folder,
     settings_of,
+    stores_of,
 )
-from vla_attention.analyze.show.output_files import report_files
-from vla_attention.schemas.command_line import OneSentenceParser
+from vla_attention.analyze.show.output_files import report_files, write_csv, writing
+from vla_attention.schemas.command_line import command_parser
+from vla_attention.schemas.errors import BadArgument
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from vla_attention.analyze.overlay.overlay_data import EpisodeOverlay
-    from vla_attention.schemas.groupings.grouping import Grouping
+    from vla_attention.analyze.overlay.overlay_study import OverlayStudy
 
 _EXAMPLES = """examples:
   vla-analyze overlay runs/libero_10.zarr
@@ -41,18 +38,15 @@ _DEFAULT_FPS = 4.0
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-analyze overlay STORE ...`."""
-    parser = OneSentenceParser(
-        prog="vla-analyze overlay",
-        description="Attention laid over the stored pictures of one episode, right way round, with one scale for all "
+    parser = command_parser(
+        "vla-analyze overlay",
+        "Attention laid over the stored pictures of one episode, right way round, with one scale for all "
         "of them: a "
         "strip of some replans (PNG, PDF, and the numbers as CSV), and a video with the ratio's curve beside it.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
     )
     add_stores(parser)
-    episode = parser.add_argument_group("episode")
-    episode.add_argument("--task", type=int, metavar="N", help="its task (default: the first one)")
-    episode.add_argument("--episode", type=int, metavar="N", help="its episode (default: the task's first one)")
+    episode = add_episode(parser, "episode")
     episode.add_argument(
         "--replans", type=int, nargs="+", metavar="N",
         help=f"replans of the strip (default: {_STRIP_REPLANS}, from the first to the last)",
@@ -76,121 +70,45 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw one episode."""
-    from dataclasses import replace
-
-    from vla_attention.analyze.groups.group_preview import find_example
-    from vla_attention.analyze.measures.question import ask
-    from vla_attention.analyze.overlay.overlay_data import (
-        camera_names,
-        check_outlines,
-        chosen_replans,
-        episode_overlay,
-        orientation_note,
-        outline_grouping,
-        overlay_table,
-        ratios_of,
-    )
+    from vla_attention.analyze.overlay.overlay_study import study_overlay
+    from vla_attention.analyze.overlay.text import overlay_text
     from vla_attention.analyze.overlay.video import check_video
-    from vla_attention.analyze.ratios.analysis import describe_heads
-    from vla_attention.schemas.errors import BadArgument, listing
-    from vla_attention.schemas.stores.reader import open_store
 
     if arguments.video:
         if arguments.no_plots:
             raise BadArgument("--no-plots and --video contradict each other; give one of them.")
         check_video(arguments.video)
-    stores = [open_store(path) for path in arguments.stores]
-    settings = settings_of(arguments)
-    groups = outline_grouping(settings.groups)
-    question = ask(stores, replace(settings, groups=()))
-    check_outlines(question, groups)
-    cameras = camera_names(question, arguments.camera)
-    item = find_example(question.selected, arguments.task, arguments.episode)
-    overlay = episode_overlay(question, item, cameras, ratios_of(question, item), groups)
-    replans = chosen_replans(overlay, arguments.replans, _STRIP_REPLANS)
-    for line in question.skipped:
-        print(line)
-    print(_text(overlay, replans))
-    note = orientation_note(overlay)
-    print(f"\n{note}" if note else "")
-    folder = output_folder(arguments, "overlay")
-    suite = f"{item.store.suite}_" if len(stores) > 1 else ""
-    stem = f"overlay_{suite}{item.episode.name}"
-    files = []
-    selection = question.selection
-    about = (
-        f"mean over layers {listing(selection.layer_labels, 8)}, denoise steps {listing(selection.denoise_steps, 8)}, "
-        f"{describe_heads(selection, stores[0].attributes.policy.num_heads).removeprefix('mean over ')}"
+    study = study_overlay(
+        stores_of(arguments),
+        settings_of(arguments),
+        task=arguments.task,
+        episode=arguments.episode,
+        cameras=arguments.camera,
+        replans=arguments.replans,
+        most_replans=_STRIP_REPLANS,
     )
-    if not arguments.no_plots:
-        from vla_attention.analyze.overlay.plot_strip import plot_overlay_strip
-
-        files += plot_overlay_strip(
-            overlay,
-            question.grouping,
-            replans,
-            folder,
-            stem,
-            measure=arguments.measure,
-            smooth=arguments.smooth,
-            about=about,
-        )
-    if arguments.video:
-        files.append(_write_video(arguments, overlay, question.grouping, folder / f"{stem}.{arguments.video}"))
-    if arguments.no_plots or arguments.video:
-        from vla_attention.analyze.show.output_files import replacing
-
-        path = folder / f"{stem}_all.csv"
-        with replacing(path) as temporary:
-            overlay_table(overlay, range(overlay.num_replans)).write_csv(temporary)
-        files.append(path)
+    print(overlay_text(study))
+    folder = output_folder(arguments, "overlay")
+    with writing("pictures", folder):
+        files = _write(arguments, study, folder)
     report_files(folder, files)
     return 0
 
 
-def _write_video(arguments: argparse.Namespace, overlay: EpisodeOverlay, grouping: Grouping, path: Path) -> Path:
-    """The whole episode, with progress at a terminal."""
-    from vla_attention.analyze.overlay.plot_video_frames import video_frames
-    from vla_attention.analyze.overlay.video import write_video
-    from vla_attention.analyze.show.progress import progress_bar
+def _write(arguments: argparse.Namespace, study: OverlayStudy, folder: Path) -> list[Path]:
+    """The strip, the video and the numbers, as far as they were asked for."""
+    files: list[Path] = []
+    if not arguments.no_plots:
+        from vla_attention.analyze.overlay.plot_strip import plot_overlay_strip
 
-    with progress_bar(overlay.num_replans, "pictures") as advance:
+        files += plot_overlay_strip(study, folder, measure=arguments.measure, smooth=arguments.smooth)
+    if arguments.video:
+        from vla_attention.analyze.overlay.plot_video_frames import write_overlay_video
 
-        def counted() -> Iterator[NDArray[np.uint8]]:
-            for frame in video_frames(overlay, grouping, measure=arguments.measure, smooth=arguments.smooth):
-                advance(1)
-                yield frame
-
-        return write_video(path, counted(), arguments.fps, arguments.video)
-
-
-def _text(overlay: EpisodeOverlay, replans: tuple[int, ...]) -> str:
-    """A line per replan of the strip: ratio, each camera's share of image attention, its brightest patch."""
-    from vla_attention.analyze.show.numbers import format_number
-    from vla_attention.analyze.show.patch_pictures import upright
-    from vla_attention.analyze.show.text_table import text_table
-
-    attributes = overlay.item.episode.attributes
-    header = ["replan", "step", *(["ratio"] if overlay.ratio is not None else [])]
-    for camera in overlay.maps:
-        header += [f"{camera} %", "most", "at"]
-    lift, rows = overlay.values("lift"), []
-    for replan in replans:
-        cells = [str(replan), str(overlay.env_step[replan])]
-        if overlay.ratio is not None:
-            cells.append(format_number(float(overlay.ratio[replan])))
-        for camera, mass in overlay.maps.items():
-            shown = upright(lift[camera][replan], overlay.views[camera])
-            place = divmod(int(shown.argmax()), shown.shape[1])
-            share = (
-                100 * mass[replan].sum() / overlay.image_mass[replan] if overlay.image_mass[replan] else float("nan")
-            )
-            cells += [format_number(float(share)), format_number(float(shown.max())), f"{place[0]},{place[1]}"]
-        rows.append(cells)
-    heading = f"{overlay.item.store.suite} {overlay.item.episode.name}: {attributes.instruction}"
-    legend = (
-        "%: camera's share of all image attention. most, at: highest lift of a patch, and its row,column in the "
-        "picture as it is "
-        "shown (numbers in the csv's row and column count as selectors do, in the stored picture)."
-    )
-    return "\n".join([heading, text_table(header, rows), *textwrap.wrap(legend, 100)])
+        path = folder / f"{study.stem}.{arguments.video}"
+        files.append(
+            write_overlay_video(study, path, arguments.fps, measure=arguments.measure, smooth=arguments.smooth)
+        )
+    if arguments.no_plots or arguments.video:
+        files += write_csv(folder, **{f"{study.stem}_all": study.whole_table})
+    return files

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vla_attention.analyze.measures.aggregate import add_layers_avg, overall_layer, per_replan
 from vla_attention.analyze.measures.patch_maps import mean_rows, seen_cameras
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.measures.selected import SelectedEpisode, check_replan
 from vla_attention.analyze.measures.steps import steps_table
 from vla_attention.analyze.overlay.colours import (
     OUTLINE_COLORS,
@@ -261,12 +261,7 @@ def chosen_replans(overlay: EpisodeOverlay, wanted: Sequence[int] | None, most: 
     count = overlay.num_replans
     if wanted is None:
         return tuple(int(i) for i in np.unique(np.linspace(0, count - 1, min(most, count)).round()))
-    for replan in wanted:
-        if not 0 <= replan < count:
-            raise BadArgument(
-                f"There is no replan {replan} in {overlay.item.episode.name}; it has replans 0 to {count - 1}."
-            )
-    return tuple(wanted)
+    return tuple(check_replan(overlay.item, replan) for replan in wanted)
 
 
 def orientation_note(overlay: EpisodeOverlay) -> str:

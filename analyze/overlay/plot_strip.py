@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.analyze.overlay.colours import OUTLINE_COLORS, Measure, Scale, color_bar
-from vla_attention.analyze.overlay.overlay_data import EpisodeOverlay, draw, orientation_note, overlay_table
+from vla_attention.analyze.overlay.overlay_data import EpisodeOverlay, draw, orientation_note
+from vla_attention.analyze.overlay.overlay_study import OverlayStudy
 from vla_attention.analyze.show.numbers import format_number
+from vla_attention.analyze.show.plot_axes import hide_frame
 from vla_attention.analyze.show.plot_colours import NOTE_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import ratio_name, title, wrapped
@@ -27,21 +29,13 @@ _SIDE = 1.55
 
 @drawn_in_our_style
 def plot_overlay_strip(
-    overlay: EpisodeOverlay,
-    grouping: Grouping,
-    replans: Sequence[int],
-    folder: Path,
-    stem: str,
-    *,
-    measure: Measure = "lift",
-    smooth: bool = False,
-    about: str = "",
+    study: OverlayStudy, folder: Path, *, measure: Measure = "lift", smooth: bool = False
 ) -> list[Path]:
     """Draw the replans side by side and the cameras below each other; returns the paths of png, pdf and csv.
 
-    All pictures share one scale (`overlays.scale_for`). Above each replan stand its environment step and the grouping's ratio.
-    `about`: what was averaged over, for the note.
+    All pictures share one scale (`colours.scale_for`). Above each replan stand its environment step and the grouping's ratio.
     """
+    overlay, grouping, replans = study.overlay, study.question.grouping, study.replans
     attributes = overlay.item.episode.attributes
     values, scale = overlay.values(measure), overlay.scale(measure, replans)
     blocks = [replans[i : i + _COLUMNS] for i in range(0, len(replans), _COLUMNS)]
@@ -52,7 +46,7 @@ def plot_overlay_strip(
     figure = new_figure(width, 1.55 + len(blocks) * (0.42 + len(cameras) * side))
     outcome = "success" if attributes.success else "failure"
     shown = f"replan{'s' * (len(replans) > 1)} {_numbers(replans)} of {overlay.num_replans}"
-    note = f"{'; '.join(part for part in (outcome, shown, about) if part)}. {orientation_note(overlay)}"
+    note = f"{'; '.join(part for part in (outcome, shown, study.averaged_over) if part)}. {orientation_note(overlay)}"
     heading = f"{overlay.item.store.suite} task {attributes.task_id}, episode {attributes.episode_index}: {attributes.instruction}"
     title(figure, heading, note)
     bar_height = 0.24 / side
@@ -66,14 +60,13 @@ def plot_overlay_strip(
                 axes.imshow(draw(overlay, camera, replan, scale, values, smooth), interpolation="nearest")
                 axes.set_xticks([])
                 axes.set_yticks([])
-                for spine in axes.spines.values():
-                    spine.set_visible(False)
+                hide_frame(axes)
                 if c == 0:
                     axes.set_ylabel(wrapped(camera, 22, 2), size=8)
                 if r == 0:
                     axes.set_title(_above(overlay, grouping, replan), size=8)
     _draw_bar(figure.add_subplot(grid[-1, :]), scale, list(overlay.outlines))
-    return save_figure(figure, folder, stem, overlay_table(overlay, replans))
+    return save_figure(figure, folder, study.stem, study.table)
 
 
 def _numbers(replans: Sequence[int]) -> str:
@@ -109,8 +102,7 @@ def draw_scale(axes: Axes, scale: Scale) -> None:
             size=7,
             color=NOTE_COLOR,
         )
-    for spine in axes.spines.values():
-        spine.set_visible(False)
+    hide_frame(axes)
 
 
 def _draw_bar(axes: Axes, scale: Scale, groups: Sequence[str]) -> None:

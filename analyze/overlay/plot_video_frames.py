@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,12 +11,15 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.overlay.colours import Measure
 from vla_attention.analyze.overlay.overlay_data import EpisodeOverlay, draw, orientation_note
+from vla_attention.analyze.overlay.overlay_study import OverlayStudy
 from vla_attention.analyze.overlay.plot_strip import draw_scale, shown_ratio
+from vla_attention.analyze.overlay.video import VideoFormat, write_video
 from vla_attention.analyze.show.numbers import format_number
-from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, ratio_axis, whole_numbers
+from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, legend_above, ratio_axis, whole_numbers
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure
 from vla_attention.analyze.show.plot_text import explain, title, wrapped
+from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.schemas.groupings.grouping import Grouping
 
 if TYPE_CHECKING:
@@ -23,6 +27,27 @@ if TYPE_CHECKING:
 
 _DPI = 100
 _SIDE, _CURVE = 2.7, 3.9
+
+
+def write_overlay_video(
+    study: OverlayStudy,
+    path: Path,
+    fps: float,
+    *,
+    measure: Measure = "lift",
+    smooth: bool = False,
+) -> Path:
+    """Write the whole episode as GIF or MP4, by the ending of `path`, `fps` replans a second; shows progress at a terminal."""
+    kind: VideoFormat = "mp4" if path.suffix == ".mp4" else "gif"
+    overlay, grouping = study.overlay, study.question.grouping
+    with progress_bar(overlay.num_replans, "pictures") as advance:
+
+        def counted() -> Iterator[NDArray[np.uint8]]:
+            for frame in video_frames(overlay, grouping, measure=measure, smooth=smooth):
+                advance(1)
+                yield frame
+
+        return write_video(path, counted(), fps, kind)
 
 
 def video_frames(
@@ -91,7 +116,7 @@ def _draw_curve(axes: Axes, overlay: EpisodeOverlay, grouping: Grouping) -> list
     axes.plot(overlay.env_step, shown, color="#C8C8C8", linewidth=1.2)
     if uniform is not None and np.isfinite(uniform).any():
         axes.plot(overlay.env_step, uniform, "--", color=BASELINE_COLOR, linewidth=1.0, label=BASELINE_LABEL)
-        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
+        legend_above(axes)
     (past,) = axes.plot([], [], "-", color=DATA_COLOR)
     (now,) = axes.plot([], [], "o", color=DATA_COLOR, markersize=6, markeredgecolor="white")
     line = axes.axvline(overlay.env_step[0], color="#888888", linewidth=0.8)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vla_attention.schemas.command_line import OneSentenceParser, run_command
+from vla_attention.schemas.command_line import command_parser, run_command
 
 if TYPE_CHECKING:
     from vla_attention.analyze.published.results_reader import ResultsFile
@@ -27,11 +27,10 @@ masses of image and text keys; --plot-comparison shows both side by side.
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `parse-attention-ratio-results`."""
-    parser = OneSentenceParser(
-        prog=PROGRAM,
-        description="Summaries and pictures from attention_ratio_results_SUITE.json files, ours or the published scripts'.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = command_parser(
+        PROGRAM,
+        "Summaries and pictures from attention_ratio_results_SUITE.json files, ours or the published scripts'.",
+        _EXAMPLES,
     )
     parser.add_argument(
         "--results",

@@ -20,7 +20,7 @@ from vla_attention.analyze.published.results_file import write_results_of_suites
 from vla_attention.analyze.ratios.summary import AnalysedRun, summary_text, write_summary
 from vla_attention.analyze.show.output_files import write_parquet
 from vla_attention.analyze.show.progress import progress_bar
-from vla_attention.analyze.stores.selection import Selection
+from vla_attention.analyze.stores.selection import Selection, heads_text
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
@@ -135,5 +135,6 @@ def _notes(root: RootAttributes, selection: Selection, site: str) -> list[str]:
 
 def describe_heads(selection: Selection, num_heads: int) -> str:
     """What was done about heads, in words."""
-    which = "all heads" if len(selection.heads) == num_heads else f"heads {listing(selection.head_numbers, 40)}"
-    return f"mean over {which}" + (" (kept apart in the steps table)" if selection.per_head else "")
+    return f"mean over {heads_text(selection, num_heads)}" + (
+        " (kept apart in the steps table)" if selection.per_head else ""
+    )

@@ -16,7 +16,7 @@ from vla_attention.analyze.arguments import (
 )
 from vla_attention.analyze.commands import list_of_commands
 from vla_attention.analyze.show.output_files import report_files
-from vla_attention.schemas.command_line import OneSentenceParser
+from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
   vla-analyze runs/libero_10.zarr
@@ -33,12 +33,11 @@ _EXAMPLES = """examples:
 
 def build_parser(prog: str = "vla-analyze") -> argparse.ArgumentParser:
     """The parser of `vla-analyze STORE ...` and `vla-analyze ratios STORE ...`."""
-    parser = OneSentenceParser(
-        prog=prog,
+    parser = command_parser(
+        prog,
+        "Masses, fractions and ratios from stored attention rows, for any grouping of tokens. Without the model.",
+        f"commands (without one: ratios):\n{list_of_commands()}\n\n{_EXAMPLES}",
         usage=f"{prog} [COMMAND] STORE [STORE ...] [options]" if prog == "vla-analyze" else None,
-        description="Masses, fractions and ratios from stored attention rows, for any grouping of tokens. Without the model.",
-        epilog=f"commands (without one: ratios):\n{list_of_commands()}\n\n{_EXAMPLES}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_stores(parser)
     parser.add_argument(

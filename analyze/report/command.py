@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from vla_attention.analyze.arguments import add_grouping, add_selection, add_stores, settings_of
-from vla_attention.schemas.command_line import OneSentenceParser
+from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
   vla-analyze report runs/libero_10.zarr
@@ -21,13 +21,12 @@ def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-analyze report STORE ...`."""
     from pathlib import Path
 
-    parser = OneSentenceParser(
-        prog="vla-analyze report",
-        description="One self-contained HTML file: what was run, the ratio with its interval and with what has to be "
+    parser = command_parser(
+        "vla-analyze report",
+        "One self-contained HTML file: what was run, the ratio with its interval and with what has to be "
         "known about it, tasks, layers, "
         "contributions, overlays of some episodes, methods.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
     )
     add_stores(parser)
     add_grouping(parser)

@@ -13,8 +13,9 @@ from vla_attention.analyze.measures.aggregate import overall_layer
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.sinks import SinkRule
 from vla_attention.analyze.objects.object_attention import object_tables
-from vla_attention.analyze.objects.object_summary import objects_summary
-from vla_attention.analyze.objects.objects_in_view import ALL_CAMERAS, ObjectSettings
+from vla_attention.analyze.objects.object_settings import ObjectSettings
+from vla_attention.analyze.objects.object_study import objects_summary
+from vla_attention.analyze.objects.object_views import ALL_CAMERAS
 from vla_attention.analyze.objects.plot_object_shares import plot_object_shares
 from vla_attention.analyze.ratios.analysis import Analysis
 from vla_attention.analyze.ratios.plot_layer_profile import plot_layer_profile
@@ -33,7 +34,8 @@ from vla_attention.analyze.show.numbers import format_number
 from vla_attention.analyze.time.plot_time_course import plot_time_courses
 from vla_attention.analyze.time.time_courses import time_courses
 from vla_attention.analyze.words.plot_word_bars import plot_word_bars
-from vla_attention.analyze.words.word_reading import site_of_words, words_summary, words_table
+from vla_attention.analyze.words.word_reading import words_table
+from vla_attention.analyze.words.word_study import site_of_words, words_summary
 from vla_attention.schemas.errors import UserError
 
 #: Rows of the tables of sinks and objects: what follows is weak, and the commands have it.

@@ -76,3 +76,9 @@ def run_header(
 def note_lines(notes: Iterable[str]) -> list[str]:
     """One `note: ...` per note."""
     return wrap_all((f"note: {note}" for note in notes), rest="  ")
+
+
+def interval_note(level: float, kind: str = "") -> str:
+    """The sentence below tables with intervals; `kind` may say more, for instance that they are pointwise."""
+    more = f"{kind}, " if kind else ""
+    return f"Intervals: {100 * level:g}%, {more}two-level bootstrap over tasks and episodes; - where fewer than two episodes."

@@ -39,7 +39,7 @@ def enlarge(patch_map: NDArray[np.floating], height: int, width: int, smooth: bo
         raise BadArgument(f"A patch map has two axes (row, column) and patches; got shape {values.shape}.")
     rows, columns = _centres(height, values.shape[0]), _centres(width, values.shape[1])
     if not smooth:
-        return values[np.floor(rows).astype(int)][:, np.floor(columns).astype(int)]
+        return np.asarray(values[np.floor(rows).astype(int)][:, np.floor(columns).astype(int)])
     for axis, centres in ((0, rows), (1, columns)):
         place = np.clip(centres - 0.5, 0.0, values.shape[axis] - 1.0)
         below = np.floor(place).astype(int)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from vla_attention.analyze.show.headings import WIDTH
 
@@ -50,3 +51,10 @@ def text_table(
 
 def _rule(lines: Sequence[str]) -> list[str]:
     return ["·" * max(map(len, lines))]
+
+
+def episode_counts(rows: Sequence[Mapping[str, Any]], several_tasks: bool) -> tuple[str, list[str]]:
+    """Header and cells of a column with `num_episodes` and, where there are several tasks, `num_tasks` in brackets."""
+    if not several_tasks:
+        return "episodes", [str(row["num_episodes"]) for row in rows]
+    return "episodes (tasks)", [f"{row['num_episodes']} ({row['num_tasks']})" for row in rows]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.layers import LayerSelection, block_of_labels, select_layers
+from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import RootAttributes, StoreError, parse_episode_name
 
@@ -73,6 +74,11 @@ def select(
     )
 
 
+def heads_text(selection: Selection, num_heads: int) -> str:
+    """The selected heads in words; `num_heads` is how many the policy has."""
+    return "all heads" if len(selection.heads) == num_heads else f"heads {listing(selection.head_numbers, 40)}"
+
+
 def choose_site(root: RootAttributes, name: str | None) -> str:
     """The wanted site, or the first one. Sites are normalised separately: one analysis never mixes them."""
     names = [site.name for site in root.sites]
@@ -81,6 +87,17 @@ def choose_site(root: RootAttributes, name: str | None) -> str:
     if name not in names:
         raise unknown_name("site", name, names)
     return name
+
+
+def site_that(root: RootAttributes, wanted: str | None, fits: Callable[[SiteLayout], bool]) -> str | None:
+    """The wanted site, or the first one that fits; None when none does, or the wanted one does not.
+
+    A wanted name that does not exist is returned as it is: `choose_site` refuses it, with the names that exist.
+    """
+    fitting = [site.name for site in root.sites if fits(site)]
+    if wanted is None:
+        return fitting[0] if fitting else None
+    return wanted if wanted in fitting or wanted not in [site.name for site in root.sites] else None
 
 
 def parse_denoise_steps(words: Sequence[str] | None, recorded: Sequence[int]) -> tuple[int, ...]:

@@ -14,7 +14,7 @@ from vla_attention.analyze.arguments import (
     settings_of,
 )
 from vla_attention.analyze.show.output_files import report_files
-from vla_attention.schemas.command_line import OneSentenceParser
+from vla_attention.schemas.command_line import command_parser
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -33,12 +33,11 @@ last number above 0 (robosuite's Panda gripper, which every suite of vla-capture
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-analyze time STORE ...`."""
-    parser = OneSentenceParser(
-        prog="vla-analyze time",
-        description="Ratio and fractions over the course of an episode and around the first gripper closing,\n"
+    parser = command_parser(
+        "vla-analyze time",
+        "Ratio and fractions over the course of an episode and around the first gripper closing,\n"
         "success against failure with effect sizes, and how many independent replans an episode is worth.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
     )
     add_stores(parser)
     time = parser.add_argument_group("time")

@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vla_attention.schemas.command_line import OneSentenceParser
+from vla_attention.schemas.command_line import command_parser
 
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-analyze verify STORE ...`."""
-    parser = OneSentenceParser(
-        prog="vla-analyze verify",
-        description="Read everything back and check counts, missing chunks, digests and row sums. Exit code 1 if anything is wrong.",
+    parser = command_parser(
+        "vla-analyze verify",
+        "Read everything back and check counts, missing chunks, digests and row sums. Exit code 1 if anything is wrong.",
     )
     parser.add_argument("stores", nargs="+", type=Path, metavar="STORE", help="one or several NAME.zarr")
     return parser

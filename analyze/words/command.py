@@ -10,9 +10,10 @@ from vla_attention.analyze.arguments import (
     add_stores,
     output_folder,
     settings_of,
+    stores_of,
 )
-from vla_attention.analyze.show.output_files import report_files
-from vla_attention.schemas.command_line import OneSentenceParser
+from vla_attention.analyze.show.output_files import report_files, write_parquet
+from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
   vla-analyze words runs/libero_10.zarr
@@ -26,12 +27,11 @@ A word is measured by all its pieces. Content and stop words are told apart by a
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-analyze words STORE ...`."""
-    parser = OneSentenceParser(
-        prog="vla-analyze words",
-        description="Which words of the instruction are read: mass, lift over uniform attention and share of the linguistic mass of "
+    parser = command_parser(
+        "vla-analyze words",
+        "Which words of the instruction are read: mass, lift over uniform attention and share of the linguistic mass of "
         "every word, with intervals over tasks and episodes; content and stop words, bos, template and state beside them.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
     )
     add_stores(parser)
     selection = add_selection(parser)
@@ -45,32 +45,16 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure the words; print them, write the table and the picture."""
-    from vla_attention.analyze.measures.aggregate import overall_layer
-    from vla_attention.analyze.measures.question import ask
-    from vla_attention.analyze.show.output_files import write_parquet
     from vla_attention.analyze.words.text import words_text
-    from vla_attention.analyze.words.word_reading import site_of_words, strongest_readers, words_summary, words_table
-    from vla_attention.schemas.errors import BadArgument
-    from vla_attention.schemas.stores.reader import open_store
+    from vla_attention.analyze.words.word_study import study_words
 
-    stores = [open_store(path) for path in arguments.stores]
-    if arguments.task is not None and arguments.tasks:
-        raise BadArgument("Give --task or --tasks, not both: --task shows one instruction word by word.")
-    arguments.site = site_of_words(stores[0].attributes, arguments.site)
-    if arguments.task is not None:
-        arguments.tasks = [arguments.task]
-    question = ask(stores, settings_of(arguments))
-    instructions = list(dict.fromkeys(item.episode.attributes.instruction for item in question.selected))
-    one = instructions[0] if arguments.task is not None and len(instructions) == 1 else None
-    table = words_table(question)
-    summary = words_summary(table, by_place=one is not None, seed=arguments.seed)
-    layer = overall_layer(table)
-    print(words_text(question, summary, strongest_readers(table), layer, one))
+    study = study_words(stores_of(arguments), settings_of(arguments), arguments.task)
+    print(words_text(study))
     folder = output_folder(arguments, "words" if arguments.task is None else f"words/task{arguments.task:03d}")
-    files = write_parquet(folder, words=table, words_summary=summary)
+    files = write_parquet(folder, words=study.episodes, words_summary=study.summary)
     if not arguments.no_plots:
         from vla_attention.analyze.words.plot_word_bars import plot_word_bars
 
-        files += plot_word_bars(summary, folder, layer, one)
+        files += plot_word_bars(study.summary, folder, study.layer, study.instruction)
     report_files(folder, files)
     return 0

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.show.numbers import plural
-from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, ratio_axis
-from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, NOTE_COLOR
+from vla_attention.analyze.measures.frames import layer_name
+from vla_attention.analyze.show.numbers import interval_name, plural
+from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, legend_above, note_at_row, ratio_axis, uniform_line
+from vla_attention.analyze.show.plot_colours import BASELINE_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, shortened, title
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,12 +40,11 @@ def plot_word_bars(
     shown = pl.concat([words.head(_MOST), summary.filter((pl.col("kind") == "scale") & pl.col("lift").is_not_null())])
     dense = shown.height > 30
     figure = new_figure(8.4, 1.7 + (0.19 if dense else 0.27) * shown.height)
-    what = "all layers" if layer == "layers_avg" else f"layer {layer}"
     heading = f"Words of '{instruction}' in reading order" if instruction else "Words of the instructions, by lift"
-    note = "Bars: mean over episodes; whiskers: 95 % bootstrap interval over tasks and episodes; n counts episodes."
+    note = f"Bars: mean over episodes; whiskers: {interval_name(DEFAULT_LEVEL, 'bootstrap')} over tasks and episodes; n counts episodes."
     if words.height > _MOST:
         note += f" The {_MOST} words with the highest lift of {words.height}."
-    title(figure, f"{heading}; {what}", note)
+    title(figure, f"{heading}; {layer_name(layer)}", note)
     axes = figure.subplots()
     lifts = shown["lift"].to_numpy() if shown.height else np.zeros(0)
     if not (lifts > 0).any():
@@ -77,14 +78,11 @@ def _draw_bars(axes: Axes, shown: pl.DataFrame, num_words: int, dense: bool) -> 
         text = f"n = {row['num_episodes']}" + (
             f" of {plural(row['num_tasks'], 'task')}" if row["num_tasks"] > 1 else ""
         )
-        axes.text(
-            1.01, position, text, transform=axes.get_yaxis_transform(), va="center", size=6.5 if dense else 7,
-            color=NOTE_COLOR,
-        )  # fmt: skip
+        note_at_row(axes, position, text, size=6.5 if dense else 7)
     axes.set_yticks(positions, labels)
     axes.tick_params(axis="y", length=0, labelsize=7 if dense else 8)
     axes.set_ylim(positions[-1] + 0.7, -0.7)
-    axes.axvline(1.0, color=BASELINE_COLOR, linestyle="--", linewidth=1.0)
+    uniform_line(axes, along="x")
     axes.grid(axis="x")
 
 
@@ -99,4 +97,4 @@ def _legend(axes: Axes, shown: pl.DataFrame) -> None:
     if (shown["kind"] == "scale").any():
         handles.append(Patch(color=COLORS[None], label=_LABELS[None]))
     handles.append(Line2D([], [], color=BASELINE_COLOR, linestyle="--", linewidth=1.0, label=BASELINE_LABEL))
-    axes.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderaxespad=0.1)
+    legend_above(axes, 4, handles)

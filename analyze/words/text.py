@@ -2,66 +2,64 @@
 
 from __future__ import annotations
 
-import textwrap
-from collections.abc import Sequence
+from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.show.headings import WIDTH
+from vla_attention.analyze.show.headings import interval_note, wrap
 from vla_attention.analyze.show.numbers import format_interval, format_number
-from vla_attention.analyze.show.text_table import text_table
+from vla_attention.analyze.show.text_table import episode_counts, text_table
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.words.word_study import WordStudy
 
 _NOTE = (
     "lift: mass per piece over that of the average valid key (1: uniform attention). share: of all linguistic mass (bos, template, "
-    "instruction). Intervals: 95 %, two-level bootstrap over tasks and episodes; - where fewer than two episodes."
+    f"instruction). {interval_note(DEFAULT_LEVEL)}"
 )
 
 
-def words_text(
-    question: Question, summary: pl.DataFrame, readers: pl.DataFrame, layer: str, instruction: str | None
-) -> str:
-    """What `words_summary` and `strongest_readers` hold, in lines of at most `WIDTH` characters (but for long instructions)."""
-    tasks = {(item.store.suite, item.episode.attributes.task_id) for item in question.selected}
+def words_text(study: WordStudy) -> str:
+    """The words with their numbers, what stands beside them for scale, and who reads most."""
+    several = study.question.num_tasks > 1
     lines = [
-        *question.header("WORDS: which words of the instruction are read", layer),
-        *([f"Instruction: {instruction}"] if instruction else []),
+        *study.question.header("WORDS: which words of the instruction are read", study.layer),
+        *([f"Instruction: {study.instruction}"] if study.instruction else []),
         "",
-        _table(summary.filter(pl.col("kind") == "word"), len(tasks) > 1),
+        _table(study.summary.filter(pl.col("kind") == "word"), several),
         "",
         "for scale",
-        _table(summary.filter(pl.col("kind") == "scale"), len(tasks) > 1),
+        _table(study.summary.filter(pl.col("kind") == "scale"), several),
         "",
-        *textwrap.wrap(_NOTE, WIDTH),
+        *wrap(_NOTE),
     ]
+    readers = study.readers
     if readers.height:
-        found = "Read most, by layer: " + "; ".join(_reader(row) for row in readers.iter_rows(named=True)) + "."
-        lines += ["", *textwrap.wrap(found, WIDTH)]
+        found = "; ".join(_reader(row) for row in readers.iter_rows(named=True))
+        lines += ["", *wrap(f"Read most, by layer: {found}.")]
     return "\n".join(lines)
 
 
 def _table(summary: pl.DataFrame, several_tasks: bool) -> str:
-    header = ["word", "class", "pieces", "episodes", "mass", "lift", "interval", "share", "interval"]
-    rows: list[Sequence[str]] = []
-    for row in summary.iter_rows(named=True):
-        count = f"{row['num_episodes']} ({row['num_tasks']})" if several_tasks else str(row["num_episodes"])
-        rows.append(
-            [
-                row["item"],
-                row["word_class"] or "",
-                format_number(row["pieces"]),
-                count,
-                format_number(row["mass"]),
-                format_number(row["lift"]),
-                format_interval(row["lift_low"], row["lift_high"]),
-                format_number(row["share"]),
-                format_interval(row["share_low"], row["share_high"]),
-            ]
-        )
-    header[3] = "episodes (tasks)" if several_tasks else "episodes"
-    return text_table(header, rows, left=(0, 1))
+    rows = summary.to_dicts()
+    heading, counts = episode_counts(rows, several_tasks)
+    header = ["word", "class", "pieces", heading, "mass", "lift", "interval", "share", "interval"]
+    body = [
+        [
+            row["item"],
+            row["word_class"] or "",
+            format_number(row["pieces"]),
+            count,
+            format_number(row["mass"]),
+            format_number(row["lift"]),
+            format_interval(row["lift_low"], row["lift_high"]),
+            format_number(row["share"]),
+            format_interval(row["share_low"], row["share_high"]),
+        ]
+        for row, count in zip(rows, counts, strict=True)
+    ]
+    return text_table(header, body, left=(0, 1))
 
 
-def _reader(row: dict) -> str:
+def _reader(row: dict[str, Any]) -> str:
     head = f" head {row['head']}" if row["head"] is not None else ""
     return f"'{row['item']}' in layer {row['layer']}{head} (lift {format_number(row['lift'])})"

@@ -8,7 +8,7 @@ import pytest
 
 from tests.kit.bowl_scene import bowl_coverage, write_bowl_store
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.groups.group_preview import UNTAKEN, GroupPreview, groups_table, preview_groups
+from vla_attention.analyze.groups.group_preview import UNTAKEN, GroupPreview, preview_groups
 from vla_attention.analyze.measures.question import AnalysisSettings, Question, ask
 from vla_attention.schemas.groupings.grouping import GroupingError
 from vla_attention.schemas.stores.reader import open_store
@@ -44,7 +44,7 @@ def test_keys_are_the_lowest_and_highest_numbers_over_replans(store):
 
 
 def test_spans_and_roles_of_a_group_add_up_to_it(store):
-    table = groups_table(question_of(store, grouping="default"))
+    table = preview_groups(question_of(store, grouping="default")).groups
     parts = table.filter(pl.col("span").is_not_null()).group_by("group").agg(pl.col("keys_mean").sum())
     whole = table.filter(pl.col("span").is_null()).join(parts, on="group", suffix="_sum")
     np.testing.assert_allclose(whole["keys_mean"], whole["keys_mean_sum"], rtol=1e-6)

@@ -20,9 +20,11 @@ from tests.kit.bowl_scene import CAMERAS, bowl_coverage, bowl_tokens, write_bowl
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.measures.question import AnalysisSettings, ask
 from vla_attention.analyze.objects.object_attention import ObjectTables, object_tables
-from vla_attention.analyze.objects.object_summary import best_finders, iou_summary, objects_summary, strongest_followers
-from vla_attention.analyze.objects.objects_in_view import ObjectSettings, site_of_pictures
-from vla_attention.analyze.words.word_reading import site_of_words, words_table
+from vla_attention.analyze.objects.object_settings import ObjectSettings
+from vla_attention.analyze.objects.object_study import best_finders, iou_summary, objects_summary, strongest_followers
+from vla_attention.analyze.objects.object_views import site_of_pictures
+from vla_attention.analyze.words.word_reading import words_table
+from vla_attention.analyze.words.word_study import site_of_words
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import SiteLayout, Span
@@ -123,41 +125,51 @@ def test_spatial_metrics_equal_loops_over_raw_maps(data):
         chosen = ObjectSettings(percentiles=(percentile,), mask_coverage=least, tolerance=tolerance)
         tables = measured(path, chosen, keep_steps=True, per_head=True)
         rows, coverage, spans = raw_episode(path, "task000_episode000")
-    steps, iou = tables.steps, tables.iou
+    steps, iou_steps = tables.steps, tables.iou_steps
     assert steps is not None
-    assert iou is not None
+    assert iou_steps is not None
+    assert tables.iou is not None
+    assert tables.pointing is not None
+    where = ["replan", "layer", "denoise_step", "head", "camera", "kind", "item"]
+    by_threshold = iou_steps.rows_by_key([*where, "threshold"], named=True)
     centres = np.array([(r + 0.5, c + 0.5) for r in range(size) for c in range(size)])
     for row in steps.sample(80, seed=seed).iter_rows(named=True):
         layer, denoise = row["layer"], {0: 0, 9: 1}[row["denoise_step"]]
         values = rows[row["replan"], layer, denoise, row["head"], spans[row["camera"]]]
         area = coverage[row["camera"]][row["replan"]][:, members_of(row["kind"], row["item"])].sum(axis=1)
         mask = set(np.flatnonzero(area >= least).tolist())
+        of_map = [row[name] for name in where]
+        otsu, overlap = (by_threshold[*of_map, name][0] for name in ("otsu", f"p{percentile:g}"))
         centre = np.average(centres, axis=0, weights=values)
         np.testing.assert_allclose([row["centre_row"], row["centre_column"]], centre, rtol=1e-5)
         assert row["mass"] == pytest.approx((values * area).sum(), rel=1e-5)
         if not mask:
             assert row["pointing"] is None
-            assert row["iou_otsu"] is None
+            assert otsu["iou"] is None
             continue
         region = set(np.flatnonzero(values >= scipy.stats.scoreatpercentile(values, percentile)).tolist())
-        assert row[f"iou_p{percentile:g}"] == pytest.approx(len(region & mask) / len(region | mask))
+        assert overlap["iou"] == pytest.approx(len(region & mask) / len(region | mask))
         common = scipy.stats.hypergeom(size**2, len(mask), len(region))
         chance = common.expect(lambda x: x / (len(region) + len(mask) - x))  # noqa: B023 - used at once
-        assert row[f"iou_p{percentile:g}_chance"] == pytest.approx(chance)
+        assert overlap["iou_chance"] == pytest.approx(chance)
         # Stored rows are rounded, so two patches can be equally high.
         highest = centres[values == values.max()]
         near = [any(math.dist(place, centres[patch]) <= tolerance for patch in mask) for place in highest]
         assert row["pointing"] == pytest.approx(np.mean(near))
         of_object = np.average(centres, axis=0, weights=area)
         assert row["distance"] == pytest.approx(np.hypot(*(centre - of_object)) / size, rel=1e-5)
-    # The episode's table holds the means of these steps over replans with a mask and denoise steps.
+    # The episode's tables hold the means of these steps over replans with a mask and denoise steps.
     keys = ["layer", "head", "camera", "kind", "item"]
-    names = [f"iou_p{percentile:g}", "iou_otsu", "pointing", "distance"]
-    means = steps.with_columns(pl.col("layer").cast(pl.String)).group_by(keys).agg(pl.col(names).mean())
-    joined = iou.filter(pl.col("layer") != "layers_avg").join(means, on=keys, suffix="_mean")
-    assert joined.height == 2 * 2 * 2 * 9
-    for name in names:
-        np.testing.assert_allclose(joined[name].to_numpy(), joined[f"{name}_mean"].to_numpy(), rtol=1e-9)
+    for table, of_steps, by, names, height in (
+        (tables.pointing, steps, keys, ["pointing", "distance"], 2 * 2 * 2 * 9),
+        (tables.iou, iou_steps, [*keys, "threshold"], ["iou", "iou_chance"], 2 * 2 * 2 * 9 * 2),
+    ):
+        means = of_steps.with_columns(pl.col("layer").cast(pl.String)).group_by(by).agg(pl.col(names).mean())
+        joined = table.filter(pl.col("layer") != "layers_avg").join(means, on=by, suffix="_mean")
+        assert joined.height == height
+        for name in names:
+            wanted = joined[f"{name}_mean"].cast(pl.Float64).to_numpy()
+            np.testing.assert_allclose(joined[name].cast(pl.Float64).to_numpy(), wanted, rtol=1e-9)
 
 
 def test_uniform_attention_scores_exactly_what_chance_does(tmp_path):
@@ -168,9 +180,12 @@ def test_uniform_attention_scores_exactly_what_chance_does(tmp_path):
     np.testing.assert_allclose(
         tables.objects["share"], tables.objects["area_share"] * _of_all(tables.objects), rtol=1e-5
     )
-    seen = tables.iou.filter(pl.col("mask_replans") > 0)
+    assert tables.pointing is not None
+    seen = tables.pointing.filter(pl.col("mask_replans") > 0)
     np.testing.assert_allclose(seen["pointing"], seen["pointing_chance"], rtol=1e-6)
-    np.testing.assert_allclose(seen["iou_p90"], seen["iou_p90_chance"], rtol=1e-6)
+    overlap = tables.iou.filter(pl.col("threshold") == "p90").drop_nulls("iou")
+    assert overlap.height == seen.height
+    np.testing.assert_allclose(overlap["iou"], overlap["iou_chance"], rtol=1e-6)
     np.testing.assert_allclose(seen["centre_row"], 8.0, rtol=1e-5)
     np.testing.assert_allclose(seen["distance"], seen["distance_uniform"], rtol=1e-4)
 
@@ -187,7 +202,8 @@ def test_a_planted_follower_is_found_and_named(follower_store):
     assert (best["item"], best["object_class"]) == ("akita_black_bowl_1", "of interest")
     assert (best["layer"], best["head"], best["num_episodes"]) == ("2", 1, 4)
     assert best["lift"] > 10
-    finder = best_finders(tables.iou, "p90").row(0, named=True)
+    assert tables.pointing is not None
+    finder = best_finders(tables.iou, tables.pointing, "p90").row(0, named=True)
     assert (finder["layer"], finder["head"]) == ("2", 1)
     assert finder["iou"] > 2 * finder["chance"]
     assert finder["pointing"] > 0.9 > finder["pointing_chance"] + 0.5
@@ -196,7 +212,7 @@ def test_a_planted_follower_is_found_and_named(follower_store):
     assert bowl["lift_low"] > 1.5
     cabinet = summary.filter((pl.col("camera") == "all") & (pl.col("item") == "wooden_cabinet_1")).row(0, named=True)
     assert cabinet["lift_high"] < 1.1
-    found = iou_summary(tables.iou, ObjectSettings())
+    found = iou_summary(tables.iou).filter(pl.col("threshold") == "p90")
     assert found.filter(pl.col("item") == "akita_black_bowl_1")["num_episodes"].to_list() == [4, 4]
 
 
@@ -223,11 +239,11 @@ def test_an_object_out_of_sight_has_no_lift_and_no_mask(tmp_path):
     plate = (pl.col("item") == "plate_1") & (pl.col("camera") == CAMERAS[1])
     assert tables.objects.filter(plate)["lift"].is_null().all()
     assert tables.iou is not None
-    unseen = tables.iou.filter(plate)
+    assert tables.iou.filter(plate)["iou"].is_null().all()
+    assert tables.pointing is not None
+    unseen = tables.pointing.filter(plate)
     assert (unseen["mask_replans"] == 0).all()
-    assert (
-        unseen.select("pointing", "iou_p90", "distance", "pointing_chance").null_count().row(0) == (unseen.height,) * 4
-    )
+    assert unseen.select("pointing", "distance", "pointing_chance").null_count().row(0) == (unseen.height,) * 3
     assert (
         tables.objects.filter((pl.col("item") == "plate_1") & (pl.col("camera") == "all"))["lift"].is_not_null().all()
     )
@@ -243,7 +259,7 @@ def test_a_block_that_has_two_numbers_counts_once_in_the_average(follower_store)
         blocks=(*chosen.blocks, chosen.blocks[1]),
     )
     once, doubled = object_tables(question), object_tables(replace(question, selection=twice))
-    for name in ("objects", "iou"):
+    for name in ("objects", "pointing", "iou"):
         averages = [getattr(tables, name).filter(pl.col("layer") == "layers_avg") for tables in (once, doubled)]
         assert_frame_equal(*averages)
     words = [words_table(part) for part in (question, replace(question, selection=twice))]
@@ -270,7 +286,10 @@ def test_the_command_prints_writes_and_draws(follower_store, tmp_path, capsys):
     assert "Followed most, by layer: 'akita_black_bowl_1' (of interest) in layer 2 head 1" in printed
     assert "Objects of interest are found best by layer 2 head 1" in printed
     assert {path.name for path in tmp_path.iterdir()} == {
-        *(f"{name}.parquet" for name in ("objects", "object_times", "object_steps", "objects_summary", "iou", "iou_summary")),
+        *(f"{name}.parquet" for name in (
+            "objects", "object_times", "object_steps", "objects_summary", "pointing", "pointing_summary", "iou", "iou_summary",
+            "iou_steps",
+        )),
         *(f"{name}.{kind}" for name in ("object_shares", "object_iou") for kind in ("png", "pdf", "csv")),
     }  # fmt: skip
     assert main(["objects", str(follower_store), "--output", str(tmp_path / "less"), "--no-iou"]) == 0

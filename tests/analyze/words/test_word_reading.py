@@ -12,7 +12,8 @@ import zarr
 from tests.kit.bowl_scene import bowl_tokens, write_bowl_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.measures.question import AnalysisSettings, Question, ask
-from vla_attention.analyze.words.word_reading import strongest_readers, words_summary, words_table
+from vla_attention.analyze.words.word_reading import words_table
+from vla_attention.analyze.words.word_study import strongest_readers, words_summary
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import open_store

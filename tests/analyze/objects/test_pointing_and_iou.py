@@ -11,7 +11,7 @@ import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vla_attention.analyze.objects.spatial import (
+from vla_attention.analyze.objects.pointing_and_iou import (
     centre_of_mass,
     distance_in_pictures,
     grown,

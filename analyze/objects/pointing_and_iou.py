@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,7 @@ def centre_of_mass(maps: NDArray[np.floating], centres: Floats) -> Floats:
     """
     values = np.asarray(maps, dtype=np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return (values @ centres) / values.sum(axis=-1, keepdims=True)
+        return np.asarray((values @ centres) / values.sum(axis=-1, keepdims=True))
 
 
 def distance_in_pictures(first: Floats, second: Floats, rows: int, columns: int) -> Floats:
@@ -116,7 +117,7 @@ def mask_sizes(masks: Masks | NDArray[np.float32]) -> Floats:
     """Number of patches of masks (replan, patch, item), shape (replan, item)."""
     # A product with ones: numpy's own sum over a middle axis takes ten times as long.
     ones = np.ones((1, masks.shape[1]), dtype=np.float32)
-    return np.matmul(ones, masks.astype(np.float32, copy=False))[:, 0].astype(np.float64)
+    return np.asarray(np.matmul(ones, masks.astype(np.float32, copy=False))[:, 0], dtype=np.float64)
 
 
 def intersection_over_union(regions: Masks, masks: Masks | NDArray[np.float32]) -> Floats:
@@ -170,9 +171,9 @@ def _over_patches(values: NDArray[np.float32], masks: Masks | NDArray[np.float32
     """Sum over patches of (replan, ..., patch) inside masks (replan, patch, item): (replan, ..., item). Exact for counts."""
     flat = values.reshape(values.shape[0], -1, values.shape[-1])
     product = np.matmul(flat, masks.astype(np.float32, copy=False)).astype(np.float64)
-    return product.reshape(*values.shape[:-1], masks.shape[-1])
+    return np.asarray(product.reshape(*values.shape[:-1], masks.shape[-1]))
 
 
-def _over_replans(values: NDArray, ndim: int) -> NDArray:
+def _over_replans(values: NDArray[Any], ndim: int) -> NDArray[Any]:
     """(replan, item) as (replan, 1, ..., item) with so many axes."""
     return values.reshape(values.shape[0], *(1,) * (ndim - 2), values.shape[-1])
