@@ -27,7 +27,14 @@ from vla_attention.capture.store.disk_estimate import describe, estimate_disk
 from vla_attention.capture.store.store_writer import RunStore, open_run
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.layers import select_layers
-from vla_attention.schemas.stores.store_format import FORMAT_NAME, FORMAT_VERSION, Protocol, Recording, RootAttributes
+from vla_attention.schemas.stores.store_format import (
+    FORMAT_NAME,
+    FORMAT_VERSION,
+    PolicyIdentity,
+    Protocol,
+    Recording,
+    RootAttributes,
+)
 
 _QUERIES = {"mean": "the mean over", "steps": "the action steps' means over", "all": "each of"}
 
@@ -142,6 +149,18 @@ def run_capture(
     return loop.record_all(todo)
 
 
+def _checkpoint_line(identity: PolicyIdentity) -> str:
+    facts = identity.config
+    precision = f", {facts['dtype']}" if "dtype" in facts else ""
+    labels = {"normalisation": "normalisation", "prompt_format": "prompt"}
+    details = [f"{label} {facts[name]}" for name, label in labels.items() if name in facts]
+    details.append(f"cameras {listing(f'{camera.name} = {camera.source}' for camera in identity.cameras)}")
+    return (
+        f"Checkpoint: {identity.family} in format {identity.checkpoint_format}{precision}, configuration: "
+        f"{facts['configuration']}; {', '.join(details)}."
+    )
+
+
 def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int) -> None:
     identity, recording, protocol = store.attributes.policy, store.attributes.recording, store.attributes.protocol
     say(
@@ -151,13 +170,8 @@ def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int) -
         say(
             "These weights are random and UNTRAINED: the numbers show that the tool works, and say nothing about any policy."
         )
-    facts = identity.config
-    if not identity.untrained:
-        say(
-            f"Checkpoint: {identity.family} in format {identity.checkpoint_format}, {facts['dtype']}, configuration: "
-            f"{facts['configuration']}; normalisation {facts['normalisation']}, prompt {facts['prompt_format']}, "
-            f"cameras {listing(f'{camera.name} = {camera.source}' for camera in identity.cameras)}."
-        )
+    else:
+        say(_checkpoint_line(identity))
     say(f"A policy call gives {identity.action_horizon} actions, of which {protocol.replan_steps} are executed.")
     grids = [camera_grid(policy.sites, camera.name) for camera in policy.cameras]
     pictures = [grid.image_height * grid.image_width * 3 for grid in grids]

@@ -8,9 +8,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from vla_attention.capture.jobs.slurm import ask_for_requeue
 from vla_attention.capture.jobs.termination import EXIT_TERMINATED, Terminated, Termination, listening_for_sigterm
-from vla_attention.capture.jobs.worker import this_worker
 from vla_attention.schemas.command_line import run_command
 from vla_attention.schemas.errors import BadArgument
 
@@ -28,6 +26,9 @@ def run_capture_command(program: str, command: Callable[[Termination], int], max
                 program, lambda: command(termination), "complete episodes are kept, continue with --resume."
             )
         except Terminated:
+            from vla_attention.capture.jobs.slurm import ask_for_requeue
+            from vla_attention.capture.jobs.worker import this_worker
+
             # SLURM sends the signal again to a job that is being requeued.
             signal.signal(signal.SIGTERM, signal.SIG_IGN)
             requeued = ask_for_requeue(this_worker(), max_requeues()) if max_requeues() else ""

@@ -7,11 +7,13 @@ bounds the relative error of any mass by the same number, and of any ratio of tw
 from __future__ import annotations
 
 import re
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from vla_attention.schemas.errors import BadArgument
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 #: Explicit mantissa bits of float32; keeping all of them is "exact".
 FLOAT32_MANTISSA_BITS = 23
@@ -34,6 +36,8 @@ def round_mantissa(values: NDArray[np.float32], bits: int) -> NDArray[np.float32
 
     `values` must be finite and non-negative (probabilities); the shape is kept.
     """
+    import numpy as np  # here, because a command line reads `--precision` without it
+
     if bits >= FLOAT32_MANTISSA_BITS:
         return values
     drop = FLOAT32_MANTISSA_BITS - bits

@@ -9,14 +9,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Literal, Protocol
 
 from vla_attention.capture.environments.protocol import IMAGE_SIZE
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.schemas.groupings.vocabulary import SceneObject
+
+# Command lines read suites and settings from here, and print their help without waiting for a library.
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from vla_attention.schemas.groupings.vocabulary import SceneObject
 
 #: Name of the scene object that stands for the arm, its gripper and its mount.
 ROBOT = "robot"

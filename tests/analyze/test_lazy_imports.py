@@ -7,20 +7,8 @@ import sys
 
 import pytest
 
+from tests.kit.lazy_imports import HEAVY, help_without_libraries
 from vla_attention.analyze.commands import COMMANDS
-
-#: Each takes a tenth of a second or more to import.
-HEAVY = ("numpy", "polars", "zarr", "matplotlib", "tqdm", "xarray", "pandas", "torch")
-_CHECK = """
-import runpy, sys
-sys.argv = {argv!r}
-try:
-    runpy.run_module({module!r}, run_name="__main__")
-except SystemExit as end:
-    assert not end.code, end.code
-heavy = [name for name in {heavy!r} if name in sys.modules]
-assert not heavy, heavy
-"""
 
 
 @pytest.mark.parametrize(
@@ -33,11 +21,9 @@ assert not heavy, heavy
     ids=lambda value: " ".join(value) if isinstance(value, list) else value,
 )
 def test_help_imports_no_library(module, words):
-    code = _CHECK.format(argv=[module, *words], module=module, heavy=HEAVY)
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("usage:")
-    assert "examples:" in done.stdout or words == ["verify", "--help"]
+    printed = help_without_libraries(module, words)
+    assert printed.startswith("usage:")
+    assert "examples:" in printed or words == ["verify", "--help"]
 
 
 def test_importing_the_package_imports_no_library():

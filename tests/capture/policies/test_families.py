@@ -1,0 +1,115 @@
+"""A third policy family: an entry in the registry is all that it takes, from the help text to the analysis."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+import zarr
+
+from vla_attention.capture.__main__ import main
+from vla_attention.capture.environments.base import Observation, StepResult
+from vla_attention.capture.policies import families
+from vla_attention.capture.policies.families import policy_families
+from vla_attention.capture.rollout import episode_loop
+from vla_attention.schemas.groupings.vocabulary import SceneObject
+
+CAPTURE = Path(families.__file__).parents[1]
+
+
+class StubEnvironment:
+    """A picture of 4 x 4 pixels that changes with every step; nothing is ever solved."""
+
+    objects = (SceneObject("robot", "robot", False), SceneObject("background", "background", False))
+    initial_state_digest = "d" * 64
+
+    def __init__(self) -> None:
+        self.steps = 0
+
+    def reset(self, initial_state_index: int, seed: int) -> None:
+        self.steps = 100 * initial_state_index
+
+    def step(self, action: np.ndarray, observe: bool) -> StepResult:
+        self.steps += 1
+        if not observe:
+            return StepResult(False, None)
+        picture = np.random.default_rng(self.steps).integers(0, 255, (4, 4, 3), dtype=np.uint8)
+        return StepResult(
+            False, Observation({"agentview": picture}, np.zeros(3), np.array([0.0, 0, 0, 1]), np.zeros(2))
+        )
+
+    def segmentation(self, camera: str) -> np.ndarray:
+        return np.repeat(np.array([0, 1], dtype=np.int32), 8).reshape(4, 4)
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def toy_is_registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(families, "FAMILY_MODULES", (*families.FAMILY_MODULES, "tests.kit.toy_family"))
+    monkeypatch.setattr(episode_loop, "make_environment", lambda suite, task_id, settings: StubEnvironment())
+
+
+@pytest.mark.usefixtures("toy_is_registered")
+def test_a_third_family_captures_and_is_analysed(tmp_path, capfd):
+    arguments = ["--task-id", "0", "--num-episodes", "2", "--max-steps", "6", "--toy-size", "3", "--no-contributions"]
+    assert main(["toy", *arguments, "--output-dir", str(tmp_path)]) == 0
+    printed = capfd.readouterr().out
+    assert "Checkpoint: toy in format toy, configuration: built in; cameras view = agentview." in printed
+    assert "A policy call gives 3 actions, of which 2 are executed." in printed
+    store = tmp_path / "toy_robosuite.zarr"
+    policy = dict(zarr.open_group(store, mode="r").attrs)["policy"]
+    assert (policy["family"], policy["checkpoint"], policy["config"]["size"]) == ("toy", "toy-weights", 3)
+    episode = zarr.open_group(store / "episodes/task000_episode001", mode="r")
+    assert episode["joint/rows"].shape == (3, 1, 1, 2, 1, 7)
+    np.testing.assert_allclose(episode["joint/row_sum"][:], 1, rtol=1e-6)
+    # Its own default of the analysis: seen over read.
+    steps = pl.read_parquet(tmp_path / "steps.parquet")
+    assert steps.height == 6
+    assert (tmp_path / "attention_ratio_results_robosuite.json").is_file()
+    assert "seen / read" in printed
+
+
+@pytest.mark.usefixtures("toy_is_registered")
+def test_a_third_family_is_in_the_help_and_has_its_parity_cases(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    said = capsys.readouterr().out
+    assert "Toy Policy" in said
+    assert "  vla-capture toy\n" in said
+    (tmp_path / "case.json").write_text(json.dumps({"toy": 1}))
+    assert main(["parity", str(tmp_path)]) == 0
+    assert capsys.readouterr().out == f"toy parity of {tmp_path.name}\n"
+
+
+def test_a_case_of_no_family_is_one_sentence(tmp_path, capsys):
+    (tmp_path / "case.json").write_text(json.dumps({"toy": 1}))
+    assert main(["parity", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert "describes no case of a policy that is known here (Cosmos Policy, pi0 or pi0.5); it states toy." in said
+    assert said.count("\n") == 1
+
+
+def test_names_prefixes_and_programs_are_unique():
+    known = policy_families()
+    for values in (
+        [family.name for family in known],
+        [family.store_prefix for family in known],
+        [family.published.program for family in known if family.published],
+    ):
+        assert len(set(values)) == len(values)
+
+
+def test_no_family_is_named_outside_its_folder():
+    """Strings of code, not comments and help: 'pi' and 'cosmos' stand in their folders and in the registry."""
+    named = re.compile(r"""["'](pi|pi0|pi05|cosmos)["']|policies\.(pi|cosmos)\b""")
+    for path in CAPTURE.rglob("*.py"):
+        place = path.relative_to(CAPTURE)
+        if place.parts[:2] in (("policies", "pi"), ("policies", "cosmos")) or place.name == "families.py":
+            continue
+        assert not named.search(path.read_text()), place

@@ -1,0 +1,107 @@
+"""A third policy family, as a user would add one: a tiny attention model in one module, with an entry for the registry."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from typing import Any
+
+from vla_attention.capture.policies.family import ParityCases, PolicyFamily
+
+
+def _build(arguments: argparse.Namespace, device: str) -> Any:
+    return make_toy_policy(arguments.checkpoint, arguments.toy_size)
+
+
+def make_toy_policy(checkpoint: str, size: int) -> Any:
+    """One attention layer with two heads over four patches of a picture and three words; trained on nothing."""
+    import numpy as np
+    import torch
+
+    from vla_attention.capture.policies.identity import PolicySource, describe_policy
+    from vla_attention.capture.policies.noise import initial_noise, noise_seed
+    from vla_attention.capture.policies.policy import PolicyInput, camera_frame
+    from vla_attention.capture.recording.attention import attend
+    from vla_attention.schemas.layout import PatchGrid, Piece, Prompt, Role, SiteLayout, Span, roles_from_spans
+    from vla_attention.schemas.stores.store_format import PolicyCameraView
+
+    layout = SiteLayout(
+        "joint",
+        (Span("view", "image", 0, 4, camera="view", grid=PatchGrid(2, 2, 4, 4)), Span("prompt", "text", 4, 7)),
+    )
+
+    class ToyPolicy:
+        name, family = "toy", "toy"
+        sites = (layout,)
+        num_layers, num_heads, num_denoise_steps = 1, 2, 1
+        action_horizon = num_action_queries = size
+        default_replan_steps = 2
+        cameras = (PolicyCameraView("view", source="agentview", upright=True, mirrored=False),)
+
+        def query_pools(self):
+            return np.eye(size)
+
+        def replan_noise_seed(self, run_seed, task_id, episode_index, replan):
+            return noise_seed(run_seed, task_id, episode_index, replan)
+
+        def denoise_times(self):
+            return np.ones(1)
+
+        def identity(self):
+            source = PolicySource("toy", checkpoint, "toy", untrained=False)
+            return describe_policy(self, source, "0" * 64, {"size": size})
+
+        def prepare(self, observation, instruction):
+            frame = camera_frame(observation, "agentview")[::-1].copy()
+            words = instruction.split()[:3]
+            starts = [instruction.index(word) for word in words]
+            pieces = tuple(Piece(4 + i, w, a, a + len(w)) for i, (w, a) in enumerate(zip(words, starts, strict=True)))
+            roles = roles_from_spans(layout, {"view": Role.IMAGE, "prompt": Role.INSTRUCTION})
+            prompt = Prompt(instruction, pieces, (0, len(instruction)))
+            patches = torch.from_numpy(frame.reshape(2, 2, 2, 2, 3).mean((1, 3, 4)).reshape(4)).float() / 255
+            keys = torch.cat([patches, torch.tensor([len(word) / 10 for word in words])])
+            return PolicyInput({"view": frame}, {"joint": roles}, prompt, np.zeros(8), {"keys": keys})
+
+        def act(self, policy_input, noise_seed, recorders=None):
+            keys = policy_input.tensors["keys"].expand(1, 1, 1, -1).transpose(-1, -2).expand(1, 1, 7, 4)
+            query = torch.from_numpy(initial_noise(noise_seed, (1, 2, size, 4)))
+            collector = (recorders or {}).get("joint")
+            rows_to = collector.sink(0, 0, slice(0, size)) if collector is not None else None
+            mixed = attend(query, keys, keys, None, 0.5, rows_to=rows_to)
+            return np.repeat(mixed[0, 0, :, :1].numpy().astype(np.float64), 7, axis=1)
+
+    return ToyPolicy()
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("model")
+    group.add_argument("--checkpoint", default="toy-weights")
+    group.add_argument("--device", default="cpu")
+    group.add_argument("--toy-size", type=int, default=4, help="actions of a chunk")
+
+
+def _analysis_arguments(arguments: argparse.Namespace) -> list[str]:
+    return ["--group", "seen=camera:view", "--group", "read=role:instruction", "--ratio", "seen/read"]
+
+
+def _is_toy_case(content: Mapping[str, Any]) -> bool:
+    return "toy" in content
+
+
+def _run_parity(arguments: argparse.Namespace, device: str) -> int:
+    print(f"toy parity of {arguments.case.name}")
+    return 0
+
+
+FAMILY = PolicyFamily(
+    name="toy",
+    title="Toy Policy",
+    description="Record a toy policy.",
+    examples="  vla-capture toy\n",
+    add_arguments=_add_arguments,
+    build=_build,
+    store_prefix="toy_",
+    replan_default="2",
+    analysis_arguments=_analysis_arguments,
+    parity=ParityCases(recognises=_is_toy_case, run=_run_parity),
+)
