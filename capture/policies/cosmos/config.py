@@ -86,7 +86,7 @@ class VaeConfig:
     @property
     def spatial_compression(self) -> int:
         """Pixels of one latent cell's side."""
-        return 2 ** (len(self.dim_mult) - 1)
+        return 1 << (len(self.dim_mult) - 1)
 
 
 #: What the nine latent frames of the LIBERO policy hold. `frameN` names any of them by number as well.

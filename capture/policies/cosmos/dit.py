@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vla_attention.capture.policies.cosmos.config import DitConfig
+from vla_attention.capture.policies.heads import join_heads, split_heads
 from vla_attention.capture.recording.attention import RowSink, attend
 
 NORM_EPS = 1e-6
@@ -102,7 +103,7 @@ class Attention(nn.Module):
         super().__init__()
         width = config.width
         self.site = site
-        self.num_heads = config.num_heads
+        self.head_dim = config.head_dim
         self.scale = config.head_dim**-0.5
         self.q_proj = nn.Linear(width, width, bias=False)
         self.q_norm = RMSNorm(config.head_dim)
@@ -110,9 +111,6 @@ class Attention(nn.Module):
         self.k_norm = RMSNorm(config.head_dim)
         self.v_proj = nn.Linear(context_dim, width, bias=False)
         self.output_proj = nn.Linear(width, width, bias=False)
-
-    def _heads(self, x: Tensor) -> Tensor:
-        return x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
 
     def forward(
         self,
@@ -129,9 +127,9 @@ class Attention(nn.Module):
         frames, tokens = x.shape[1:3]
         flat = x.flatten(1, 2)
         context = flat if text is None else text
-        query = self.q_norm(self._heads(self.q_proj(flat)))
-        key = self.k_norm(self._heads(self.k_proj(context)))
-        value = self._heads(self.v_proj(context))
+        query = self.q_norm(split_heads(self.q_proj(flat), self.head_dim))
+        key = self.k_norm(split_heads(self.k_proj(context), self.head_dim))
+        value = split_heads(self.v_proj(context), self.head_dim)
         if rotary is not None:
             query, key = rotate(query, *rotary), rotate(key, *rotary)
         key = key.float()  # once, and not again for every frame of queries
@@ -140,9 +138,8 @@ class Attention(nn.Module):
             part = query[:, :, frame * tokens : (frame + 1) * tokens]
             sink = observer.rows(self.site, layer, frame, self, value) if observer is not None else None
             mixed.append(attend(part, key, value, None, self.scale, rows_to=sink))
-        joined = torch.cat(mixed, dim=2).transpose(1, 2).flatten(2)
-        update: Tensor = self.output_proj(joined)
-        return update.unflatten(1, (frames, tokens))
+        update = self.output_proj(join_heads(torch.cat(mixed, dim=2)))
+        return torch.unflatten(update, 1, (frames, tokens))
 
 
 class FeedForward(nn.Module):
@@ -259,7 +256,7 @@ class Patchify(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Return features ordered (channel, row in the patch, column in the patch), tokens row by row."""
         size = self.patch_size
-        cut = x.unflatten(4, (-1, size)).unflatten(3, (-1, size))  # b c t (h p) (w q)
+        cut = torch.unflatten(torch.unflatten(x, 4, (-1, size)), 3, (-1, size))  # b c t (h p) (w q)
         return cut.permute(0, 2, 3, 5, 1, 4, 6).flatten(4).flatten(2, 3)
 
 
@@ -353,5 +350,6 @@ class Dit(nn.Module):
             x = block(x, time, shared_modulation, text, rotary, layer, observer)
         features = self.final_layer(x, time, shared_modulation)
         size = self.config.patch_size
-        patches = features.unflatten(-1, (size, size, -1)).unflatten(2, (rows, columns))  # b t i j p q c
+        cut = torch.unflatten(features, -1, (size, size, -1))
+        patches = torch.unflatten(cut, 2, (rows, columns))  # b t i j p q c
         return patches.permute(0, 6, 1, 2, 4, 3, 5).flatten(5).flatten(3, 4)

@@ -129,12 +129,14 @@ class CausalEncoder(nn.Module):
     @property
     def dtype(self) -> torch.dtype:
         """Precision of the weights."""
-        return self.encoder.conv_in.weight.dtype
+        dtype: torch.dtype = self.encoder.conv_in.weight.dtype
+        return dtype
 
     @property
     def device(self) -> torch.device:
         """Where the weights are."""
-        return self.encoder.conv_in.weight.device
+        device: torch.device = self.encoder.conv_in.weight.device
+        return device
 
     def _encode_chunk(self, frames: Tensor, cache: list[Tensor | None]) -> Tensor:
         """Encode pixel frames that make one latent frame; `cache` holds, and gets, what the convolutions saw before."""

@@ -106,8 +106,8 @@ def _scaled(name: str, normal: np.ndarray, config: PiConfig) -> np.ndarray:
     weight = normal * np.float32(fan_in**-0.5)
     if name.endswith("patch_embedding.weight"):
         # Pictures are smooth: without taking out a filter's mean, all patches would differ in brightness only.
-        weight = weight - np.float32(0.7) * weight.mean(axis=(1, 2, 3), keepdims=True)
-        return weight * np.float32(6.0)
+        contrast: np.ndarray = weight - np.float32(0.7) * weight.mean(axis=(1, 2, 3), keepdims=True)
+        return contrast * np.float32(6.0)
     if "vision_tower" not in name and name.endswith("q_proj.weight"):
         heads = config.paligemma.num_heads
         sharpness = np.geomspace(_FLATTEST, _SHARPEST, heads, dtype=np.float32)

@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from vla_attention.capture.policies.heads import join_heads, split_heads
 from vla_attention.capture.policies.pi.config import GemmaConfig
 from vla_attention.capture.recording.attention import RowSink, UpdateSink, attend
 from vla_attention.capture.recording.contributions import Projection
@@ -118,21 +119,19 @@ class GemmaAttention(nn.Module):
         self.v_proj = nn.Linear(config.width, config.num_kv_heads * config.head_dim, bias=False)
         self.o_proj = nn.Linear(config.num_heads * config.head_dim, config.width, bias=False)
 
-    def _heads(self, x: Tensor) -> Tensor:
-        """Split (batch, token, head · dim) into (batch, head, token, dim)."""
-        return x.unflatten(-1, (-1, self.head_dim)).transpose(1, 2)
-
     def keys_values(self, x: Tensor, rotation: Rotation) -> KeysValues:
         """Return this block's keys and values of the tokens (batch, token, width)."""
-        return KeysValues(rotation.apply(self._heads(self.k_proj(x))), self._heads(self.v_proj(x)))
+        keys, values = split_heads(self.k_proj(x), self.head_dim), split_heads(self.v_proj(x), self.head_dim)
+        return KeysValues(rotation.apply(keys), values)
 
     def forward(
         self, x: Tensor, seen: KeysValues, mask: Tensor | None, rotation: Rotation, rows_to: RowSink | None
     ) -> Tensor:
         """Attend from the tokens (batch, token, width) to all `seen` keys, mask (batch, token or 1, key)."""
-        query = rotation.apply(self._heads(self.q_proj(x)))
+        query = rotation.apply(split_heads(self.q_proj(x), self.head_dim))
         mixed = attend(query, seen.keys, seen.values, mask, self.scale, rows_to=rows_to)
-        return self.o_proj(mixed.transpose(1, 2).flatten(2))
+        update: Tensor = self.o_proj(join_heads(mixed))
+        return update
 
 
 class GemmaMlp(nn.Module):
@@ -146,7 +145,8 @@ class GemmaMlp(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (batch, token, width) to the same shape."""
-        return self.down_proj(F.gelu(self.gate_proj(x), approximate="tanh") * self.up_proj(x))
+        update: Tensor = self.down_proj(F.gelu(self.gate_proj(x), approximate="tanh") * self.up_proj(x))
+        return update
 
 
 def make_norm(width: int, condition_width: int | None) -> nn.Module:
@@ -214,9 +214,10 @@ class GemmaModel(nn.Module):
 
     @property
     def blocks(self) -> list[GemmaBlock]:
-        """The layers, as the type they are (a ModuleList only promises modules)."""
+        """The layers with their own type; for mypy a ModuleList holds plain modules."""
         return [cast(GemmaBlock, layer) for layer in self.layers]
 
     def embed(self, tokens: Tensor) -> Tensor:
         """Look up tokens (batch, token) and scale by sqrt(width), as Gemma does with text and only with text."""
-        return self.embed_tokens(tokens) * self.config.width**0.5
+        embedded: Tensor = self.embed_tokens(tokens) * self.config.width**0.5
+        return embedded

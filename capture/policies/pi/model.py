@@ -139,7 +139,8 @@ class PiModel(nn.Module):
         batch = tokens.shape[0]
         # All cameras share the encoder: one pass over (camera · batch) images.
         encoded = self._inner.vision_tower(torch.cat([images[camera] for camera in cameras]))
-        patches = self._inner.multi_modal_projector(encoded).to(self.dtype).unflatten(0, (len(cameras), batch))
+        projected = self._inner.multi_modal_projector(encoded).to(self.dtype)
+        patches = torch.unflatten(projected, 0, (len(cameras), batch))
         text = self._vlm.embed(tokens)
         valid = [image_masks[camera][:, None].expand(batch, self.config.siglip.num_tokens) for camera in cameras]
         return torch.cat([*patches.unbind(0), text], dim=1), torch.cat([*valid, token_mask], dim=1)

@@ -6,9 +6,11 @@ class token and pooling.
 
 from __future__ import annotations
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from vla_attention.capture.policies.heads import join_heads, split_heads
 from vla_attention.capture.policies.pi.config import SiglipConfig
 from vla_attention.capture.recording.attention import attend
 
@@ -27,7 +29,7 @@ class PatchEmbeddings(nn.Module):
         """Map (image, 3, height, width) float32 to (image, patch, width), patches row by row from the top left."""
         weight, bias = self.patch_embedding.weight, self.patch_embedding.bias
         size = weight.shape[-1]
-        pixels = images.unflatten(3, (-1, size)).unflatten(2, (-1, size))
+        pixels = torch.unflatten(torch.unflatten(images, 3, (-1, size)), 2, (-1, size))
         # (image, 3, row, y, column, x) -> (image, row · column, 3 · y · x): patches do not overlap, so the convolution is
         # one matrix product. Convolutions on a GPU are rounded to TF32 unless a global switch says otherwise.
         patches = pixels.permute(0, 2, 4, 1, 3, 5).flatten(3).flatten(1, 2)
@@ -39,22 +41,18 @@ class SiglipAttention(nn.Module):
 
     def __init__(self, config: SiglipConfig):
         super().__init__()
-        self.num_heads = config.num_heads
-        self.scale = (config.width // config.num_heads) ** -0.5
+        self.head_dim = config.width // config.num_heads
+        self.scale = self.head_dim**-0.5
         self.q_proj = nn.Linear(config.width, config.width)
         self.k_proj = nn.Linear(config.width, config.width)
         self.v_proj = nn.Linear(config.width, config.width)
         self.out_proj = nn.Linear(config.width, config.width)
 
-    def _heads(self, x: Tensor) -> Tensor:
-        """Split (image, patch, width) into (image, head, patch, dim)."""
-        return x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
-
     def forward(self, x: Tensor) -> Tensor:
         """Map (image, patch, width) to the same shape."""
-        query, key, value = self._heads(self.q_proj(x)), self._heads(self.k_proj(x)), self._heads(self.v_proj(x))
-        mixed = attend(query, key, value, None, self.scale)
-        return self.out_proj(mixed.transpose(1, 2).flatten(2))
+        query, key, value = (split_heads(layer(x), self.head_dim) for layer in (self.q_proj, self.k_proj, self.v_proj))
+        update: Tensor = self.out_proj(join_heads(attend(query, key, value, None, self.scale)))
+        return update
 
 
 class SiglipMlp(nn.Module):
@@ -67,7 +65,8 @@ class SiglipMlp(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (image, patch, width) to the same shape."""
-        return self.fc2(F.gelu(self.fc1(x), approximate="tanh"))
+        update: Tensor = self.fc2(F.gelu(self.fc1(x), approximate="tanh"))
+        return update
 
 
 class SiglipBlock(nn.Module):
@@ -83,7 +82,8 @@ class SiglipBlock(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map (image, patch, width) to the same shape."""
         x = x + self.self_attn(self.layer_norm1(x))
-        return x + self.mlp(self.layer_norm2(x))
+        x = x + self.mlp(self.layer_norm2(x))
+        return x
 
 
 class SiglipEncoder(nn.Module):
@@ -112,7 +112,8 @@ class SiglipVisionModel(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         """Map (image, 3, height, width) in [-1, 1] to (image, patch, width)."""
         patches = self.embeddings(images)
-        return self.post_layernorm(self.encoder(patches.to(self.post_layernorm.weight.dtype)))
+        encoded: Tensor = self.post_layernorm(self.encoder(patches.to(self.post_layernorm.weight.dtype)))
+        return encoded
 
 
 class VisionTower(nn.Module):
@@ -124,7 +125,8 @@ class VisionTower(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Map (image, 3, height, width) in [-1, 1] to (image, patch, width)."""
-        return self.vision_model(images)
+        encoded: Tensor = self.vision_model(images)
+        return encoded
 
 
 class Projector(nn.Module):
@@ -136,4 +138,5 @@ class Projector(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (image, patch, vision width) to (image, patch, text width)."""
-        return self.linear(x)
+        projected: Tensor = self.linear(x)
+        return projected

@@ -88,7 +88,8 @@ def digitise_state(state: NDArray[np.floating]) -> NDArray[np.int64]:
 
     The -1 is what openpi's formula gives, so it occurs in the prompts that its policies were trained on.
     """
-    return np.digitize(state, np.linspace(-1, 1, 256 + 1)[:-1]) - 1
+    bins: NDArray[np.int64] = np.digitize(state, np.linspace(-1, 1, 256 + 1)[:-1]) - 1
+    return bins
 
 
 class PromptTokenizer:
