@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
 from vla_attention.analyze.measures.steps import episode_masses
-from vla_attention.analyze.show.output_files import replacing
+from vla_attention.analyze.show.numbers import format_bytes
+from vla_attention.analyze.show.output_files import replacing, writing
 from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.schemas.errors import BadArgument, MissingDependency
@@ -59,7 +60,7 @@ class RowsSize:
         samples, layers, steps, heads, keys = self.shape
         return (
             f"{samples} samples x {layers} layers x {steps} denoise steps x {heads} heads x {keys} keys, "
-            f"{_bytes(self.num_bytes)} in float32"
+            f"{format_bytes(self.num_bytes)} in float32"
         )
 
 
@@ -122,7 +123,7 @@ def rows_array(
     size = rows_size(question)
     if most_bytes is not None and size.num_bytes > most_bytes:
         raise BadArgument(
-            f"The rows would take {size}, more than the {_bytes(most_bytes)} that are allowed; choose fewer layers, denoise steps, "
+            f"The rows would take {size}, more than the {format_bytes(most_bytes)} that are allowed; choose fewer layers, denoise steps, "
             "heads or tasks, allow more, or write them to a file with vla-analyze export --netcdf --rows."
         )
     rows = np.empty(size.shape, dtype=np.float32)
@@ -131,11 +132,12 @@ def rows_array(
     variables = {
         name: (dimensions, values, attributes) for name, dimensions, values, attributes in _key_variables(question)
     }
-    return xr.Dataset(
+    dataset: xarray.Dataset = xr.Dataset(
         {"rows": (ROW_DIMENSIONS, rows, _rows_attributes(question))},
         coords={**_sample_coordinates(question), **_axis_coordinates(question), **variables},
         attrs=_attributes(question),
     )
+    return dataset
 
 
 def write_netcdf(
@@ -153,14 +155,11 @@ def write_netcdf(
     _needed("h5py")
     masses = masses_array(question, progress)
     compressed = {name: {"zlib": True, "complevel": 4} for name in ("mass", "row_sum")}
-    try:
-        with replacing(path) as temporary:
-            masses.to_netcdf(temporary, engine="h5netcdf", encoding=compressed)
-            if rows:
-                with h5netcdf.File(temporary, "a") as file:
-                    _write_rows(file, question, progress)
-    except OSError as error:
-        raise BadArgument(f"Cannot write {path}: {error.strerror or error}; give another --output.") from None
+    with writing("the arrays", path), replacing(path) as temporary:
+        masses.to_netcdf(temporary, engine="h5netcdf", encoding=compressed)
+        if rows:
+            with h5netcdf.File(temporary, "a") as file:
+                _write_rows(file, question, progress)
     return path
 
 
@@ -314,10 +313,3 @@ def _needed(module: str) -> Any:
 
 def _text_type() -> Any:
     return _needed("h5py").string_dtype()
-
-
-def _bytes(count: int) -> str:
-    for size, unit in ((10**12, "TB"), (10**9, "GB"), (10**6, "MB")):
-        if count >= size:
-            return f"{count / size:.1f} {unit}"
-    return f"{count / 1000:.0f} kB"

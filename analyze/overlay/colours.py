@@ -149,6 +149,11 @@ def outline(
     return result
 
 
+def outline_color(number: int) -> tuple[int, int, int]:
+    """Red, green and blue (0..255) of the outline of the group with this number, from 0."""
+    return OUTLINE_COLORS[number % len(OUTLINE_COLORS)]
+
+
 def color_bar(scale: Scale, length: int = 256, thickness: int = 16) -> NDArray[np.uint8]:
     """The scale as a picture (thickness, length, 3), from 0 on the left: colours as they look on a grey picture."""
     values = np.broadcast_to((np.arange(length) + 0.5) / length * scale.high, (thickness, length))

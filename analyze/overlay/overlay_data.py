@@ -16,10 +16,10 @@ from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, check_replan
 from vla_attention.analyze.measures.steps import steps_table
 from vla_attention.analyze.overlay.colours import (
-    OUTLINE_COLORS,
     Measure,
     Scale,
     outline,
+    outline_color,
     overlay_image,
     patch_values,
     scale_for,
@@ -218,7 +218,7 @@ def draw(
     image = overlay_image(frame, values[camera][replan], scale, smooth, (grid.image_height, grid.image_width))
     for i, by_camera in enumerate(overlay.outlines.values()):
         member = by_camera[camera]
-        color = OUTLINE_COLORS[i % len(OUTLINE_COLORS)]
+        color = outline_color(i)
         image = outline(image, member[replan if len(member) > 1 else 0], color, max(1, image.shape[0] // 112))
     return upright(image, overlay.views[camera])
 

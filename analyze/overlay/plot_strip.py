@@ -6,17 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
-from vla_attention.analyze.overlay.colours import OUTLINE_COLORS, Measure, Scale, color_bar
+from vla_attention.analyze.overlay.colours import Measure, Scale, color_bar, outline_color
 from vla_attention.analyze.overlay.overlay_data import EpisodeOverlay, draw, orientation_note
 from vla_attention.analyze.overlay.overlay_study import OverlayStudy
 from vla_attention.analyze.show.numbers import format_number
-from vla_attention.analyze.show.plot_axes import hide_frame
+from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, hide_frame
 from vla_attention.analyze.show.plot_colours import NOTE_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
-from vla_attention.analyze.show.plot_text import ratio_name, title, wrapped
+from vla_attention.analyze.show.plot_text import title, wrapped
 from vla_attention.schemas.groupings.grouping import Grouping
 
 if TYPE_CHECKING:
@@ -45,10 +42,9 @@ def plot_overlay_strip(
     side = _SIDE if columns > 3 else 2.1
     figure = new_figure(width, 1.55 + len(blocks) * (0.42 + len(cameras) * side))
     outcome = "success" if attributes.success else "failure"
-    shown = f"replan{'s' * (len(replans) > 1)} {_numbers(replans)} of {overlay.num_replans}"
+    shown = f"replan{'s' if len(replans) > 1 else ''} {_numbers(replans)} of {overlay.num_replans}"
     note = f"{'; '.join(part for part in (outcome, shown, study.averaged_over) if part)}. {orientation_note(overlay)}"
-    heading = f"{overlay.item.store.suite} task {attributes.task_id}, episode {attributes.episode_index}: {attributes.instruction}"
-    title(figure, heading, note)
+    title(figure, episode_heading(overlay), note)
     bar_height = 0.24 / side
     grid = figure.add_gridspec(
         len(blocks) * len(cameras) + 1, columns, height_ratios=[*[1.0] * (len(blocks) * len(cameras)), bar_height]
@@ -67,6 +63,12 @@ def plot_overlay_strip(
                     axes.set_title(_above(overlay, grouping, replan), size=8)
     _draw_bar(figure.add_subplot(grid[-1, :]), scale, list(overlay.outlines))
     return save_figure(figure, folder, study.stem, study.table)
+
+
+def episode_heading(overlay: EpisodeOverlay) -> str:
+    """Suite, task, episode and instruction, for a title."""
+    attributes = overlay.item.episode.attributes
+    return f"{overlay.item.store.suite} task {attributes.task_id}, episode {attributes.episode_index}: {attributes.instruction}"
 
 
 def _numbers(replans: Sequence[int]) -> str:
@@ -95,7 +97,7 @@ def draw_scale(axes: Axes, scale: Scale) -> None:
         axes.axvline(scale.uniform, color="white", linewidth=1.6)
         axes.axvline(scale.uniform, color="black", linewidth=0.9, linestyle="--")
         axes.annotate(
-            "uniform attention",
+            BASELINE_LABEL,
             (scale.uniform, 1.0),
             xytext=(2, 2),
             textcoords="offset points",
@@ -111,9 +113,7 @@ def _draw_bar(axes: Axes, scale: Scale, groups: Sequence[str]) -> None:
         from matplotlib.patches import Rectangle
 
         handles = [
-            Rectangle(
-                (0, 0), 1, 1, facecolor="#808080", edgecolor=rgb(OUTLINE_COLORS[i % len(OUTLINE_COLORS)]), linewidth=2
-            )
+            Rectangle((0, 0), 1, 1, facecolor="#808080", edgecolor=rgb(outline_color(i)), linewidth=2)
             for i in range(len(groups))
         ]
         labels = [wrapped(f"outlined: {name}", 40, 1) for name in groups]
@@ -121,14 +121,5 @@ def _draw_bar(axes: Axes, scale: Scale, groups: Sequence[str]) -> None:
 
 
 def rgb(color: tuple[int, int, int]) -> tuple[float, float, float]:
-    """A colour of 0..255 as matplotlib wants it."""
+    """A colour of 0..255 in matplotlib's range, 0..1."""
     return (color[0] / 255, color[1] / 255, color[2] / 255)
-
-
-def shown_ratio(
-    overlay: EpisodeOverlay, grouping: Grouping
-) -> tuple[NDArray[np.float64], NDArray[np.float64] | None, str]:
-    """What runs beside the pictures: the ratio with its uniform baseline, or without a ratio the image keys' mass; and its name."""
-    if overlay.ratio is None or grouping.ratio is None:
-        return overlay.image_mass, None, "mass of all image keys"
-    return overlay.ratio, overlay.uniform_ratio, f"{ratio_name(grouping.ratio)} (log axis)"
