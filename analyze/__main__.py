@@ -15,8 +15,8 @@ from vla_attention.schemas.errors import UnknownName, UserError, did_you_mean, l
 
 #: Episodes are measured in threads (`stores.parallel`); matrix products that start threads too make them slower.
 _ONE_THREAD_EACH = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
-#: Objects made between two runs of the garbage collector. Token pieces and steps are tens of thousands, without cycles; Python's
-#: default of 700 would search them again and again.
+#: Objects made between two runs of the garbage collector. Token pieces and steps are tens of thousands, without cycles;
+#: Python's default of 700 would search them again and again.
 _OBJECTS_BETWEEN_COLLECTIONS = 5_000_000
 
 

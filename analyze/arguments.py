@@ -1,4 +1,4 @@
-"""Command-line arguments that the commands of `vla-analyze` share, and what they mean. Imports nothing heavy."""
+"""Command-line arguments that the commands of `vla-analyze` share, and their values. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def sink_rule(arguments: argparse.Namespace) -> SinkRule:
 
 
 def settings_of(arguments: argparse.Namespace) -> AnalysisSettings:
-    """What the parsed arguments ask for; arguments that a command does not have keep their defaults."""
+    """The settings in the parsed arguments; those that a command has no argument for keep their defaults."""
     from dataclasses import fields
 
     from vla_attention.analyze.measures.question import AnalysisSettings

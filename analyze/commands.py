@@ -1,11 +1,11 @@
-"""The commands of `vla-analyze` by name. Each is a folder with a module `command`: `build_parser()` and `run(arguments)`.
+"""The commands of `vla-analyze`. Each is a folder with a module `command`: `build_parser()` and `run(arguments)`.
 
-`run` returns the exit code. This module imports nothing, so that `vla-analyze --help` waits for no library.
+`run` returns the exit code. This module imports nothing, so that `vla-analyze --help` is fast.
 """
 
 from __future__ import annotations
 
-#: Command, and folder of the same name, to what it answers.
+#: Command (and folder of the same name) -> what it answers.
 COMMANDS: dict[str, str] = {
     "ratios": "look or read: masses, fractions and ratios, with intervals",
     "groups": "what a grouping takes, before any number: keys, words, a picture of the patches",
@@ -20,7 +20,7 @@ COMMANDS: dict[str, str] = {
     "copy": "a smaller copy of a store, for instance without frames",
     "verify": "read everything back and check it",
 }
-#: What `vla-analyze STORE` without a command does.
+#: The command of `vla-analyze STORE`.
 DEFAULT_COMMAND = "ratios"
 
 

@@ -13,9 +13,9 @@ _EXAMPLES = """examples:
   vla-analyze copy libero_10.zarr slim.zarr --without frames objects contributions
   vla-analyze copy libero_10.zarr slim.zarr --without frames    again: adds what was captured meanwhile
 
-frames: the cameras' pictures (overlays need them). objects: what each patch shows (object: groups need it). contributions: norms of
-what keys add. Rows, and everything else that groupings of keys, words, cameras and roles need, always come along. The copy
-verifies, and says in its provenance what was left behind.
+frames: the cameras' pictures (overlays need them). objects: what each patch shows (object: groups need it).
+contributions: norms of what keys add. Rows, and everything else that groupings of keys, words, cameras and
+roles need, are always copied. The copy passes verify, and its provenance names the omitted parts.
 """
 
 
@@ -23,7 +23,7 @@ def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-analyze copy STORE DEST`."""
     parser = command_parser(
         "vla-analyze copy",
-        "Copy a store, for instance without its pictures; or, without DEST, say how large each part is.",
+        "Copy a store, for instance without its pictures; without DEST, print how large each part is.",
         _EXAMPLES,
     )
     parser.add_argument("store", type=Path, metavar="STORE", help="NAME.zarr")
@@ -35,7 +35,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Copy the store, or say how large its parts are."""
+    """Copy the store, or print how large its parts are."""
     from vla_attention.analyze.copy.copying import PARTS, REST, check_parts, copy_store, part_sizes
     from vla_attention.analyze.show.progress import progress_bar
     from vla_attention.schemas.stores.reader import open_store

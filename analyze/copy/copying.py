@@ -1,10 +1,10 @@
-"""Copies of stores with parts left behind: smaller, honest about what is missing, and whole for `verify`.
+"""Copies of stores without some of their arrays. A copy is a whole store: `verify` accepts it.
 
-An episode's attributes list its arrays, and its seal has the digest of every piece of metadata. A copy without some arrays is
-therefore not what is left after deleting folders, which is a damaged store. Its attributes list what it has, its root says
-what was left behind and from which run it comes, and it is sealed anew. Everything that is kept is copied byte by byte, and before
-metadata is rewritten it is held against the seal that it came with: a damaged episode is refused, never sealed as if it were
-whole. The values keep the digests that the capture wrote, so damage to them is found in the copy as well.
+An episode's attributes list its arrays, and its seal holds the digest of every piece of metadata. Deleting folders
+therefore gives a damaged store. A copy has attributes that list the arrays it has, a root that names the omitted parts
+and the run it was copied from, and a new seal. Arrays are copied byte by byte. Metadata is checked against its old seal
+before it is rewritten, so a damaged episode is refused. Values keep the digests that the capture wrote, so damage to
+them is found in the copy too.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from vla_attention.schemas.stores.store_format import (
 
 @dataclass(frozen=True)
 class Part:
-    """Arrays that may stay behind: what they are for, and a pattern that finds their names, and their files', in an episode."""
+    """Arrays that a copy may omit: their purpose, and a pattern of their names and of their files' names."""
 
     purpose: str
     pattern: str
 
 
-#: What may stay behind. Rows, atoms, roles and the small arrays are the store, and always come along.
+#: The parts that may be omitted. Rows, atoms, roles and the small arrays are always copied.
 PARTS: dict[str, Part] = {
     "frames": Part("the cameras' pictures; overlays need them", r"^frames/"),
     "objects": Part("what each patch shows; object: groups need it", r"^objects/"),
@@ -54,7 +54,7 @@ REST = "rest"
 
 @dataclass(frozen=True)
 class Copied:
-    """What a copy came to: episodes added, episodes that were there already, bytes copied and bytes left behind."""
+    """What a copy did: episodes added, episodes that were there already, bytes copied and bytes omitted."""
 
     added: int
     present: int
@@ -63,7 +63,7 @@ class Copied:
 
 
 def part_sizes(store: Store) -> dict[str, int]:
-    """Bytes of each part of a store, of everything else as `rest`."""
+    """Bytes of each part of a store; `rest` is everything else."""
     sizes = dict.fromkeys((*PARTS, REST), 0)
     for episode in store.episodes:
         for file in _files(episode.folder):
@@ -126,7 +126,7 @@ def _copy(store: Store, target: Path, without: tuple[str, ...], progress: Callab
 
 
 def _ensure_root(store: Store, target: Path, root: bytes, building: Path) -> None:
-    """Make the empty copy in one step, or check that what is there is a copy of the same run without the same parts."""
+    """Make the empty copy in one step, or check that the target is a copy of the same run without the same parts."""
     if not target.exists():
         empty = building / "root"
         (empty / EPISODES_GROUP).mkdir(parents=True)
@@ -134,7 +134,7 @@ def _ensure_root(store: Store, target: Path, root: bytes, building: Path) -> Non
         shutil.copyfile(store.path / EPISODES_GROUP / "zarr.json", empty / EPISODES_GROUP / "zarr.json")
         _rename_new(empty, target)
     if (target / "zarr.json").read_bytes() != root if (target / "zarr.json").is_file() else True:
-        open_store(target)  # says so when it is no store at all
+        open_store(target)  # raises when it is no store
         raise RunMismatch(
             f"Cannot continue the copy {target}: it is of another run than {store.path}, or leaves other parts behind; "
             "give another name."
@@ -142,7 +142,7 @@ def _ensure_root(store: Store, target: Path, root: bytes, building: Path) -> Non
 
 
 def _copy_episode(episode: StoredEpisode, folder: Path, without: tuple[str, ...], run: str) -> tuple[int, int]:
-    """Write the copy of one episode; returns (bytes copied, bytes left behind)."""
+    """Write the copy of one episode; returns (bytes copied, bytes omitted)."""
     if not episode.is_of_this_run:
         raise CorruptEpisode(f"Episode {episode.name} was recorded under other attributes than its store has now.")
     attributes = episode.attributes
@@ -158,7 +158,7 @@ def _copy_episode(episode: StoredEpisode, folder: Path, without: tuple[str, ...]
         if place.name != "zarr.json":
             shutil.copyfile(episode.folder / file, place)
         else:
-            content = episode.sealed(file)  # an error when it is not what was written
+            content = episode.sealed(file)  # raises when it differs from what was written
             if file == "zarr.json":
                 content = _with_attributes(content, to_json(replace(attributes, arrays=kept)))
             place.write_bytes(content)
@@ -176,7 +176,7 @@ def _copy_episode(episode: StoredEpisode, folder: Path, without: tuple[str, ...]
 
 
 def _root_document(store: Store, without: tuple[str, ...]) -> bytes:
-    """The copy's `zarr.json`: the run's, with what was left behind."""
+    """The copy's `zarr.json`: that of the run, with the omitted parts."""
     content = (store.path / "zarr.json").read_bytes()
     if not without:
         return content
@@ -189,7 +189,7 @@ def _root_document(store: Store, without: tuple[str, ...]) -> bytes:
     before = root.provenance.get("copied_without", "")
     everything = [name for name in PARTS if name in without or name in before.split(", ")]
     provenance = dict(root.provenance) | {"copied_without": ", ".join(everything)}
-    # The first store of the line: a copy of a copy still names what was captured.
+    # A copy of a copy names the store that was captured, not the copy.
     provenance.setdefault("copied_from", hashlib.sha256(content).hexdigest())
     changed: RootAttributes = replace(root, recording=recording, provenance=provenance)
     return _with_attributes(content, to_json(changed))
@@ -211,7 +211,7 @@ def _files(folder: Path) -> list[str]:
 
 
 def _rename_new(source: Path, target: Path) -> None:
-    """Rename a folder to a name that nobody uses; another copy may have been first, with the same content."""
+    """Rename a folder to a new name. When another copy was faster, its folder has the same content and stays."""
     try:
         source.rename(target)
     except OSError as error:

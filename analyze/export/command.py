@@ -23,9 +23,9 @@ _EXAMPLES = """examples:
   vla-analyze export runs/libero_10.zarr --netcdf --group bowl=word:bowl --group rest='*'
   vla-analyze export runs/libero_10.zarr --netcdf --rows --layers 25 --tasks 0
 
-Tables: steps (every replan, layer and denoise step), replans, episodes, tasks (with intervals), contributions (norms, where
-recorded). The NetCDF file, attention.nc, has (episode, replan) as one axis `sample`, so that nothing is padded; open it with
-xarray.open_dataset, or anything that reads HDF5.
+Tables: steps (every replan, layer and denoise step), replans, episodes, tasks (with intervals), contributions
+(norms, where recorded). The NetCDF file, attention.nc, has (episode, replan) as one axis `sample`, so that nothing
+is padded; open it with xarray.open_dataset, or with any program that reads HDF5.
 """
 
 

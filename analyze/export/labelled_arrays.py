@@ -1,13 +1,15 @@
 """Masses and rows as labelled arrays (xarray), and as NetCDF files.
 
-Episodes have different lengths, so that (episode, replan) is one axis, `sample`, with coordinates that say which episode and which
-environment step each sample is; nothing is padded. Heads are always kept apart; stored queries are averaged.
+Episodes have different lengths, so that (episode, replan) is one axis, `sample`, with coordinates that say which
+episode and which environment step each sample is; nothing is padded. Heads are always kept apart; stored queries are
+averaged.
 
     mass       (sample, layer, denoise, head, group)   sum of probability x weight
     row_sum    (sample, layer, denoise, head)          what the row sums to, before storage rounded it
     num_keys   (sample, group), num_valid (sample)     keys of the group; keys that can hold information
     rows       (sample, layer, denoise, head, key)     only on request: the probabilities themselves
-    key_role   (sample, key)                           with rows: codes of the roles of `vla_attention.schemas.layout.Role`
+    key_role   (sample, key)                           with rows: codes of the roles of
+               `vla_attention.schemas.layout.Role`
 
 xarray and h5netcdf are the extra `xarray`; nothing here imports them before an array is asked for.
 """
@@ -123,8 +125,9 @@ def rows_array(
     size = rows_size(question)
     if most_bytes is not None and size.num_bytes > most_bytes:
         raise BadArgument(
-            f"The rows would take {size}, more than the {format_bytes(most_bytes)} that are allowed; choose fewer layers, denoise steps, "
-            "heads or tasks, allow more, or write them to a file with vla-analyze export --netcdf --rows."
+            f"The rows would take {size}, more than the {format_bytes(most_bytes)} that are allowed; choose fewer "
+            "layers, denoise steps, heads or tasks, allow more, or write them to a file with vla-analyze export "
+            "--netcdf --rows."
         )
     rows = np.empty(size.shape, dtype=np.float32)
     for part, values in _parts(question, progress):

@@ -1,4 +1,4 @@
-"""What a grouping takes, before any number is computed from rows: keys by span and role, words with their pieces, overlaps."""
+"""What a grouping takes, without reading rows: keys by span and role, words with their pieces, overlaps."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from vla_attention.schemas.segments import merge_segments, segment_members, segm
 #: Name under which tables list what no group takes.
 UNTAKEN = "(no group)"
 _UNTAKEN_GROUP = "_no_group"
-#: Less than this part of a key is rounding of covered areas, and is not listed.
+#: A smaller part of a key comes from rounded areas, and is not listed.
 _NEGLIGIBLE = 1e-4
 
 
@@ -30,12 +30,14 @@ class GroupPreview:
     """What the groups of a grouping are on the selected episodes.
 
     Attributes:
-        groups: one row per (group, span, role) with keys in at least one replan; columns `keys_min`, `keys_mean`, `keys_max`
-            over all replans of all episodes (a replan without such keys counts as 0), `kind` of the span, `span_keys`. Rows whose
-            span and role are null are a group's totals. What no group takes is listed as `(no group)`.
-        words: one row per (group, word, pieces): `pieces` is the word's tokens joined by `+`, `num_pieces` how many of them there
-            are, `episodes` in how many episodes the group takes at least one of them.
-        overlaps: one row per pair of groups that share keys, with `keys_min`, `keys_mean`, `keys_max`; empty for disjoint groups.
+        groups: one row per (group, span, role) with keys in at least one replan; columns `keys_min`, `keys_mean`,
+            `keys_max` over all replans of all episodes (a replan without such keys counts as 0), `kind` of the span,
+            `span_keys`. Rows whose span and role are null are a group's totals. What no group takes is listed as `(no
+            group)`.
+        words: one row per (group, word, pieces): `pieces` is the word's tokens joined by `+`, `num_pieces` how many of
+            them there are, `episodes` in how many episodes the group takes at least one of them.
+        overlaps: one row per pair of groups that share keys, with `keys_min`, `keys_mean`, `keys_max`; empty for
+            disjoint groups.
         uniform_ratio: (lowest, highest) ratio that uniform attention gives over all replans, None without a ratio.
     """
 
@@ -46,10 +48,10 @@ class GroupPreview:
 
 
 def preview_groups(question: Question) -> GroupPreview:
-    """Resolve the grouping on every selected episode and describe what it takes. Reads roles and object coverage, no rows.
+    """Resolve the grouping on every selected episode. Reads roles and object coverage, no rows.
 
     Raises:
-        UserError: a subclass that says what is wrong with the grouping; see `vla_attention.analyze.measures.steps.resolve_all`.
+        UserError: a subclass that says what is wrong with the grouping; see `measures.selected.resolve_all`.
     """
     grouping = question.grouping
     resolve_all(grouping, question.selected, question.vocabulary)  # all checks, with the user's own groups
@@ -71,7 +73,7 @@ def pieces_of(word: Word, prompt: Prompt) -> tuple[str, ...]:
 
 
 def _with_untaken(grouping: Grouping) -> Grouping:
-    """The grouping with one more group for what no other takes, unless one of them is the rest already."""
+    """The grouping with one more group, of the keys that no group takes; unless a group takes the rest already."""
     if any(selectors[0].strip() == REST for selectors in grouping.groups.values()):
         return grouping
     return replace(grouping, groups={**grouping.groups, _UNTAKEN_GROUP: (REST,)})
@@ -84,7 +86,7 @@ def _groups_table(question: Question, names: Sequence[str], resolved: Sequence[R
     for item, groups in zip(question.selected, resolved, strict=True):
         members = segment_members(layout, item.tokens.static_roles, segments).astype(np.float32)
         keys = np.matmul(groups.weights.transpose(0, 2, 1), members)  # (replan or 1, group, segment)
-        # A number that never changes in the episode counts once for each of its replans all the same.
+        # A number that is the same at all replans of an episode counts once per replan.
         counts.append(np.broadcast_to(keys, (item.tokens.num_replans, *keys.shape[1:])))
     every = np.concatenate(counts).astype(np.float64)
     rows = []

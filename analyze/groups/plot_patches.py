@@ -1,4 +1,4 @@
-"""`group_patches`: what the groups take at one replan: patches of the stored pictures, pieces of the prompt, shares of every span."""
+"""`group_patches`: what the groups take at one replan: patches of pictures, pieces of the prompt, shares of spans."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STEM = "group_patches"
-#: Opacity of a patch that a group takes whole: the picture under it stays recognisable.
+#: Opacity of a patch that a group takes completely: the picture below stays visible.
 _OPACITY = 0.62
-#: Groups that may overlap get a row of pictures each; more rows than this make no readable page.
+#: Most rows of pictures; groups that may overlap get a row each.
 _MOST_ROWS = 12
 _CHARACTERS = 84
 
@@ -38,8 +38,9 @@ _CHARACTERS = 84
 def plot_group_patches(item: SelectedEpisode, grouping: Grouping, replan: int, folder: Path) -> list[Path]:
     """Draw a grouping on one replan of one episode; returns the paths of png, pdf and csv.
 
-    A patch has the colour of its group, as opaque as the group's weight there; a patch that several groups share (objects cover
-    parts of it) has their mixture. Groups that may overlap get a picture each. The csv has every weight that is not 0.
+    A patch has the colour of its group, as opaque as the group's weight there; a patch that several groups share
+    (objects cover parts of it) has their mixture. Groups that may overlap get a picture each. The csv has every weight
+    that is not 0.
     """
     resolved = resolve(grouping, item.tokens)
     weights = resolved.weights[replan if len(resolved.weights) > 1 else 0]

@@ -20,7 +20,8 @@ def preview_text(question: Question, preview: GroupPreview) -> str:
     lines = [
         f"Grouping '{grouping.name}': {len(grouping.names)} groups, {sharing}"
         + (f" ({grouping.description})" if grouping.description else ""),
-        f"Site '{question.site}' with {tokens.layout.num_keys} keys; {of_tasks(len(question.selected), question.num_tasks)}",
+        f"Site '{question.site}' with {tokens.layout.num_keys} keys; "
+        f"{of_tasks(len(question.selected), question.num_tasks)}",
         *question.skipped,
         "",
         _groups_text(preview, grouping),

@@ -23,8 +23,8 @@ _EXAMPLES = """examples:
   vla-analyze objects runs/libero_10.zarr --percentiles 75 90 --mask-coverage 0.3 --tolerance 0
   vla-analyze objects runs/libero_10.zarr --no-iou
 
-Shares and lifts of 50 episodes take seconds; pointing game and IoU several times as long, and with --per-head that times the
-number of heads.
+Shares and lifts of 50 episodes take seconds; pointing game and IoU several times as long, and with --per-head
+that times the number of heads.
 """
 
 
@@ -33,7 +33,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser = command_parser(
         "vla-analyze objects",
         "Which objects are looked at: share of the image attention and lift over covered area per object and class (of "
-        "interest, other, robot, background); centre of attention, pointing game and IoU with the objects' masks, with chance levels.",
+        "interest, other, robot, background); centre of attention, pointing game and IoU with the objects' masks, with "
+        "chance levels.",
         _EXAMPLES,
     )
     add_stores(parser)

@@ -1,4 +1,4 @@
-"""How much attention objects get: shares and lifts per object and class, and how well attention maps find the objects."""
+"""How much attention objects get: shares and lifts per object and class, and how well maps find the objects."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ObjectTables:
-    """Tables of objects; `object_tables` describes them. `pointing` and `iou` are None without `ObjectSettings.spatial`."""
+    """Tables of objects, see `object_tables`; `pointing` and `iou` are None without `ObjectSettings.spatial`."""
 
     objects: pl.DataFrame
     times: pl.DataFrame
@@ -66,19 +66,24 @@ class ObjectTables:
 def object_tables(question: Question, settings: ObjectSettings | None = None, keep_steps: bool = False) -> ObjectTables:
     """Measure every object and class of objects in every selected episode; shows progress at a terminal.
 
-    Items are the scene's objects (`kind` "object") and their classes in the task (`kind` "class": of interest, other objects, robot,
-    background), by `camera` and for all cameras together ("all"). Rows are averaged over heads unless they are kept apart.
+    Items are the scene's objects (`kind` "object") and their classes in the task (`kind` "class": of interest, other
+    objects, robot, background), by `camera` and for all cameras together ("all"). Rows are averaged over heads unless
+    they are kept apart.
 
     Returns:
-        objects: one row per (episode, layer or "layers_avg"[, head], camera, item), from masses averaged over denoise steps:
+        objects: one row per (episode, layer or "layers_avg"[, head], camera, item), from masses averaged over denoise
+            steps:
             mass        sum over patches of row x covered area, mean over replans
             share       mass / mass of all patches of all cameras, mean over replans
             area_share  covered area / area of these cameras' pictures, mean over replans
-            lift        share of this camera's mass / area_share, of these means: 1 is what uniform attention gives. A mean of
-                        quotients would give a sliver that is in sight at one replan as much weight as all other replans.
-        times: one row per (episode, replan, camera, item) of the layers' and heads' mean: `share`, `area_share`, `env_step`.
-        pointing: with `settings.spatial`, one row per (episode, layer or "layers_avg"[, head], camera, item): means over denoise
-            steps and over the replans at which the item has a mask (`mask_replans` of `num_replans`; null where there is none):
+            lift        share of this camera's mass / area_share, of these means: 1 is what uniform attention gives. A
+                        mean of quotients would give a sliver that is in sight at one replan as much weight as all other
+                        replans.
+        times: one row per (episode, replan, camera, item) of the layers' and heads' mean: `share`, `area_share`,
+            `env_step`.
+        pointing: with `settings.spatial`, one row per (episode, layer or "layers_avg"[, head], camera, item): means
+            over denoise steps and over the replans at which the item has a mask (`mask_replans` of `num_replans`; null
+            where there is none):
             mask_patches                          number of patches of the mask
             centre_row, centre_column             centre of attention in patch units, of this camera's map
             centre_row_share, centre_column_share the same as a part of the picture's height and width
@@ -87,8 +92,8 @@ def object_tables(question: Question, settings: ObjectSettings | None = None, ke
             In "layers_avg" each is the mean of the layers' values, not the value of the layers' mean map.
         iou: with `settings.spatial`, the same rows once for each `threshold` (`settings.thresholds`):
             iou, iou_chance                       IoU with the mask, and of a random region of the same size
-        steps, iou_steps: with `keep_steps`, mass and the measures of `pointing` and of `iou` per (episode, replan, layer, denoise
-            step, head, camera, item).
+        steps, iou_steps: with `keep_steps`, mass and the measures of `pointing` and of `iou` per (episode, replan,
+            layer, denoise step, head, camera, item).
 
     Raises:
         BadArgument: no selected episode has object coverage at this site.
@@ -113,7 +118,8 @@ def object_tables(question: Question, settings: ObjectSettings | None = None, ke
 class _Measured:
     """Arrays of one camera.
 
-    `by_map` are (replan, layer, denoise, head), `by_item` have a further axis item, and `by_threshold` two: threshold, item.
+    `by_map` are (replan, layer, denoise, head), `by_item` have a further axis item, and `by_threshold` two: threshold,
+    item.
     """
 
     by_map: dict[str, Array] = field(default_factory=dict)
@@ -173,7 +179,7 @@ def _measure_episode(
 
 
 def _measure_maps(maps: NDArray[np.float32], view: View, settings: ObjectSettings) -> _Measured:
-    """Measures of maps (replan, head, patch) of one layer and denoise step: arrays as in `_Measured`, (replan, head, ...)."""
+    """Measures of maps (replan, head, patch) of one layer and denoise step, each (replan, head, ...)."""
     by_item = {"mass": np.matmul(maps, view.area).astype(np.float64)}
     by_map = {"camera_mass": maps.sum(axis=-1, dtype=np.float64)}
     if not settings.spatial:

@@ -14,8 +14,8 @@ class ObjectSettings:
     Attributes:
         percentiles: thresholds of the attended region, beside Otsu's.
         mask_coverage: a patch belongs to an object when the object covers at least this share of it.
-        tolerance: of the pointing game, in patch widths: how far beside the object the maximum may lie. One patch of 14 pixels is
-            about the 15 pixels of Zhang et al. 2018.
+        tolerance: of the pointing game, in patch widths: how far beside the object the maximum may lie. One patch of 14
+            pixels is about the 15 pixels of Zhang et al. 2018.
         spatial: whether centres, pointing game and IoU are computed (they take most of the time).
     """
 

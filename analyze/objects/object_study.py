@@ -132,7 +132,7 @@ def pointing_summary(pointing: pl.DataFrame, seed: int = DEFAULT_SEED) -> pl.Dat
 
 
 def iou_summary(iou: pl.DataFrame, seed: int = DEFAULT_SEED) -> pl.DataFrame:
-    """Mean IoU of every item at every threshold, as `pointing_summary`; from `object_tables`, `iou`. Highest IoU first."""
+    """Mean IoU of every item at every threshold, highest first, as in `pointing_summary`; from the table `iou`."""
     values = {"iou": SHARE, "iou_chance": SHARE}
     return _ordered(_means(iou.drop_nulls("iou"), (*_ITEM, "threshold"), values, seed), "iou")
 
@@ -140,8 +140,8 @@ def iou_summary(iou: pl.DataFrame, seed: int = DEFAULT_SEED) -> pl.DataFrame:
 def strongest_followers(objects: pl.DataFrame, most: int = 5) -> pl.DataFrame:
     """The layers (and heads, where they were kept apart) in which an object has its highest lift, mean over episodes.
 
-    One row per object: `item`, `object_class`, `layer`, `head`, `lift`, `num_episodes`; the background and items that cover
-    hardly anything are left out.
+    One row per object: `item`, `object_class`, `layer`, `head`, `lift`, `num_episodes`; the background and items that
+    cover hardly anything are left out.
     """
     single = _single_layers(objects).filter(
         (pl.col("kind") == "object")
@@ -159,7 +159,7 @@ def strongest_followers(objects: pl.DataFrame, most: int = 5) -> pl.DataFrame:
 
 
 def best_finders(iou: pl.DataFrame, pointing: pl.DataFrame, threshold: str, most: int = 3) -> pl.DataFrame:
-    """The layers (and heads) whose maps overlap most with the objects of interest, by camera: IoU above chance, mean over episodes."""
+    """The layers (and heads) whose maps have the highest IoU above chance with the objects of interest, by camera."""
     of_interest = (pl.col("kind") == "class") & (pl.col("item") == CLASSES[0])
     where = ["camera", "layer", "head"]
     overlap = _single_layers(iou).filter(of_interest, pl.col("threshold") == threshold).group_by(where)

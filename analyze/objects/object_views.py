@@ -1,4 +1,4 @@
-"""What each camera of an episode shows: the patches, areas and masks of objects and of classes of objects. Arrays only."""
+"""What each camera of an episode shows: areas and masks of objects and of their classes, by patch. Arrays only."""
 
 from __future__ import annotations
 
@@ -137,5 +137,5 @@ def distance_of_uniform(view: View) -> Array:
 
 
 def item_name(row: Mapping[str, Any]) -> str:
-    """The name of an item in texts and plots: classes in brackets, so that the object `robot` differs from the class of that name."""
+    """The name of an item in texts and plots: classes in brackets, because an object may have the name of a class."""
     return f"[{row['item']}]" if row["kind"] == "class" else str(row["item"])

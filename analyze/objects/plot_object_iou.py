@@ -33,8 +33,8 @@ _POINTING = "pointing"
 def plot_object_iou(study: ObjectStudy, folder: Path) -> list[Path]:
     """Draw the study's `iou_summary` and `pointing_summary`; returns the paths of png, pdf and csv.
 
-    A row of panels per camera: IoU at the shown percentile, IoU at Otsu's threshold, pointing game. Points are means over episodes
-    with bootstrap intervals, black ticks are chance.
+    A row of panels per camera: IoU at the shown percentile, IoU at Otsu's threshold, pointing game. Points are means
+    over episodes with bootstrap intervals, black ticks are chance.
     """
     data, settings = _data(study), study.settings
     panels = list(dict.fromkeys([settings.shown_threshold, "otsu", _POINTING]))
@@ -87,8 +87,8 @@ def _data(study: ObjectStudy) -> pl.DataFrame:
 def _note(settings: ObjectSettings, cut: bool) -> str:
     note = (
         f"Mask: patches covered by at least {100 * settings.mask_coverage:g}%. Points: mean over episodes with "
-        f"{interval_name(DEFAULT_LEVEL, 'bootstrap')}; n counts episodes in which the object has a mask. Black: chance (a random "
-        "region of the same size; the mask's share of the picture). Pointing game: within "
+        f"{interval_name(DEFAULT_LEVEL, 'bootstrap')}; n counts episodes in which the object has a mask. Black: chance "
+        "(a random region of the same size; the mask's share of the picture). Pointing game: within "
         f"{settings.tolerance:g} patch of the mask. Lines at the right edge go on."
     )
     return note + (f" At most {_MOST} objects a camera, those with the highest IoU." if cut else "")
@@ -116,7 +116,8 @@ def _draw(axes: Axes, part: pl.DataFrame, panel: str, last: bool) -> None:
     num_classes = part.filter(pl.col("kind") == "class").height
     if 0 < num_classes < part.height:
         axes.axhline(num_classes - 0.5, color=GUIDE_COLOR, linewidth=0.7)
-    # Two or three episodes have wide intervals, which would squeeze everything else into a corner; they run out of the picture.
+    # Two or three episodes have wide intervals, which would squeeze everything else into a corner; they run out of the
+    # picture.
     values = part.select("value", "chance").to_numpy().astype(float)
     top = float(np.nanmax(values)) if np.isfinite(values).any() else 0.0
     axes.set_xlim(0, min(1.0, max(1.8 * top, 0.05)) if panel != _POINTING else 1.03)

@@ -1,9 +1,9 @@
-"""`object_shares`: what the image attention goes to over time, by object in one episode and by class over all episodes."""
+"""`object_shares`: shares of the image attention over time, by object in one episode and by class over all."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -45,11 +45,11 @@ _OTHERS = "other objects"
 def plot_object_shares(
     times: pl.DataFrame, example: SelectedEpisode, folder: Path, seed: int = DEFAULT_SEED
 ) -> list[Path]:
-    """Draw from `object_attention.object_tables`, `times`, over all cameras together; returns the paths of png, pdf and csv.
+    """Draw `times` of `object_attention.object_tables`, all cameras together; returns the paths of png, pdf and csv.
 
-    Left: shares of the example episode's image attention, stacked by object. Middle: mean over episodes by class, over the
-    episode's time from 0 to 1 (replans interpolated linearly), with pointwise intervals; dashed: covered area, what uniform
-    attention gives. Right: lift at each time, sum of the episodes' shares / sum of their covered areas.
+    Left: shares of the example episode's image attention, stacked by object. Middle: mean over episodes by class, over
+    the episode's time from 0 to 1 (replans interpolated linearly), with pointwise intervals; dashed: covered area, what
+    uniform attention gives. Right: lift at each time, sum of the episodes' shares / sum of their covered areas.
     """
     whole = times.filter(pl.col("camera") == ALL_CAMERAS)
     attributes = example.episode.attributes
@@ -120,13 +120,16 @@ def _draw_example(axes: Axes, own: pl.DataFrame) -> pl.DataFrame:
     # In the order of the layers on the page, from the top.
     axes.legend(handles[::-1], labels[::-1], loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
     return series.select(
-        pl.lit("example").alias("panel"), pl.col("shown").alias("name"), pl.col("env_step").cast(pl.Float64).alias("time"),
-        "share", "area_share",
-    ).sort("name", "time")  # fmt: skip
+        pl.lit("example").alias("panel"),
+        pl.col("shown").alias("name"),
+        pl.col("env_step").cast(pl.Float64).alias("time"),
+        "share",
+        "area_share",
+    ).sort("name", "time")
 
 
 def _draw_classes(axes: Axes, lift_axes: Axes, whole: pl.DataFrame, seed: int) -> pl.DataFrame:
-    rows: list[dict[str, Any]] = []
+    parts: list[pl.DataFrame] = []
     for name in CLASSES:
         part = whole.filter((pl.col("kind") == "class") & (pl.col("item") == name))
         if part.is_empty():
@@ -143,13 +146,20 @@ def _draw_classes(axes: Axes, lift_axes: Axes, whole: pl.DataFrame, seed: int) -
         for target, factor, (value, low, high) in ((axes, 100, shares), (lift_axes, 1, lifts)):
             target.plot(_PHASES, factor * value, color=color, label=label)
             target.fill_between(_PHASES, factor * low, factor * high, color=color, alpha=0.2, linewidth=0)
-        rows += [
-            {"panel": "mean", "name": name, "time": float(_PHASES[i]), "area_share": float(covered[i]), "num_episodes": len(tasks)}
-            | {f"{what}{end}": float(values[i]) for what, three in (("share", shares), ("lift", lifts))
-               for end, values in zip(("", "_low", "_high"), three, strict=True)}
-            for i in range(len(_PHASES))
-        ]  # fmt: skip
-    data = pl.DataFrame(rows).with_columns(pl.col(pl.Float64).fill_nan(None))
+        drawn: dict[str, NDArray[np.float64]] = {"time": _PHASES, "area_share": covered}
+        drawn |= dict(zip(("share", "share_low", "share_high"), shares, strict=True))
+        drawn |= dict(zip(("lift", "lift_low", "lift_high"), lifts, strict=True))
+        parts.append(
+            pl.DataFrame(drawn).select(
+                pl.lit("mean").alias("panel"),
+                pl.lit(name).alias("name"),
+                "time",
+                "area_share",
+                pl.lit(len(tasks), dtype=pl.Int64).alias("num_episodes"),
+                pl.exclude("time", "area_share"),
+            )
+        )
+    data = pl.concat(parts).with_columns(pl.col(pl.Float64).fill_nan(None))
     top = 100 * max(data.select(pl.max_horizontal("share", "share_high", "area_share").max()).item() or 0.0, 0.01)
     axes.set_ylim(0, 1.05 * top)
     axes.set_ylabel("share of image attention (%)")

@@ -1,7 +1,7 @@
-"""Where on a picture attention lies, against object masks: centre, pointing game, IoU, and what chance gives. Pure arithmetic.
+"""Attention maps against object masks: centre of attention, pointing game, IoU, and chance levels. Pure arithmetic.
 
-A map has one value per patch; patches go row by row from the top left, on a grid of `rows` x `columns`. Masks are sets of
-patches. Axes are named in the docstrings; `...` stands for any axes in between, such as (denoise, head).
+A map has one value per patch; patches go row by row from the top left, on a grid of `rows` x `columns`. Masks are sets
+of patches. Axes are named in the docstrings; `...` stands for any axes in between, such as (denoise, head).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def patch_centres(rows: int, columns: int) -> Floats:
 def centre_of_mass(maps: NDArray[np.floating], centres: Floats) -> Floats:
     """Mean position under a map: sum of value x position / sum of values; (..., patch) gives (..., 2) in patch units.
 
-    NaN where a map is all 0. Of a uniform map it is the picture's middle, whatever the objects are.
+    NaN where a map is all 0. Of a uniform map it is the picture's middle.
     """
     values = np.asarray(maps, dtype=np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -34,9 +34,9 @@ def centre_of_mass(maps: NDArray[np.floating], centres: Floats) -> Floats:
 
 
 def distance_in_pictures(first: Floats, second: Floats, rows: int, columns: int) -> Floats:
-    """Distance of positions (..., 2) in patch units as a part of the picture's side: sqrt((dr / rows)^2 + (dc / columns)^2).
+    """Distance of positions (..., 2) in patch units, in picture sides: sqrt((dr / rows)^2 + (dc / columns)^2).
 
-    1.41 is the whole diagonal, and half of that the most that a uniform map's centre can be off.
+    The diagonal is 1.41 long; the centre of a uniform map is at most half of that away.
     """
     step = (first - second) / np.array([rows, columns], dtype=np.float64)
     return np.asarray(np.sqrt((step**2).sum(axis=-1)))
@@ -62,9 +62,10 @@ def grown(masks: Masks, near: Masks) -> Masks:
 def pointing_hits(maps: NDArray[np.floating], masks: Masks | NDArray[np.float32]) -> Floats:
     """The pointing game: 1 where a map's highest patch lies in the mask, else 0.
 
-    Zhang, Lin, Brandt, Shen & Sclaroff 2018, "Top-down neural attention by excitation backprop", IJCV 126, section 5.1, who
-    accept a maximum within 15 pixels of the object: give masks that `grown` has widened by as much. Of several equally high
-    patches each counts its part, so that a uniform map scores what chance does: the mask's share of the picture.
+    Zhang, Lin, Brandt, Shen & Sclaroff 2018, "Top-down neural attention by excitation backprop", IJCV 126, section 5.1,
+    who accept a maximum within 15 pixels of the object: give masks that `grown` has widened by as much. Of several
+    equally high patches each counts its part, so that a uniform map scores what chance does: the mask's share of the
+    picture.
 
     Args:
         maps: (replan, ..., patch).
@@ -80,9 +81,9 @@ def pointing_hits(maps: NDArray[np.floating], masks: Masks | NDArray[np.float32]
 
 
 def percentile_regions(maps: NDArray[np.floating], percentile: float) -> Masks:
-    """Patches at or above a map's own percentile (linear interpolation between values): of 256 patches 26 at 90, 52 at 80.
+    """Patches at or above a map's own percentile (linear interpolation between values).
 
-    Of a constant map that is all of them.
+    Of 256 patches that is 26 at 90 and 52 at 80; of a constant map it is all.
     """
     return np.asarray(maps >= np.percentile(maps, percentile, axis=-1, keepdims=True))
 
@@ -91,8 +92,8 @@ def otsu_thresholds(maps: NDArray[np.floating]) -> Floats:
     """Otsu's threshold of each map (..., patch): the value t for which {<= t} and {> t} differ most.
 
     Maximises the between-class variance w0 w1 (mu0 - mu1)^2 (Otsu 1979, "A threshold selection method from gray-level
-    histograms", IEEE SMC 9, eq. 14) over all splits between different values, not over bins of a histogram; the lowest of equally
-    good ones. Shape (...); NaN for a constant map, which has nothing to tell apart.
+    histograms", IEEE SMC 9, eq. 14) over all splits between different values, not over bins of a histogram; the lowest
+    of equally good ones. Shape (...); NaN for a constant map.
     """
     ordered = np.sort(np.asarray(maps, dtype=np.float64), axis=-1)
     count = ordered.shape[-1]
@@ -121,9 +122,9 @@ def mask_sizes(masks: Masks | NDArray[np.float32]) -> Floats:
 
 
 def intersection_over_union(regions: Masks, masks: Masks | NDArray[np.float32]) -> Floats:
-    """|region and mask| / |region or mask| (Jaccard 1912) of regions (replan, ..., patch) and masks (replan, patch, item).
+    """IoU of regions (replan, ..., patch) and masks (replan, patch, item): |both| / |either| (Jaccard 1912).
 
-    Masks may be given as 0 and 1 in float32, which saves their conversion when many regions are held against the same ones.
+    Masks may be 0 and 1 in float32, which saves converting the same masks for every region.
 
     Returns:
         (replan, ..., item); NaN where the item has no patch, so that there is nothing to find.
@@ -138,8 +139,8 @@ def intersection_over_union(regions: Masks, masks: Masks | NDArray[np.float32]) 
 def random_iou(region_sizes: NDArray[np.integer], mask_sizes: NDArray[np.integer], num_patches: int) -> Floats:
     """Mean IoU of a mask with a region of the given size whose patches are drawn at random: what chance gives.
 
-    E[X / (k + m - X)], where X, the number of common patches of k drawn and m wanted ones, has the hypergeometric distribution
-    over `num_patches`. Sizes are broadcast; NaN where the mask is empty.
+    E[X / (k + m - X)], where X, the number of common patches of k drawn and m wanted ones, has the hypergeometric
+    distribution over `num_patches`. Sizes are broadcast; NaN where the mask is empty.
     """
     drawn, wanted = np.broadcast_arrays(region_sizes, mask_sizes)
     pairs, place = np.unique(drawn.astype(np.int64) * (num_patches + 1) + wanted, return_inverse=True)
@@ -168,7 +169,7 @@ def _log_factorials(last: int) -> Floats:
 
 
 def _over_patches(values: NDArray[np.float32], masks: Masks | NDArray[np.float32]) -> Floats:
-    """Sum over patches of (replan, ..., patch) inside masks (replan, patch, item): (replan, ..., item). Exact for counts."""
+    """Sum of values (replan, ..., patch) over the patches of masks (replan, patch, item): (replan, ..., item)."""
     flat = values.reshape(values.shape[0], -1, values.shape[-1])
     product = np.matmul(flat, masks.astype(np.float32, copy=False)).astype(np.float64)
     return np.asarray(product.reshape(*values.shape[:-1], masks.shape[-1]))

@@ -17,8 +17,8 @@ from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 #: Rows of a printed table; the written ones have all.
 _MOST_ROWS = 28
 _SHARES_NOTE = (
-    "share: of the attention on all cameras' patches. area: covered part of the picture. lift: share of the picture's attention over "
-    f"area (1: uniform attention). {interval_note(DEFAULT_LEVEL)}"
+    "share: of the attention on all cameras' patches. area: covered part of the picture. lift: share of the picture's "
+    f"attention over area (1: uniform attention). {interval_note(DEFAULT_LEVEL)}"
 )
 
 
@@ -42,7 +42,8 @@ def _shares(study: ObjectStudy) -> list[str]:
             lines += ["", f"camera {camera}", _shares_table(classes, several)]
     lines += ["", *wrap(_SHARES_NOTE)]
     followers = [
-        f"'{row['item']}' ({row['object_class']}) in layer {row['layer']}{_head(row)} (lift {format_number(row['lift'])})"
+        f"'{row['item']}' ({row['object_class']}) in layer {row['layer']}{_head(row)} (lift "
+        f"{format_number(row['lift'])})"
         for row in study.followers.iter_rows(named=True)
     ]
     return [*lines, "", *wrap(f"Followed most, by layer: {'; '.join(followers)}.")] if followers else lines
@@ -73,11 +74,12 @@ def _finding(study: ObjectStudy) -> list[str]:
 
 def _finding_note(settings: ObjectSettings) -> str:
     return (
-        f"An object's mask is the patches of which it covers at least {100 * settings.mask_coverage:g}%; replans without any are "
-        f"left out; n counts episodes. IoU {settings.shown_threshold}: of the mask with the attended region, the patches at or "
-        "above that percentile of their map; otsu: above Otsu's threshold; chance: a random region of the same size. pointing: "
-        f"the highest patch is at most {settings.tolerance:g} patch from the mask. distance: from the centre of attention to the "
-        "object's, in picture sides; in brackets: from the middle of the picture."
+        f"An object's mask is the patches of which it covers at least {100 * settings.mask_coverage:g}%; replans "
+        f"without any are left out; n counts episodes. IoU {settings.shown_threshold}: of the mask with the attended "
+        "region, the patches at or above that percentile of their map; otsu: above Otsu's threshold; chance: a random "
+        f"region of the same size. pointing: the highest patch is at most {settings.tolerance:g} patch from the mask. "
+        "distance: from the centre of attention to the object's, in picture sides; in brackets: from the middle of the "
+        "picture."
     )
 
 

@@ -1,4 +1,4 @@
-"""Attention laid over pictures: colours, opacity and scale of the overlays, and the colours of outlined groups. Pure functions.
+"""Attention laid over pictures: colours, opacity and scale of overlays, colours of outlined groups. Pure functions.
 
 To change how overlays look, change the constants below. Which pixels a patch has is in `show/patch_pictures.py`.
 """
@@ -16,15 +16,16 @@ from vla_attention.schemas.errors import BadArgument
 
 Measure = Literal["lift", "share"]
 MEASURES: tuple[Measure, ...] = ("lift", "share")
-#: Perceptually uniform, readable with any colour vision, and its bright end is in few photographs.
+#: Perceptually uniform, legible with any colour vision, and few photographs have the colours of its bright end.
 COLORMAP = "inferno"
 #: Opacity of attention at the top of the scale; at the bottom it is 0, and between them it grows with the value.
 OPACITY = 0.8
-#: How much of the picture's own colour is kept under the attention, so that a yellow cup is not taken for a bright patch.
+#: How much of the picture's own colour is kept under the attention, so that a yellow cup is not taken for a bright
+#: patch.
 COLOR_KEPT = 0.35
 #: Outlines of groups; the scale has none of these colours: cyan, green, white, pink.
 OUTLINE_COLORS = ((0, 229, 255), (118, 255, 3), (255, 255, 255), (255, 128, 171))
-#: The scale ends at this quantile of all values that are shown with it: a single patch shall not hide the others.
+#: The scale ends at this quantile of all values that are shown with it: a single patch must not make the others dark.
 _TOP_QUANTILE = 0.995
 #: The scale never ends before this many times what uniform attention gives.
 _LEAST_TOP = 4.0
@@ -32,9 +33,9 @@ _LEAST_TOP = 4.0
 
 @dataclass(frozen=True)
 class Scale:
-    """What the colours of a set of overlays stand for: 0 has none, `high` and more have the last one.
+    """The scale of a set of overlays: 0 is transparent, `high` and more have the last colour.
 
-    `uniform` is the value that attention gives which treats all keys alike, None where that differs from replan to replan.
+    `uniform` is the value of uniform attention, None where it differs from replan to replan.
     """
 
     high: float
@@ -59,16 +60,17 @@ class Scale:
 def patch_values(
     mass: NDArray[np.floating], image_mass: NDArray[np.floating], uniform_mass: NDArray[np.floating], measure: Measure
 ) -> NDArray[np.float64]:
-    """What an overlay shows of patches' masses.
+    """The values that an overlay shows, from the masses of patches.
 
     share: 100 x mass / summed mass of all image keys of the replan, in per cent.
-    lift: mass / (mean mass of a valid key of the replan), so that attention that is uniform over all valid keys gives 1.
+    lift: mass / (mean mass of a valid key of the replan), so that attention that is uniform over all valid keys gives
+    1.
 
     Args:
         mass: (replan, row, column).
         image_mass: (replan,), mass of all image keys of all cameras.
         uniform_mass: (replan,), mass of all valid keys / their number.
-        measure: which of the two.
+        measure: lift or share.
 
     Returns:
         (replan, row, column); NaN where the divisor is 0.
@@ -79,9 +81,10 @@ def patch_values(
 
 
 def scale_for(values: NDArray[np.floating], measure: Measure, num_patches: int) -> Scale:
-    """The scale of all overlays that shall be compared: from 0 to the 99.5 % quantile of `values`, at least 4 times the uniform value.
+    """One scale for overlays that are compared: 0 to the 99.5% quantile of `values`, at least 4 times the uniform
+    value.
 
-    That limit keeps attention that is nearly uniform from looking as if it were somewhere. `num_patches`: image keys of
+    The lower limit keeps nearly uniform attention from looking concentrated. `num_patches`: image keys of
     all cameras together, which share 100 %.
     """
     uniform = 1.0 if measure == "lift" else 100.0 / num_patches
@@ -94,7 +97,7 @@ def scale_for(values: NDArray[np.floating], measure: Measure, num_patches: int) 
 
 
 def _round_up(value: float) -> float:
-    """To two significant digits, upwards: a scale that ends on a number one can say."""
+    """Round up to two significant digits, for the end of a scale."""
     step = 10.0 ** (np.floor(np.log10(value)) - 1)
     return float(np.round(np.ceil(np.round(value / step, 9)) * step, 12))
 
@@ -108,8 +111,8 @@ def overlay_image(
 ) -> NDArray[np.uint8]:
     """Lay a patch map over the picture that it belongs to, both as they are stored.
 
-    Colours are of `inferno`; opacity grows linearly from 0 at the bottom of the scale to 0.8 at its top; the picture is drawn with a
-    third of its own colour. A value that is undefined (NaN) leaves the picture as it is.
+    Colours are of `inferno`; opacity grows linearly from 0 at the bottom of the scale to 0.8 at its top; the picture is
+    drawn with a third of its own colour. A value that is undefined (NaN) leaves the picture as it is.
 
     Args:
         frame: (row, column, 3) uint8; None when no picture was stored: the map alone, on grey.
@@ -138,7 +141,7 @@ def overlay_image(
 def outline(
     image: NDArray[np.uint8], member: NDArray[np.bool_], color: tuple[int, int, int], width: int = 2
 ) -> NDArray[np.uint8]:
-    """Draw a line of `width` pixels along the inner border of the patches (row, column) that are members, on (row, column, 3)."""
+    """Draw a line of `width` pixels along the inner border of the member patches (row, column), on (row, column, 3)."""
     inside = enlarge(member.astype(np.float64), image.shape[0], image.shape[1]) > 0.5
     kept = inside.copy()
     for _ in range(width):

@@ -1,4 +1,4 @@
-"""What an episode's overlays show: patch maps with their pictures, the ratio beside them, and the outlines of groups."""
+"""The data of an episode's overlays: patch maps, pictures, the ratio at each replan, outlines of groups."""
 
 from __future__ import annotations
 
@@ -47,7 +47,8 @@ class EpisodeOverlay:
         image_mass: mass of all image keys of all cameras, (replan,).
         uniform_mass: mass of all valid keys / their number, (replan,).
         num_image_keys: image keys of all cameras.
-        ratio: ratio of the question's grouping at each replan (replan,), NaN where undefined; None when it has no ratio.
+        ratio: ratio of the question's grouping at each replan (replan,), NaN where undefined; None when it has no
+            ratio.
         uniform_ratio: what uniform attention would give, (replan,); None as above.
         outlines: by group and camera, which patches the group takes, (replan or 1, row, column).
     """
@@ -226,8 +227,8 @@ def draw(
 def overlay_table(overlay: EpisodeOverlay, replans: Sequence[int]) -> pl.DataFrame:
     """The numbers that overlays show, one row per (camera, replan, patch).
 
-    `row` and `column` count in the stored picture, as selectors such as patch:CAMERA[r0:r1,c0:c1] do; `shown_row` and `shown_column`
-    in the picture as it is drawn.
+    `row` and `column` count in the stored picture, as selectors such as patch:CAMERA[r0:r1,c0:c1] do; `shown_row` and
+    `shown_column` in the picture as it is drawn.
     """
     lift, share = overlay.values("lift"), overlay.values("share")
     frames = []
@@ -265,7 +266,7 @@ def chosen_replans(overlay: EpisodeOverlay, wanted: Sequence[int] | None, most: 
 
 
 def orientation_note(overlay: EpisodeOverlay) -> str:
-    """How the pictures were turned for people, as a sentence; empty when they are as stored."""
+    """How the pictures were turned for display, in a sentence; empty when they are shown as stored."""
     mirrored = [camera for camera, view in overlay.views.items() if view.mirrored]
     turned = [camera for camera, view in overlay.views.items() if not view.upright]
     notes = []

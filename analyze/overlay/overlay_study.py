@@ -1,4 +1,4 @@
-"""The overlay of one episode, from stores and settings: which episode, cameras and replans, and which groups are outlined."""
+"""The overlay of one episode from stores and settings: episode, cameras, replans and outlined groups are chosen."""
 
 from __future__ import annotations
 

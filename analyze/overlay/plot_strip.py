@@ -1,4 +1,4 @@
-"""`overlay_...`: attention on the pictures at some replans of an episode, a row per camera, with one scale."""
+"""`overlay_EPISODE`: attention on the pictures at some replans of an episode, a row per camera, with one scale."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ def plot_overlay_strip(
 ) -> list[Path]:
     """Draw the replans side by side and the cameras below each other; returns the paths of png, pdf and csv.
 
-    All pictures share one scale (`colours.scale_for`). Above each replan stand its environment step and the grouping's ratio.
+    All pictures share one scale (`colours.scale_for`). Above each replan stand its environment step and the grouping's
+    ratio.
     """
     overlay, grouping, replans = study.overlay, study.question.grouping, study.replans
     attributes = overlay.item.episode.attributes
@@ -67,8 +68,8 @@ def plot_overlay_strip(
 
 def episode_heading(overlay: EpisodeOverlay) -> str:
     """Suite, task, episode and instruction, for a title."""
-    attributes = overlay.item.episode.attributes
-    return f"{overlay.item.store.suite} task {attributes.task_id}, episode {attributes.episode_index}: {attributes.instruction}"
+    suite, episode = overlay.item.store.suite, overlay.item.episode.attributes
+    return f"{suite} task {episode.task_id}, episode {episode.episode_index}: {episode.instruction}"
 
 
 def _numbers(replans: Sequence[int]) -> str:

@@ -43,7 +43,7 @@ def write_overlay_video(
     measure: Measure = "lift",
     smooth: bool = False,
 ) -> Path:
-    """Write the whole episode as GIF or MP4, by the ending of `path`, `fps` replans a second; shows progress at a terminal."""
+    """Write the whole episode as GIF or MP4 (by the ending of `path`), `fps` replans a second; shows progress."""
     kind: VideoFormat = "mp4" if path.suffix == ".mp4" else "gif"
     overlay, grouping = study.overlay, study.question.grouping
     with progress_bar(overlay.num_replans, "pictures") as advance:
@@ -73,7 +73,7 @@ def video_frames(
 
 @dataclass(frozen=True)
 class _Curve:
-    """The curve beside the pictures: `values` (replan,), NaN where nothing is drawn; `moving` are the parts that change."""
+    """The curve beside the pictures: `values` (replan,), and the parts that move; None where there is no curve."""
 
     axes: Axes
     values: NDArray[np.float64]
@@ -168,7 +168,7 @@ def _move(curve: _Curve, overlay: EpisodeOverlay, replan: int) -> None:
 def _shown_ratio(
     overlay: EpisodeOverlay, grouping: Grouping
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None, str]:
-    """The values of the curve, their uniform baseline and their name: the ratio, or without one the mass of all image keys."""
+    """Values of the curve, uniform baseline and name: of the ratio, or without one of the mass of all image keys."""
     if overlay.ratio is None or grouping.ratio is None:
         return overlay.image_mass, None, "mass of all image keys"
     return overlay.ratio, overlay.uniform_ratio, f"{ratio_name(grouping.ratio)} (log axis)"

@@ -10,13 +10,13 @@ from vla_attention.analyze.show.patch_pictures import upright
 from vla_attention.analyze.show.text_table import text_table
 
 _LEGEND = (
-    "%: camera's share of all image attention. most, at: highest lift of a patch, and its row,column in the picture as it is "
-    "shown (numbers in the csv's row and column count as selectors do, in the stored picture)."
+    "%: camera's share of all image attention. most, at: highest lift of a patch, and its row,column in the picture as "
+    "it is shown (numbers in the csv's row and column count as selectors do, in the stored picture)."
 )
 
 
 def overlay_text(study: OverlayStudy) -> str:
-    """A line per shown replan: ratio, each camera's share of image attention, its brightest patch; and how pictures were turned."""
+    """A line per shown replan: ratio, each camera's share and brightest patch; and how the pictures were turned."""
     overlay = study.overlay
     header = ["replan", "step", *(["ratio"] if overlay.ratio is not None else [])]
     for camera in overlay.maps:

@@ -38,8 +38,8 @@ def check_video(kind: VideoFormat) -> None:
             import imageio_ffmpeg  # noqa: F401
         except ImportError:
             raise MissingDependency(
-                "Writing MP4 needs imageio-ffmpeg, which is not installed; pip install 'vla-attention[video]', or choose "
-                "--video gif."
+                "Writing MP4 needs imageio-ffmpeg, which is not installed; pip install 'vla-attention[video]', or "
+                "choose --video gif."
             ) from None
 
 

@@ -1,1 +1,1 @@
-"""What every question shows its results with: text tables, headings, result files, progress, plot style, shared plots."""
+"""How results are shown: numbers, headings and tables as text, output files, progress, and what plots share."""

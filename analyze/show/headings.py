@@ -1,4 +1,4 @@
-"""The parts that every printed text has: title, section headings, what the run is, the warning of untrained weights, notes."""
+"""The parts that printed texts share: titles, headings, what was analysed, the warning of untrained weights, notes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ WIDTH = 100
 
 
 def wrap(text: str, first: str = "", rest: str = "") -> list[str]:
-    """Lines of at most `WIDTH` columns; `first` and `rest` indent the first line and the others. Empty text gives no line."""
+    """Lines of at most `WIDTH` columns, none of an empty text.
+
+    `first` and `rest` indent the first line and the others.
+    """
     return textwrap.wrap(
         text, WIDTH, initial_indent=first, subsequent_indent=rest, break_long_words=False, break_on_hyphens=False
     )
@@ -36,8 +39,8 @@ def heading(text: str) -> str:
 def untrained_warning(whose: str = "the policy has") -> str:
     """The warning that stands above all numbers of a policy with untrained weights."""
     return (
-        f"WARNING: {whose} untrained (random) weights. These numbers show that the pipeline works; they say nothing about any "
-        "policy."
+        f"WARNING: {whose} untrained (random) weights. These numbers show that the pipeline works; they say nothing "
+        "about any policy."
     )
 
 
@@ -80,5 +83,5 @@ def note_lines(notes: Iterable[str]) -> list[str]:
 
 def interval_note(level: float, kind: str = "") -> str:
     """The sentence below tables with intervals; `kind` may say more, for instance that they are pointwise."""
-    more = f"{kind}, " if kind else ""
-    return f"Intervals: {100 * level:g}%, {more}two-level bootstrap over tasks and episodes; - where fewer than two episodes."
+    which = ", ".join(part for part in (f"{100 * level:g}%", kind, "two-level bootstrap") if part)
+    return f"Intervals: {which} over tasks and episodes; - where fewer than two episodes."

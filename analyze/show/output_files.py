@@ -1,4 +1,4 @@
-"""Files that a command writes: each appears whole or not at all, and a place that cannot be written to is one sentence."""
+"""Files that commands write: each appears whole or not at all; where one cannot be written, one sentence says so."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def write_parquet(folder: Path, **tables: pl.DataFrame) -> list[Path]:
 
 
 def write_csv(folder: Path, **tables: pl.DataFrame) -> list[Path]:
-    """Write each table as `NAME.csv`, otherwise like `write_parquet`: UTF-8, a header, nothing for null, `inf` for infinite."""
+    """As `write_parquet`, but `NAME.csv`: UTF-8, a header, nothing for null, `inf` for infinite."""
     return _write(folder, "csv", tables, lambda table, path: table.write_csv(path))
 
 

@@ -1,8 +1,8 @@
 """Patches of stored pictures: which pixels a patch has, and which way up a person sees them. Pure functions on arrays.
 
-The stored frame is what the model sees (turned, resized and cropped already, see `PolicyCameraView`), and a camera's patches tile
-all of it evenly, row by row from its top left corner. Frame and map are therefore laid over each other first, and only then
-turned to the way a person sees the scene.
+The stored frame is what the model sees (turned, resized and cropped already, see `PolicyCameraView`), and a camera's
+patches tile all of it evenly, row by row from its top left corner. Frame and map are therefore laid over each other
+first, and only then turned to the way a person sees the scene.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ NO_PICTURE = 205
 def upright(image: NDArray[Any], view: PolicyCameraView) -> NDArray[Any]:
     """A stored picture or patch map (row, column, ...) as a person in the camera's place would see it.
 
-    Rows are reversed unless the stored picture is upright; columns are reversed if it is mirrored, so that left is left as in
-    the instruction. Turning twice gives the stored picture back.
+    Rows are reversed unless the stored picture is upright; columns are reversed if it is mirrored, so that left is left
+    as in the instruction. Turning twice gives the stored picture back.
     """
     return image[:: 1 if view.upright else -1, :: -1 if view.mirrored else 1]
 
@@ -31,8 +31,8 @@ def upright(image: NDArray[Any], view: PolicyCameraView) -> NDArray[Any]:
 def enlarge(patch_map: NDArray[np.floating], height: int, width: int, smooth: bool = False) -> NDArray[np.float64]:
     """A patch map (row, column) with a value for every pixel, (height, width): patches divide both sides evenly.
 
-    A pixel has the value of the patch in which its centre lies; with `smooth`, values are bilinear between patch centres and
-    constant beyond the outermost ones, which shows the map softer than it is known.
+    A pixel has the value of the patch in which its centre lies; with `smooth`, values are bilinear between patch
+    centres and constant beyond the outermost ones, which shows the map softer than it is known.
     """
     values = np.asarray(patch_map, dtype=np.float64)
     if values.ndim != 2 or not values.size:

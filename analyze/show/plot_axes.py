@@ -1,4 +1,4 @@
-"""What axes of plots share: logarithmic and whole-number scales, labels, legends, notes beside rows, lines of uniform attention."""
+"""What the axes of plots share: scales, labels, legends, notes beside rows, the line of uniform attention."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ BASELINE_LABEL = "uniform attention"
 
 
 def ratio_axis(axis: Any, values: Any) -> None:
-    """Make an x or y axis logarithmic around finite positive values, with plain numbers (0.5, 20) as labels.
+    """Make an x or y axis logarithmic around finite positive values, with decimal numbers (0.5, 20) as labels.
 
-    A ratio and its inverse are equally far from 1 on such an axis; on a linear one the denominator's side is squeezed.
+    A ratio and its inverse are equally far from 1 on such an axis; on a linear axis the denominator's side is squeezed.
     """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
@@ -42,7 +42,7 @@ def ratio_axis(axis: Any, values: Any) -> None:
 
 
 def whole_numbers(axis: Axis) -> None:
-    """Ticks of a linear axis at whole numbers only: counts and steps have no halves."""
+    """Ticks of a linear axis at whole numbers only, for counts and steps."""
     from matplotlib.ticker import MaxNLocator
 
     axis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
@@ -75,7 +75,7 @@ def uniform_line(
 
 
 def note_at_row(axes: Axes, position: float, text: str, x: float = 1.01, size: float = 7) -> None:
-    """Small print beside a row of a plot, such as `n = 5`: `position` on the y axis, `x` in widths of the axes (1: right edge)."""
+    """Small print beside a row of a plot, such as `n = 5`; `position` is on the y axis, `x` in widths of the axes."""
     axes.text(x, position, text, transform=axes.get_yaxis_transform(), va="center", size=size, color=NOTE_COLOR)
 
 

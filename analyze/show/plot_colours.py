@@ -1,4 +1,7 @@
-"""The colours of plots: groups, single marks, heat maps. The colours of attention on pictures are in `overlay/colours.py`."""
+"""The colours of plots: groups, single series, heat maps.
+
+Those of attention on pictures are in `overlay/colours.py`.
+"""
 
 from __future__ import annotations
 
@@ -28,13 +31,14 @@ _HATCHES = ("", "///", "...", "xxx")
 DATA_COLOR, BASELINE_COLOR, NOTE_COLOR = "#0072B2", "#000000", "#555555"
 #: Single episodes beside their mean, the stripe behind every second row, and lines that lead the eye.
 DOT_COLOR, STRIPE_COLOR, GUIDE_COLOR = "#56B4E9", "#F0F0F0", "#BBBBBB"
-#: Heat maps: more and less than uniform attention (as the visual and the linguistic group), about as much, and no value.
+#: Heat maps: more and less than uniform attention (as the visual and the linguistic group), about as much, and no
+#: value.
 _LESS, _EVEN, _MORE = "#A63C00", "#F7F7F7", "#00507D"
 _NOTHING = "#D9D9D9"
 
 
 def group_styles(names: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Colour and hatch of each group: fixed for the usual names, else the next free colour; hatched when colours run out."""
+    """Colour and hatch of each group: fixed for the usual names, else the next free colour, then hatches."""
     taken = {FIXED_COLORS[name] for name in names if name in FIXED_COLORS}
     palette = list(FURTHER_COLORS) + [color for color in dict.fromkeys(FIXED_COLORS.values()) if color not in taken]
     styles = {}

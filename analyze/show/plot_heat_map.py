@@ -1,4 +1,4 @@
-"""Heat maps around the uniform baseline: one colour for more, one for less, and marks for what is infinite, undefined or uncertain."""
+"""Heat maps around the uniform baseline: colours for more and less; marks for infinite, undefined, uncertain cells."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Half of what the colours span at least, in powers of two: tiny differences must not look large.
+#: The colours span at least this much on either side of 0, in powers of two: tiny differences must not look large.
 _LEAST_SPAN = 0.5
 #: Marks of the colour bar, on either side of 1.
 _FACTORS = ((1.1, 1.2, 1.3, 1.4), (1.2, 1.5, 2.0), (1.5, 2.0, 3.0))
@@ -35,15 +35,21 @@ def draw_log2_map(
 ) -> None:
     """Draw values (row, column) as colours around 0, row 0 at the bottom, with a colour bar in plain factors.
 
-    Infinite values have the colour's end and are marked ∞ or 0, undefined ones (NaN) are grey; `uncertain` cells carry a small
-    dot. Few cells carry their number, because a colour among few others says little.
+    Infinite values have the colour's end and are marked ∞ or 0, undefined ones (NaN) are grey; `uncertain` cells carry
+    a small dot. In a small map every cell also shows its number.
     """
     finite = log2[np.isfinite(log2)]
     numbered = _has_numbers(*log2.shape)
     span = max(_LEAST_SPAN, float(np.abs(finite).max()) if finite.size else 0.0)
     image = axes.imshow(
-        np.clip(log2, -span, span), origin="lower", aspect="auto", interpolation="none", cmap=diverging_colors(), vmin=-span, vmax=span
-    )  # fmt: skip
+        np.clip(log2, -span, span),
+        origin="lower",
+        aspect="auto",
+        interpolation="none",
+        cmap=diverging_colors(),
+        vmin=-span,
+        vmax=span,
+    )
     for row, column in np.argwhere(~np.isnan(log2)):
         value = log2[row, column]
         if np.isinf(value):
@@ -61,7 +67,7 @@ def draw_log2_map(
 
 
 def map_height(num_rows: int, num_columns: int) -> float:
-    """Inches that the cells of a map need: more where there are numbers in them."""
+    """Height of the cells of a map in inches: larger where the cells hold numbers."""
     return num_rows * (0.36 if _has_numbers(num_rows, num_columns) else 0.2)
 
 
@@ -77,7 +83,7 @@ def label_axis(axes: Axes, which: str, labels: Sequence[str]) -> None:
 
 
 def _ink(log2: float, span: float) -> str:
-    """What can be read on a cell's colour."""
+    """The text colour that is legible on a cell."""
     return "white" if abs(log2) > 0.6 * span else "black"
 
 
@@ -93,6 +99,6 @@ def _factor_ticks(span: float) -> list[float]:
 
 
 def _factor(log2: float) -> str:
-    """2 to the power, as 4 or 1/4."""
+    """2 to the power `log2` as text: 4 or 1/4."""
     text = f"{2.0 ** abs(log2):.3g}"
     return f"1/{text}" if log2 < 0 and text != "1" else text

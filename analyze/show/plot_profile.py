@@ -1,4 +1,4 @@
-"""What the profiles over layers and over denoise steps share: a panel of ratios and a panel of fractions, with intervals."""
+"""Profiles over layers or denoise steps: a panel of ratios and a panel of fractions, with intervals."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def draw_profile(
 
 
 def shown_groups(rows: pl.DataFrame, grouping: Grouping) -> list[str]:
-    """Groups that a panel of fractions shows: those of the ratio first, then those with most mass; groups without mass never."""
+    """The groups in a panel of fractions: those of the ratio, then those with most mass; none without mass."""
     means = {name: rows[f"{name}_fraction"].mean() for name in grouping.names}
     having = [name for name in grouping.names if isinstance(means[name], float) and means[name] > 0]  # type: ignore[operator]
     first = (*grouping.ratio.numerator, *grouping.ratio.denominator) if grouping.ratio else ()
@@ -67,7 +67,7 @@ def _ratio_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping, level: floa
     at = np.arange(len(mean))
     # An interval may reach 0, which a logarithmic axis does not have: there it runs to the edge.
     low = np.where(low > 0, low, np.where(np.isnan(low), np.nan, axes.get_ylim()[0]))
-    # The line breaks where there is no ratio: nothing is known there.
+    # The line breaks where there is no ratio.
     shown = np.where(drawn, mean, np.nan)
     axes.plot(at, shown, "o-", color=DATA_COLOR, markersize=4.5, label="mean over episodes", zorder=3)
     axes.vlines(at, low, high, color=DATA_COLOR, linewidth=2.2, alpha=0.55, zorder=2, label=_interval(low, level))
@@ -84,7 +84,7 @@ def _fraction_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping) -> None:
     groups = shown_groups(rows, grouping)
     at = np.arange(rows.height, dtype=float)
     highest = 0.0
-    # Side by side, so that intervals of different groups do not cover each other; near their label where there are few positions.
+    # Side by side, so that the intervals of groups do not cover each other; near their label where positions are few.
     apart = min(0.08, 0.012 * (rows.height + 0.2))
     for i, name in enumerate(groups):
         mean, low, high = (

@@ -52,7 +52,7 @@ def _our_settings() -> Iterator[None]:
 
 
 def drawn_in_our_style(draw: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Run a drawing function under our settings, which are taken back afterwards: the caller's own stay as they were."""
+    """Run a drawing function with our settings, and restore the caller's settings afterwards."""
 
     @functools.wraps(draw)
     def wrapped(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:

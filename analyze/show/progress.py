@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 @contextmanager
 def progress_bar(total: int, unit: str) -> Iterator[Callable[[int], object]]:
-    """Yield a function that advances a bar; the bar is only drawn at a terminal, and when the work lasts over a second."""
+    """Yield a function that advances a bar. The bar is drawn at a terminal only, when the work takes over a second."""
     bar = tqdm(total=total, unit=f" {unit}", disable=not sys.stderr.isatty(), delay=1.0, leave=False)
     try:
         yield bar.update

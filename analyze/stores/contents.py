@@ -1,4 +1,4 @@
-"""`--list`: what stores hold, before any number is computed."""
+"""`--list`: what stores hold."""
 
 from __future__ import annotations
 
@@ -62,7 +62,8 @@ def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
             seen.add(attributes.task_id)
             count = sum(other.attributes.task_id == attributes.task_id for other in episodes)
             interest = listing([thing.name for thing in attributes.objects if thing.of_interest])
-            yield f"  {attributes.task_id:>3}  {attributes.instruction}  ({count} episodes; objects of interest: {interest})"
+            held = f"({count} episodes; objects of interest: {interest})"
+            yield f"  {attributes.task_id:>3}  {attributes.instruction}  {held}"
     yield "Selectors"
     for name, kind in SELECTOR_KINDS.items():
         yield f"  {name + ':':<9} {kind.takes}"

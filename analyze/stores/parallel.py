@@ -1,4 +1,4 @@
-"""The same work on many episodes, a few at a time: while one is waiting for its chunks, another is being added up."""
+"""The same work on many episodes in a few threads: one waits for its chunks while another is computed."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import TypeVar
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-#: More episodes at once would not be faster (decoding has threads of its own), and each holds a layer's rows in memory.
+#: More threads are not faster (decoding has its own), and each holds the rows of one layer in memory.
 _MOST_AT_ONCE = 4
 
 
 def map_episodes(
     function: Callable[[Item], Result], items: Iterable[Item], progress: Callable[[int], object] | None = None
 ) -> list[Result]:
-    """Results in the order of the items; the first error is raised, and nothing further is begun after it.
+    """Results in the order of the items. The first error is raised, and no further item is started.
 
     `progress` is called with 1 after each, in the caller's thread.
     """

@@ -1,4 +1,4 @@
-"""Rows of one episode, a layer and a denoise step at a time, so that no analysis ever holds an episode's rows at once."""
+"""Rows of one episode, one layer and denoise step at a time: no analysis holds all rows of an episode."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What part of the stores an analysis looks at: tasks, layers, denoise steps, heads."""
+"""The part of the stores that an analysis uses: tasks, layers, denoise steps, heads."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from vla_attention.schemas.stores.store_format import RootAttributes, StoreError
 class Selection:
     """Positions along the stored axes, and the numbers they stand for.
 
-    `layers`, `denoise` and `heads` are positions in the stored arrays; `layer_labels` and `blocks` are the number that the
-    user typed and the block index of each layer; `head_numbers` and `denoise_steps` likewise. `per_head`: keep heads apart
-    instead of averaging over the selected ones.
+    `layers`, `denoise` and `heads` are positions in the stored arrays; `layer_labels` and `blocks` are the number that
+    the user typed and the block index of each layer; `head_numbers` and `denoise_steps` likewise. `per_head`: keep
+    heads apart instead of averaging over the selected ones.
     """
 
     layers: tuple[int, ...]
@@ -113,7 +113,8 @@ def parse_denoise_steps(words: Sequence[str] | None, recorded: Sequence[int]) ->
             steps.append(int(word))
         else:
             raise BadArgument(
-                f"Denoise step '{word}' was not recorded; recorded: {listing(recorded, 40)}; 'first', 'last' and 'all' also work."
+                f"Denoise step '{word}' was not recorded; recorded: {listing(recorded, 40)}; 'first', 'last' and 'all' "
+                "also work."
             )
     return tuple(steps)
 
@@ -150,5 +151,6 @@ def check_combinable(stores: Sequence[Store]) -> None:
             other = seen.setdefault((store.suite, episode.name), store)
             if other is not store:
                 raise StoreError(
-                    f"Stores {other.path} and {store.path} both hold {episode.name} of {store.suite}; analyse them one at a time."
+                    f"Stores {other.path} and {store.path} both hold {episode.name} of {store.suite}; analyse them one "
+                    "at a time."
                 )

@@ -12,7 +12,8 @@ def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-analyze verify STORE ...`."""
     parser = command_parser(
         "vla-analyze verify",
-        "Read everything back and check counts, missing chunks, digests and row sums. Exit code 1 if anything is wrong.",
+        "Read everything back and check counts, missing chunks, digests and row sums. Exit code 1 if anything is "
+        "wrong.",
     )
     parser.add_argument("stores", nargs="+", type=Path, metavar="STORE", help="one or several NAME.zarr")
     return parser

@@ -21,7 +21,8 @@ _EXAMPLES = """examples:
   vla-analyze words runs/libero_10.zarr --layers 5 6 7 --per-head
   vla-analyze words runs/cosmos.zarr
 
-A word is measured by all its pieces. Content and stop words are told apart by a shipped list of function words (docs/groupings.md).
+A word is measured by all its pieces. Stop words are those of a shipped list of function words (docs/groupings.md),
+content words all others.
 """
 
 
@@ -29,8 +30,9 @@ def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-analyze words STORE ...`."""
     parser = command_parser(
         "vla-analyze words",
-        "Which words of the instruction are read: mass, lift over uniform attention and share of the linguistic mass of "
-        "every word, with intervals over tasks and episodes; content and stop words, bos, template and state beside them.",
+        "Which words of the instruction are read: mass, lift over uniform attention and share of the linguistic mass "
+        "of every word, with intervals over tasks and episodes; content and stop words, bos, template and state beside "
+        "them.",
         _EXAMPLES,
     )
     add_stores(parser)

@@ -1,4 +1,4 @@
-"""`word_bars`: how much every word of the instructions is read, as lift over uniform attention, with intervals and numbers."""
+"""`word_bars`: how much every word of the instructions is read, as lift over uniform attention, with intervals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ STEM = "word_bars"
 #: Content words, stop words, and what stands beside them for scale.
 COLORS = {"content": "#0072B2", "stop": "#E69F00", None: "#9A9A9A"}
 _LABELS = {"content": "content word", "stop": "stop word", None: "for scale"}
-#: More words than this make no readable page; the csv has them all.
+#: Words in the picture; the csv has all.
 _MOST = 60
 
 
@@ -33,15 +33,16 @@ def plot_word_bars(
 ) -> list[Path]:
     """Draw from `word_reading.words_summary`; returns the paths of png, pdf and csv.
 
-    Words are in the summary's order (sorted by lift; with `instruction`, of one task, in reading order). A bar begins at 1, which
-    uniform attention gives, on a logarithmic axis: twice and half as much are equally long.
+    Words are in the summary's order (sorted by lift; with `instruction`, of one task, in reading order). A bar starts
+    at 1, the value of uniform attention, on a logarithmic axis: bars of twice and of half as much are equally long.
     """
     words = summary.filter((pl.col("kind") == "word") & pl.col("lift").is_not_null())
     shown = pl.concat([words.head(_MOST), summary.filter((pl.col("kind") == "scale") & pl.col("lift").is_not_null())])
     dense = shown.height > 30
     figure = new_figure(8.4, 1.7 + (0.19 if dense else 0.27) * shown.height)
     heading = f"Words of '{instruction}' in reading order" if instruction else "Words of the instructions, by lift"
-    note = f"Bars: mean over episodes; whiskers: {interval_name(DEFAULT_LEVEL, 'bootstrap')} over tasks and episodes; n counts episodes."
+    whiskers = interval_name(DEFAULT_LEVEL, "bootstrap")
+    note = f"Bars: mean over episodes; whiskers: {whiskers} over tasks and episodes; n counts episodes."
     if words.height > _MOST:
         note += f" The {_MOST} words with the highest lift of {words.height}."
     title(figure, f"{heading}; {layer_name(layer)}", note)

@@ -1,4 +1,4 @@
-"""How much the words of an instruction are read: mass, density, lift and share of every word, of classes of words and of roles."""
+"""How much the words of an instruction are read: mass, density, lift and share of words, of their classes, of roles."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ CONTENT, STOP = "content words", "stop words"
 class _Items:
     """What is measured in one episode: its words by place in the instruction, then classes and roles.
 
-    `names`: (kind, word or name, place, class). `weights`: (replan or 1, key, item), then two further ones: all linguistic keys
-    and all valid keys.
+    `names`: (kind, word or name, place, class). `weights`: (replan or 1, key, item), then two further ones: all
+    linguistic keys and all valid keys.
     """
 
     names: tuple[tuple[str, str, int | None, str | None], ...]
@@ -44,16 +44,16 @@ def words_table(question: Question) -> pl.DataFrame:
     """Measure every word of every selected episode; shows progress at a terminal.
 
     Returns:
-        One row per (episode, layer or "layers_avg"[, head], item), means over the episode's replans. An item (`kind`) is a "word"
-        at a `place` of the instruction, from 0, with its `word_class` (content or stop), or, for "scale", all content words, all
-        stop words, or the keys of a role (bos, template, text, state, image). Columns:
+        One row per (episode, layer or "layers_avg"[, head], item), means over the episode's replans. An item (`kind`)
+        is a "word" at a `place` of the instruction, from 0, with its `word_class` (content or stop), or, for "scale",
+        all content words, all stop words, or the keys of a role (bos, template, text, state, image). Columns:
             pieces    number of keys
             mass      sum of the rows over these keys, mean over denoise steps and heads
             density   mass / pieces
             lift      density / (mass of all valid keys / their number): 1 is what uniform attention gives
             share     mass / mass of all linguistic keys (bos, template, instruction, text; null where there is none)
-        `density`, `lift` and `share` are computed per replan from masses that were averaged over denoise steps and heads (for
-        "layers_avg" also over layers), as everywhere in `vla_attention.analyze.measures`.
+        `density`, `lift` and `share` are computed per replan from masses that were averaged over denoise steps and
+        heads (for "layers_avg" also over layers), as everywhere in `vla_attention.analyze.measures`.
 
     Raises:
         BadArgument: the keys of the site spell no words.

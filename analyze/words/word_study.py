@@ -1,4 +1,4 @@
-"""Which words of the instructions are read, over episodes: means with intervals, and the layers and heads that read most."""
+"""Which words are read, over episodes: means with intervals, and the layers and heads that read most."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ class WordStudy:
 
     Attributes:
         question: what was asked, at a site whose keys spell words.
-        instruction: the instruction, when one task was asked for and has a single one: words are then kept in its order.
+        instruction: the instruction, when one task was asked for and has a single one: words are then kept in its
+            order.
         episodes: one row per episode, layer, head and word; see `words_table`.
     """
 
@@ -88,9 +89,10 @@ def words_summary(
 ) -> pl.DataFrame:
     """Mean of every word over the episodes that have it, with two-level intervals, from `words_table`.
 
-    A word that occurs twice in an instruction is one item (its masses are added up) unless `by_place`, which keeps the places of
-    one instruction apart and in reading order. `layer`: the label of one layer, else "layers_avg" where there is one. Heads that
-    were kept apart are averaged. Sorted by lift, words first and scale last; columns as in `episode_intervals.means_with_intervals`.
+    A word that occurs twice in an instruction is one item (its masses are added up) unless `by_place`, which keeps the
+    places of one instruction apart and in reading order. `layer`: the label of one layer, else "layers_avg" where there
+    is one. Heads that were kept apart are averaged. Sorted by lift, words first and scale last; columns as in
+    `episode_intervals.means_with_intervals`.
     """
     chosen = table.filter(pl.col("layer") == (layer or overall_layer(table)))
     if chosen.is_empty():
@@ -117,7 +119,8 @@ def words_summary(
 def strongest_readers(table: pl.DataFrame, most: int = 5) -> pl.DataFrame:
     """The layers (and heads, where they were kept apart) in which a word has its highest lift, mean over episodes.
 
-    One row per (word, layer, head), highest lift first, at most one per word; words that occur twice count by their mean.
+    One row per (word, layer, head), highest lift first, at most one per word; words that occur twice count by their
+    mean.
     """
     layers = table.filter((pl.col("kind") == "word") & (pl.col("layer") != LAYERS_AVG))
     episodes = layers.group_by(*EPISODE_ID, "item", "word_class", "layer", "head").agg(pl.col("lift").mean())

@@ -1,4 +1,6 @@
-"""Copies of stores: whole for `verify`, equal in every number that is kept, and never a whole face on a damaged episode."""
+"""Copies of stores: whole for `verify`, equal in every number that is kept, and never a whole face on a damaged
+episode.
+"""
 
 from __future__ import annotations
 

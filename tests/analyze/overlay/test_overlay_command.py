@@ -1,4 +1,6 @@
-"""`vla-analyze overlay` on stores made by the real writer: numbers from raw arrays, pictures, a planted follower, bad input."""
+"""`vla-analyze overlay` on stores made by the real writer: numbers from raw arrays, pictures, a planted follower, bad
+input.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Overlays: the right patch on the right pixels, whichever way a camera's picture was turned; values and scales by hand."""
+"""Overlays: the right patch on the right pixels, whichever way a camera's picture was turned; values and scales by
+hand.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +67,10 @@ def test_a_bright_patch_lies_on_the_object_that_the_person_sees(
 
 @pytest.mark.parametrize("flip_columns", [True, False])
 def test_patches_line_up_with_what_a_cropping_policy_stores(flip_columns: bool) -> None:
-    """Coverage is computed from the whole picture and `visible`; the stored frame is the crop. Both must mean the same pixels."""
+    """Coverage is computed from the whole picture and `visible`; the stored frame is the crop.
+
+    Both must mean the same pixels.
+    """
     size, patches = 224, 16
     segmentation = np.zeros((size, size), dtype=np.int64)
     segmentation[40:124, 150:190] = 1  # in the simulator's order
@@ -77,7 +82,8 @@ def test_patches_line_up_with_what_a_cropping_policy_stores(flip_columns: bool) 
     )[:, 1]
     seen = (frame[..., 0] / 255.0).reshape(patches, size // patches, patches, size // patches).mean(axis=(1, 3))
     assert 0.05 < seen.mean() < 0.5
-    # The crop begins at a whole pixel: a border may be off by one pixel of fourteen, a shifted patch would be off by one.
+    # The crop begins at a whole pixel: a border may be off by one pixel of fourteen, a shifted patch would be off by
+    # one.
     np.testing.assert_allclose(share.reshape(patches, patches), seen, atol=0.1)
 
 

@@ -14,9 +14,6 @@ from vla_attention.analyze.ratios.plot_attention_fractions import plot_attention
 from vla_attention.analyze.ratios.plot_ratio_distribution import plot_ratio_distribution
 from vla_attention.analyze.ratios.plot_ratio_evolution import evolution_stem, plot_all_evolutions, plot_ratio_evolution
 from vla_attention.analyze.ratios.plot_ratio_per_task import plot_ratio_per_task
-from vla_attention.analyze.show.plot_axes import ratio_axis
-from vla_attention.analyze.show.plot_colours import FIXED_COLORS, group_styles
-from vla_attention.analyze.show.plot_style import new_figure
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -117,22 +114,6 @@ def test_names_of_evolution_files():
     assert stem == "task3_put_the_5_mug_1_on_the_plate_then_stop_ep2_layer25_ratio_evolution"
     assert evolution_stem(0, "", 0, LAYERS_AVG) == "task0_task_ep0_layers_avg_ratio_evolution"
     assert len(evolution_stem(0, "word " * 100, 0, "1")) < 120
-
-
-def test_groups_keep_their_colours_and_no_two_look_alike():
-    grouping, _ = many_groups(30)
-    styles = group_styles(grouping.names)
-    assert styles["linguistic"]["color"] == FIXED_COLORS["linguistic"]
-    looks = [(style["color"], style["hatch"]) for style in styles.values()]
-    assert len(set(looks)) == len(looks)
-    assert group_styles(("visual", "mine"))["visual"] == group_styles(("visual",))["visual"]
-
-
-def test_axis_of_nearly_equal_ratios_is_not_blown_up():
-    axes = new_figure(4, 3).subplots()
-    ratio_axis(axes.xaxis, [10.0, 10.001])
-    low, high = axes.get_xlim()
-    assert high / low > 1.9
 
 
 def test_importing_analyze_and_its_plots_does_not_import_matplotlib():

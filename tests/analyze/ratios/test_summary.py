@@ -6,8 +6,6 @@ import pytest
 from tests.kit.synthetic import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups
 from vla_attention.analyze.measures.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
 from vla_attention.analyze.ratios.summary import AnalysedRun, summary_text, verdict, write_summary
-from vla_attention.analyze.show.numbers import format_interval, format_number
-from vla_attention.analyze.show.text_table import text_table
 
 RUN = AnalysedRun(
     stores=["runs/pi05_libero_10.zarr"],
@@ -122,24 +120,6 @@ def test_every_task_and_suite_has_a_row():
 )
 def test_verdict_has_the_published_thresholds(ratio, word):
     assert verdict(ratio) == word
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (None, "-"), (float("nan"), "-"), (float("inf"), "inf"), (0.0, "0"), (14.0, "14"), (2.3456, "2.346"),
-        (36.571, "36.57"), (999.96, "1000"), (99.951, "100.0"), (12345.6, "12346"), (1e-5, "1.0e-05"), (-0.5, "-0.500"),
-    ],
-)  # fmt: skip
-def test_numbers_are_short(value, text):
-    assert format_number(value) == text
-
-
-def test_interval_and_table():
-    assert format_interval(1.0, 2.5) == "[1, 2.500]"
-    assert format_interval(None, 2.5) == "-"
-    table = text_table(["a", "bb"], [["x", "1"], ["yy", "10"]], left=(0,))
-    assert table.splitlines() == ["a   bb", "······", "x    1", "yy  10"]
 
 
 def test_written_file_is_the_text(tmp_path):

@@ -40,7 +40,9 @@ def reader_store(tmp_path_factory) -> Path:
 
 
 def raw_measures(path: Path, name: str, layer: int) -> dict[tuple[str, int], tuple[float, float, float, float]]:
-    """(word, place) to pieces, mass, lift and share by loops over replans, with the instruction's characters found anew."""
+    """(word, place) to pieces, mass, lift and share by loops over replans, with the instruction's characters found
+    anew.
+    """
     episode = zarr.open_group(path / "episodes" / name, mode="r")
     rows = episode["joint/rows"][:].astype(np.float64).mean(axis=(2, 3, 4))  # (replan, layer, key)
     roles, index = episode["joint/key_role"][:], episode["prompt_index"][:]
@@ -134,7 +136,8 @@ def test_a_word_that_stands_twice_is_one_item_unless_places_are_wanted(reader_st
 
 
 def test_words_of_several_tasks_are_averaged_over_the_episodes_that_have_them(tmp_path):
-    # "put the bowl on the plate", "open the top drawer", "turn on the stove"; state digits change from replan to replan.
+    # "put the bowl on the plate", "open the top drawer", "turn on the stove"; state digits change from replan to
+    # replan.
     path = write_store(tmp_path / "tasks.zarr", tasks=(0, 1, 2), episodes=2)
     table = words_table(question_of(path))
     summary = words_summary(table)

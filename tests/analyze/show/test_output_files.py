@@ -1,0 +1,47 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from vla_attention.analyze.show.output_files import (
+    replacing,
+    report_files,
+    write_csv,
+    write_parquet,
+    write_text,
+    writing,
+)
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.stores.store_format import StoreNotFound
+
+
+def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "a.txt"
+    write_text(path, "ratio ± 1\n")
+    assert path.read_text(encoding="utf-8") == "ratio ± 1\n"
+    with pytest.raises(UnicodeEncodeError):
+        write_text(path, "half a \ud800 pair")
+    assert path.read_text(encoding="utf-8") == "ratio ± 1\n"
+    assert [file.name for file in path.parent.iterdir()] == ["a.txt"]
+
+
+def test_what_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    message = f"Cannot write the page to {tmp_path / 'file' / 'a.html'}: File exists; give another path."
+    with pytest.raises(BadArgument) as caught, writing("the page", tmp_path / "file" / "a.html", "another path"):
+        write_text(tmp_path / "file" / "a.html", "")
+    assert str(caught.value) == message
+    # A mistake of the user that is an OSError too keeps its own sentence.
+    with pytest.raises(StoreNotFound, match="no store"), writing("results", tmp_path):
+        raise StoreNotFound("no store")
+
+
+def test_tables_become_files_and_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = pl.DataFrame({"ratio": [1.5, float("inf"), None]})
+    files = [*write_parquet(tmp_path / "out", a=table), *write_csv(tmp_path / "out", a=table)]
+    assert pl.read_parquet(files[0]).equals(table)
+    assert files[1].read_text() == "ratio\n1.5\ninf\n\n"
+    report_files(tmp_path / "out", files[:1])
+    assert capsys.readouterr().out == f"1 file in {tmp_path / 'out'}:\n  a.parquet\n"
