@@ -1,6 +1,4 @@
-"""Copies of stores: whole for `verify`, equal in every number that is kept, and never a whole face on a damaged
-episode.
-"""
+"""Copies of stores: `verify` accepts them, every kept number is equal, and a damaged episode is refused."""
 
 from __future__ import annotations
 

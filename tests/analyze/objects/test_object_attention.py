@@ -286,10 +286,8 @@ def test_the_command_prints_writes_and_draws(follower_store, tmp_path, capsys):
     assert "Followed most, by layer: 'akita_black_bowl_1' (of interest) in layer 2 head 1" in printed
     assert "Objects of interest are found best by layer 2 head 1" in printed
     assert {path.name for path in tmp_path.iterdir()} == {
-        *(f"{name}.parquet" for name in (
-            "objects", "object_times", "object_steps", "objects_summary", "pointing", "pointing_summary", "iou", "iou_summary",
-            "iou_steps",
-        )),
+        *(f"{name}.parquet" for name in ("objects", "object_times", "object_steps", "objects_summary", "iou_steps")),
+        *(f"{name}{end}.parquet" for name in ("pointing", "iou") for end in ("", "_summary")),
         *(f"{name}.{kind}" for name in ("object_shares", "object_iou") for kind in ("png", "pdf", "csv")),
     }  # fmt: skip
     assert main(["objects", str(follower_store), "--output", str(tmp_path / "less"), "--no-iou"]) == 0

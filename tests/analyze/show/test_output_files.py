@@ -6,7 +6,6 @@ import polars as pl
 import pytest
 
 from vla_attention.analyze.show.output_files import (
-    replacing,
     report_files,
     write_csv,
     write_parquet,
