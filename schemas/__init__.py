@@ -1,1 +1,4 @@
-"""The contract between the two stages: token layout, groupings, store, results. No torch; zarr only where stores are read."""
+"""The contract between the two stages: token layout, groupings, store, results; and the reading and checking of stores.
+
+No torch. zarr is imported when an array is opened.
+"""

@@ -1,4 +1,7 @@
-"""The JSON Schema files in `schemas/json/`, made from the dataclasses: `python -m vla_attention.schemas.json_files` writes them anew."""
+"""The JSON Schema files in `schemas/json/`, made from the dataclasses.
+
+`python -m vla_attention.schemas.json_files` writes them again after a change.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,7 @@ def schema_documents() -> dict[str, dict[str, Any]]:
 
 
 def schema_text(document: dict[str, Any]) -> str:
-    """A schema as it stands in its file."""
+    """The content of a schema's file."""
     return json.dumps(document, indent=2, ensure_ascii=False) + "\n"
 
 

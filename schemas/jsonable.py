@@ -1,7 +1,14 @@
 """Frozen dataclasses to JSON, back, and to JSON Schema.
 
-One declaration serves three purposes: the object in memory, the text in the store, and the schema file that other
-languages check against. Decoding is strict (unknown and missing fields are errors) and an error says where: `$.spans[2].kind`.
+One declaration gives three things: the object in memory, the text in the store, and the schema file that other
+languages check against. Decoding is strict (unknown and missing fields are errors), and an error gives the path:
+`$.spans[2].kind`.
+
+Why not msgspec (0.22, tried): with our dataclasses it ignores unknown fields without a word; `forbid_unknown_fields`
+needs every class to be its `Struct`. Its errors name neither the key of a mapping (`$.groups[...]`), nor the allowed
+values, nor the nearest field. It writes NaN as null. It is faster (0.1 ms instead of 2.9 ms for the attributes of a
+LIBERO episode of 60 replans), which adds up to 0.3 s for 100 episodes. With the messages and the check for NaN written
+around it, the code is not shorter.
 """
 
 from __future__ import annotations
@@ -78,7 +85,7 @@ def _fields(declared: type) -> dict[str, tuple[Any, bool]]:
 
 
 class _Misfit(Exception):
-    """A value that does not fit; every level that it passes on its way out adds its part of the path."""
+    """A value that does not fit; each level of the document adds its part of the path as the error passes it."""
 
     def __init__(self, problem: str) -> None:
         super().__init__(problem)
@@ -92,7 +99,7 @@ class _Misfit(Exception):
 
 @functools.cache
 def _decoder(declared: Any) -> Callable[[Any], Any]:
-    """The function that decodes one declared type, made once: an episode holds ten thousands of token pieces."""
+    """The function that decodes one declared type, made once: an episode may hold ten thousand token pieces."""
     origin, arguments = get_origin(declared), get_args(declared)
     if declared is Any:
         return lambda data: data
@@ -173,7 +180,7 @@ def _dict_decoder(declared: Any) -> Callable[[Any], Any]:
 
 def _dataclass_decoder(declared: type) -> Callable[[Any], Any]:
     fields = _fields(declared)
-    # Fields are looked up when the first value comes: a dataclass may hold itself.
+    # Fields are looked up at the first value, not before: a dataclass may contain itself.
     decoders: dict[str, Callable[[Any], Any]] = {}
     needed = {name for name, (_, required) in fields.items() if required}
 
@@ -249,7 +256,7 @@ def _schema(declared: Any, definitions: dict[str, Any]) -> dict[str, Any]:
         return {"type": "object", "additionalProperties": _schema(arguments[1], definitions)}
     name = declared.__name__
     if name not in definitions:
-        definitions[name] = {}  # stands in while the fields are visited
+        definitions[name] = {}  # a dataclass that contains itself ends here
         fields = _fields(declared)
         definitions[name] = {
             "type": "object",

@@ -13,7 +13,9 @@ CALL_NUMBERED_FAMILIES = ("pi0", "pi05")
 
 @dataclass(frozen=True)
 class LayerSelection:
-    """Blocks to use, and the number that the user typed for each. `note` is a line to print, when numbers were translated."""
+    """Blocks to use, and the number that the user typed for each. `note` is a line to print, when numbers were
+    translated.
+    """
 
     blocks: tuple[int, ...]
     labels: tuple[int, ...]
@@ -23,11 +25,12 @@ class LayerSelection:
 def select_layers(numbers: Sequence[int] | None, num_layers: int, family: str) -> LayerSelection:
     """Translate `--layers` into block indices.
 
-    The published pi0 scripts number attention *calls* of one inference: 0..n-1 are the prefix pass (without action queries), n..2n-1
-    the first denoise step. Their numbers n..2n-1 are accepted for the families above, and mean block number - n.
+    The published pi0 scripts number the attention *calls* of one inference: 0..n-1 are the prefix pass (without action
+    queries), n..2n-1 the first denoise step. Their numbers n..2n-1 are accepted for the families above; number i means
+    block i - n.
 
-    A block may be named both ways (the published example `0 8 17 25 26 27` names block 8 twice): results then carry both numbers.
-    Raises `BadArgument` for any other number, or for the same number twice.
+    A block may be given both ways (the published example `0 8 17 25 26 27` has block 8 twice): results then have both
+    numbers. Raises `BadArgument` for any other number, and for the same number twice.
     """
     if numbers is None:
         return LayerSelection(tuple(range(num_layers)), tuple(range(num_layers)))
@@ -53,8 +56,8 @@ def _translation_note(numbers: Sequence[int], num_layers: int) -> str | None:
         return None
     translated = ", ".join(f"{number} = block {number - num_layers}" for number in calls)
     note = (
-        f"Layers {translated}: numbers from {num_layers} on are read as the published scripts' recorded-call numbers (first denoise "
-        "step there; here the block at every selected denoise step)."
+        f"Layers {translated}: numbers from {num_layers} on are read as the published scripts' recorded-call numbers "
+        "(first denoise step there; here the block at every selected denoise step)."
     )
     twice = [number for number in calls if number - num_layers in numbers]
     if twice:

@@ -1,8 +1,8 @@
-"""Token layout: what every key of a site is. The only place that knows where anything is.
+"""Token layout: what every key of a site is. No other module contains the position or number of any key.
 
-A site's keys are cut into spans (a camera's patches, the prompt, the actions ...). What stays the same for a whole run is
-a `SiteLayout`; what may change from replan to replan (the role of each key, the prompt) is stored beside the rows, because
-a policy that writes its state into the prompt has different tokens at every replan.
+A site's keys are divided into spans (a camera's patches, the prompt, the actions ...). A `SiteLayout` is the same for a
+whole run. The role of each key and the prompt may change from replan to replan, because some policies write their state
+into the prompt; they are stored beside the rows.
 """
 
 from __future__ import annotations
@@ -106,8 +106,8 @@ class SiteLayout:
         for span in self.spans:
             if span.start != position or span.stop <= span.start:
                 raise BadArgument(
-                    f"Span '{span.name}' of site '{self.name}' covers keys {span.start}..{span.stop}, but the next free "
-                    f"key is {position}: spans must follow each other without gap or overlap."
+                    f"Span '{span.name}' of site '{self.name}' covers keys {span.start}..{span.stop}, but the next "
+                    f"free key is {position}: spans must follow each other without gap or overlap."
                 )
             if span.name in seen:
                 raise BadArgument(f"Site '{self.name}' has two spans named '{span.name}': names must be unique.")
@@ -144,7 +144,10 @@ class SiteLayout:
         raise unknown_name("camera", camera, self.cameras)
 
     def frame(self, name: str) -> Span:
-        """Return a latent frame by its name, by `frameN`, or as `curr_last`: the last camera picture of now (Cosmos's scripts)."""
+        """Return a latent frame by its name, by `frameN`, or as `curr_last`.
+
+        `curr_last` is the name in the published Cosmos scripts of the last frame with a current camera picture.
+        """
         frames = [span for span in self.spans if span.kind == "latent"]
         for span in frames:
             if span.name == name:

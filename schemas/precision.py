@@ -1,7 +1,8 @@
-"""Mantissa rounding: how rows are made smaller, and the bound that this puts on every grouping's error.
+"""Mantissa rounding of the stored rows, and the bound that it puts on the error of every grouping's masses.
 
-All terms of a mass are non-negative, so rounding each of them to k mantissa bits (relative error <= 2^-(k+1), round to nearest)
-bounds the relative error of any mass by the same number, and of any ratio of two masses by about 2^-k, whatever the grouping.
+All terms of a mass are non-negative. Rounding each of them to k mantissa bits (relative error <= 2^-(k+1), round to
+nearest) therefore bounds the relative error of any mass by the same number, and that of any ratio of two masses by
+about 2^-k, whatever the grouping.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""The results file `attention_ratio_results_<suite>.json`: a list of episodes, in the structure of the published scripts.
+"""The results file `attention_ratio_results_<suite>.json`: a list of episodes, structured as by the published scripts.
 
-Where this differs from the published scripts' files: a ratio that is not finite is null (they write Infinity, which is not JSON),
-summaries count such ratios in `num_nonfinite`, and a summary over no finite ratio is null (they write 0.0).
+It differs from the published scripts' files in three points: a ratio that is not finite is null (they write Infinity,
+which is not JSON), summaries count such ratios in `num_nonfinite`, and a summary over no finite ratio is null (they
+write 0.0).
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ class ResultsNotFound(ResultsError, FileNotFoundError):
 
 @dataclass(frozen=True)
 class FrameProxy:
-    """What the published Cosmos scripts measure: one latent frame's mass over another's, of one frame's queries, in self-attention.
+    """What the published Cosmos scripts measure: the ratio of two latent frames' masses in self-attention.
 
-    Their masses are sums over the queries, their fractions parts of the two frames' masses only. `selected_call_s` is the
-    sequence length of the call whose rows are used, the frames are named as the user named them, and `num_queries` is the number of
-    queries in the frame.
+    The queries are those of one frame. Masses are sums over the queries; fractions are fractions of the two frames'
+    masses. `selected_call_s` is the sequence length of the call whose rows are used, the frames have the names that the
+    user gave, and `num_queries` is the number of queries in the frame.
     """
 
     selected_call_s: int
@@ -38,7 +39,7 @@ class FrameProxy:
     num_queries: int
 
     def fields(self) -> dict[str, int | str]:
-        """The fields that every step of a results file has of it, under their published names."""
+        """The fields that it adds to every step of a results file, under their published names."""
         return {
             "selected_call_S": self.selected_call_s,
             "query_frame": self.query_frame,
@@ -51,7 +52,7 @@ class FrameProxy:
 class StepRatio:
     """One replan. `step` is the environment step index, waiting steps included; masses and fractions are without unit.
 
-    The last four are there when a ratio of latent frames was measured (see `FrameProxy`), and absent otherwise.
+    The last four fields are set only for a ratio of latent frames (see `FrameProxy`).
     """
 
     step: int
@@ -121,5 +122,5 @@ def results_file_name(suite: str) -> str:
 
 
 def suite_of_results_file(path: Path) -> str:
-    """The suite that a results file is about: its name without prefix and ending."""
+    """The suite of a results file: its name without prefix and ending."""
     return path.stem.removeprefix(RESULTS_PREFIX)

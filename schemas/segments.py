@@ -1,7 +1,7 @@
-"""Segments: the finest pieces of the key axis that any span-level grouping can be built from, one per (span, role).
+"""Segments: all keys of one span that have one role. Every grouping by camera, role or span is made of whole segments.
 
-Their masses are stored beside the rows (`atoms`), a few numbers instead of a thousand keys, so that a grouping by camera,
-role or span is answered without reading a row. A grouping that cuts through a segment (a word, a patch, an object) needs rows.
+Their masses are stored beside the rows (`atoms`), a few numbers instead of a thousand keys, so that such a grouping is
+computed without reading a row. A grouping that takes part of a segment (a word, a patch, an object) needs the rows.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def segment_members(
 
 
 def segment_masses(rows: NDArray[np.float32], members: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Masses of the segments of one replan: rows (..., key) and members (key, segment) give (..., segment), summed in float64."""
+    """Masses (..., segment) of one replan, summed in float64 from rows (..., key) and members (key, segment)."""
     masses = rows.astype(np.float64) @ members.astype(np.float64)
     return masses.astype(np.float32)
 

@@ -1,1 +1,1 @@
-"""Writing a store: arrays and codecs, episodes, the root, files that survive a crash, the disk estimate."""
+"""Writing a store: codecs, episodes, the root, files that survive a crash, the disk estimate. Needs no torch."""

@@ -1,7 +1,9 @@
-"""How arrays are laid out in an episode's group: codecs, chunks and shards of the Zarr v3 store.
+"""The codec chain of every array of a store, and its chunks and shards.
 
-Only core codecs are used (bytes, blosc, crc32c, sharding_indexed), so that any Zarr v3 reader opens the store, and every
-chunk carries a checksum. The reasons behind each choice are measured facts of `docs/store.md`.
+Only core codecs of Zarr v3 are used (bytes, blosc, crc32c, sharding_indexed), so that any Zarr v3 reader opens the
+store, and every chunk has a checksum. `docs/store.md` gives the reasons and measurements. `schemas/stores/shards.py`
+reads the layout of `create_blocked` without zarr; after a change here it must know the new layout, or zarr reads it,
+more slowly.
 """
 
 from __future__ import annotations
@@ -15,19 +17,18 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-#: Decoded size that a chunk of rows aims at: large enough for the codec, small enough to read one layer quickly.
+#: Decoded size of a chunk, about: large enough for the codec, small enough to read one layer quickly.
 TARGET_CHUNK_BYTES = 2 << 20
 
-
-#: What a missing chunk reads as, by kind of number. None of these occurs in floats and signed integers that are stored. Any
-#: value of a picture can be one, so that readers of pictures must look whether the chunk's file is there.
+#: Fill values, which zarr gives for a missing chunk, by kind of number. No stored float or signed integer has this
+#: value. A stored byte may, so readers of pictures must check that the chunk's file exists.
 MISSING = {"f": float("nan"), "i": -1, "u": 0}
 
 
 def replans_per_block(bytes_per_replan: int, max_replans: int) -> int:
     """Replans in one chunk, for one layer and denoise step.
 
-    The chunk's number of elements is a multiple of 8: Blosc silently skips its bit shuffle when it is not.
+    The chunk's number of elements is a multiple of 8; Blosc leaves out its bit shuffle when it is not, without a word.
     """
     step = 8 // math.gcd(8, bytes_per_replan // 4)
     wanted = min(max(1, TARGET_CHUNK_BYTES // max(1, bytes_per_replan)), max(1, max_replans))
@@ -39,8 +40,8 @@ def create_blocked(
 ) -> zarr.Array[Any]:
     """Create a float32 array (replan, layer, denoise, ...) that grows along replans by whole shards of `block` replans.
 
-    A chunk holds one layer and one denoise step, so that an analysis of three layers does not read the others. A missing
-    chunk reads as NaN, never as zeros that look like data.
+    A chunk holds one layer and one denoise step, so that an analysis of three layers does not read the others. A
+    missing chunk reads as NaN, never as zeros that look like data.
     """
     shard = (block, *shape[1:])
     chunk = (block, 1, 1, *shape[3:])
@@ -60,7 +61,7 @@ def create_blocked(
 
 
 def write_whole(group: zarr.Group, name: str, values: NDArray[np.generic], axes: Sequence[str]) -> zarr.Array[Any]:
-    """Write a complete array in one go and as one file: one chunk when it is small, else a shard of chunks along its first axis."""
+    """Write a complete array as one file: one chunk when it is small, else a shard of chunks along its first axis."""
     length = values.shape[0]
     chunk_length = max(
         1, min(length, TARGET_CHUNK_BYTES // max(1, math.prod(values.shape[1:]) * values.dtype.itemsize))
@@ -78,7 +79,7 @@ def write_whole(group: zarr.Group, name: str, values: NDArray[np.generic], axes:
         ),
         fill_value=MISSING[values.dtype.kind],
         dimension_names=list(axes),
-        # A chunk that happens to hold only the fill value is data, too.
+        # A chunk in which every number is the fill value is data, too.
         config={"write_empty_chunks": True},
     )
     array[...] = values

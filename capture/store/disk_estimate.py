@@ -1,4 +1,4 @@
-"""How much disk a run will take, said before it starts."""
+"""The upper bound of a run's disk space that is printed before the run."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
 from vla_attention.schemas.stores.store_format import Recording
 
-#: Bits of an exponent that differ between probabilities: of a float32 in [0, 2), the sign and the highest one are always 0.
+#: Exponent bits that differ between probabilities: a float32 in [0, 2) has 0 as its sign and highest exponent bit.
 _EXPONENT_BITS = 7
-#: What compression can add to numbers that it cannot make smaller.
+#: Factor by which compression can enlarge numbers that it cannot make smaller.
 _INCOMPRESSIBLE = 1.01
 #: Header, checksum and place in the index of one chunk.
 _CHUNK_OVERHEAD = 40
@@ -47,8 +47,8 @@ class DiskEstimate:
 def bytes_per_number(mantissa_bits: int) -> float:
     """Largest number of stored bytes per recorded float32 at a precision.
 
-    Bit shuffle puts the bits that rounding cleared, and those that are the same in all probabilities, side by side, where
-    they cost nothing; at worst the others do not compress at all. Rows of trained models take 10 to 25 % less.
+    Bit shuffle puts side by side the bits that rounding cleared and those that are the same in all probabilities; there
+    they take no space. At worst the others do not compress at all. Rows of trained models take 10 to 25 % less.
     """
     return _INCOMPRESSIBLE * (_EXPONENT_BITS + min(mantissa_bits, FLOAT32_MANTISSA_BITS)) / 8
 
@@ -77,8 +77,8 @@ def describe(estimate: DiskEstimate, path: Path) -> str:
     free = shutil.disk_usage(existing).free
     line = (
         f"Disk: at most {format_bytes(estimate.total_bytes)} "
-        f"({estimate.num_episodes} episodes x up to {estimate.max_replans} replans x {format_bytes(estimate.bytes_per_replan)}); "
-        f"{format_bytes(free)} free."
+        f"({estimate.num_episodes} episodes x up to {estimate.max_replans} replans "
+        f"x {format_bytes(estimate.bytes_per_replan)}); {format_bytes(free)} free."
     )
     if estimate.total_bytes > free:
         line += " WARNING: that is more than the disk has room for; record fewer layers, denoise steps or episodes."

@@ -21,17 +21,20 @@ class StoreWriteFailed(StoreError, OSError):
 
 
 def partial_folder(store: Path) -> Path:
-    """Where things are while they are written: beside the store, on the same file system, never in it."""
+    """The folder for what is being written: beside the store, on the same file system, and not in it."""
     return store.with_name(store.name + PARTIAL_SUFFIX)
 
 
 def process_tag() -> str:
-    """A name that no other process uses, and from which this machine can tell whether its process still lives."""
+    """A name that no other process uses; it has the host and the process number, see `remove_dead_partials`."""
     return f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
 
 
 def remove_dead_partials(store: Path) -> None:
-    """Remove what killed processes of this machine left beside the store. Other machines' processes cannot be judged from here."""
+    """Remove what killed processes of this machine left beside the store.
+
+    Those of other machines cannot be checked here.
+    """
     partial = partial_folder(store)
     for folder in partial.glob("*"):
         host, _, process = folder.name.partition("-")[2].rpartition("-")[0].rpartition("-")
@@ -42,7 +45,7 @@ def remove_dead_partials(store: Path) -> None:
 
 def _is_running(process: int) -> bool:
     try:
-        os.kill(process, 0)  # signal 0 asks, and does nothing
+        os.kill(process, 0)  # signal 0 only checks that the process exists
     except ProcessLookupError:
         return False
     except PermissionError:
@@ -52,15 +55,15 @@ def _is_running(process: int) -> bool:
 
 @contextmanager
 def naming_the_failure(what: str) -> Iterator[None]:
-    """Turn an error of the operating system into one sentence that says what was being written."""
+    """Turn an error of the operating system into one sentence with what was being written."""
     try:
         yield
     except OSError as error:
         if isinstance(error, UserError):
             raise
         raise StoreWriteFailed(
-            f"Cannot write {what}: {error.strerror or error}. Nothing of this episode was kept, and the episodes before it are "
-            "unharmed; remove the cause and go on with --resume."
+            f"Cannot write {what}: {error.strerror or error}. Nothing of this episode was kept, and the episodes "
+            "before it are unharmed; remove the cause and go on with --resume."
         ) from error
 
 
@@ -76,18 +79,18 @@ def make_partial(folder: Path) -> None:
 
 
 def remove_if_empty(folder: Path) -> None:
-    """Remove a folder unless somebody uses it."""
+    """Remove a folder if it is empty."""
     try:
         folder.rmdir()
     except OSError:
-        return  # another writer's episode is in it, or it is gone
+        return  # another writer's episode is in it, or another process has removed it
 
 
 def publish(folder: Path, target: Path, durable: bool) -> None:
     """Rename a complete folder to `target`.
 
-    `durable`: flush its content to disk before and the new name after it, so that a crash of the machine leaves all of it or
-    nothing. Without, only a crash of the process does.
+    `durable`: flush the content to disk before the rename and the new name after it, so that a crash of the machine
+    leaves all of it or nothing. Otherwise only a crash of the process does.
     """
     if durable:
         # The rename must not reach the disk before the content.
@@ -106,7 +109,7 @@ def _flush(path: Path) -> None:
     try:
         os.fsync(handle)
     except OSError as error:
-        # Some network file systems cannot flush directories; they have nothing to offer instead.
+        # Some network file systems cannot flush directories, and have no other way to do it.
         if error.errno not in (errno.EINVAL, errno.ENOTSUP):
             raise
     finally:

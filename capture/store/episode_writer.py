@@ -1,4 +1,4 @@
-"""Writing one episode: it is collected in a folder beside the store, read back, sealed, and renamed into place when whole."""
+"""Writing one episode: it is written into a folder beside the store, sealed, read back, and renamed into place."""
 
 from __future__ import annotations
 
@@ -40,8 +40,9 @@ from vla_attention.schemas.stores.verify import content_problems
 class ReplanRecord:
     """Everything stored about one replan.
 
-    `rows` and `key_role` are per site. `state` is (state_dim,), `actions` (horizon, action_dim) as given to the environment,
-    `frames` per policy camera (row, column, channel) uint8, `coverage` per policy camera (patch, object) float32.
+    `rows` and `key_role` are per site. `state` is (state_dim,), `actions` (horizon, action_dim) as given to the
+    environment, `frames` per policy camera (row, column, channel) uint8, `coverage` per policy camera (patch, object)
+    float32.
     """
 
     env_step: int
@@ -57,7 +58,7 @@ class ReplanRecord:
 
 @dataclass(frozen=True)
 class EpisodeStart:
-    """What is known of an episode before its first replan."""
+    """The attributes of an episode that are known before its first replan."""
 
     task_id: int
     task_name: str
@@ -70,7 +71,7 @@ class EpisodeStart:
 
 
 class EpisodeWriter:
-    """Collects replans; keeps at most one block of rows in memory and writes whole shards only."""
+    """Collects replans; has at most one block of rows in memory and writes whole shards only."""
 
     def __init__(
         self,
@@ -110,7 +111,7 @@ class EpisodeWriter:
             for name, site in self.sites.items():
                 site.append(record.rows[name], record.key_role[name])
         self.prompts.setdefault(record.prompt, len(self.prompts))
-        # Rows are on their way to disk; the rest is small and waits for the end.
+        # The site writers have the rows; the rest is small and is written at the end.
         self.records.append(replace(record, rows={}))
 
     def _check(self, record: ReplanRecord) -> None:

@@ -1,4 +1,4 @@
-"""Rows, row sums, atoms and contributions of one site of one episode, written in whole shards as they come."""
+"""Writing rows, row sums, atoms and contributions of one site of one episode; rows are written in whole shards."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WriteArray = Callable[[str, NDArray[np.generic], tuple[str, ...]], None]
 
 
 class SiteWriter:
-    """Collects one site's replans; keeps at most one block of rows in memory."""
+    """Collects one site's replans; has at most one block of rows in memory."""
 
     def __init__(
         self, group: zarr.Group, write: WriteArray, layout: SiteLayout, recording: Recording, max_replans: int
@@ -52,7 +52,8 @@ class SiteWriter:
         shapes = (recorded.rows.shape, recorded.row_sum.shape, key_role.shape)
         if shapes != (expected, self.shape, expected[-1:]):
             raise ValueError(
-                f"site '{self.layout.name}' recorded rows, row sums and key roles of shapes {shapes}, expected {expected} and so on"
+                f"site '{self.layout.name}' recorded rows, row sums and key roles of shapes {shapes}; "
+                f"expected {(expected, self.shape, expected[-1:])}"
             )
         if not np.isfinite(recorded.rows).all() or (recorded.rows < 0).any():
             raise ValueError(
@@ -61,7 +62,7 @@ class SiteWriter:
         segments = segments_of(self.layout, key_role)
         members = segment_members(self.layout, key_role[None], segments)[0]
         self._take_contribution(recorded.contribution, len(segments))
-        # Atoms and sums come from the rows as computed, before rounding: what storage takes away stays known.
+        # Atoms and sums come from the rows as computed, so that the rounded rows can be compared with them.
         self.masses.append((segments, segment_masses(recorded.rows, members)))
         self.row_sums.append(recorded.row_sum)
         self.roles.append(key_role)
@@ -74,11 +75,12 @@ class SiteWriter:
         expected = (*self.shape[:2], num_segments + 1, num_segments + 1) if wanted else None
         if (None if gram is None else gram.shape) != expected:
             raise ValueError(
-                f"site '{self.layout.name}' gave contributions {None if gram is None else gram.shape}, expected {expected}"
+                f"site '{self.layout.name}' recorded contributions of shape {None if gram is None else gram.shape}; "
+                f"expected {expected}"
             )
         if gram is not None:
             if not np.isfinite(gram).all():
-                raise ValueError(f"site '{self.layout.name}' gave contributions that are not all finite")
+                raise ValueError(f"site '{self.layout.name}' recorded contributions that are not all finite")
             self.contributions.append(gram)
 
     def _flush(self) -> None:
@@ -96,7 +98,7 @@ class SiteWriter:
         self.num_written = total
 
     def finish(self) -> ArrayRecord:
-        """Write what is left and everything that waited for the end; returns what is to be known of the rows."""
+        """Write the last rows and all other arrays of the site; returns shape and digest of the rows."""
         if self.pending:
             self._flush()
         if self.rows_array is None:
@@ -125,7 +127,7 @@ class SiteWriter:
         size = len(column) + 1
         grams = np.zeros((self.num_written, *self.shape[:2], size, size), dtype=np.float32)
         for replan, ((segments, _), gram) in enumerate(zip(self.masses, self.contributions, strict=True)):
-            # A segment that a replan does not have contributes nothing there; the update is the last part.
+            # A segment that a replan lacks contributes nothing there; the last part is the whole attention update.
             at = [*(column[segment] for segment in segments), size - 1]
             grams[replan][..., np.ix_(at, at)[0], np.ix_(at, at)[1]] = gram
         self.write(f"{self.layout.name}/contribution", grams, CONTRIBUTION_AXES)

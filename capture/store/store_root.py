@@ -1,4 +1,4 @@
-"""The root of a store as a run needs it: create it in one step, delete it, and check that it belongs to the same run."""
+"""The root of a store for a run: create it in one step, delete it, and check that it belongs to the same run."""
 
 from __future__ import annotations
 
@@ -66,9 +66,9 @@ def read_existing_root(path: Path) -> RootAttributes:
 
 
 def create_root(path: Path, attributes: RootAttributes, durable: bool) -> RootAttributes:
-    """Create an empty store in one step; returns the attributes of the store at `path`, which another process may have made.
+    """Create an empty store in one step; returns the attributes of the store that is then at `path`.
 
-    `durable`: flush it to disk first, see `RunStore`.
+    Another process may have created it first. `durable`: flush it to disk, see `RunStore`.
     """
     building = partial_folder(path) / f"root-{process_tag()}"
     try:
@@ -78,7 +78,7 @@ def create_root(path: Path, attributes: RootAttributes, durable: bool) -> RootAt
         root.create_group(EPISODES_GROUP)
         publish(building, path, durable)
     except OSError:
-        # Another process of the same array job was first, unless there is nothing.
+        # If a store is there now, another process of the same array job was first.
         if not path.exists():
             raise
     finally:
@@ -89,7 +89,7 @@ def create_root(path: Path, attributes: RootAttributes, durable: bool) -> RootAt
 
 def delete_store(path: Path) -> None:
     """Delete a store."""
-    # Renamed first, so that a crash while deleting cannot leave half a store under the old name.
+    # Rename it first, so that a crash while deleting cannot leave half a store under the old name.
     doomed = partial_folder(path) / f"deleted-{process_tag()}"
     make_partial(doomed)
     path.rename(doomed)

@@ -1,7 +1,7 @@
 """A store opened for adding episodes.
 
-An episode is written into a folder beside the store, read back, flushed to disk and then renamed into place. Whatever
-kills the process in between leaves the store as it was.
+An episode is written into a folder beside the store, read back, flushed to disk and then renamed into place. A process
+that is killed at any moment leaves the store as it was.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ WriteMode = Literal["new", "resume", "overwrite"]
 class RunStore:
     """A store opened for adding episodes. Any number of processes may open one; each episode has one writer.
 
-    `durable`: an episode is flushed to disk before it appears in the store, so that it survives a crash of the machine. Tests, which
-    write many small stores and throw them away, go without.
+    `durable`: an episode is flushed to disk before it appears in the store, so that it survives a crash of the machine.
+    Tests, which write many small stores and delete them, do without.
     """
 
     def __init__(self, path: Path, attributes: RootAttributes, durable: bool = True) -> None:
@@ -56,7 +56,7 @@ class RunStore:
         return {parse_episode_name(folder.name) for folder in episode_folders(self.path)}
 
     def has(self, task_id: int, episode_index: int) -> bool:
-        """Whether an episode is complete; asks the file system, as other processes may have added it."""
+        """Whether an episode is complete; looks into the store, because other processes may have added it."""
         return (self.path / EPISODES_GROUP / episode_name(task_id, episode_index)).is_dir()
 
     @contextmanager
@@ -87,7 +87,7 @@ def open_run(path: Path, attributes: RootAttributes, mode: WriteMode, *, durable
     """
     if path.suffix != STORE_SUFFIX:
         raise BadArgument(f"Cannot write a store at {path}: expected a name that ends with '{STORE_SUFFIX}'.")
-    # Episodes are written beside the store itself: beside a link to it may be another file system.
+    # Episodes are written beside the store itself; a link to it may be on another file system.
     path = path.resolve() if path.is_symlink() else path
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -110,7 +110,7 @@ def open_run(path: Path, attributes: RootAttributes, mode: WriteMode, *, durable
 
 
 def refuse_existing(path: Path) -> NoReturn:
-    """Raise `StoreExists` for a store that is in the way (or `StoreError` when what is there is no store)."""
+    """Raise `StoreExists` for the store at `path`, or `StoreError` when it is not a store."""
     read_existing_root(path)
     count = len(episode_folders(path))
     raise StoreExists(

@@ -1,4 +1,7 @@
-"""The groupings that come with the tool. Each is a function of what the stores hold, because cameras and objects differ."""
+"""The built-in groupings. Each is a function of the names in the stores, because cameras and objects differ.
+
+To add one, write its function and its entry in `BUILTIN_GROUPINGS`.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +22,8 @@ _TEXT = "role:bos | role:template | role:instruction | role:text"
 
 
 def _others(vocabulary: Vocabulary) -> dict[str, tuple[str, ...]]:
-    """Groups that stand beside the visual and the linguistic ones so that the masses of a grouping sum to the row sum."""
-    # Cosmos's padded text: attended to, and without effect.
+    """Groups of all other keys, so that the masses of a grouping sum to the row sum."""
+    # Cosmos's padded text takes attention and adds nothing.
     null = {"null": ("role:null",)} if "null" in vocabulary.roles else {}
     return {
         "state": ("role:state | role:proprio",),
@@ -36,7 +39,7 @@ _TEXT_ROLES = {"bos", "template", "instruction", "text"}
 
 
 def _over_linguistic(vocabulary: Vocabulary, *numerator: str) -> Ratio | None:
-    """The ratio to the linguistic group, where a site has both kinds of keys: Cosmos's self-attention has no text."""
+    """The ratio to the linguistic group, at sites that have both kinds of keys (Cosmos: not at `self`)."""
     both = "image" in vocabulary.roles and _TEXT_ROLES & set(vocabulary.roles)
     return Ratio(numerator, ("linguistic",)) if numerator and both else None
 
@@ -96,16 +99,19 @@ def objects(vocabulary: Vocabulary) -> Grouping:
         groups={**things, "linguistic": (_TEXT,), **others},
         ratio=_over_linguistic(vocabulary, *things),
         allow_empty=(*things, "linguistic", *others),
-        description="one group per scene object, weighted by the area of each patch that it covers; linguistic as in 'default'",
+        description="one group per scene object, weighted by the area of each patch that it covers; "
+        "linguistic as in 'default'",
     )
 
 
 def reference(vocabulary: Vocabulary) -> Grouping:
-    """The published scripts' arithmetic on our rows, to compare with old numbers; its labels do not say what its keys are.
+    """The published scripts' key ranges on our rows, to compare with old numbers. The groups are not what their names
+    say.
 
-    pi: "visual" is the first camera, "linguistic" as many keys after it as the prompt has slots (in truth the next camera's
-    patches), "action" all the rest. Cosmos: frame `curr_last` over frame `frame0`, a blank picture. The scripts' query rows
-    differ too: theirs is one token of the prefix pass for pi, and for Cosmos a sum over the queries where ours is their mean.
+    pi: "visual" is the first camera, "linguistic" the next keys, as many as the prompt has slots (they are patches of
+    the next camera), "action" all the rest. Cosmos: frame `curr_last` over frame `frame0`, a blank picture. The
+    scripts' queries differ too: theirs is one token of the prefix pass for pi, and for Cosmos they sum over the
+    queries, whereas our rows are means.
     """
     spans = vocabulary.layout.spans if vocabulary.layout is not None else ()
     if any(span.kind == "latent" for span in spans):
@@ -121,7 +127,8 @@ def reference(vocabulary: Vocabulary) -> Grouping:
     texts = [span.num_keys for span in spans if span.kind == "text"]
     if not images or not texts:
         raise GroupingError(
-            "The grouping 'reference' is defined for the sites 'joint' (pi) and 'self' (Cosmos) only; choose with --site."
+            "The grouping 'reference' is defined for the sites 'joint' (pi) and 'self' (Cosmos) only; "
+            "choose with --site."
         )
     first, last = images[0], images[0] + texts[0] - 1
     return Grouping(
@@ -129,7 +136,8 @@ def reference(vocabulary: Vocabulary) -> Grouping:
         groups={"visual": (f"keys:0-{first - 1}",), "linguistic": (f"keys:{first}-{last}",), "action": ("*",)},
         ratio=Ratio(("visual",), ("linguistic",)),
         allow_empty=("action",),
-        description=f"the published pi scripts' key ranges: 'linguistic' is keys {first} to {last}, wherever the prompt really is",
+        description=f"the published pi scripts' key ranges: 'linguistic' is keys {first} to {last}, "
+        "wherever the prompt really is",
         proxy=True,
     )
 
@@ -152,5 +160,6 @@ def find_grouping(name_or_file: str, vocabulary: Vocabulary) -> Grouping:
         return read_grouping_file(path)
     raise GroupingNotFound(
         f"Unknown grouping '{name_or_file}'.{did_you_mean(name_or_file, BUILTIN_GROUPINGS)} "
-        f"Built in: {listing(BUILTIN_GROUPINGS)}; anything else is taken as a TOML file, and there is none of that name."
+        f"Built in: {listing(BUILTIN_GROUPINGS)}; "
+        "anything else is taken as a TOML file, and there is none of that name."
     )

@@ -55,8 +55,8 @@ class Grouping:
     """A named set of groups. Order matters only for display and for the rest group.
 
     `groups`: group name to selectors (their union). `overlap`: a key may belong to more than one group. `allow_empty`:
-    groups that may have no keys at all in what is analysed; for any other group that is an error. `proxy`: its groups are called
-    visual and linguistic as in published scripts, and are not.
+    groups that may have no keys in any selected episode; for any other group that is an error. `proxy`: groups are
+    called visual and linguistic, as in the published scripts, although their keys are something else.
     """
 
     name: str
@@ -100,10 +100,10 @@ class Grouping:
 
     @property
     def compares_modalities(self) -> bool:
-        """Whether the ratio is one of seeing over reading, so that the published thresholds can be applied to it.
+        """Whether the ratio is visual over linguistic attention, so that the published thresholds apply to it.
 
-        It is not, whatever the groups are called, for a proxy and when the denominator is made of latent frames: those are
-        pictures, numbers and noise.
+        A proxy's ratio is not, whatever its groups are called, nor is one whose denominator consists of latent frames,
+        which are pictures, numbers and noise.
         """
         if self.proxy or self.ratio is None or self.ratio.denominator != ("linguistic",):
             return False
@@ -143,7 +143,7 @@ def read_grouping_file(path: Path) -> Grouping:
 
 
 def conventional_ratio(groups: Iterable[str]) -> Ratio | None:
-    """visual / linguistic when a grouping has groups of these names and says nothing else."""
+    """visual / linguistic for a grouping that has groups of these names and no ratio of its own."""
     names = set(groups)
     return Ratio(("visual",), ("linguistic",)) if {"visual", "linguistic"} <= names else None
 

@@ -1,8 +1,8 @@
-"""From a grouping and an episode's tokens to a weight per key: the arithmetic of regrouping, and its checks.
+"""From a grouping and an episode's tokens to a weight per key and group, with the checks of names and overlaps.
 
-Objects cover patches by fractions, so sets of keys are not enough. Every key is therefore seen as split into cells, one
-per scene object (for keys without object coverage: a single cell). A selector is a set of (key, cell) pairs, so that union,
-intersection and difference are exact, and a key's weight is the covered area of its chosen cells.
+An object covers a fraction of a patch, so sets of keys are not enough. Every key is divided into cells, one per scene
+object (a key without object coverage has one cell). A selector is a set of (key, cell) pairs, so that union,
+intersection and difference are exact. A key's weight is the covered area of its chosen cells.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class ResolvedGrouping:
 
 
 def check_names(grouping: Grouping, vocabulary: Vocabulary, layout: SiteLayout) -> None:
-    """Raise `SelectorError` or `UnknownName` for the first selector that names something which no selected episode has."""
+    """Raise `SelectorError` or `UnknownName` for the first selector with a name that no selected episode has."""
     for group, selectors in grouping.groups.items():
         for text in selectors:
             for atom in atoms_of(parse_selector(text)):
@@ -57,8 +57,8 @@ def check_names(grouping: Grouping, vocabulary: Vocabulary, layout: SiteLayout) 
 def resolve(grouping: Grouping, tokens: EpisodeTokens) -> ResolvedGrouping:
     """Turn a grouping into weights on one episode's keys.
 
-    A word or an object that this episode does not have gives a group without keys here (`check_names` has made sure that it
-    exists somewhere). Raises `OverlappingGroups` unless the grouping allows overlap.
+    A word or an object that this episode lacks gives a group without keys here (`check_names` has checked that another
+    episode has it). Raises `OverlappingGroups` unless the grouping allows overlap.
     """
     members = memberships(grouping, tokens)
     cells = cell_coverage(tokens) if any(member.shape[2] > 1 for member in members.values()) else None
@@ -80,7 +80,7 @@ def memberships(grouping: Grouping, tokens: EpisodeTokens) -> dict[str, Membersh
     taken = no_keys(tokens)
     for group, selectors in grouping.groups.items():
         if selectors[0].strip() == REST:
-            members[group] = taken  # replaced below, when everything else is known
+            members[group] = taken  # keeps the order; replaced below
             continue
         member = no_keys(tokens)
         for selector in selectors:
@@ -99,7 +99,7 @@ def memberships(grouping: Grouping, tokens: EpisodeTokens) -> dict[str, Membersh
 
 
 def shared_keys(grouping: Grouping, tokens: EpisodeTokens) -> NDArray[np.float64]:
-    """How many keys two groups have in common, shape (replan or 1, group, group); the diagonal is each group's own number.
+    """Number of keys that two groups share, shape (replan or 1, group, group); each group's own on the diagonal.
 
     Exact for objects too: two halves of one patch that do not touch share nothing.
     """
@@ -123,20 +123,21 @@ def _raise_overlap(group: str, member: Membership, others: dict[str, Membership]
         if shared.any():
             key = int(np.flatnonzero(shared)[0])
             raise OverlappingGroups(
-                f"Groups '{other}' and '{group}' share {int(shared.sum())} keys (the first is {describe_key(key, tokens)}); "
+                f"Groups '{other}' and '{group}' share {int(shared.sum())} keys "
+                f"(the first is {describe_key(key, tokens)}); "
                 "take them out of one group with ' - ', or set overlap = true."
             )
 
 
 def describe_key(key: int, tokens: EpisodeTokens) -> str:
-    """Say in words what a key is, for messages: its number, its span, and its piece of text if it has one."""
+    """A key in words, for messages: its number, its span, and its piece of text if it has one."""
     span = next(span for span in tokens.layout.spans if span.start <= key < span.stop)
     text = next((piece.text for prompt in tokens.prompts for piece in prompt.pieces if piece.key == key), None)
     return f"key {key} of span '{span.name}'" + (f", {text!r}" if text is not None else "")
 
 
 def cell_coverage(tokens: EpisodeTokens) -> NDArray[np.float32]:
-    """Area of each key's cells, shape (replan, key, 1 + object). Cell 0 is what no object accounts for; a key's cells sum to 1."""
+    """Area of each key's cells, shape (replan, key, 1 + object); they sum to 1. Cell 0 is what no object covers."""
     replans, keys, things = tokens.num_replans, tokens.layout.num_keys, len(tokens.objects)
     area = np.zeros((replans, keys, 1 + things), dtype=np.float32)
     for camera, coverage in (tokens.coverage or {}).items():

@@ -1,7 +1,7 @@
-"""The kinds of selectors: what each one takes, which keys it gives, and when a name is wrong. One entry of `SELECTOR_KINDS` per kind.
+"""The kinds of selectors, one entry of `SELECTOR_KINDS` each: its description, its keys, and what makes a name wrong.
 
-To add a kind, write its two functions and its entry in the table at the end; the parser, the checks, the errors and `--list`
-take it from there. The grammar that joins selectors (`&`, `|`, `-`, parentheses) is in `selector_parser`.
+To add a kind, write its two functions and its entry in the table at the end. The parser, the checks, the errors and
+`--list` use the table. The grammar that joins selectors (`&`, `|`, `-`, parentheses) is in `selector_parser`.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class SelectorKind:
 
     Attributes:
         takes: what it selects, in words, for errors and `--list`.
-        keys: argument and an episode's tokens to the keys that it takes.
-        problem: argument, the names in all selected episodes and the site's layout to what is wrong with the argument, as the end
-            of a sentence; None when nothing is. An episode that lacks an existing name gives a group without keys.
+        keys: a function of the argument and an episode's tokens; returns the keys that it takes.
+        problem: a function of the argument, the names in all selected episodes and the site's layout; returns what is
+            wrong with the argument, as the end of a sentence, or None.
     """
 
     takes: str
@@ -250,7 +250,8 @@ SELECTOR_KINDS: dict[str, SelectorKind] = {
         _object_problem,
     ),
     "patch": SelectorKind(
-        "a region of a camera's patch grid: camera[r0:r1,c0:c1], rows and columns from the top left, r1 and c1 excluded",
+        "a region of a camera's patch grid: camera[r0:r1,c0:c1], rows and columns from the top left, "
+        "r1 and c1 excluded",
         _patch_keys,
         _patch_problem,
     ),

@@ -1,4 +1,4 @@
-"""What selectors can name: the tokens of one episode, and the union of names over a selection of episodes."""
+"""The names that selectors can use: the tokens of one episode, and the union over a selection of episodes."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ ObjectKind = Literal["object", "fixture", "robot", "background"]
 
 #: Why a site has no words to name, or no objects, and what to do about it.
 NO_WORDS = (
-    "the keys of this site spell no words; choose a site with text by --site (Cosmos: cross); a text that was captured without "
-    "its tokenizer needs a capture with --t5-tokenizer"
+    "the keys of this site spell no words; choose a site with text by --site (Cosmos: cross); a text that was captured "
+    "without its tokenizer needs a capture with --t5-tokenizer"
 )
 NO_COVERAGE = (
-    "no selected episode has object coverage at this site, which is recorded from the simulator's segmentation; choose a site "
-    "with pictures by --site (Cosmos: self), or use a store as vla-capture wrote it, not a copy without objects"
+    "no selected episode has object coverage at this site, which is recorded from the simulator's segmentation; choose "
+    "a site with pictures by --site (Cosmos: self), or use a store as vla-capture wrote it, not a copy without objects"
 )
 
 
@@ -40,7 +40,7 @@ class SceneObject:
 
 @dataclass(frozen=True)
 class EpisodeTokens:
-    """Everything about one episode's keys at one site that a selector may ask for.
+    """What selectors need of one episode's keys at one site.
 
     Attributes:
         layout: the site's spans.
@@ -83,8 +83,8 @@ class EpisodeTokens:
 class Vocabulary:
     """The names that selectors may use over a selection of episodes, for validation and for "did you mean".
 
-    `words` are case-folded, and `sentences` are the instructions as such words; `layout` is the site's, which all episodes of a
-    selection share.
+    `words` are case-folded, and `sentences` are the instructions as such words; `layout` is the site's, the same for
+    all episodes of a selection.
     """
 
     cameras: tuple[str, ...]
@@ -97,7 +97,7 @@ class Vocabulary:
 
 
 def collect_vocabulary(episodes: Iterable[EpisodeTokens]) -> Vocabulary:
-    """Union of the names in the given episodes, in order of first appearance. Cameras that are always masked are left out."""
+    """Union of the names in the given episodes in order of appearance, without cameras that are always masked."""
     cameras: dict[str, None] = {}
     spans: dict[str, None] = {}
     roles: dict[str, None] = {}
@@ -114,7 +114,7 @@ def collect_vocabulary(episodes: Iterable[EpisodeTokens]) -> Vocabulary:
         roles.update({Role(code).label: None for code in np.unique(tokens.static_roles)})
         for line in tokens.words:
             if not any(word.keys for word in line):
-                continue  # a text whose positions are known, and not which word each of them is
+                continue  # a text that was captured without its tokenizer
             sentence = tuple(word.text.casefold() for word in line)
             sentences[sentence] = None
             words.update(dict.fromkeys(sentence))

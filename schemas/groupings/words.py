@@ -61,7 +61,7 @@ def stop_words() -> frozenset[str]:
 
 
 def word_class(word: str) -> WordClass:
-    """`stop` for a word of the stop list, else `content`. Needs no model: the same word has the same class everywhere."""
+    """`stop` for a word of the stop list, else `content`; independent of the sentence."""
     return "stop" if word.casefold().replace("\u2019", "'") in stop_words() else "content"
 
 

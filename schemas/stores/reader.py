@@ -1,6 +1,7 @@
-"""Reading stores: the run, its episodes, what their keys are, and their arrays. zarr is imported when an array is opened.
+"""Reading stores: the run, its episodes, what their keys are, and their arrays.
 
-Both stages read with this module: analysis, and capture before it publishes an episode.
+Both stages read with this module: analysis, and capture before it publishes an episode. zarr is imported when an array
+is opened.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StoredEpisode:
-    """One episode in its folder. Nothing is read before it is needed, and metadata is checked against the seal when read."""
+    """One episode in its folder. It is read when it is needed, and its metadata is then checked against the seal."""
 
     folder: Path
 
@@ -91,7 +92,7 @@ class StoredEpisode:
         return {}
 
     def array(self, name: str) -> zarr.Array[Any]:
-        """Open one array; raises `CorruptEpisode` when it lacks a file or its shape is not the one in the attributes."""
+        """Open one array; raises `CorruptEpisode` when it lacks a file or has another shape than in the attributes."""
         if name not in self._opened:
             self._opened[name] = self._open(name)
         return self._opened[name]
@@ -226,7 +227,7 @@ def _lost_chunk(episode: StoredEpisode, name: str) -> CorruptEpisode:
 
 
 def _holds_missing(values: NDArray[Any]) -> bool:
-    """Whether numbers that a missing chunk reads as are among the values."""
+    """Whether the values contain the fill value that zarr gives for a missing chunk (of pictures and roles: never)."""
     if values.dtype.kind == "i":
         return bool((values == -1).any())
     if values.dtype.kind != "f" or not np.isnan(values.sum()):

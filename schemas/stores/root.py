@@ -28,8 +28,8 @@ def read_root(path: Path) -> RootAttributes:
     if not path.exists():
         nearby = sorted(str(found) for found in path.parent.glob("*.zarr")) if path.parent.is_dir() else []
         raise StoreNotFound(
-            f"There is no store at {path}.{did_you_mean(str(path), nearby)} Stores in {path.parent}: {listing(nearby)}. "
-            "Make one with vla-capture."
+            f"There is no store at {path}.{did_you_mean(str(path), nearby)} "
+            f"Stores in {path.parent}: {listing(nearby)}. Make one with vla-capture."
         )
     try:
         attributes = group_attributes((path / "zarr.json").read_bytes())

@@ -1,8 +1,9 @@
 """Reading one layer and denoise step of a sharded array, straight from the shard's file.
 
-A shard is a file of compressed chunks with an index of their places at its end (Zarr's `sharding_indexed` codec). zarr-python
-reads it through an event loop whose hand-overs between threads cost as much as decoding; an analysis of words reads thousands of
-chunks. This reader knows the one layout that `vla-capture` writes; an array of any other layout is read with zarr-python.
+A shard is a file of compressed chunks, with an index of their positions at its end (Zarr's `sharding_indexed` codec).
+zarr-python reads it through an event loop, and passing the chunks between threads takes as long as decoding them; an
+analysis of words reads thousands of chunks. This reader handles the one layout that `capture/store/codecs.py` writes.
+An array of any other layout is read with zarr-python.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _ABSENT = np.uint64(2**64 - 1)
 
 @dataclass(frozen=True)
 class _Shard:
-    """One shard's file and where in it each chunk lies: `index` (layer, denoise, 2): offset and length in bytes, uint64."""
+    """One shard's file; `index` (layer, denoise, 2) uint64 has the offset and the length of each chunk in bytes."""
 
     path: Path
     index: NDArray[np.uint64]
@@ -48,7 +49,7 @@ class ShardedLayers:
 
     @classmethod
     def of(cls, folder: Path, metadata: dict[str, Any]) -> ShardedLayers | None:
-        """The array's reader, or None when its metadata (its `zarr.json`) describe another layout than the one known here."""
+        """The array's reader, or None when its metadata (its `zarr.json`) describe another layout."""
         shape = tuple(metadata["shape"])
         shard = tuple(metadata["chunk_grid"].get("configuration", {}).get("chunk_shape", ()))
         codecs = metadata["codecs"]

@@ -1,4 +1,8 @@
-"""The store contract, format version 1: names, axes and attributes of `NAME.zarr`. No I/O here.
+"""The store format: its version, the names, axes and attributes of `NAME.zarr`, and its errors. No I/O here.
+
+To raise the version, change `FORMAT_VERSION` and the dataclasses below; a new field with a default lets stores of lower
+versions be read. Then write the JSON Schema files again (`python -m vla_attention.schemas.json_files`) and describe the
+version in `docs/store.md`.
 
 NAME.zarr/                            attributes: `RootAttributes`
   episodes/task003_episode007/        attributes: `EpisodeAttributes`; listed = complete
@@ -27,10 +31,11 @@ from vla_attention.schemas.layout import Prompt, SiteLayout
 from vla_attention.schemas.segments import Segment
 
 FORMAT_NAME = "vla-attention"
+#: A whole number. A reader accepts its own version and lower ones.
 FORMAT_VERSION = 1
 STORE_SUFFIX = ".zarr"
 EPISODES_GROUP = "episodes"
-#: Beside the store, not in it: episodes being written. A reader of the store never meets them.
+#: Ending of the folder beside the store in which episodes are written. Readers of the store do not look there.
 PARTIAL_SUFFIX = ".partial"
 
 ROW_AXES = ("replan", "layer", "denoise", "head", "query", "key")
@@ -45,7 +50,7 @@ _EPISODE_NAME = re.compile(r"task(\d{3,})_episode(\d{3,})$")
 
 
 class StoreError(UserError, ValueError):
-    """Something that calls itself a store and cannot be used as one."""
+    """What is at the path of a store cannot be used as one."""
 
 
 class StoreNotFound(StoreError, FileNotFoundError):
@@ -53,7 +58,7 @@ class StoreNotFound(StoreError, FileNotFoundError):
 
 
 class StoreExists(StoreError, FileExistsError):
-    """A store is there already, and neither resuming nor overwriting was asked for."""
+    """A store exists already, and the run is neither to resume nor to overwrite it."""
 
 
 class FormatTooNew(StoreError):
@@ -65,7 +70,7 @@ class RunMismatch(StoreError):
 
 
 class CorruptEpisode(StoreError):
-    """An episode whose content does not agree with what its attributes promise."""
+    """An episode whose content does not agree with its attributes or its seal."""
 
 
 @dataclass(frozen=True)
@@ -73,10 +78,10 @@ class Recording:
     """What of the attention is recorded.
 
     `layers` are block indices; `layer_labels` are the numbers that the user typed for them (the same unless the
-    reference's recorded-call numbers were used; a block named both ways has two). `queries` is `mean` (over the action
-    queries), `steps` (weighted means of them, `num_pools` many, one per action step or per step and dimension) or `all`.
-    `mantissa_bits` is the precision of the rows (23 = exact). `contributions`: the Gram matrix of value-weighted contributions,
-    mean over the action queries, is recorded too.
+    reference's recorded-call numbers were used; a block that was given both ways has two). `queries` is `mean` (over
+    the action queries), `steps` (`num_pools` weighted means of them, one per action step or per step and dimension) or
+    `all`. `mantissa_bits` is the precision of the rows (23 = exact). `contributions`: the Gram matrix of value-weighted
+    contributions, mean over the action queries, is recorded too.
     """
 
     layers: tuple[int, ...]
@@ -98,7 +103,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Protocol:
-    """How episodes are run: what must be equal for episodes to belong to one run."""
+    """How episodes are run. It is the same for all episodes of a run."""
 
     suite: str
     seed: int
@@ -111,9 +116,9 @@ class Protocol:
 class PolicyCameraView:
     """How a policy camera's picture came from the simulator's.
 
-    The simulators deliver the bottom row first. `upright`: rows were reversed, so that row 0 of the stored frame is the top of
-    the scene. `mirrored`: columns were reversed, so that column 0 is the scene's right edge. `visible`: the model sees the
-    middle of the picture, this share of its side.
+    The simulators give the bottom row first. `upright`: rows were reversed, so that row 0 of the stored frame is the
+    top of the scene. `mirrored`: columns were reversed, so that column 0 is the scene's right edge. `visible`: the
+    model sees the middle of the picture, this fraction of its side.
     """
 
     name: str
@@ -125,7 +130,7 @@ class PolicyCameraView:
 
 @dataclass(frozen=True)
 class PolicyIdentity:
-    """Which policy ran. `digest` is over the weights; `config` is whatever the policy's family needs to be told apart."""
+    """Which policy ran. `digest` is over the weights; `config` has what else distinguishes policies of its family."""
 
     name: str
     family: str
@@ -156,7 +161,7 @@ class RootAttributes:
 
 @dataclass(frozen=True)
 class ArrayRecord:
-    """What `verify` holds an array against: its shape and the sha256 of its values (C order, little endian)."""
+    """Shape of an array and sha256 of its values (C order, little endian), with which `verify` compares it."""
 
     shape: tuple[int, ...]
     sha256: str
@@ -164,7 +169,7 @@ class ArrayRecord:
 
 @dataclass(frozen=True)
 class EpisodeSeal:
-    """sha256 of every `zarr.json` of an episode by its path, and of the store's own: chunks have checksums, and JSON has none."""
+    """sha256 of every `zarr.json` of an episode by its path, and of that of the store (`run`)."""
 
     run: str
     files: dict[str, str]
