@@ -1,4 +1,4 @@
-"""A realistic episode for tests of words, objects and groupings: two cameras of 16 x 16 patches, a two-piece word, a moving bowl."""
+"""An episode for tests of words, objects and groupings: cameras of 16 x 16 patches, a two-piece word, a moving bowl."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ INSTRUCTION = "put the black bowl on the plate"
 
 
 def bowl_prompt(site: SiteLayout, digits: tuple[str, ...], instruction: str = INSTRUCTION) -> SpelledPrompt:
-    """State digits come first, so that the instruction's keys move with their number; 'bowl' is two pieces ('bo', 'wl')."""
+    """State digits stand before the instruction, whose keys move with their number; 'bowl' is two pieces, 'bo' and 'wl'."""
     texts = [(f"{digit} ", Role.STATE) for digit in digits]
     for word in instruction.split():
         cut = [word[:2], word[2:]] if word == "bowl" else [word]

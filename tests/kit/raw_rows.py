@@ -1,4 +1,4 @@
-"""Rows of a made store as plain arrays, read by zarr alone: what the tests of metrics compute from, with code of their own."""
+"""Rows of a made-up store as plain arrays, read by zarr alone, from which the tests of metrics compute."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A made-up table of steps in the form that `vla_attention.analyze.measures.steps` gives, with its metrics computed in numpy, not with our code."""
+"""A made-up table of steps as `vla_attention.analyze.measures.steps` makes it, with metrics computed in numpy."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ INSTRUCTIONS = (
     "put both the alphabet soup and the tomato sauce in the basket",
     "turn on the stove and put the moka pot on it",
     "pick up the book and place it in the back compartment of the caddy",
-    "put the $5 mug_1 on the left $plate_2 and the other mug on the right plate, then close the bottom drawer of the cabinet",
+    "put the $5 mug_1 on the left $plate_2 and the other mug on the right plate, "
+    "then close the bottom drawer of the cabinet",
 )
 
 
@@ -79,7 +80,7 @@ def make_steps(
 ) -> pl.DataFrame:
     """Steps with smooth changes over time, and differences between layers, tasks and episodes.
 
-    `no_denominator`: share of (episode, replan) pairs whose denominator groups get no mass at all, so that their ratio is +inf.
+    `no_denominator`: share of (episode, replan) pairs whose denominator groups get no mass, so that their ratio is +inf.
     """
     grouping = grouping or default_grouping()
     keys = dict(keys or DEFAULT_KEYS)

@@ -62,9 +62,19 @@ def test_root_attributes_validate():
     )
     view = PolicyCameraView("base", "agentview", upright=True, mirrored=True)
     policy = PolicyIdentity(
-        name="pi05", family="pi", checkpoint="pi05_libero", checkpoint_format="openpi", digest="ab" * 32, untrained=False,
-        num_layers=18, num_heads=8, num_denoise_steps=10, action_horizon=10, cameras=(view,), config={"width": 1024, "x": None},
-    )  # fmt: skip
+        name="pi05",
+        family="pi",
+        checkpoint="pi05_libero",
+        checkpoint_format="openpi",
+        digest="ab" * 32,
+        untrained=False,
+        num_layers=18,
+        num_heads=8,
+        num_denoise_steps=10,
+        action_horizon=10,
+        cameras=(view,),
+        config={"width": 1024, "x": None},
+    )
     attributes = RootAttributes(
         format="vla-attention",
         format_version=1,

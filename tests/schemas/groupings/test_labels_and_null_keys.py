@@ -1,4 +1,4 @@
-"""Groups that are named for what they are: null keys apart from padding, words that nobody can place, proxies without a verdict."""
+"""Names of groups: null keys apart from padding, words whose keys are not known, proxies without a verdict."""
 
 from __future__ import annotations
 

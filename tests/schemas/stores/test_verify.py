@@ -219,7 +219,7 @@ def test_damaged_attributes_are_not_read(path):
 
 
 def test_rows_that_do_not_add_up_to_their_sums(tmp_path, monkeypatch):
-    """Checksums, digests and seal are all in order. The writer refuses such an episode; verification finds one from elsewhere."""
+    """Checksums, digests and seal are in order. The writer refuses the episode; `verify_store` finds it."""
     store = open_run(tmp_path / "a.zarr", root_attributes(SPEC), "new", durable=False)
     start, records = episode_records(SPEC, 0, 0)
 
