@@ -16,7 +16,7 @@ INSTRUCTION = "put the black bowl on the plate"
 
 
 def bowl_prompt(site: SiteLayout, digits: tuple[str, ...], instruction: str = INSTRUCTION) -> SpelledPrompt:
-    """State digits stand before the instruction, whose keys move with their number; 'bowl' is two pieces, 'bo' and 'wl'."""
+    """State digits stand before the instruction, so that its keys move; 'bowl' is two pieces, 'bo' and 'wl'."""
     texts = [(f"{digit} ", Role.STATE) for digit in digits]
     for word in instruction.split():
         cut = [word[:2], word[2:]] if word == "bowl" else [word]

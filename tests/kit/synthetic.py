@@ -80,7 +80,7 @@ def make_steps(
 ) -> pl.DataFrame:
     """Steps with smooth changes over time, and differences between layers, tasks and episodes.
 
-    `no_denominator`: share of (episode, replan) pairs whose denominator groups get no mass, so that their ratio is +inf.
+    `no_denominator`: share of (episode, replan) pairs whose denominator groups get no mass (ratio +inf).
     """
     grouping = grouping or default_grouping()
     keys = dict(keys or DEFAULT_KEYS)

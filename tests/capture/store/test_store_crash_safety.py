@@ -69,7 +69,7 @@ def uninterrupted(tmp_path_factory) -> dict[str, bytes]:
 
 @contextmanager
 def before_call(kind: str, number: int, action: Callable[[], None]):
-    """Do something before the number-th (from 0) call of a kind: `set` (a file), `fsync`, `rename`; "renamed": after one."""
+    """Act before the number-th (from 0) call of a kind: `set` (a file), `fsync`, `rename`; "renamed": after a rename."""
     owner: Any = {"set": LocalStore, "fsync": os, "rename": Path, "renamed": Path}[kind]
     name = kind.removesuffix("d")
     original = getattr(owner, name)
