@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from vla_attention.analyze.show.numbers import format_bytes, format_percent, plural
 from vla_attention.schemas.command_line import command_parser
+
+if TYPE_CHECKING:
+    from vla_attention.schemas.stores.reader import Store
 
 _EXAMPLES = """examples:
   vla-analyze copy libero_10.zarr                               how large each part is
@@ -36,36 +42,37 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Copy the store, or print how large its parts are."""
-    from vla_attention.analyze.copy.copying import PARTS, REST, check_parts, copy_store, part_sizes
+    from vla_attention.analyze.copy.copying import check_parts, copy_store
     from vla_attention.analyze.show.progress import progress_bar
     from vla_attention.schemas.stores.reader import open_store
 
     store = open_store(arguments.store)
     without = check_parts(arguments.without)
     if arguments.target is None:
-        sizes = part_sizes(store)
-        total = sum(sizes.values())
-        print(f"{store.path}: {len(store.episodes)} episodes, {_size(total)}")
-        for name, size in sizes.items():
-            purpose = "rows, atoms, roles, actions: always copied" if name == REST else PARTS[name].purpose
-            share = size / total if total else 0.0
-            mark = "  left behind" if name in without else ""
-            print(f"  {name:<13} {_size(size):>8}  {share:>4.0%}  {purpose}{mark}")
-        if without:
-            print(f"A copy without {', '.join(without)} takes {_size(total - sum(sizes[name] for name in without))}.")
+        print(_sizes_text(store, without))
         return 0
     with progress_bar(len(store.episodes), "episodes") as advance:
         copied = copy_store(store, arguments.target, without, advance)
     there = f" ({copied.present} were there already)" if copied.present else ""
-    left = f", {_size(copied.left_bytes)} left behind: {', '.join(without)}" if without else ""
-    print(f"{arguments.target}: {copied.added} episodes added{there}, {_size(copied.copied_bytes)}{left}.")
+    left = f", {format_bytes(copied.left_bytes)} left behind: {', '.join(without)}" if without else ""
+    added = plural(copied.added, "episode")
+    print(f"{arguments.target}: {added} added{there}, {format_bytes(copied.copied_bytes)}{left}.")
     return 0
 
 
-def _size(count: float) -> str:
-    """A byte count for people, decimal units."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if count < 999.5:
-            return f"{count:.3g} {unit}"
-        count /= 1000
-    return f"{count:.3g} TB"
+def _sizes_text(store: Store, without: Sequence[str]) -> str:
+    """The size of each part of the store, and of a copy without some of them."""
+    from vla_attention.analyze.copy.copying import PARTS, REST, part_sizes
+
+    sizes = part_sizes(store)
+    total = sum(sizes.values())
+    lines = [f"{store.path}: {plural(len(store.episodes), 'episode')}, {format_bytes(total)}"]
+    for name, size in sizes.items():
+        purpose = "rows, atoms, roles, actions: always copied" if name == REST else PARTS[name].purpose
+        share = format_percent(size / total if total else 0.0, 0)
+        mark = "  left behind" if name in without else ""
+        lines.append(f"  {name:<13} {format_bytes(size):>8}  {share:>4}  {purpose}{mark}")
+    if without:
+        rest = format_bytes(total - sum(sizes[name] for name in without))
+        lines.append(f"A copy without {', '.join(without)} takes {rest}.")
+    return "\n".join(lines)

@@ -98,7 +98,7 @@ def masses_array(question: Question, progress: Callable[[int], object] | None = 
     parts = map_episodes(measure, list(zip(question.selected, resolved, strict=True)), progress)
     mass, row_sum, keys, valid = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     cells = _MASS_DIMENSIONS[:-1]
-    return xr.Dataset(
+    dataset: xarray.Dataset = xr.Dataset(
         {
             "mass": (_MASS_DIMENSIONS, mass, {"long_name": "attention mass", "units": "1"}),
             "row_sum": (cells, row_sum, {"long_name": "sum of the row as computed", "units": "1"}),
@@ -110,6 +110,7 @@ def masses_array(question: Question, progress: Callable[[int], object] | None = 
         coords={**_sample_coordinates(question), **_axis_coordinates(question), "group": list(question.grouping.names)},
         attrs=_attributes(question),
     )  # fmt: skip
+    return dataset
 
 
 def rows_array(

@@ -73,6 +73,16 @@ def _labels(name: str, labels: Sequence[Any] | NDArray[Any] | pl.Series) -> pl.S
     return pl.Series(name, given, dtype=kinds[type(known)])
 
 
+def rows_of_episode(table: pl.DataFrame, item: SelectedEpisode) -> pl.DataFrame:
+    """The rows of one episode."""
+    attributes = item.episode.attributes
+    return table.filter(
+        (pl.col("suite") == item.store.suite)
+        & (pl.col("task_id") == attributes.task_id)
+        & (pl.col("episode_index") == attributes.episode_index)
+    )
+
+
 def layer_name(layer: str) -> str:
     """A layer's label in tables as text: `layer 5`, or `all layers` for the mean over the selected ones."""
     return "all layers" if layer == LAYERS_AVG else f"layer {layer}"

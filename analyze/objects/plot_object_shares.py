@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.frames import EPISODE_ID
+from vla_attention.analyze.measures.frames import EPISODE_ID, rows_of_episode
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.objects.object_views import ALL_CAMERAS, CLASSES
 from vla_attention.analyze.show.numbers import interval_name, of_tasks
@@ -53,11 +53,7 @@ def plot_object_shares(
     """
     whole = times.filter(pl.col("camera") == ALL_CAMERAS)
     attributes = example.episode.attributes
-    own = whole.filter(
-        (pl.col("suite") == example.store.suite)
-        & (pl.col("task_id") == attributes.task_id)
-        & (pl.col("episode_index") == attributes.episode_index)
-    )
+    own = rows_of_episode(whole, example)
     figure = new_figure(14.5, 4.7)
     num_episodes = whole.select(EPISODE_ID).unique().height
     num_tasks = whole.select(EPISODE_ID[:2]).unique().height

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.aggregate import add_layers_avg, overall_layer, per_replan
+from vla_attention.analyze.measures.frames import Axis, long_table, rows_of_episode
 from vla_attention.analyze.measures.patch_maps import mean_rows, seen_cameras
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, check_replan
@@ -97,9 +97,8 @@ def camera_names(question: Question, wanted: Sequence[str] | None) -> tuple[str,
     if not cameras:
         sites = [site.name for site in question.stores[0].attributes.sites if site.cameras]
         raise BadArgument(
-            f"The keys of site '{question.site}' are no patches of pictures, so there is nothing to lay over one; "
-            f"sites with "
-            f"cameras: {listing(sites)}. Choose with --site."
+            f"The keys of site '{question.site}' are no patches of pictures, so an overlay has nothing to show; "
+            f"sites with cameras: {listing(sites)}. Choose with --site."
         )
     for camera in wanted or ():
         if camera not in cameras:
@@ -111,8 +110,6 @@ def outline_grouping(texts: Sequence[str]) -> Grouping | None:
     """The groups of `--group NAME=SELECTOR`, which may share keys; None without any."""
     if not texts:
         return None
-    from dataclasses import replace
-
     grouping = with_groups(None, [parse_group_argument(text) for text in texts])
     named = {name: value for name, value in grouping.groups.items() if name != "rest" or value != ("*",)}
     return replace(grouping, groups=named, overlap=True, ratio=None, allow_empty=tuple(named))
@@ -154,7 +151,8 @@ def episode_overlay(
         views[camera] = by_name.get(camera, PolicyCameraView(camera, camera, True, False))
     ratio = uniform = None
     if question.grouping.ratio is not None:
-        rows = _of_episode(replans, item)
+        own = rows_of_episode(replans, item)
+        rows = own.filter(pl.col("layer") == overall_layer(own)).sort("replan")
         ratio = rows["ratio"].fill_null(float("nan")).to_numpy()
         uniform = rows["uniform_ratio"].fill_null(float("nan")).to_numpy()
     return EpisodeOverlay(
@@ -169,16 +167,6 @@ def episode_overlay(
         uniform_ratio=uniform,
         outlines=_outlines(item, cameras, groups),
     )
-
-
-def _of_episode(replans: pl.DataFrame, item: SelectedEpisode) -> pl.DataFrame:
-    attributes = item.episode.attributes
-    own = replans.filter(
-        (pl.col("suite") == item.store.suite)
-        & (pl.col("task_id") == attributes.task_id)
-        & (pl.col("episode_index") == attributes.episode_index)
-    )
-    return own.filter(pl.col("layer") == overall_layer(own)).sort("replan")
 
 
 def _outlines(
@@ -199,7 +187,7 @@ def _outlines(
 
 
 def check_outlines(question: Question, groups: Grouping | None) -> None:
-    """Raise `SelectorError` for a group that names what exists nowhere in the selection."""
+    """Raise `SelectorError` for a group with a name that exists nowhere in the selection."""
     if groups is not None:
         check_names(groups, question.vocabulary, question.selected[0].tokens.layout)
 
@@ -231,29 +219,25 @@ def overlay_table(overlay: EpisodeOverlay, replans: Sequence[int]) -> pl.DataFra
     `shown_column` in the picture as it is drawn.
     """
     lift, share = overlay.values("lift"), overlay.values("share")
+    chosen = list(replans)
+    axis: Axis = {"replan": chosen, "env_step": overlay.env_step[chosen]}
     frames = []
-    chosen = np.asarray(list(replans))
     for camera, mass in overlay.maps.items():
-        place = np.indices(mass.shape[1:])
-        turned = upright(np.moveaxis(place, 0, -1), overlay.views[camera])
-        shown = np.empty_like(turned)
-        shown[turned[..., 0], turned[..., 1]] = np.moveaxis(place, 0, -1)
-        count, patches = len(chosen), mass[0].size
-        columns: dict[str, Any] = {
-            "camera": [camera] * (count * patches),
-            "replan": np.repeat(chosen, patches),
-            "env_step": np.repeat(overlay.env_step[chosen], patches),
-            "row": np.tile(place[0].ravel(), count),
-            "column": np.tile(place[1].ravel(), count),
-            "shown_row": np.tile(shown[..., 0].ravel(), count),
-            "shown_column": np.tile(shown[..., 1].ravel(), count),
-            "mass": mass[chosen].ravel(),
-            "share_percent": share[camera][chosen].ravel(),
-            "lift": lift[camera][chosen].ravel(),
+        place = np.moveaxis(np.indices(mass.shape[1:]), 0, -1)  # (row, column, 2)
+        shown = np.empty_like(place)
+        turned = upright(place, overlay.views[camera])
+        shown[turned[..., 0], turned[..., 1]] = place
+        patches = {
+            "row": place[..., 0].ravel(),
+            "column": place[..., 1].ravel(),
+            "shown_row": shown[..., 0].ravel(),
+            "shown_column": shown[..., 1].ravel(),
         }
+        values = {"mass": mass, "share_percent": share[camera], "lift": lift[camera]}
+        columns = {name: array[chosen].reshape(1, len(chosen), -1) for name, array in values.items()}
         if overlay.ratio is not None:
-            columns["ratio"] = np.repeat(overlay.ratio[chosen], patches)
-        frames.append(pl.DataFrame(columns))
+            columns["ratio"] = overlay.ratio[chosen][:, None]
+        frames.append(long_table(overlay.item, [{"camera": (camera,)}, axis, patches], columns, keys=()))
     return pl.concat(frames)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from vla_attention.analyze.show.numbers import plural
 from vla_attention.schemas.command_line import command_parser
 
 
@@ -32,6 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
             faults = verify_store(store, advance)
         for fault in faults:
             print(f"{path}: {fault.episode}: {fault.problem}")
-        print(f"{path}: {len(store.episodes)} episodes, {'all whole' if not faults else f'{len(faults)} faults'}.")
+        result = plural(len(faults), "fault") if faults else "all whole"
+        print(f"{path}: {plural(len(store.episodes), 'episode')}, {result}.")
         faulty = faulty or bool(faults)
     return 1 if faulty else 0
