@@ -5,11 +5,10 @@ episode and which environment step each sample is; nothing is padded. Heads are 
 averaged.
 
     mass       (sample, layer, denoise, head, group)   sum of probability x weight
-    row_sum    (sample, layer, denoise, head)          what the row sums to, before storage rounded it
+    row_sum    (sample, layer, denoise, head)          sum of the row, before storage rounded it
     num_keys   (sample, group), num_valid (sample)     keys of the group; keys that can hold information
     rows       (sample, layer, denoise, head, key)     only on request: the probabilities themselves
-    key_role   (sample, key)                           with rows: codes of the roles of
-               `vla_attention.schemas.layout.Role`
+    key_role   (sample, key)                           with rows: codes of `vla_attention.schemas.layout.Role`
 
 xarray and h5netcdf are the extra `xarray`; nothing here imports them before an array is asked for.
 """
@@ -49,7 +48,7 @@ _CHUNK_BYTES = 1 << 18
 
 @dataclass(frozen=True)
 class RowsSize:
-    """How large the rows of a question are: lengths of the axes, and bytes in float32 before compression."""
+    """The size of the rows of a question: lengths of the axes, and bytes in float32 before compression."""
 
     shape: tuple[int, int, int, int, int]
 

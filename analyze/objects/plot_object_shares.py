@@ -13,8 +13,8 @@ from vla_attention.analyze.measures.frames import EPISODE_ID, rows_of_episode
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.objects.object_views import ALL_CAMERAS, CLASSES
 from vla_attention.analyze.show.numbers import interval_name, of_tasks
-from vla_attention.analyze.show.plot_axes import ratio_axis, uniform_line, whole_numbers
-from vla_attention.analyze.show.plot_colours import FURTHER_COLORS
+from vla_attention.analyze.show.plot_axes import legend_below, ratio_axis, uniform_line, whole_numbers
+from vla_attention.analyze.show.plot_colours import FIXED_COLORS, FURTHER_COLORS
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import shortened, title
 from vla_attention.analyze.statistics.bootstrap import (
@@ -61,9 +61,8 @@ def plot_object_shares(
         figure,
         "Share of the image attention by object, all cameras, mean over layers and heads",
         f"Left: {example.episode.name}, '{attributes.instruction}'. Middle and right: mean over "
-        f"{of_tasks(num_episodes, num_tasks)} with "
-        f"{interval_name(DEFAULT_LEVEL, 'bootstrap')} at each time; dashed: what "
-        "uniform attention gives (in the middle: the covered area).",
+        f"{of_tasks(num_episodes, num_tasks)} with {interval_name(DEFAULT_LEVEL, 'bootstrap')} at each time; "
+        "dashed: what uniform attention gives (in the middle: the covered area).",
     )
     left, middle, right = figure.subplots(1, 3)
     shown = _draw_example(left, own)
@@ -99,7 +98,9 @@ def _draw_example(axes: Axes, own: pl.DataFrame) -> pl.DataFrame:
         part = series.filter(pl.col("shown") == name).group_by("env_step").agg(pl.col("share").sum()).sort("env_step")
         share = np.nan_to_num(100 * part["share"].to_numpy().astype(float))
         kind = kinds.get(name, CLASSES[1])
-        color = CLASS_COLORS[kind] if kind in CLASSES[2:] else "#4D4D4D" if name == _OTHERS else next(further)
+        color = (
+            CLASS_COLORS[kind] if kind in CLASSES[2:] else FIXED_COLORS["other"] if name == _OTHERS else next(further)
+        )
         label = shortened(name, 26) + (" (of interest)" if kind == CLASSES[0] else "")
         if len(steps) > 1:
             axes.fill_between(steps, bottom, bottom + share, color=color, linewidth=0, label=label)
@@ -112,9 +113,7 @@ def _draw_example(axes: Axes, own: pl.DataFrame) -> pl.DataFrame:
     whole_numbers(axes.xaxis)
     if len(steps) > 1:
         axes.set_xlim(steps[0], steps[-1])
-    handles, labels = axes.get_legend_handles_labels()
-    # In the order of the layers on the page, from the top.
-    axes.legend(handles[::-1], labels[::-1], loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
+    legend_below(axes, 3, from_top=True)
     return series.select(
         pl.lit("example").alias("panel"),
         pl.col("shown").alias("name"),
@@ -166,7 +165,7 @@ def _draw_classes(axes: Axes, lift_axes: Axes, whole: pl.DataFrame, seed: int) -
         target.set_xlabel("time in the episode (0: first replan, 1: last)")
         target.set_xlim(0, 1)
         target.grid(axis="y")
-        target.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
+        legend_below(target, 2)
     return data
 
 

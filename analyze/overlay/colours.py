@@ -20,14 +20,13 @@ MEASURES: tuple[Measure, ...] = ("lift", "share")
 COLORMAP = "inferno"
 #: Opacity of attention at the top of the scale; at the bottom it is 0, and between them it grows with the value.
 OPACITY = 0.8
-#: How much of the picture's own colour is kept under the attention, so that a yellow cup is not taken for a bright
-#: patch.
+#: Part of the picture's own colour that is kept, so that a yellow cup does not look like a bright patch.
 COLOR_KEPT = 0.35
 #: Outlines of groups; the scale has none of these colours: cyan, green, white, pink.
 OUTLINE_COLORS = ((0, 229, 255), (118, 255, 3), (255, 255, 255), (255, 128, 171))
 #: The scale ends at this quantile of all values that are shown with it: a single patch must not make the others dark.
 _TOP_QUANTILE = 0.995
-#: The scale never ends before this many times what uniform attention gives.
+#: The scale ends at this many times the value of uniform attention, or above.
 _LEAST_TOP = 4.0
 
 
@@ -63,8 +62,7 @@ def patch_values(
     """The values that an overlay shows, from the masses of patches.
 
     share: 100 x mass / summed mass of all image keys of the replan, in per cent.
-    lift: mass / (mean mass of a valid key of the replan), so that attention that is uniform over all valid keys gives
-    1.
+    lift: mass / (mean mass of a valid key of the replan): uniform attention over the valid keys gives 1.
 
     Args:
         mass: (replan, row, column).
@@ -81,11 +79,10 @@ def patch_values(
 
 
 def scale_for(values: NDArray[np.floating], measure: Measure, num_patches: int) -> Scale:
-    """One scale for overlays that are compared: 0 to the 99.5% quantile of `values`, at least 4 times the uniform
-    value.
+    """One scale for overlays that are compared, from 0 to the 99.5% quantile of `values`.
 
-    The lower limit keeps nearly uniform attention from looking concentrated. `num_patches`: image keys of
-    all cameras together, which share 100 %.
+    It ends at 4 times the uniform value or above, so that nearly uniform attention does not look concentrated.
+    `num_patches`: image keys of all cameras together, which share 100%.
     """
     uniform = 1.0 if measure == "lift" else 100.0 / num_patches
     finite = np.asarray(values)[np.isfinite(values)]
@@ -109,7 +106,7 @@ def overlay_image(
     smooth: bool = False,
     size: tuple[int, int] | None = None,
 ) -> NDArray[np.uint8]:
-    """Lay a patch map over the picture that it belongs to, both as they are stored.
+    """Lay a patch map over its picture, both as they are stored.
 
     Colours are of `inferno`; opacity grows linearly from 0 at the bottom of the scale to 0.8 at its top; the picture is
     drawn with a third of its own colour. A value that is undefined (NaN) leaves the picture as it is.
@@ -117,7 +114,7 @@ def overlay_image(
     Args:
         frame: (row, column, 3) uint8; None when no picture was stored: the map alone, on grey.
         patch_map: (row, column) values of patches.
-        scale: what the colours stand for.
+        scale: the values of the colours.
         smooth: bilinear instead of nearest; see `enlarge`.
         size: (height, width) of the result without a frame.
 

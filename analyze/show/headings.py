@@ -82,6 +82,6 @@ def note_lines(notes: Iterable[str]) -> list[str]:
 
 
 def interval_note(level: float, kind: str = "") -> str:
-    """The sentence below tables with intervals; `kind` may say more, for instance that they are pointwise."""
+    """The sentence below tables with intervals; `kind` adds a property, for instance that they are pointwise."""
     which = ", ".join(part for part in (f"{100 * level:g}%", kind, "two-level bootstrap") if part)
     return f"Intervals: {which} over tasks and episodes; - where fewer than two episodes."

@@ -85,6 +85,13 @@ def legend_above(axes: Axes, columns: int = 1, handles: Sequence[Any] | None = N
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.1, **chosen, **options)
 
 
+def legend_below(axes: Axes, columns: int, from_top: bool = False) -> None:
+    """A legend below the axes; `from_top`: the last drawn part first, as parts that are stacked are seen."""
+    handles, labels = axes.get_legend_handles_labels()
+    order = -1 if from_top else 1
+    axes.legend(handles[::order], labels[::order], loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=columns)
+
+
 def legend_beside(axes: Axes, **options: Any) -> None:
     """A legend to the right of the axes, from the top."""
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), **options)

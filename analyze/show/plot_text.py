@@ -28,7 +28,7 @@ def shortened(name: str, width: int) -> str:
 
 
 def explain(axes: Axes, text: str) -> None:
-    """Say in the middle of empty axes why there is nothing to see."""
+    """Write into the middle of empty axes why they are empty."""
     axes.set_xticks([])
     axes.set_yticks([])
     hide_frame(axes)
@@ -38,14 +38,14 @@ def explain(axes: Axes, text: str) -> None:
 
 
 def title(figure: Figure, text: str, note: str = "") -> None:
-    """First lines of the whole figure: what it is, then notes (n, what was left out), wrapped to the figure's width."""
+    """The title of a figure, and below it a note (n, what was left out), wrapped to the figure's width."""
     width = int(figure.get_figwidth() * _CHARACTERS_PER_INCH)
     lines = textwrap.wrap(note, width) if note else []
     figure.suptitle("\n".join([wrapped(text, width, 2), *lines]), x=0.01, ha="left", size=9, linespacing=1.35)
 
 
 def named(grouping: Grouping) -> str:
-    """What a picture is about, for its title."""
+    """The name of a grouping in a title."""
     return f"grouping '{grouping.name}'"
 
 

@@ -60,7 +60,7 @@ def test_a_copy_verifies_and_holds_the_same_numbers(original, tmp_path, without)
         assert all_bytes(tmp_path / "b.zarr") == before
 
 
-def test_the_copy_says_what_was_left_behind(original, tmp_path):
+def test_the_copy_lists_the_parts_it_lacks(original, tmp_path):
     copy_store(open_store(original), tmp_path / "b.zarr", ("frames",))
     root = open_store(tmp_path / "b.zarr").attributes
     assert root.provenance["copied_without"] == "frames"

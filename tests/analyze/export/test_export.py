@@ -189,7 +189,7 @@ def test_rows_that_are_too_large_for_memory_are_refused_with_their_size(store):
 
 
 @pytest.mark.parametrize("missing", ["xarray", "h5netcdf"])
-def test_what_is_not_installed_is_said_with_its_extra(store, tmp_path, monkeypatch, capsys, missing):
+def test_a_missing_package_is_named_with_its_extra(store, tmp_path, monkeypatch, capsys, missing):
     monkeypatch.setitem(sys.modules, missing, None)
     assert exported(store, "--netcdf", "--output", tmp_path / "out") == 2
     assert f"need {missing}, which is not installed; pip install 'vla-attention[xarray]'" in capsys.readouterr().err
@@ -220,7 +220,7 @@ def test_contributions_that_were_not_recorded_are_no_table(ragged, tmp_path, cap
     assert "hold no contributions" in capsys.readouterr().err
 
 
-def test_a_folder_that_cannot_be_written_is_said(store, tmp_path, capsys):
+def test_the_error_of_a_folder_that_cannot_be_written_names_it(store, tmp_path, capsys):
     file = tmp_path / "file"
     file.write_text("")
     for kind in ("--csv", "--parquet", "--netcdf"):

@@ -64,7 +64,7 @@ def test_words_come_with_their_pieces(store):
     assert set(words.filter(pl.col("group") == "rest")["word"]) == {"the", "on"}
 
 
-def test_overlaps_and_what_no_group_takes_are_said(store, tmp_path, capsys):
+def test_overlaps_and_keys_without_a_group_are_printed(store, tmp_path, capsys):
     (tmp_path / "g.toml").write_text(
         'overlap = true\n[groups]\nlooks = "role:image"\nbowl = "object:akita_black_bowl_1"\nnoun = "word:bowl"\n'
     )
@@ -132,7 +132,7 @@ def test_words_of_one_task_are_no_mistake_in_a_store_of_several(tmp_path):
         (["--group", "x=role:image", "--group", "y=camera:base_0_rgb"], "share 256 keys"),
     ],
 )
-def test_mistakes_are_said_in_one_sentence(store, tmp_path, capsys, arguments, said):
+def test_a_mistake_ends_with_one_sentence(store, tmp_path, capsys, arguments, said):
     assert main(["groups", str(store), "--output", str(tmp_path), *arguments]) == 2
     error = capsys.readouterr().err
     assert said in error

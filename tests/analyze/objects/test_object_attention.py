@@ -295,7 +295,7 @@ def test_the_command_prints_writes_and_draws(follower_store, tmp_path, capsys):
     assert "IoU" not in capsys.readouterr().out
 
 
-def test_mistakes_are_said_in_one_sentence(follower_store, tmp_path, capsys):
+def test_a_mistake_ends_with_one_sentence(follower_store, tmp_path, capsys):
     for arguments, said in (
         (["--task", "9"], "There is no task 9 among the 4 selected episodes"),
         (["--percentiles", "100"], "Percentile 100 was given"),
@@ -308,7 +308,7 @@ def test_mistakes_are_said_in_one_sentence(follower_store, tmp_path, capsys):
         assert "Traceback" not in error
 
 
-def test_a_store_without_coverage_says_so_and_what_to_do(tmp_path, capsys):
+def test_the_error_without_coverage_names_the_cause_and_the_remedy(tmp_path, capsys):
     path = write_store(tmp_path / "bare.zarr", coverage=False, tasks=(0,), episodes=1)
     for command in (
         ["objects", str(path)],

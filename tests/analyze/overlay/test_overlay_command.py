@@ -126,7 +126,7 @@ def test_the_csv_has_the_raw_rows_numbers(made: Path, tmp_path: Path, capsys: py
     assert "task001_episode001: open the top drawer" in printed
 
 
-def test_without_frames_the_map_alone_is_drawn_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_frames_the_map_alone_is_drawn_with_a_note(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     store = kit.write_store(tmp_path / "bare.zarr", tasks=(0,), episodes=1, frames=False)
     assert main(["overlay", str(store), "--output", str(tmp_path / "out"), "--video", "gif", "--smooth"]) == 0
     assert "No pictures were stored" in capsys.readouterr().out
