@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import zarr
 from hypothesis import HealthCheck, Phase, settings
 
-from vla_attention.analyze.measures.question import AnalysisSettings, Question, ask
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import resolve
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
-from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import StoreSpec
 from vla_attention.testing.tokens import valid_keys
 
@@ -52,12 +50,6 @@ def raw_episodes(path: Path, spec: StoreSpec) -> list[RawEpisode]:
         rows = site["rows"][:].astype(np.float64).mean(axis=4)[:, layers]
         found.append(RawEpisode((task, episode), rows, valid_keys(site["key_role"][:])))
     return found
-
-
-def question_about(path: Path, grouping: Grouping | None = None, **settings_) -> Question:
-    """The question about all of a store, with a grouping that no file or name stands for."""
-    question = ask([open_store(path)], AnalysisSettings(**settings_))
-    return question if grouping is None else replace(question, grouping=grouping)
 
 
 def weights_of(grouping: Grouping, tokens: EpisodeTokens) -> np.ndarray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +15,14 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
+from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.export.labelled_arrays import masses_array, rows_array, rows_size, write_netcdf
-from vla_attention.analyze.measures.question import AnalysisSettings, ask
 from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.errors import BadArgument, MissingDependency
 from vla_attention.schemas.groupings.resolve import resolve
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.precision import mass_error_bound
-from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import write_store
 from vla_attention.testing.strategies import episode_tokens, groupings
 from vla_attention.testing.tokens import small_layout
@@ -65,7 +63,7 @@ def test_tables_are_those_of_the_analysis(store, tmp_path, capsys):
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(
         f"{n}.{e}" for n in names for e in ("csv", "parquet")
     )
-    analysis = analyse(ask([open_store(store)], AnalysisSettings()))
+    analysis = analyse(question_about(store))
     for name in names:
         table = getattr(analysis, name)
         assert_frame_equal(pl.read_parquet(tmp_path / f"{name}.parquet"), table)
@@ -164,7 +162,7 @@ def test_a_selection_of_axes_is_labelled(store, tmp_path):
 
 
 def test_arrays_in_memory_are_those_of_the_file(store, tmp_path):
-    question = ask([open_store(store)], AnalysisSettings(grouping="cameras"))
+    question = question_about(store, grouping="cameras")
     exported(store, "--netcdf", "--rows", "--grouping", "cameras", "--output", tmp_path)
     with xr.open_dataset(tmp_path / "attention.nc") as data:
         masses = masses_array(question)
@@ -175,14 +173,14 @@ def test_arrays_in_memory_are_those_of_the_file(store, tmp_path):
 
 
 def test_the_means_over_heads_are_those_of_the_steps_table(store):
-    question = ask([open_store(store)], AnalysisSettings())
+    question = question_about(store)
     mean = masses_array(question)["mass"].mean("head")
     steps = analyse(question).steps
     np.testing.assert_allclose(mean.sel(group="visual").values.ravel(), steps["visual_mass"].to_numpy(), rtol=1e-5)
 
 
 def test_rows_that_are_too_large_for_memory_are_refused_with_their_size(store):
-    question = ask([open_store(store)], AnalysisSettings())
+    question = question_about(store)
     assert rows_size(question).num_bytes == 12 * 2 * 2 * 2 * 39 * 4
     with pytest.raises(BadArgument, match=r"12 samples x 2 layers.*more than the 1 kB.*--netcdf --rows"):
         rows_array(question, most_bytes=1000)
@@ -196,7 +194,7 @@ def test_a_missing_package_is_named_with_its_extra(store, tmp_path, monkeypatch,
     assert not (tmp_path / "out").exists()
     if missing == "xarray":
         with pytest.raises(MissingDependency):
-            masses_array(ask([open_store(store)], AnalysisSettings()))
+            masses_array(question_about(store))
 
 
 @pytest.mark.parametrize(
@@ -240,7 +238,7 @@ def test_files_of_any_layout_and_grouping_hold_the_raw_rows_and_their_sums(data)
     grouping = data.draw(groupings(tokens))
     with tempfile.TemporaryDirectory() as folder:
         path = write_store(Path(folder) / "a.zarr", tokens=tokens, tasks=(0, 3), episodes=1)
-        question = replace(ask([open_store(path)], AnalysisSettings(grouping="default")), grouping=grouping)
+        question = question_about(path, grouping)
         with xr.open_dataset(write_netcdf(question, Path(folder) / "a.nc", rows=True)) as found:
             rows = raw_rows(path)
             np.testing.assert_array_equal(found["rows"].values, rows)

@@ -7,11 +7,10 @@ import polars as pl
 import pytest
 
 from tests.kit.bowl_scene import bowl_coverage, write_bowl_store
+from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.groups.group_preview import UNTAKEN, GroupPreview, preview_groups
-from vla_attention.analyze.measures.question import AnalysisSettings, Question, ask
 from vla_attention.schemas.groupings.grouping import GroupingError
-from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import write_store
 
 
@@ -20,12 +19,8 @@ def store(tmp_path_factory):
     return write_bowl_store(tmp_path_factory.mktemp("groups") / "a.zarr")
 
 
-def question_of(path, **settings) -> Question:
-    return ask([open_store(path)], AnalysisSettings(**settings))
-
-
 def preview_of(path, **settings) -> GroupPreview:
-    return preview_groups(question_of(path, **settings))
+    return preview_groups(question_about(path, **settings))
 
 
 def totals(preview: GroupPreview) -> dict[str, tuple[float, float]]:
@@ -44,7 +39,7 @@ def test_keys_are_the_lowest_and_highest_numbers_over_replans(store):
 
 
 def test_spans_and_roles_of_a_group_add_up_to_it(store):
-    table = preview_groups(question_of(store, grouping="default")).groups
+    table = preview_groups(question_about(store, grouping="default")).groups
     parts = table.filter(pl.col("span").is_not_null()).group_by("group").agg(pl.col("keys_mean").sum())
     whole = table.filter(pl.col("span").is_null()).join(parts, on="group", suffix="_sum")
     np.testing.assert_allclose(whole["keys_mean"], whole["keys_mean_sum"], rtol=1e-6)

@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.kit.raw_rows import FEW, question_about, raw_episodes, weights_of
+from tests.kit.questions import question_about
+from tests.kit.raw_rows import FEW, raw_episodes, weights_of
 from tests.kit.synthetic import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps
 from vla_attention.analyze.heads.denoise import denoise_table
 from vla_attention.analyze.heads.depth import depth_table

@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import entropy as entropy_of_scipy
 
-from tests.kit.raw_rows import FEW, leaky, question_about, raw_episodes, weights_of
+from tests.kit.questions import question_about
+from tests.kit.raw_rows import FEW, leaky, raw_episodes, weights_of
 from vla_attention.analyze.heads.entropy import effective_keys, entropies, top_mass
 from vla_attention.analyze.heads.row_metrics import RowOptions, groups_with_valid_keys, row_metrics_table
 from vla_attention.analyze.measures.selected import resolve_all

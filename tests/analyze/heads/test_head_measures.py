@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
-from tests.kit.raw_rows import FEW, leaky, question_about, raw_episodes, weights_of
+from tests.kit.questions import question_about
+from tests.kit.raw_rows import FEW, leaky, raw_episodes, weights_of
 from vla_attention.analyze.heads.head_measures import ranked_heads
 from vla_attention.analyze.heads.head_study import HeadStudy, study_heads
 from vla_attention.analyze.heads.row_metrics import RowOptions

@@ -16,17 +16,16 @@ from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 from scipy import stats
 
+from tests.kit.questions import question_about
 from vla_attention.analyze.heads import command as heads_command
 from vla_attention.analyze.heads.head_measures import ranked_heads
 from vla_attention.analyze.heads.head_study import study_heads
 from vla_attention.analyze.heads.row_metrics import RowOptions, row_metrics_table
 from vla_attention.analyze.heads.text import heads_text
-from vla_attention.analyze.measures.question import AnalysisSettings, Question, ask
 from vla_attention.analyze.measures.sinks import SinkRule, sinks_table, without_sinks
 from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.groupings.resolve import resolve
 from vla_attention.schemas.precision import mass_error_bound
-from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import StoreSpec, write_store
 from vla_attention.testing.strategies import episode_tokens
 from vla_attention.testing.tokens import valid_keys
@@ -38,10 +37,6 @@ QUICK = settings(
     suppress_health_check=[HealthCheck.too_slow],
 )
 BOUND = mass_error_bound(10) + 1e-4
-
-
-def question_of(path: Path, **wanted) -> Question:
-    return ask([open_store(path)], AnalysisSettings(**wanted))
 
 
 def raw_rows(path: Path, episode: str) -> np.ndarray:
@@ -57,7 +52,7 @@ def test_row_metrics_equal_scipy_on_raw_rows(data):
     grouping = data.draw(st.sampled_from(["default", "objects"]))
     with tempfile.TemporaryDirectory() as folder:
         path = write_store(Path(folder) / "a.zarr", tokens=tokens, tasks=(0,), episodes=1, queries=queries)
-        question = question_of(path, grouping=grouping)
+        question = question_about(path, grouping=grouping)
         table = row_metrics_table(question, RowOptions(top=(1, 3)))
         rows = raw_rows(path, "task000_episode000")
     resolved = resolve(question.grouping, tokens)
@@ -92,7 +87,7 @@ def test_heads_equal_sums_over_raw_rows(data):
     wanted = data.draw(st.sampled_from([{}, {"grouping": "objects"}]))
     with tempfile.TemporaryDirectory() as folder:
         path = write_store(Path(folder) / "a.zarr", tokens=tokens, tasks=(0,), episodes=2)
-        question = question_of(path, **wanted)
+        question = question_about(path, **wanted)
         study = study_heads(question, RowOptions() if with_rows else None)
         rows = [raw_rows(path, f"task000_episode{i:03d}") for i in range(2)]
     grouping, names = question.grouping, question.grouping.names
@@ -130,15 +125,17 @@ def test_heads_equal_sums_over_raw_rows(data):
 
 def test_a_head_of_the_grid_is_what_the_whole_analysis_says_of_that_head_alone(tmp_path):
     path = write_store(tmp_path / "a.zarr", tasks=(0, 1), episodes=3)
-    study = study_heads(question_of(path))
-    alone = analyse(question_of(path, heads=(1,), layers=(2,)))
+    study = study_heads(question_about(path))
+    alone = analyse(question_about(path, heads=(1,), layers=(2,)))
     expected = alone.tasks.filter(scope="all", layer="2").row(0, named=True)
     row = study.heads.filter(block=2, head=1).row(0, named=True)
     assert 2 ** row["log2_ratio"] == pytest.approx(expected["geometric_mean"])
     assert 2 ** row["log2_ratio_low"] == pytest.approx(expected["geometric_mean_low"])
     assert row["visual_fraction_high"] == pytest.approx(expected["visual_fraction_high"])
     assert row["ratio_of_means"] == pytest.approx(expected["ratio_of_means"])
-    step = analyse(question_of(path, denoise=("9",))).tasks.filter(scope="all", layer="layers_avg").row(0, named=True)
+    step = (
+        analyse(question_about(path, denoise=("9",))).tasks.filter(scope="all", layer="layers_avg").row(0, named=True)
+    )
     found = study.denoise.filter(denoise_step=9).row(0, named=True)
     assert found["denoise_time"] == pytest.approx(0.1)
     for name in ("ratio_mean", "ratio_mean_low", "visual_fraction", "uniform_ratio"):
@@ -147,10 +144,10 @@ def test_a_head_of_the_grid_is_what_the_whole_analysis_says_of_that_head_alone(t
 
 def test_contribution_depth_is_there_where_gram_matrices_are(tmp_path):
     path = write_store(tmp_path / "a.zarr", contributions=True)
-    depth = study_heads(question_of(path)).depth
+    depth = study_heads(question_about(path)).depth
     assert set(depth["of"]) == {"mass", "contribution"}
     assert depth["centre"].is_between(0, 2).all()
-    assert set(study_heads(question_of(write_store(tmp_path / "b.zarr"))).depth["of"]) == {"mass"}
+    assert set(study_heads(question_about(write_store(tmp_path / "b.zarr"))).depth["of"]) == {"mass"}
 
 
 # --- planted truths ---------------------------------------------------------------------------------------------------
@@ -170,7 +167,7 @@ def plant_specialists(task, episode, tokens, rows):
 
 def test_planted_specialist_heads_are_found_and_named(tmp_path):
     path = write_store(tmp_path / "a.zarr", spec=StoreSpec(plant_rows=plant_specialists, tasks=(0, 1, 2), episodes=3))
-    study = study_heads(question_of(path), RowOptions())
+    study = study_heads(question_about(path), RowOptions())
     ranked = ranked_heads(study.heads, study.question.grouping)
     first, last = ranked.row(0, named=True), ranked.row(-1, named=True)
     assert (first["block"], first["head"]) == (2, 1)
@@ -210,7 +207,7 @@ RULE = SinkRule(factor=5.0, share=0.7)
 
 
 def test_planted_sinks_are_found_named_and_told_apart_by_task(sunken):
-    question = question_of(sunken)
+    question = question_about(sunken)
     sinks = sinks_table(question, RULE)
     bos = question.selected[0].tokens.layout.span("prompt").start
     assert sinks.select("task_id", "key").rows() == [(0, bos), (1, 5), (1, bos)]
@@ -236,7 +233,7 @@ def test_planted_sinks_are_found_named_and_told_apart_by_task(sunken):
 
 
 def test_masses_without_sinks_are_those_of_the_remaining_keys(sunken):
-    question = question_of(sunken)
+    question = question_about(sunken)
     sinks = sinks_table(question, RULE)
     corrected = without_sinks(question, sinks, RULE)
     assert corrected.grouping.name == "default-without-sinks"

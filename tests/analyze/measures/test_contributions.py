@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.kit.questions import question_about
 from vla_attention.analyze.measures.contributions import (
     LINGUISTIC_ROLES,
     VISUAL_ROLES,
@@ -14,7 +15,6 @@ from vla_attention.analyze.measures.contributions import (
     joint_norm,
     summarise_contributions,
 )
-from vla_attention.analyze.measures.question import AnalysisSettings, ask
 from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.analyze.stores.selection import select
 from vla_attention.schemas.segments import segments_of
@@ -56,7 +56,7 @@ def test_both_sides_and_their_ratio_equal_a_direct_computation(tmp_path):
 
 
 def test_the_summary_has_a_line_per_layer_and_an_interval(tmp_path):
-    analysis = analyse(ask([open_store(write_store(tmp_path / "a.zarr", spec=SPEC))], AnalysisSettings()))
+    analysis = analyse(question_about(write_store(tmp_path / "a.zarr", spec=SPEC)))
     assert analysis.contributions is not None
     section = summarise_contributions(analysis.contributions, seed=0)
     assert section in analysis.summary
@@ -67,6 +67,6 @@ def test_the_summary_has_a_line_per_layer_and_an_interval(tmp_path):
 
 
 def test_a_store_without_contributions_has_no_section(tmp_path):
-    analysis = analyse(ask([open_store(write_store(tmp_path / "a.zarr"))], AnalysisSettings()))
+    analysis = analyse(question_about(write_store(tmp_path / "a.zarr")))
     assert analysis.contributions is None
     assert "CONTRIBUTIONS" not in analysis.summary

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tests.kit.raw_rows import question_about
+from tests.kit.questions import question_about
 from vla_attention.analyze.measures.group_contributions import (
     group_contribution_table,
     summarise_group_contributions,

@@ -8,8 +8,8 @@ from pathlib import Path
 import polars as pl
 import pytest
 
+from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.measures.question import AnalysisSettings, ask
 from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.store_format import StoreError
@@ -46,7 +46,7 @@ def test_a_damaged_episode_ends_the_analysis_with_its_name_and_a_way_out(tmp_pat
 
 def test_a_damaged_episode_is_left_out_by_name_when_asked(tmp_path, capsys):
     path = write_store(tmp_path / "a.zarr")
-    whole = analyse(ask([open_store(path)], AnalysisSettings())).episodes
+    whole = analyse(question_about(path)).episodes
     damage_rows(path, "task000_episode001")
     words = [str(path), "--no-plots", "--output", str(tmp_path / "out"), "--skip-corrupt"]
     assert main(words) == 0
@@ -69,8 +69,8 @@ def test_when_every_episode_is_damaged_nothing_is_left_to_analyse(tmp_path, caps
 def test_an_episode_without_replans_is_named_and_left_out_only_when_asked(tmp_path):
     path = write_store(tmp_path / "a.zarr")
     with pytest.raises(StoreError, match=r"task000_episode001 of .* holds no replan.*--skip-corrupt"):
-        ask([without_replans(open_store(path), 1)], AnalysisSettings())
-    question = ask([without_replans(open_store(path), 1)], AnalysisSettings(skip_corrupt=True))
+        question_about(without_replans(open_store(path), 1))
+    question = question_about(without_replans(open_store(path), 1), skip_corrupt=True)
     assert [item.episode.name for item in question.selected] == [
         "task000_episode000",
         "task001_episode000",

@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import entropy as entropy_of_scipy
 
-from tests.kit.raw_rows import FEW, RawEpisode, leaky, question_about, raw_episodes, weights_of
+from tests.kit.questions import question_about
+from tests.kit.raw_rows import FEW, RawEpisode, leaky, raw_episodes, weights_of
 from vla_attention.analyze.heads.head_study import study_heads
 from vla_attention.analyze.heads.row_metrics import RowOptions, row_metrics_table
 from vla_attention.analyze.measures.selected import resolve_all

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
-from vla_attention.analyze.measures.question import AnalysisSettings, ask
+from tests.kit.questions import question_about
 from vla_attention.analyze.measures.selected import load_tokens, vocabulary_of
 from vla_attention.analyze.measures.steps import steps_table
 from vla_attention.analyze.ratios.analysis import analyse
@@ -152,18 +152,18 @@ def test_a_word_of_one_task_only_gives_empty_groups_elsewhere(tmp_path):
 def test_several_stores_are_analysed_as_one_when_they_fit(tmp_path):
     first = open_store(write_store(tmp_path / "a.zarr", suite="one"))
     second = open_store(write_store(tmp_path / "b.zarr", suite="two"))
-    together = analyse(ask([first, second], AnalysisSettings()))
+    together = analyse(question_about([first, second]))
     assert together.steps["suite"].unique().sort().to_list() == ["one", "two"]
     assert "two" in together.summary
     other = open_store(write_store(tmp_path / "c.zarr", suite="three", layers=(1,)))
     with pytest.raises(StoreError, match="differ in their recording"):
-        analyse(ask([first, other], AnalysisSettings()))
+        analyse(question_about([first, other]))
 
 
 def test_a_store_without_episodes_says_so(tmp_path):
     store = open_store(write_store(tmp_path / "a.zarr", tasks=()))
     with pytest.raises(StoreError, match="holds no complete episode yet"):
-        analyse(ask([store], AnalysisSettings()))
+        analyse(question_about(store))
 
 
 def test_call_numbers_are_translated_and_kept_as_labels():

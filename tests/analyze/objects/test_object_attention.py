@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
 from tests.kit.bowl_scene import CAMERAS, bowl_coverage, bowl_tokens, write_bowl_store
+from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.measures.question import AnalysisSettings, ask
 from vla_attention.analyze.objects.object_attention import ObjectTables, object_tables
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_study import best_finders, iou_summary, objects_summary, strongest_followers
@@ -28,7 +28,6 @@ from vla_attention.analyze.words.word_study import site_of_words
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import SiteLayout, Span
-from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import StoreSpec, root_attributes, write_store
 from vla_attention.testing.tokens import OBJECTS, random_rows
 
@@ -40,7 +39,7 @@ CLASS_OF = {"akita_black_bowl_1": "of interest", "plate_1": "of interest", "wood
 
 
 def measured(path: Path, wanted: ObjectSettings | None = None, keep_steps: bool = False, **selected) -> ObjectTables:
-    return object_tables(ask([open_store(path)], AnalysisSettings(**selected)), wanted, keep_steps)
+    return object_tables(question_about(path, **selected), wanted, keep_steps)
 
 
 def follow_bowl(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
@@ -250,7 +249,7 @@ def test_an_object_out_of_sight_has_no_lift_and_no_mask(tmp_path):
 
 
 def test_a_block_that_has_two_numbers_counts_once_in_the_average(follower_store):
-    question = ask([open_store(follower_store)], AnalysisSettings(tasks=(0,)))
+    question = question_about(follower_store, tasks=(0,))
     chosen = question.selection
     twice = replace(
         chosen,

@@ -13,8 +13,8 @@ import pytest
 import zarr
 
 import vla_attention.testing.stores as kit
+from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.measures.question import AnalysisSettings, ask
 from vla_attention.analyze.overlay.overlay_data import camera_names, draw, episode_overlay, ratios_of
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument
@@ -63,7 +63,7 @@ def write_turned_store(path: Path, upright: bool, mirrored: bool) -> Path:
 @pytest.mark.parametrize("mirrored", [True, False])
 def test_the_follower_s_attention_is_drawn_on_what_it_follows(tmp_path: Path, upright: bool, mirrored: bool) -> None:
     store = open_store(write_turned_store(tmp_path / "a.zarr", upright, mirrored))
-    question = ask([store], AnalysisSettings())
+    question = question_about(store)
     item = question.selected[0]
     overlay = episode_overlay(question, item, camera_names(question, None), ratios_of(question, item))
     scale, values = overlay.scale("lift", range(3)), overlay.values("lift")
@@ -176,6 +176,6 @@ def test_a_site_without_pictures_is_refused(tmp_path: Path) -> None:
     key_role = np.tile(np.concatenate([roles, np.full(5, Role.ACTION, dtype=np.uint8)]), (2, 1))
     tokens = EpisodeTokens(layout, key_role, (prompt,), np.zeros(2, dtype=np.int64), OBJECTS, {})
     store = kit.write_store(tmp_path / "blind.zarr", tasks=(0,), episodes=1, tokens=tokens)
-    question = ask([open_store(store)], AnalysisSettings())
+    question = question_about(store)
     with pytest.raises(BadArgument, match="no patches of pictures"):
         camera_names(question, None)

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import vla_attention.testing.stores as kit
+from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.measures.question import AnalysisSettings, ask
 from vla_attention.analyze.ratios.analysis import Analysis, analyse
 from vla_attention.analyze.report.caveats import caveats, role_shares, verdict_sentence
 from vla_attention.analyze.report.markup import Cell, interval_cell, number_cell, table
@@ -22,7 +22,6 @@ from vla_attention.analyze.report.page import report_html
 from vla_attention.analyze.show.numbers import format_number
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
-from vla_attention.schemas.stores.reader import open_store
 
 _VOID = {"meta", "link", "img", "input", "br", "hr"}
 _HOSTILE = "<script>alert('task')</script> & \"bowl\""
@@ -69,7 +68,7 @@ def analysis(tmp_path_factory: pytest.TempPathFactory) -> Analysis:
         patch.setattr(kit, "INSTRUCTIONS", (_HOSTILE, "open <b>the</b> drawer", "turn on the stove"))
         path = tmp_path_factory.mktemp("report") / "made.zarr"
         kit.write_store(path, contributions=True, policy="<i>made & up</i>", suite="suite<1>")
-    return analyse(ask([open_store(path)], AnalysisSettings()))
+    return analyse(question_about(path))
 
 
 @pytest.fixture(scope="module")
@@ -237,7 +236,7 @@ def test_bad_input_is_one_sentence(
 
 def test_episodes_are_chosen_over_tasks_and_outcomes(tmp_path: Path) -> None:
     path = kit.write_store(tmp_path / "a.zarr", tasks=(0, 1, 2, 3), episodes=3, replans=1, layers=(0,))
-    selected = ask([open_store(path)], AnalysisSettings()).selected
+    selected = question_about(path).selected
     chosen = [item.episode.attributes for item in choose_episodes(selected, 4)]
     assert [item.task_id for item in chosen] == [0, 1, 2, 3]
     assert [item.success for item in chosen] == [True, False, True, False]

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.measures.question import AnalysisSettings, ask
 from vla_attention.analyze.time.phases import (
     around_event,
     change_at_event,
@@ -22,7 +22,6 @@ from vla_attention.analyze.time.text import time_text
 from vla_attention.analyze.time.time_courses import ALL, FAILURE, GRIPPER_CLOSING, SUCCESS, TimeSettings, time_courses
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import Role
-from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import StoreError
 from vla_attention.testing.stores import StoreSpec, write_store
 
@@ -82,7 +81,7 @@ def store(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def question(store):
-    return ask([open_store(store)], AnalysisSettings())
+    return question_about(store)
 
 
 @pytest.fixture(scope="module")
@@ -217,7 +216,7 @@ def test_the_text_says_what_was_found(question, courses):
 
 def test_one_class_alone_is_said_and_not_computed(tmp_path):
     spec = StoreSpec(plant_success=lambda task, episode: False)
-    question = ask([open_store(write_store(tmp_path / "failed.zarr", spec=spec))], AnalysisSettings())
+    question = question_about(write_store(tmp_path / "failed.zarr", spec=spec))
     found = time_courses(question)
     assert found.course["outcome"].unique().to_list() == [ALL]
     assert found.outcomes["difference"].null_count() == found.outcomes.height

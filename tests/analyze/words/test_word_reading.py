@@ -10,19 +10,14 @@ import pytest
 import zarr
 
 from tests.kit.bowl_scene import bowl_tokens, write_bowl_store
+from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.measures.question import AnalysisSettings, Question, ask
 from vla_attention.analyze.words.word_reading import words_table
 from vla_attention.analyze.words.word_study import strongest_readers, words_summary
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
-from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import write_store
 from vla_attention.testing.tokens import random_rows
-
-
-def question_of(path: Path, **settings) -> Question:
-    return ask([open_store(path)], AnalysisSettings(**settings))
 
 
 def read_bowl(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
@@ -63,7 +58,7 @@ def raw_measures(path: Path, name: str, layer: int) -> dict[tuple[str, int], tup
 
 
 def test_words_equal_sums_over_raw_rows(reader_store):
-    table = words_table(question_of(reader_store))
+    table = words_table(question_about(reader_store))
     for task, episode in ((0, 0), (1, 1)):
         own = table.filter(
             (pl.col("task_id") == task) & (pl.col("episode_index") == episode) & (pl.col("kind") == "word")
@@ -78,7 +73,7 @@ def test_words_equal_sums_over_raw_rows(reader_store):
 
 
 def test_layers_avg_comes_from_averaged_masses(reader_store):
-    table = words_table(question_of(reader_store)).filter(pl.col("kind") == "word")
+    table = words_table(question_about(reader_store)).filter(pl.col("kind") == "word")
     by_layer = (
         table.filter(pl.col("layer") != "layers_avg")
         .group_by("task_id", "episode_index", "place")
@@ -91,7 +86,7 @@ def test_layers_avg_comes_from_averaged_masses(reader_store):
 
 
 def test_classes_add_up_to_their_words(reader_store):
-    table = words_table(question_of(reader_store)).filter(pl.col("layer") == "layers_avg")
+    table = words_table(question_about(reader_store)).filter(pl.col("layer") == "layers_avg")
     keys = ["task_id", "episode_index"]
     for name, kind in (("content words", "content"), ("stop words", "stop")):
         words = (
@@ -108,7 +103,7 @@ def test_classes_add_up_to_their_words(reader_store):
 
 
 def test_a_planted_reader_is_found_and_named(reader_store):
-    table = words_table(question_of(reader_store, per_head=True))
+    table = words_table(question_about(reader_store, per_head=True))
     best = strongest_readers(table).row(0, named=True)
     assert (best["item"], best["layer"], best["head"], best["num_episodes"]) == ("bowl", "3", 1, 4)
     assert best["lift"] > 15
@@ -120,7 +115,7 @@ def test_a_planted_reader_is_found_and_named(reader_store):
 
 
 def test_a_word_that_stands_twice_is_one_item_unless_places_are_wanted(reader_store):
-    table = words_table(question_of(reader_store)).filter(pl.col("layer") == "layers_avg")
+    table = words_table(question_about(reader_store)).filter(pl.col("layer") == "layers_avg")
     both = (
         table.filter(pl.col("item") == "the")
         .group_by("task_id", "episode_index")
@@ -139,7 +134,7 @@ def test_words_of_several_tasks_are_averaged_over_the_episodes_that_have_them(tm
     # "put the bowl on the plate", "open the top drawer", "turn on the stove"; state digits change from replan to
     # replan.
     path = write_store(tmp_path / "tasks.zarr", tasks=(0, 1, 2), episodes=2)
-    table = words_table(question_of(path))
+    table = words_table(question_about(path))
     summary = words_summary(table)
     counts = {row["item"]: (row["num_episodes"], row["num_tasks"]) for row in summary.iter_rows(named=True)}
     assert (counts["the"], counts["on"], counts["drawer"]) == ((6, 3), (4, 2), (2, 1))

@@ -1,0 +1,28 @@
+"""How a test asks a question about stores."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from vla_attention.analyze.measures.question import AnalysisSettings, Question, ask
+from vla_attention.schemas.groupings.grouping import Grouping
+from vla_attention.schemas.stores.reader import Store, open_store
+
+
+def question_about(
+    stores: Path | Store | Sequence[Store], grouping: Grouping | str | None = None, **settings: Any
+) -> Question:
+    """The question about one store or several, with fields of `AnalysisSettings`.
+
+    `grouping`: a built-in one by its name, or a `Grouping` that has neither a name nor a file.
+    """
+    if isinstance(stores, Path):
+        stores = open_store(stores)
+    opened = [stores] if isinstance(stores, Store) else list(stores)
+    if isinstance(grouping, str):
+        settings["grouping"] = grouping
+    question = ask(opened, AnalysisSettings(**settings))
+    return replace(question, grouping=grouping) if isinstance(grouping, Grouping) else question
