@@ -15,7 +15,7 @@ from vla_attention.capture.policies.cosmos.preprocess import crop_and_enlarge, v
 
 @pytest.mark.parametrize("flip_columns", [True, False])
 def test_patches_line_up_with_what_a_cropping_policy_stores(flip_columns: bool) -> None:
-    """Coverage comes from the whole picture and `visible`, the stored frame is the crop: both are of the same pixels."""
+    """Coverage comes from the whole picture and `visible`, the stored frame is the crop: both have the same pixels."""
     size, patches = 224, 16
     segmentation = np.zeros((size, size), dtype=np.int64)
     segmentation[40:124, 150:190] = 1  # in the simulator's order
