@@ -1,4 +1,4 @@
-"""Stage two as a process of its own: the two stages share a store, not code."""
+"""Stage two as a separate process: the two stages share a store, not code."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vla_attention.capture.policies.family import PolicyFamily
 
 
 def run_analysis(arguments: argparse.Namespace, store: Path, output: Path | None, more: Sequence[str] = ()) -> int:
-    """Analyse a store as its policy family wants it by default; returns the exit code of `vla-analyze`.
+    """Analyse a store with the default arguments of its policy family; returns the exit code of `vla-analyze`.
 
     arguments: the parsed command line of the capture. more: further arguments for `vla-analyze`.
     """

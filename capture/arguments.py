@@ -23,7 +23,7 @@ _FURTHER_EXAMPLES = """\
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-capture`. Parsed arguments carry the function to call as `command`."""
+    """Return the parser of `vla-capture`. In parsed arguments, `command` is the function to call."""
     families = policy_families()
     examples = "".join(family.examples for family in families)
     parser = OneSentenceParser(
@@ -46,15 +46,15 @@ def build_parser() -> argparse.ArgumentParser:
     parity = commands.add_parser(
         "parity",
         help="compare a policy with what a reference implementation computed",
-        description="Run a case folder (case.json, a checkpoint, inputs.npz, expected.npz) and print the largest differences. "
-        "Exit code 0: all within the limit, 1: beyond it, 2: the case cannot be used.",
+        description="Run a case folder (case.json, a checkpoint, inputs.npz, expected.npz) and print the largest "
+        "differences. Exit code 0: all within the limit, 1: beyond it, 2: the case cannot be used.",
     )
     _add_parity_arguments(parity, families)
     status = commands.add_parser(
         "status",
         help="what a store holds, what is missing, and who is writing",
-        description="Episodes committed and expected per task, success, size, last writer, what is missing and what is being "
-        "written. Reads only; works while captures run, and needs neither torch nor a GPU.",
+        description="Episodes committed and expected per task, success, size, last writer, what is missing and what "
+        "is being written. Reads only; works while captures run, and needs neither torch nor a GPU.",
     )
     _add_status_arguments(status)
     tasks = commands.add_parser("tasks", help="the tasks of a suite", description="The tasks of a suite by their ids.")
@@ -65,11 +65,11 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def build_evaluate_parser(family: PolicyFamily, script: PublishedScript) -> argparse.ArgumentParser:
-    """The parser of a published script's command line: the family's own, with the script's defaults and options for clusters."""
+    """Return the parser of a published script: the family's, with the script's defaults and cluster options."""
     parser = OneSentenceParser(
         prog=script.program,
-        description=f"{family.description} Then analyse, with the arguments of the published script. All layers are recorded, "
-        "so that other --layers need no second capture; an existing store is continued with what is missing.",
+        description=f"{family.description} Then analyse, with the arguments of the published script. All layers are "
+        "recorded, so that other --layers need no second capture; an existing store is continued with what is missing.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     _add_capture_arguments(parser, family, script)
@@ -95,7 +95,8 @@ def build_evaluate_parser(family: PolicyFamily, script: PublishedScript) -> argp
     job.add_argument(
         "--from-environment",
         action="store_true",
-        help="also read the variables of scripts/run_attention_ratio*.sh (CHECKPOINT, TASK_SUITE, LAYERS ...); see their heads",
+        help="also read the variables of scripts/run_attention_ratio*.sh (CHECKPOINT, TASK_SUITE, LAYERS ...); see "
+        "their heads",
     )
     parser.set_defaults(family=family, checkpoint=script.checkpoint, task_suite="libero_10", resume=True, store=None)
     return parser
@@ -104,7 +105,7 @@ def build_evaluate_parser(family: PolicyFamily, script: PublishedScript) -> argp
 def _add_capture_arguments(
     parser: argparse.ArgumentParser, family: PolicyFamily, script: PublishedScript | None = None
 ) -> None:
-    """Add everything that capturing with one policy family takes. `script`: for the published script's command line."""
+    """Add all options of a capture with one policy family; `script`: of a published script instead."""
     family.add_arguments(parser)
     _add_evaluation_arguments(parser, family, script)
     _add_recording_arguments(parser, family, script)

@@ -1,4 +1,4 @@
-"""`vla-capture FAMILY`: record a policy into a store, and analyse the store if that was asked for."""
+"""`vla-capture FAMILY`: record a policy into a store, and analyse the store on request."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def run_capture_of_family(arguments: argparse.Namespace, termination: Terminatio
     from vla_attention.capture.store.store_writer import refuse_existing
 
     settings = run_settings(arguments)
-    # An existing store, or a place that cannot be written to, is found before minutes are spent on loading a model.
+    # An existing store or an unwritable place is an error now, before the minutes for loading a model.
     if settings.mode == "new" and settings.store.exists():
         refuse_existing(settings.store)
     check_writable(settings.store.parent, "--store")

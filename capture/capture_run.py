@@ -40,7 +40,7 @@ _QUERIES = {"mean": "the mean over", "steps": "the action steps' means over", "a
 
 
 def plan_recording(settings: RecordingSettings, policy: Policy) -> tuple[Recording, str | None]:
-    """Check what is asked for against the policy; also returns the line to print when layer numbers were translated."""
+    """Check the settings against the policy; also returns a line to print if layer numbers were translated."""
     layers = select_layers(settings.layers, policy.num_layers, policy.family)
     steps = _denoise_steps(settings.denoise_steps, policy.num_denoise_steps)
     heads = tuple(range(policy.num_heads)) if settings.heads is None else settings.heads
@@ -84,10 +84,10 @@ def _denoise_steps(words: Sequence[str], count: int) -> tuple[int, ...]:
 def run_capture(
     settings: RunSettings, policy: Policy, device: str, termination: Termination | None = None
 ) -> list[EpisodeResult]:
-    """Run every missing episode of the settings into the store; returns the episodes that this process added.
+    """Record every missing episode of the settings; returns the episodes that this process added.
 
     Raises:
-        Terminated: `termination` was told to stop; the episode in flight was dropped.
+        Terminated: SIGTERM was received; the episode in progress was dropped.
     """
     protocol = Protocol(
         suite=settings.suite.name,
@@ -164,11 +164,13 @@ def _checkpoint_line(identity: PolicyIdentity) -> str:
 def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int) -> None:
     identity, recording, protocol = store.attributes.policy, store.attributes.recording, store.attributes.protocol
     say(
-        f"Policy: {identity.name} ({identity.checkpoint_format}: {identity.checkpoint}), weights {identity.digest[:12]}."
+        f"Policy: {identity.name} ({identity.checkpoint_format}: {identity.checkpoint}), weights "
+        f"{identity.digest[:12]}."
     )
     if identity.untrained:
         say(
-            "These weights are random and UNTRAINED: the numbers show that the tool works, and say nothing about any policy."
+            "These weights are random and UNTRAINED: the numbers show that the tool works, and say nothing about any "
+            "policy."
         )
     else:
         say(_checkpoint_line(identity))
@@ -176,8 +178,8 @@ def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int) -
     grids = [camera_grid(policy.sites, camera.name) for camera in policy.cameras]
     pictures = [grid.image_height * grid.image_width * 3 for grid in grids]
     say(
-        f"Recording {len(recording.layers)} layers, denoise steps {listing(recording.denoise_steps)}, {len(recording.heads)} heads, "
-        f"{_QUERIES[recording.queries]} {recording.num_action_queries} action queries, "
+        f"Recording {len(recording.layers)} layers, denoise steps {listing(recording.denoise_steps)}, "
+        f"{len(recording.heads)} heads, {_QUERIES[recording.queries]} {recording.num_action_queries} action queries, "
         f"{', '.join(str(site.num_keys) for site in store.attributes.sites)} keys."
     )
     estimate = estimate_disk(recording, store.attributes.sites, pictures, max_replans(protocol), num_todo)

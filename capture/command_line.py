@@ -1,4 +1,4 @@
-"""Running a command that captures: SIGTERM, exit codes, and an early check of the places that it writes to."""
+"""Running a capture command: SIGTERM, exit codes, and an early check of output folders."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vla_attention.schemas.errors import BadArgument
 def run_capture_command(program: str, command: Callable[[Termination], int], max_requeues: Callable[[], int]) -> int:
     """Run a command that captures; returns the exit code: 2 after a mistake, 130 after Ctrl-C, 75 after SIGTERM.
 
-    After SIGTERM a SLURM job is put back into the queue, unless that has happened `max_requeues()` times (0: never).
+    After SIGTERM a SLURM job is put back into the queue, at most `max_requeues()` times (0: never).
     """
     # Set before MuJoCo is imported, because GPU nodes and CI have no display.
     os.environ.setdefault("MUJOCO_GL", "egl")
@@ -38,7 +38,7 @@ def run_capture_command(program: str, command: Callable[[Termination], int], max
 
 
 def check_writable(path: Path, option: str) -> None:
-    """Raise `BadArgument` when nothing can be created at `path`. Called before a model is loaded; creates nothing."""
+    """Raise `BadArgument` if nothing can be created at `path`. Creates nothing itself."""
     nearest = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
     if not nearest.is_dir():
         raise BadArgument(f"Cannot write to {path}: {nearest} is a file; give another {option}.")

@@ -1,4 +1,4 @@
-"""Which device a model runs on."""
+"""The device that a model runs on."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from vla_attention.schemas.errors import BadArgument
 
 
 def choose_device(name: str) -> str:
-    """Turn `--device` into a torch device that exists; `auto` takes a GPU if there is one."""
+    """Return the torch device of `--device`, which exists; `auto` takes a GPU if there is one."""
     import torch
 
     if name == "auto":

@@ -19,7 +19,7 @@ def run_parity_command(arguments: argparse.Namespace, termination: Termination) 
 
 
 def _cases_of(arguments: argparse.Namespace) -> ParityCases:
-    """Ask every family whether the case is its own."""
+    """Return the cases of the family that recognises the case; `UnusableCase` if none does."""
     from vla_attention.capture.policies.parity_case import CASE_FILE, UnusableCase, read_case_file
 
     content = read_case_file(arguments.case)

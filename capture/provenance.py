@@ -1,4 +1,4 @@
-"""Provenance: which code, libraries and hardware made an episode."""
+"""Provenance of an episode: versions of code and libraries, and the hardware."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _LIBRARIES = ("torch", "numpy", "mujoco", "robosuite", "hf-libero", "zarr", "num
 
 
 def describe_machine(device: str) -> dict[str, str]:
-    """Code version, library versions, processor and GPU, as plain strings; nothing that identifies a person or a host."""
+    """Return code version, library versions, processor and GPU; nothing that identifies a person or a host."""
     import torch
 
     facts = {"code": code_version(), "python": platform.python_version(), "processor": platform.machine()}
@@ -26,7 +26,7 @@ def describe_machine(device: str) -> dict[str, str]:
 
 
 def code_version() -> str:
-    """The installed version, and the commit when the code runs from a git checkout."""
+    """Return the installed version, with the commit if the code runs from a git checkout."""
     version = metadata.version("vla-attention")
     folder = Path(__file__).resolve().parent.parent
     if not (folder / ".git").exists():

@@ -1,6 +1,6 @@
-"""Settings of a capture, and their making from command-line arguments.
+"""Settings of a capture, from command-line arguments.
 
-Imports nothing heavy, because a mistake in the arguments is reported before torch is loaded.
+Imports nothing heavy: mistakes in the arguments are reported before torch is loaded.
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ class RecordingSettings:
 class RunSettings:
     """Which episodes are run, and into which store.
 
-    task_id: None runs all tasks of the suite. replan_steps: None takes the number of the policy's own published evaluation.
-    array_task_ids: tasks that other processes of the same array job run; the store is expected to hold these too.
+    task_id: None runs all tasks of the suite. replan_steps: None takes the number of the policy's own published
+    evaluation. array_task_ids: tasks that other processes of the same array job run; the store is expected to hold
+    these too.
     """
 
     suite: Suite
@@ -56,7 +57,7 @@ class RunSettings:
 
 
 def run_settings(arguments: argparse.Namespace) -> RunSettings:
-    """Check the arguments that need no policy and turn them into settings."""
+    """Return the settings of parsed arguments; checks everything that needs no policy."""
     suite = find_suite(arguments.task_suite)
     if arguments.task_id is not None:
         check_task_id(suite, arguments.task_id)
@@ -87,7 +88,7 @@ def run_settings(arguments: argparse.Namespace) -> RunSettings:
 
 
 def store_path(arguments: argparse.Namespace) -> Path:
-    """The store to write: --store, else a name made of policy family and suite, in --output-dir or `runs`."""
+    """Return the store's path: --store, else the name of family and suite, in --output-dir or `runs`."""
     if arguments.store is not None:
         return Path(arguments.store)
     family: PolicyFamily = arguments.family

@@ -10,7 +10,7 @@ from vla_attention.schemas.errors import BadArgument
 
 
 def run_tasks_command(arguments: argparse.Namespace, termination: Termination) -> int:
-    """Print a line per task, or with `--array` the range of task ids only. The range needs no simulator: login nodes have none."""
+    """Print a line per task, or with `--array` the range of task ids, which needs no simulator (login nodes)."""
     if arguments.array:
         names = STANDARD_SUITES if arguments.suite == ALL_SUITES else (arguments.suite,)
         print(f"0-{sum(find_suite(name).num_tasks for name in names) - 1}")

@@ -6,7 +6,7 @@ from importlib import import_module
 
 from vla_attention.capture.policies.family import PolicyFamily
 
-#: Modules with a `FAMILY`. They are imported for `--help`, and must therefore import neither torch nor numpy at the top.
+#: Modules with a `FAMILY`. `--help` imports them, so they import neither torch nor numpy at the top.
 FAMILY_MODULES = (
     "vla_attention.capture.policies.cosmos.family",
     "vla_attention.capture.policies.pi.family",

@@ -1,7 +1,7 @@
-"""What a policy family brings: its command-line arguments, how a policy is built, parity cases, and its published script.
+"""The entry of a policy family: its options, how a policy is built, its parity cases, its published script.
 
-Each family has a module `family.py` with one `PolicyFamily`. Importing it must be cheap, because every command line does so: torch
-and the model's code are imported inside `build` and the parity command.
+Each family has a module `family.py` with one `PolicyFamily`. Importing it must be cheap, because every command line
+does so: torch and the model's code are imported inside `build` and the parity command.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ if TYPE_CHECKING:
 class ParityCases:
     """The cases of a family that `vla-capture parity CASE` runs.
 
-    recognises: tells from the content of a case.json whether the case is of this family. run: takes the parsed arguments and the
-    device, prints the differences, and returns the exit code. formats: the names that `--format` takes; empty when it is refused.
-    default_limit: the largest difference that passes, for the help text of `--limit`; empty when that option is refused.
+    recognises: tells from the content of a case.json whether the case is of this family. run: takes the parsed
+    arguments and the device, prints the differences, and returns the exit code. formats: the names that `--format`
+    takes; empty when it is refused. default_limit: the largest difference that passes, for the help text of `--limit`;
+    empty when that option is refused.
     """
 
     recognises: Callable[[Mapping[str, Any]], bool]
@@ -34,8 +35,8 @@ class ParityCases:
 class PublishedScript:
     """The published script whose command line a family keeps, with the defaults of that script.
 
-    program: the console script. checkpoint, layers: what it loads and analyses by default. variables: environment variables of
-    its batch script that no other family has, and the option that each one sets.
+    program: the console script. checkpoint, layers: what it loads and analyses by default. variables: environment
+    variables of its batch script that no other family has, and the option that each one sets.
     """
 
     program: str
@@ -45,33 +46,35 @@ class PublishedScript:
 
 
 def no_arguments(arguments: argparse.Namespace) -> list[str]:
-    """Return no arguments for the analysis: its own defaults fit."""
+    """Return no arguments: the analysis keeps its own defaults."""
     return []
 
 
 @dataclass(frozen=True)
 class PolicyFamily:
-    """One policy family on the command line.
+    """One policy family on the command line."""
 
-    name: the command, as in `vla-capture NAME`. title, description, examples: of its help text. add_arguments: adds the options
-    that choose and configure the model; one of them has to set `arguments.checkpoint`, another one `arguments.device`
-    (see `model_arguments.py`). build: makes the policy from the parsed arguments, on a device.
-    store_prefix: begins the names of its stores and results folders, so that runs of two families on one suite stay apart.
-    untrained: checkpoints that come with the program and run without a GPU.
-    replan_default, layers_note: parts of the help texts of `--replan-steps` and `--layers`.
-    analysis_arguments: what an analysis that follows a capture is given, beside the store and the output folder.
-    """
-
+    #: the command, as in `vla-capture NAME`
     name: str
+    #: the family in a list and in messages
     title: str
+    #: one sentence for the help text
     description: str
+    #: lines of examples for the help text, each ending with a newline
     examples: str
+    #: Adds the options of the model, among them `checkpoint` and `device` (see `model_arguments.py`).
     add_arguments: Callable[[argparse.ArgumentParser], None]
+    #: (parsed arguments, device) -> the policy
     build: Callable[[argparse.Namespace, str], Policy]
+    #: First part of the names of stores and results folders. Two families on one suite need different ones.
     store_prefix: str
+    #: the default of `--replan-steps`, for its help text
     replan_default: str
+    #: a note on further layer numbers, for the help text of `--layers`
     layers_note: str = ""
+    #: checkpoints that come with the program and run without a GPU
     untrained: tuple[str, ...] = ()
+    #: parsed arguments -> further arguments of an analysis that follows the capture
     analysis_arguments: Callable[[argparse.Namespace], list[str]] = no_arguments
     parity: ParityCases | None = None
     published: PublishedScript | None = None

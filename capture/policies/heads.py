@@ -1,4 +1,4 @@
-"""Between the residual stream's width and attention heads."""
+"""Splitting the width of the residual stream into attention heads, and joining them."""
 
 from __future__ import annotations
 

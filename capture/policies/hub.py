@@ -1,4 +1,4 @@
-"""Repositories of the Hugging Face hub: their names, the cache they are downloaded to, and fetching with the hub's own client."""
+"""Repositories of the Hugging Face hub: names, the local cache, and downloads with the hub's own client."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 
 
 class CheckpointUnavailable(UserError, ConnectionError):
-    """A checkpoint, or a file of it, has to be fetched and cannot be."""
+    """A checkpoint, or a file of it, cannot be downloaded."""
 
 
 def hub_cache() -> Path:
-    """The folder that the hub's client downloads to."""
+    """Return the folder that the hub's client downloads to."""
     home = os.environ.get("HF_HOME") or Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "huggingface"
     return Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub").expanduser()
 
 
 def snapshots_folder(repository: str) -> Path:
-    """The folder of a repository's downloaded versions, whether or not there are any."""
+    """Return the folder for a repository's downloaded versions; it may not exist."""
     return hub_cache() / f"models--{repository.replace('/', '--')}" / "snapshots"
 
 
 def fetch_from_hub(repository: str, patterns: Sequence[str], how: str) -> Path:
     """Return the folder of a repository's files that match the patterns, downloaded unless they are in the cache.
 
-    `how` says in an error how the files can be had otherwise. Raises `MissingDependency` without the client,
-    `CheckpointUnavailable` when it fails.
+    how: ends an error message with another way to get the files. Raises `MissingDependency` without the client,
+    `CheckpointUnavailable` if the download fails.
     """
     try:
         from huggingface_hub import snapshot_download
@@ -43,13 +43,13 @@ def fetch_from_hub(repository: str, patterns: Sequence[str], how: str) -> Path:
         ) from error
     try:
         return Path(snapshot_download(repository, allow_patterns=list(patterns)))
-    except Exception as error:  # the client raises its own errors, those of its HTTP library, and OSError
+    except Exception as error:  # the client's own errors, those of its HTTP library, and OSError
         raise CheckpointUnavailable(
             f"'{repository}' could not be fetched from the Hugging Face hub ({first_line(error)}); {how}."
         ) from error
 
 
 def first_line(error: BaseException) -> str:
-    """An error in one line, for a message: its kind and the first line of what it says."""
+    """Return an error in one line, for a message: its class and the first line of its text."""
     text = str(error).strip()
     return f"{type(error).__name__}: {text.splitlines()[0].rstrip('.')}" if text else type(error).__name__

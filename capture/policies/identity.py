@@ -1,4 +1,4 @@
-"""Which policy ran: where its weights come from, and its description in a store's root attributes."""
+"""The identity of a policy: the source of its weights, and its description in a store's root attributes."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PolicySource:
-    """Where a policy's weights come from.
+    """The source of a policy's weights.
 
-    checkpoint: a path, a name on a hub, or for random weights how they were drawn. untrained: the weights are random.
-    configuration: what fixed the sizes and the layout: the checkpoint itself, a named configuration, a case.json.
+    checkpoint: a path, a name on a hub, or a description of random weights. untrained: the weights are random.
+    configuration: the source of sizes and layout: the checkpoint itself, a named configuration, a case.json.
     """
 
     name: str
@@ -29,8 +29,8 @@ class PolicySource:
 def describe_policy(policy: Policy, source: PolicySource, digest: str, config: dict[str, Any]) -> PolicyIdentity:
     """Return a policy's identity for the store.
 
-    digest: SHA-256 (hex) over the weights. config: what else tells policies of the family apart, as plain JSON values; two runs
-    that differ in it are never merged.
+    digest: SHA-256 (hex) over the weights. config: other properties of the policy, as plain JSON values; runs that
+    differ in them are never merged.
     """
     return PolicyIdentity(
         name=policy.name,

@@ -18,7 +18,7 @@ def add_model_arguments(
     dtype_default: str,
     checkpoint_options: tuple[str, ...] = ("--checkpoint",),
 ) -> argparse._ArgumentGroup:
-    """Add the group `model` with checkpoint, configuration, precision and device; returns it for the family's own options.
+    """Add the group `model` with checkpoint, configuration, precision and device, and return the group.
 
     checkpoint, config_name: help texts of these options. checkpoint_options: the spellings of the first one.
     """
@@ -28,8 +28,8 @@ def add_model_arguments(
         dest="checkpoint",
         default=EMBEDDED,
         metavar="PATH",
-        help=f"{checkpoint}; '{EMBEDDED}' is a small untrained policy that comes with the tool, '{DUMMY}' a smaller one "
-        "(default: %(default)s)",
+        help=f"{checkpoint}; '{EMBEDDED}' is a small untrained policy that comes with the tool, '{DUMMY}' a "
+        "smaller one (default: %(default)s)",
     )
     group.add_argument("--config-name", metavar="NAME", help=config_name)
     group.add_argument("--dtype", metavar="NAME", help=f"float32 or bfloat16 (default: {dtype_default})")

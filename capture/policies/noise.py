@@ -1,4 +1,4 @@
-"""Noise of the denoise loop: seeds that depend on the episode and replan only, and normal numbers from a seed."""
+"""Noise of the denoise loop: a seed per replan, and normal numbers from a seed."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 
 
 def noise_seed(run_seed: int, task_id: int, episode_index: int, replan: int) -> int:
-    """Return the seed of one replan's initial noise: an unsigned 63-bit number, which fits the signed integers of every reader.
+    """Return the seed of one replan's initial noise, a non-negative 63-bit number.
 
-    It is derived from the run's seed and these indices, so that an episode never depends on what ran before it.
+    It depends on the arguments only, so that an episode does not depend on the episodes before it. It fits a signed
+    64-bit integer, which every reader of a store has.
     """
     words = np.random.SeedSequence([run_seed, task_id, episode_index, replan]).generate_state(1, dtype=np.uint64)
     return int(words[0] >> np.uint64(1))

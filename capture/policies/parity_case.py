@@ -1,4 +1,4 @@
-"""Parity cases of any family: a folder with case.json, inputs.npz, and expected.npz as a reference implementation computed it."""
+"""Parity cases of any family: folders with case.json, inputs.npz, and the reference's results in expected.npz."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CASE_FILE = "case.json"
 
 
 class UnusableCase(UserError, ValueError):
-    """The case folder lacks a file, or a file does not hold what a case needs."""
+    """The case folder lacks a file, or a file lacks an entry that a case needs."""
 
 
 class ParityResult(Protocol):
@@ -35,7 +35,7 @@ Result = TypeVar("Result", bound=ParityResult)
 
 
 def read_case_file(folder: Path) -> dict[str, Any]:
-    """Return the content of a folder's case.json; `UnusableCase` when there is none."""
+    """Return the content of a folder's case.json; `UnusableCase` if there is none."""
     if not folder.is_dir():
         raise UnusableCase(f"There is no case folder at '{folder}'.")
     if not (folder / CASE_FILE).is_file():
@@ -45,7 +45,7 @@ def read_case_file(folder: Path) -> dict[str, Any]:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an npz file by their names; `UnusableCase` when it is missing or damaged."""
+    """Return the arrays of an npz file by their names; `UnusableCase` if it is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as stored:
             return dict(stored)
@@ -56,12 +56,12 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def json_number(x: float) -> float | None:
-    """Return a number for JSON, which has no NaN and no infinity: None stands for these."""
+    """Return a number for JSON; None for NaN and infinity, which JSON does not have."""
     return float(x) if np.isfinite(x) else None
 
 
 def print_results(results: Iterable[Result], as_text: Callable[[Result], str], *, as_json: bool) -> int:
-    """Print each result as soon as it is computed, or all of them as one JSON list; returns 0 when all passed, else 1."""
+    """Print each result when it is computed, or all as one JSON list; returns 0 if all passed, else 1."""
     done = []
     for result in results:
         done.append(result)

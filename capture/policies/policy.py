@@ -1,7 +1,7 @@
-"""The interface of a policy: what the rollout and the store need of it.
+"""The interface between a policy and the rollout.
 
-A policy is a small adapter around a model. It has cameras, a prompt format and a normalisation; it has no access to the simulator,
-to episodes or to files.
+A policy is a small adapter around a model, with cameras, a prompt format and a normalisation. It has no access to the
+simulator, to episodes or to files.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from vla_attention.schemas.stores.store_format import PolicyCameraView, PolicyId
 class PolicyInput:
     """One observation and instruction, ready for the model.
 
-    frames: camera -> (height, width, 3) uint8, the images as the model sees them. key_role: site -> (key,) uint8 codes of `Role`.
-    state: (state dim,) float64, not normalised. tensors: the model's inputs by its own names, batch 1.
+    frames: camera -> (height, width, 3) uint8, the images as the model sees them. key_role: site -> (key,) uint8 codes
+    of `Role`. state: (state dim,) float64, not normalised. tensors: the model's inputs by its own names, batch 1.
     """
 
     frames: Mapping[str, NDArray[np.uint8]]
@@ -41,7 +41,7 @@ class Policy(Protocol):
 
     @property
     def name(self) -> str:
-        """Short name, as the store and the first lines of a run show it."""
+        """Short name, for the store and the first lines of a run."""
 
     @property
     def family(self) -> str:
@@ -69,7 +69,7 @@ class Policy(Protocol):
 
     @property
     def default_replan_steps(self) -> int:
-        """Actions of a chunk that the policy's own published evaluation executes before the next policy call."""
+        """Actions of a chunk that the published evaluation executes before the next policy call."""
 
     @property
     def num_action_queries(self) -> int:
@@ -97,14 +97,14 @@ class Policy(Protocol):
     def act(
         self, policy_input: PolicyInput, noise_seed: int, recorders: Mapping[str, RowCollector] | None = None
     ) -> NDArray[np.float64]:
-        """Return the action chunk (horizon, 7) for the environment. The same seed gives the same noise on every machine.
+        """Return the action chunk (horizon, 7) for the environment. A seed gives the same noise on every machine.
 
-        `recorders`: the row collector of each site that is recorded.
+        recorders: the row collector of each recorded site.
         """
 
 
 def camera_frame(observation: Observation, camera: str) -> NDArray[np.uint8]:
-    """Return a camera's picture (height, width, 3); `UnknownName` lists the cameras that the environment has."""
+    """Return a camera's picture (height, width, 3); `UnknownName` lists the environment's cameras."""
     if camera not in observation.images:
         raise unknown_name("environment camera", camera, observation.images)
     return observation.images[camera]

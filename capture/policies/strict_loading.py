@@ -46,6 +46,6 @@ def check_shapes(found: Shapes, expected: Shapes, what: str = "the model") -> No
 
 
 def fill(model: Model, tensors: Mapping[str, Tensor]) -> Model:
-    """Put tensors into an empty model in place of its own, without copying them, and switch gradients off."""
+    """Replace the tensors of an empty model by the given ones, without a copy, and switch gradients off."""
     model.load_state_dict(dict(tensors), strict=True, assign=True)
     return model.requires_grad_(False)

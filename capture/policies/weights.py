@@ -21,10 +21,10 @@ def weights_digest(model: nn.Module) -> str:
 
 
 def random_tensor(seed: int, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Return standard normal numbers (float32) for one tensor of a model, from a random stream of the tensor's own.
+    """Return standard normal numbers (float32) for one tensor of a model, from a random stream of its own.
 
-    The stream is counter-based and depends on the seed and the tensor's name only. torch's normal numbers differ in the last bits
-    between processors, and then so would the digest of the same weights.
+    The stream is counter-based and depends on the seed and the tensor's name only. torch's normal numbers differ in the
+    last bits between processors, and then so would the digest of the same weights.
     """
     stream = np.random.Philox(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
     return np.random.Generator(stream).standard_normal(shape, dtype=np.float32)

@@ -1,7 +1,7 @@
 """The batch scripts' environment variables as arguments: `evaluate-attention-ratio --from-environment`.
 
-The heads of the batch scripts, `scripts/run_attention_ratio*.sh`, document the variables. Those of a single policy family stand in
-the family's `PublishedScript`.
+The heads of the batch scripts, `scripts/run_attention_ratio*.sh`, document the variables. Variables of a
+single policy family are in its `PublishedScript`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _SWITCH = {"1": True, "true": True, "yes": True, "": False, "0": False, "false":
 
 
 def arguments_from_environment(environment: Mapping[str, str], family: PolicyFamily) -> list[str]:
-    """Return the arguments that the variables stand for. A variable that is empty counts as not set.
+    """Return the arguments for the variables. An empty variable counts as not set.
 
     Raises:
         BadArgument: a variable has a value that it cannot have, or belongs to another family's script.
@@ -79,7 +79,7 @@ def arguments_from_environment(environment: Mapping[str, str], family: PolicyFam
 
 
 def describe_job(environment: Mapping[str, str], host: str) -> str:
-    """The line that begins a SLURM job's log; empty without SLURM."""
+    """Return the first line of a SLURM job's log; empty without SLURM."""
     job = environment.get("SLURM_JOB_ID")
     if not job:
         return ""
@@ -90,7 +90,7 @@ def describe_job(environment: Mapping[str, str], host: str) -> str:
 
 
 def _family_arguments(given: Mapping[str, str], family: PolicyFamily) -> list[str]:
-    """The options of the variables that not every family has; `BadArgument` when one is another family's."""
+    """Return the options of the family's own variables; `BadArgument` for a variable of another family."""
     own = family.published.variables if family.published else {}
     for other in policy_families():
         for name in other.published.variables if other.published else {}:

@@ -1,8 +1,8 @@
-"""The published scripts' commands, `evaluate-attention-ratio` and `evaluate-attention-ratio-cosmos`: capture, then analysis.
+"""The published scripts' commands, `evaluate-attention-ratio` and its `-cosmos` form: capture, then analysis.
 
-Each is `vla-capture FAMILY` with the published defaults, and differs in three ways. `--layers` are the layers to *analyse*: all
-layers are recorded, so that an analysis of others needs no second capture. An existing store is continued. One command may run
-several suites, or one task of an array job.
+Each is `vla-capture FAMILY` with the published defaults, and differs in three ways. `--layers` are the layers to
+*analyse*: all layers are recorded, so that an analysis of others needs no second capture. An existing store is
+continued. One command may run several suites, or one task of an array job.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def _find_script(program: str) -> tuple[PolicyFamily, PublishedScript]:
 
 
 def _with_environment(given: Sequence[str], family: PolicyFamily) -> list[str]:
-    """The arguments; `--from-environment` is replaced by the arguments that the batch scripts' variables stand for."""
+    """Return the arguments, with those of the batch scripts' variables in place of `--from-environment`."""
     if _FROM_ENVIRONMENT not in given:
         return list(given)
     from vla_attention.capture.published.environment_variables import arguments_from_environment, describe_job
@@ -79,7 +79,7 @@ def _with_environment(given: Sequence[str], family: PolicyFamily) -> list[str]:
 
 @dataclass(frozen=True)
 class _Job:
-    """One suite of a command: its settings, and where its results go."""
+    """One suite of a command: its settings, and the folder of its results."""
 
     arguments: argparse.Namespace
     settings: RunSettings
@@ -113,8 +113,8 @@ def _jobs(arguments: argparse.Namespace) -> list[_Job]:
     suites = STANDARD_SUITES if several else (arguments.task_suite,)
     if several and arguments.store is not None:
         raise BadArgument(
-            f"Cannot put the suites of '{ALL_SUITES}' into one store, {arguments.store}: a store holds one suite; leave --store out "
-            "(each suite gets its own in --output-dir)."
+            f"Cannot put the suites of '{ALL_SUITES}' into one store, {arguments.store}: a store holds one suite; "
+            "leave --store out (each suite gets its own in --output-dir)."
         )
     task_id: int | None = arguments.task_id
     of_array: list[tuple[str, int]] = []
@@ -142,13 +142,13 @@ def _jobs(arguments: argparse.Namespace) -> list[_Job]:
 
 
 def _task_of_array_index(arguments: argparse.Namespace, suites: Sequence[str]) -> tuple[str, int]:
-    """The suite and task of an array job's index; the indices run through the suites in order."""
+    """Return suite and task of an array job's index; the indices run through the suites in order."""
     from vla_attention.capture.environments.suites import find_suite
 
     if arguments.task_id is not None:
         raise BadArgument(
-            f"Cannot run task {arguments.task_id} and array index {arguments.array_index}: in an array the index is the task; "
-            "give --task-id (TASK_ID) or --array, not both."
+            f"Cannot run task {arguments.task_id} and array index {arguments.array_index}: in an array the index is "
+            "the task; give --task-id (TASK_ID) or --array, not both."
         )
     place = _place(arguments.array_index, suites)
     if place is not None:
@@ -161,7 +161,7 @@ def _task_of_array_index(arguments: argparse.Namespace, suites: Sequence[str]) -
 
 
 def _place(index: int, suites: Sequence[str]) -> tuple[str, int] | None:
-    """Suite and task of an index; None when there is none."""
+    """Return suite and task of an index, or None if there is none."""
     from vla_attention.capture.environments.suites import find_suite
 
     for name in suites:
@@ -182,7 +182,7 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], termination: T
 
     device = choose_device(arguments.device)
     policy = arguments.family.build(arguments, device)
-    # A layer that does not exist is found before the capture, not after it.
+    # A layer that does not exist is an error before the capture, not after it.
     select_layers(arguments.layers, policy.num_layers, policy.family)
     for job in jobs:
         if len(jobs) > 1:
@@ -207,8 +207,8 @@ def _analyze(job: _Job, script: PublishedScript) -> int:
         more += ["--tasks", str(arguments.task_id)]
     if not (typed and job.default_output):
         return run_analysis(arguments, store, job.output, more)
-    # Several layer groups in turn, or at once, with the published default folder: each keeps its results, and the folder itself
-    # has those of the last one, under the published names.
+    # In the published default folder, each group of layers keeps its results in a folder of its own. The default folder
+    # itself has the results of the last group, under the published names.
     apart = job.output / f"layers_{'_'.join(map(str, layers or ()))}"
     code = run_analysis(arguments, store, apart, more)
     if code == 0:
@@ -220,7 +220,7 @@ def _analyze(job: _Job, script: PublishedScript) -> int:
 def _layers(
     typed: Sequence[int] | None, published: Sequence[int], num_layers: int, model_family: str
 ) -> tuple[tuple[int, ...] | None, bool]:
-    """The layers to analyse (None: all), and whether the user typed them."""
+    """Return the layers to analyse (None: all), and whether the user typed them."""
     from vla_attention.capture.rollout.progress import say
 
     if typed is not None:
@@ -234,7 +234,7 @@ def _layers(
 
 
 def _publish(source: Path, target: Path) -> None:
-    """Copy every file of a folder into another, each appearing whole."""
+    """Copy every file of a folder into another one; no reader sees a partial file."""
     for file in sorted(path for path in source.rglob("*") if path.is_file()):
         place = target / file.relative_to(source)
         place.parent.mkdir(parents=True, exist_ok=True)

@@ -187,7 +187,7 @@ def test_spoiled_checkpoints(name, spoil, expected, small_tokenizer, tmp_path, c
         (["--model-config", "none.json"], "There is no 'none.json'"),
         (["--discrete-state-input"], "is for pi0.5"),
         (["--tokenizer", "none.model"], "There is no tokenizer file"),
-        (["--tokenizer", str(TOKENIZER_PATH)], "the model 'pi0' knows 300: it is another model's tokenizer"),
+        (["--tokenizer", str(TOKENIZER_PATH)], "the model 'pi0' has 300: it is another model's tokenizer"),
         (["--replan-steps", "8"], "expected 1 to 7"),
     ],
 )

@@ -24,7 +24,8 @@ from vla_attention.capture.policies.cosmos.config import CosmosConfig, DitConfig
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG
 from vla_attention.capture.policies.cosmos.locate import EMBEDDINGS_NAME, STATISTICS_NAME
 
-#: The published policy's 28 blocks, nine latent frames of 14 x 14 tokens, 512 text positions and five calls; narrow inside.
+#: The published policy's 28 blocks, nine latent frames of 14 x 14 tokens, 512 text positions and five calls; narrow
+#: inside.
 PUBLISHED_SHAPE = replace(
     CosmosConfig(),
     dit=DitConfig(width=24, num_blocks=28, num_heads=2, mlp_dim=48, text_dim=24, adaln_dim=8),

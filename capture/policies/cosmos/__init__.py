@@ -1,1 +1,1 @@
-"""Cosmos Policy in plain torch: the diffusion transformer, its sampler, observation to action, and its two attention sites."""
+"""Cosmos Policy in plain torch: diffusion transformer, sampler, observation to action, and both attention sites."""

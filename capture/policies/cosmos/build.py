@@ -1,13 +1,13 @@
-"""From what a user names on the command line to a Cosmos policy."""
+"""Build a Cosmos policy from the options of the command line."""
 
 from __future__ import annotations
 
 import torch
 
 from vla_attention.capture.policies.cosmos.calls import select_call
-from vla_attention.capture.policies.cosmos.checkpoint import CosmosOptions, load_cosmos_policy
 from vla_attention.capture.policies.cosmos.config import DEFAULT_CONFIG_NAME, find_config
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, random_policy
+from vla_attention.capture.policies.cosmos.loading import CosmosOptions, load_cosmos_policy
 from vla_attention.capture.policies.cosmos.policy import ACTION_FRAME, CosmosPolicy
 from vla_attention.capture.policies.precision import find_dtype
 from vla_attention.schemas.errors import BadArgument
@@ -35,10 +35,10 @@ def build_cosmos_policy(
     prefer_s: int | None = None,
     prefer_call: str = "last",
 ) -> CosmosPolicy:
-    """Build the policy and hold it against what the user says about it; parameters are the options of the command line.
+    """Build the policy and check the options against it; parameters are the options of the command line.
 
     `checkpoint` is a folder, a file of weights, a name on the hub, or one of the untrained policies that come with the
-    package: `embedded`, `dummy`. Frames and calls that do not exist are errors here, before anything runs.
+    package: `embedded`, `dummy`. Raises `BadArgument` or `UnknownName` for frames and calls that do not exist.
     """
     find_config(config_name)  # checked first, so that the error comes before any download
     options = CosmosOptions(
@@ -74,8 +74,9 @@ def _untrained(name: str, options: CosmosOptions, device: str) -> CosmosPolicy:
     )
     if any(files) or options.dtype == torch.bfloat16 or options.config_name != DEFAULT_CONFIG_NAME:
         raise BadArgument(
-            f"The policy '{name}' comes with the program, in float32; --config-name, --dataset-stats-path, --t5-text-embeddings-path, "
-            "--t5-tokenizer, --t5-encoder, --vae-path and --dtype bfloat16 are for checkpoints."
+            f"The policy '{name}' comes with the program, in float32; --config-name, --dataset-stats-path, "
+            "--t5-text-embeddings-path, --t5-tokenizer, --t5-encoder, --vae-path and --dtype bfloat16 are for "
+            "checkpoints."
         )
     config = options.apply(_UNTRAINED[name])
     return random_policy(

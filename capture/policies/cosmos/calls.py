@@ -1,4 +1,4 @@
-"""Which recorded call the published script's options name. A call is one denoise evaluation; all have the same length."""
+"""The call that the published script's options choose. A call is one denoise evaluation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from vla_attention.schemas.errors import BadArgument
 
 
 def select_call(config: CosmosConfig, prefer_s: int | None, prefer_call: str) -> int:
-    """Return the denoise step that `--prefer-S` and `--prefer-call` name.
+    """Return the denoise step that `--prefer-S` and `--prefer-call` choose.
 
     prefer_s: sequence length that the call must have; None takes any. prefer_call: `last` or `first` of those.
     Raises `BadArgument` when no call has that length.

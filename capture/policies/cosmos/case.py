@@ -1,4 +1,4 @@
-"""Parity cases of Cosmos: a folder with case.json, weights, inputs.npz and expected.npz made by the reference implementation."""
+"""Parity cases of Cosmos: the sizes and weights of a case, and the networks that are built from them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from vla_attention.schemas.errors import listing
 CaseKind = Literal["dit_forward", "policy_sample"]
 KINDS: tuple[CaseKind, ...] = ("dit_forward", "policy_sample")
 
-#: What the network here always does; a case that wants otherwise cannot be run.
+#: Settings that the network here does not vary. A case with other values cannot be run.
 _FIXED = {
     "patch_temporal": 1,
     "concat_padding_mask": True,
@@ -45,7 +45,7 @@ _POLICY_INPUTS = ("primary_image", "wrist_image", "proprio", "text_embedding", *
 
 @dataclass(frozen=True)
 class CosmosCase:
-    """A case folder: what case.json says, inputs and expected results."""
+    """A case folder: the content of case.json, inputs and expected results."""
 
     name: str
     folder: Path
@@ -55,13 +55,13 @@ class CosmosCase:
     expected: Mapping[str, np.ndarray]
 
     def fact(self, name: str) -> Any:
-        """Return one entry of case.json; the error says that it is missing."""
+        """Return one entry of case.json; `UnusableCase` if it is missing."""
         if name not in self.facts:
             raise UnusableCase(f"'{self.folder / CASE_FILE}' does not state '{name}'.")
         return self.facts[name]
 
     def weights(self) -> tuple[DitConfig, dict[str, Any]]:
-        """Return the transformer's sizes and its weights by model name; the sizes are held against case.json."""
+        """Return the transformer's sizes and its weights by model name; the sizes are checked against case.json."""
         weights = dit_tensors(read_tensors(self.folder / self.fact("state_dict")))
         stated = self.fact("net_config")
         base = DitConfig(
@@ -121,20 +121,21 @@ class CosmosCase:
         return CosmosModel(config, build_dit(dit_config, weights, device=device), encoder)
 
     def _frames(self) -> FrameConfig:
-        """The LIBERO frames, when the case's are those."""
+        """The LIBERO frames; `UnusableCase` if the case has others."""
         frames = FrameConfig()
         stated = (self.fact("state_t"), self.fact("num_conditional_frames"), self.fact("action_latent_idx"))
         ours = (frames.count, frames.num_conditioned, LIBERO_FRAMES.index("action"))
         if stated != ours or self.facts.get("solver", "2ab") != "2ab":
             raise UnusableCase(
-                f"The case '{self.name}' has {stated[0]} latent frames, {stated[1]} of them given, actions in frame {stated[2]} and "
-                f"the solver {self.facts.get('solver')}; a policy here has {ours[0]}, {ours[1]}, {ours[2]} and 2ab."
+                f"The case '{self.name}' has {stated[0]} latent frames, {stated[1]} of them given, actions in frame "
+                f"{stated[2]} and the solver {self.facts.get('solver')}; a policy here has {ours[0]}, {ours[1]}, "
+                f"{ours[2]} and 2ab."
             )
         return frames
 
 
 def read_case(folder: str | Path) -> CosmosCase:
-    """Read a case folder; `UnusableCase` says which file or array is missing or does not fit."""
+    """Read a case folder; `UnusableCase` names the file or array that is missing or does not fit."""
     folder = Path(folder)
     facts = read_case_file(folder)
     kind = facts.get("kind")

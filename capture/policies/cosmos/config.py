@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from vla_attention.schemas.errors import BadArgument, unknown_name
 
-#: The text encoder's positions after the real tokens are exact zeros; a real token's embedding never is.
+#: Positions of the text encoder. Positions after the real tokens are exactly 0; the embedding of a real token never is.
 TEXT_LENGTH = 512
 
 
@@ -61,14 +61,14 @@ class DitConfig:
         patch = self.patch_size
         if latent_height % patch or latent_width % patch or not latent_height or not latent_width:
             raise BadArgument(
-                f"A latent frame of {latent_height} x {latent_width} cannot be cut into patches of {patch} x {patch}: both sides "
-                f"must be multiples of {patch}."
+                f"A latent frame of {latent_height} x {latent_width} cannot be cut into patches of {patch} x {patch}: "
+                f"both sides must be multiples of {patch}."
             )
         rows, columns = latent_height // patch, latent_width // patch
         if max(rows, columns) > self.max_positions:
             raise BadArgument(
-                f"A latent frame of {rows} x {columns} tokens is larger than the {self.max_positions} positions that the network "
-                "knows."
+                f"A latent frame of {rows} x {columns} tokens is larger than the {self.max_positions} positions of "
+                "the network."
             )
         return rows, columns
 
@@ -89,7 +89,7 @@ class VaeConfig:
         return 1 << (len(self.dim_mult) - 1)
 
 
-#: What the nine latent frames of the LIBERO policy hold. `frameN` names any of them by number as well.
+#: Content of the nine latent frames of the LIBERO policy. `frameN` is another name of each of them.
 LIBERO_FRAMES = (
     "blank",
     "proprio",
@@ -105,7 +105,7 @@ LIBERO_FRAMES = (
 
 @dataclass(frozen=True)
 class FrameConfig:
-    """The latent frames: what each holds, and how many of the first are given rather than denoised."""
+    """The latent frames: the content of each, and how many of the first are given instead of denoised."""
 
     names: tuple[str, ...] = LIBERO_FRAMES
     num_conditioned: int = 4
@@ -118,7 +118,7 @@ class FrameConfig:
     def index(self, name: str) -> int:
         """Return a frame's number by its name, as `frameN`, or as `curr_last` (the last given frame).
 
-        Raises `UnknownName` that names the frames.
+        Raises `UnknownName` with the names of all frames.
         """
         if name == "curr_last":
             return self.num_conditioned - 1
@@ -143,7 +143,7 @@ class SamplerConfig:
 
 @dataclass(frozen=True)
 class CosmosConfig:
-    """Everything that fixes a Cosmos policy apart from its weights and statistics."""
+    """Everything that determines a Cosmos policy except its weights and statistics."""
 
     dit: DitConfig = field(default_factory=DitConfig)
     vae: VaeConfig = field(default_factory=VaeConfig)
@@ -162,8 +162,8 @@ class CosmosConfig:
             raise BadArgument(f"Cannot use --num-denoising-steps-action {self.sampler.num_steps}; expected at least 1.")
         if self.image_size % self.vae.spatial_compression:
             raise BadArgument(
-                f"An image of {self.image_size} pixels is not a whole number of the {self.vae.spatial_compression} pixels "
-                "of a latent cell."
+                f"An image of {self.image_size} pixels is not a whole number of the {self.vae.spatial_compression} "
+                "pixels of a latent cell."
             )
         self.dit.grid(self.latent_size, self.latent_size)
         elements = self.dit.in_channels * self.latent_size**2
@@ -192,7 +192,7 @@ class CosmosConfig:
 
 DEFAULT_CONFIG_NAME = "cosmos_predict2_2b_480p_libero__inference_only"
 
-#: Full-size policies by the reference's names. Only the LIBERO policy's frames and ranges are known here.
+#: Full-size policies by the reference's names. Frames and ranges are those of the LIBERO policy.
 NAMED_CONFIGS: dict[str, CosmosConfig] = {DEFAULT_CONFIG_NAME: CosmosConfig()}
 
 

@@ -1,8 +1,8 @@
 """The diffusion transformer of Cosmos Policy, with the checkpoint's own module names and shapes.
 
-Tokens are kept as (batch, frame, token of the frame, width): time conditioning is per latent frame. Self-attention is
-computed one frame of queries at a time, so that nothing token x token sized is ever made, and so that the rows of the frame
-that is recorded are the very ones that the model uses: recording cannot change the arithmetic.
+Tokens have the axes (batch, frame, token of the frame, width), because the time conditioning is per latent frame.
+Self-attention is computed one frame of queries at a time. So nothing of token x token size is ever allocated, and the
+recorded rows are those that the model itself uses: recording cannot change the arithmetic.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ NORM_EPS = 1e-6
 
 
 class BlockObserver(Protocol):
-    """Whoever wants to see the inside of a block. Asked for every block and, at `self`, for every frame of queries.
+    """Observes the inside of a block. The model calls it for every block and, at `self`, for every frame of queries.
 
-    `rows`: returns what takes the float32 probabilities (batch, head, query of the frame, key), or None.
+    `rows`: returns the function that takes the float32 probabilities (batch, head, query of the frame, key), or None.
     `updates`: takes the block's gated updates, name -> (batch, frame, token, width), after the block.
-    `wants_updates`: whether it shall be called.
+    `wants_updates`: whether `updates` is called.
     """
 
     def rows(self, site: str, layer: int, frame: int, attention: Attention, value: Tensor) -> RowSink | None:
         """Return the function that takes the rows of these queries; `value` is (batch, head, key, dim)."""
 
     def wants_updates(self, layer: int) -> bool:
-        """Say whether `updates` shall be called for this block."""
+        """Return whether `updates` is called for this block."""
 
     def updates(self, layer: int, updates: dict[str, Tensor], gates: dict[str, Tensor], block_input: Tensor) -> None:
         """Take the gated updates of one block; gates are (batch, frame, 1, width)."""
@@ -53,10 +53,10 @@ class RMSNorm(nn.Module):
 
 
 class RotaryPositions(nn.Module):
-    """Rotary angles of (frame, row, column), from the exponents that the checkpoint keeps.
+    """Rotary angles of (frame, row, column), from the exponents in the checkpoint.
 
-    The reference casts its exponents to bfloat16 with everything else and computes frequencies from those in float32; the
-    buffers are therefore part of the weights, and kept in float32 whatever the precision of the model.
+    The reference casts its exponents to bfloat16 with everything else and computes frequencies from those in float32;
+    the buffers are therefore part of the weights, and float32 in every precision of the model.
     """
 
     seq: Tensor
@@ -122,7 +122,7 @@ class Attention(nn.Module):
     ) -> Tensor:
         """Return the update (batch, frame, token, width) of the tokens x, before the gate.
 
-        text: (batch, position, text width) is what `cross` attends to. rotary: positions, for `self`.
+        text: (batch, position, text width), the keys of `cross`. rotary: positions, for `self`.
         """
         frames, tokens = x.shape[1:3]
         flat = x.flatten(1, 2)
@@ -132,7 +132,7 @@ class Attention(nn.Module):
         value = split_heads(self.v_proj(context), self.head_dim)
         if rotary is not None:
             query, key = rotate(query, *rotary), rotate(key, *rotary)
-        key = key.float()  # once, and not again for every frame of queries
+        key = key.float()  # once, not for every frame of queries
         mixed = []
         for frame in range(frames):
             part = query[:, :, frame * tokens : (frame + 1) * tokens]
@@ -192,7 +192,7 @@ class Block(nn.Module):
         layer: int,
         observer: BlockObserver | None,
     ) -> Tensor:
-        """Return the tokens (batch, frame, token, width) after the block; time and modulation are (batch, frame, ...)."""
+        """Return the tokens (batch, frame, token, width) after the block; time, modulation: (batch, frame, ...)."""
         modulations = {
             "self": self.adaln_modulation_self_attn,
             "cross": self.adaln_modulation_cross_attn,
@@ -310,7 +310,7 @@ class Dit(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """Device of the weights."""
         return self.final_layer.linear.weight.device
 
     def forward(
@@ -328,11 +328,12 @@ class Dit(nn.Module):
 
         Args:
             latents: (batch, channel, frame, row, column).
-            times: (batch, frame), 0 for a given frame, else t = sigma / (1 + sigma); or (batch, 1), the same for all frames.
+            times: (batch, frame), 0 for a given frame, else t = sigma / (1 + sigma); or (batch, 1), the same for all
+                frames.
             condition_mask: (batch, 1, frame, row, column), 1 for a given frame.
             padding_mask: (batch, 1, pixel row, pixel column), resized to the latent's size.
             text: (batch, position, text width).
-            observer: sees rows and updates; nothing depends on it.
+            observer: gets rows and updates; the output does not depend on it.
         """
         frames, height, width = latents.shape[2:]
         rows, columns = self.config.grid(height, width)

@@ -1,4 +1,4 @@
-"""Weights of the diffusion transformer: which of a checkpoint's entries are weights, the sizes they imply, strict loading."""
+"""Weights of the diffusion transformer: selecting them from a checkpoint, the sizes that they imply, strict loading."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from vla_attention.capture.policies.strict_loading import Shapes, check_shapes, 
 from vla_attention.schemas.errors import listing
 
 PREFIX = "net."
-#: Training counters: no weights.
+#: Prefix of training counters, which are no weights.
 COUNTER_PREFIX = "accum_"
-#: Transformer Engine's extra state: no weights; absent when the checkpoint was written without it.
+#: Suffix of Transformer Engine's extra state, which is no weight; some checkpoints are written without it.
 EXTRA_STATE = "_extra_state"
-#: What activation checkpointing leaves in names.
+#: Part of a name that activation checkpointing adds.
 _WRAPPED = "_checkpoint_wrapped_module."
 _ROTARY_PREFIX = "pos_embedder."
 
@@ -28,8 +28,8 @@ _ROTARY_PREFIX = "pos_embedder."
 def dit_tensors(stored: Mapping[str, Any]) -> dict[str, Tensor]:
     """Return the weights of a stored state, by their names in the model.
 
-    The prefix `net.` and traces of activation checkpointing are taken off; counters, extra state and the averaged copy
-    (`net_ema.`) are left out. Nothing else is: what is unknown shows up when the model is filled.
+    The prefix `net.` and the part that activation checkpointing adds are removed from the names. Counters, extra state
+    and the averaged copy (`net_ema.`) are left out. Other entries stay, so that strict loading reports unknown ones.
     """
     weights: dict[str, Tensor] = {}
     for name, value in stored.items():
@@ -45,7 +45,7 @@ def dit_tensors(stored: Mapping[str, Any]) -> dict[str, Tensor]:
 
 
 def infer_dit_config(weights: Mapping[str, Tensor], base: DitConfig | None = None) -> DitConfig:
-    """Return the sizes that the weights have; what no weight tells (rotary factors, patch size) is that of `base`."""
+    """Return the sizes of the weights. Rotary factors and patch size, which no weight states, are those of `base`."""
     base = base or DitConfig()
 
     def shape(name: str) -> tuple[int, ...]:
@@ -92,7 +92,8 @@ def build_dit(
 ) -> Dit:
     """Build the transformer from tensors by model name, strictly.
 
-    The rotary buffers are rounded to `dtype`, as the reference's are, but kept in float32: frequencies are computed there.
+    The rotary buffers are rounded to `dtype`, as in the reference, but stay float32: frequencies are computed in
+    float32.
     """
     check_shapes(shapes_of(weights), expected_shapes(config), "the Cosmos transformer")
     filled = {}

@@ -1,7 +1,8 @@
-"""Untrained Cosmos policies with seeded random weights, so that everything runs anywhere.
+"""Untrained Cosmos policies with seeded random weights, which run on any machine.
 
-They solve nothing. `embedded` has the published policy's depth, latent frames and sampler at a quarter of its picture
-area, so that layer and frame numbers exist; `dummy` is for tests. Weights are scaled such that attention has structure:
+They solve no task. `embedded` has the published policy's depth, latent frames and sampler at a quarter of its picture
+area, so that the same layer and frame
+numbers exist; `dummy` is for tests. Weights are scaled such that attention has structure:
 rows are neither uniform nor on one key, and depend on pictures, words, noise and time.
 """
 
@@ -33,7 +34,7 @@ EMBEDDED_CONFIG = CosmosConfig(
     image_size=112,
 )
 
-#: The same code in milliseconds: 16 tokens a frame, three blocks.
+#: For tests, runs in milliseconds: 16 tokens per frame, three blocks.
 DUMMY_CONFIG = CosmosConfig(
     dit=DitConfig(width=48, num_blocks=3, num_heads=2, mlp_dim=96, text_dim=24, adaln_dim=8),
     vae=VaeConfig(base_dim=4),
@@ -50,7 +51,8 @@ BUILTIN_RANGES: Mapping[str, object] = {
     "proprio_max": [0.04, 0.0, 0.2, 0.35, 1.3, 1.0, 1.0, 1.0, 1.0],
 }
 
-#: Spread of the logits of the first and the last block: exp(-σ²/2) of the keys would effectively be looked at.
+#: Standard deviation σ of the logits of the first and the last block. Attention then spreads over about exp(-σ²/2) of
+#: the keys.
 _FLATTEST, _SHARPEST = 1.5, 4.0
 
 

@@ -86,9 +86,9 @@ def _build(arguments: argparse.Namespace, device: str) -> CosmosPolicy:
 
 
 def _analysis_arguments(arguments: argparse.Namespace) -> list[str]:
-    """The published scripts' proxy: the mass of one latent frame over that of another, both of self-attention.
+    """Return the published scripts' proxy: the mass of one latent frame over that of another, of self-attention.
 
-    The groups carry the frames' names, because the denominator's default frame is a blank picture and holds no language.
+    The groups carry the frames' names, because the denominator's default frame is a blank picture without language.
     """
     above, below = arguments.visual_frame, arguments.text_frame
     groups = ["--group", f"{above}=frame:{above}", "--group", f"{below}=frame:{below}"]

@@ -1,4 +1,4 @@
-"""Numbers inside latent frames: proprioception written into one, actions and the value read out of others.
+"""Numbers in latent frames: proprioception is written into one frame, actions and the value are read from others.
 
 A latent frame is a volume (channel, row, column), read as one long list in that order.
 """
@@ -33,10 +33,10 @@ def read_value(frame: Tensor) -> float:
 
 
 def action_shares(config: CosmosConfig) -> NDArray[np.float64]:
-    """Return what each token of the action frame stands for: (token, step, dim), the share of its elements, summing to <= 1.
+    """Return the shares (token, step, dim) of each token's elements that hold an action number; a token sums to <= 1.
 
-    With the published sizes every token holds four (step, dim) pairs, the same in every channel. Elements of a copy that
-    is cut off stand for nothing.
+    With the published sizes every token holds four (step, dim) pairs, the same in every channel. Elements of an
+    incomplete copy count for none.
     """
     channels, side, patch = config.dit.in_channels, config.latent_size, config.dit.patch_size
     size = config.chunk_size * config.action_dim
@@ -51,7 +51,7 @@ def action_shares(config: CosmosConfig) -> NDArray[np.float64]:
 
 
 def query_pools(shares: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return weights (step · dim, token), step-major, that turn the action frame's queries into one mean per step and dim.
+    """Return weights (step · dim, token), step-major, that pool the action frame's queries by step and dim.
 
     Every row sums to 1: the mean over the tokens that hold the step and dim, by the share of it that each holds.
     """
@@ -61,7 +61,7 @@ def query_pools(shares: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def condition_mask(config: CosmosConfig, num_given: int | None = None) -> Tensor:
-    """Return (1, 1, frame, row, column) float32: 1 for the first frames, which are given, 0 for those to be denoised."""
+    """Return (1, 1, frame, row, column) float32: 1 for the given frames, 0 for the frames that are denoised."""
     given = config.frames.num_conditioned if num_given is None else num_given
     mask = torch.zeros(1, 1, config.frames.count, config.latent_size, config.latent_size)
     mask[:, :, :given] = 1.0

@@ -1,4 +1,4 @@
-"""What the keys of the two attention sites are: latent frames for `self`, text positions for `cross`."""
+"""The key axes of the two attention sites: latent frames for `self`, text positions for `cross`."""
 
 from __future__ import annotations
 

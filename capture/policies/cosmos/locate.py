@@ -1,4 +1,4 @@
-"""Find a checkpoint's files: in a folder, beside it, in the Hugging Face hub's cache, or through the hub's own client."""
+"""Find a checkpoint's files: in its folder, beside it, in the Hugging Face hub's cache, or through the hub's client."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from vla_attention.capture.policies.hub import HUB_NAME, fetch_from_hub, snapsho
 from vla_attention.schemas.errors import BadArgument, listing
 
 POLICY_REPOSITORY = "nvidia/Cosmos-Policy-LIBERO-Predict2-2B"
-#: Where the image encoder is published; the policy's own repository does not have it.
+#: Repository of the image encoder, which the policy's own repository does not contain.
 VAE_REPOSITORY = "nvidia/Cosmos-Predict2-2B-Video2World"
 VAE_NAME = "tokenizer/tokenizer.pth"
 STATISTICS_NAME = "libero_dataset_statistics.json"
@@ -28,7 +28,7 @@ def in_hub_cache(repository: str, file: str) -> Path | None:
 def find_checkpoint(name: str) -> Path:
     """Return the folder (or the file of weights) that `--ckpt-path` names: a local path, or `ORG/NAME` of the hub.
 
-    What is not in the hub's cache is downloaded; `CheckpointUnavailable` says what to do when that fails.
+    Files that are not in the hub's cache are downloaded; `CheckpointUnavailable` if that fails.
     """
     path = Path(name).expanduser()
     if path.exists():
@@ -36,15 +36,15 @@ def find_checkpoint(name: str) -> Path:
     if HUB_NAME.fullmatch(name):
         return _from_hub(name, ["*.pt", STATISTICS_NAME, EMBEDDINGS_NAME])
     raise CheckpointNotFound(
-        f"There is no checkpoint at '{path}'; give a folder with a .pt file, {STATISTICS_NAME} and {EMBEDDINGS_NAME}, or "
-        f"{POLICY_REPOSITORY}."
+        f"There is no checkpoint at '{path}'; give a folder with a .pt file, {STATISTICS_NAME} and {EMBEDDINGS_NAME}, "
+        f"or {POLICY_REPOSITORY}."
     )
 
 
 def _from_hub(repository: str, patterns: list[str]) -> Path:
     how = (
-        f"fetch {listing(patterns)} of it where there is a network (`hf download {repository}`), copy the folder here and give its "
-        "path (there is no such local folder)"
+        f"fetch {listing(patterns)} of it where there is a network (`hf download {repository}`), copy the folder here "
+        "and give its path (there is no such local folder)"
     )
     return fetch_from_hub(repository, patterns, how)
 
@@ -55,8 +55,8 @@ def find_weights(checkpoint: Path) -> Path:
         return checkpoint
     if (checkpoint / "model").is_dir():
         raise UnsupportedCheckpoint(
-            f"'{checkpoint}' has its weights in the distributed form (folder 'model'), which the reference would read first and which "
-            "is not read here; convert it to one .pt file, and give that file as --ckpt-path."
+            f"'{checkpoint}' has its weights in the distributed form (folder 'model'), which the reference would read "
+            "first and which is not read here; convert it to one .pt file, and give that file as --ckpt-path."
         )
     found = sorted([*checkpoint.glob("*.pt"), *checkpoint.glob("*.safetensors")])
     if len(found) != 1:
@@ -70,7 +70,7 @@ def find_weights(checkpoint: Path) -> Path:
 
 
 def find_vae(checkpoint: Path, given: str | None, *, from_hub: bool = False) -> Path:
-    """Return the image encoder's file: the one named, else in or beside the checkpoint, else from the hub or its cache."""
+    """Return the image encoder's file: the given one, else in or beside the checkpoint, else from the hub."""
     folder = checkpoint if checkpoint.is_dir() else checkpoint.parent
     if given is not None:
         named = Path(given).expanduser()
@@ -86,13 +86,13 @@ def find_vae(checkpoint: Path, given: str | None, *, from_hub: bool = False) -> 
     if from_hub and given is None:
         return _from_hub(VAE_REPOSITORY, [VAE_NAME]) / VAE_NAME
     raise CheckpointNotFound(
-        f"The image encoder was not found at {listing(places)}; it is published apart from the policy: fetch it with "
-        f"`hf download {VAE_REPOSITORY} {VAE_NAME}` and give --vae-path."
+        f"The image encoder was not found at {listing(places)}; it is published separately from the policy: fetch it "
+        f"with `hf download {VAE_REPOSITORY} {VAE_NAME}` and give --vae-path."
     )
 
 
 def find_beside(checkpoint: Path, given: str | None, name: str) -> Path:
-    """Return a file that comes with the checkpoint, or the one given instead (a path, or ORG/NAME/FILE in the hub's cache)."""
+    """Return a file of the checkpoint's folder, or the given one: a path, or ORG/NAME/FILE in the hub's cache."""
     folder = checkpoint if checkpoint.is_dir() else checkpoint.parent
     if given is None:
         return folder / name
@@ -105,7 +105,7 @@ def find_beside(checkpoint: Path, given: str | None, name: str) -> Path:
 
 
 def find_t5_tokenizer(checkpoint: Path, given: str | None) -> Path | None:
-    """Return T5's sentencepiece model: the one named, else the checkpoint's or that of the hub's cache; None if there is none."""
+    """Return T5's sentencepiece model: the given one, else of the checkpoint or the hub's cache; None if not found."""
     if given is not None:
         path = Path(given).expanduser()
         if path.is_dir():

@@ -1,4 +1,4 @@
-"""The whole model: pictures, proprioception and text in; a clean latent video with actions and value in it out."""
+"""The whole model: from pictures, proprioception and text to a clean latent video, which holds actions and value."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PROPRIO_FRAME = "proprio"
 
 @dataclass
 class CallTrace:
-    """What the network took and gave in one evaluation; for comparing with a reference, not kept otherwise."""
+    """Inputs and outputs of each network evaluation, kept for a comparison with the reference only."""
 
     noisy: list[Tensor] = field(default_factory=list)
     net_input: list[Tensor] = field(default_factory=list)
@@ -36,14 +36,14 @@ class CallTrace:
 
 @dataclass(frozen=True)
 class Recorders:
-    """Who wants to see what, while actions are sampled. Nothing that is sampled depends on them."""
+    """The row collector of each site, and the latent frame whose queries they get. Sampling does not depend on them."""
 
     rows: Mapping[str, RowCollector] = field(default_factory=dict)
     query_frame: int = 4
 
 
 class CosmosModel(nn.Module):
-    """Transformer and image encoder with the sizes that fix how they are used."""
+    """Transformer and image encoder, with their sizes and conventions."""
 
     def __init__(self, config: CosmosConfig, dit: Dit, encoder: CausalEncoder):
         super().__init__()
@@ -59,7 +59,7 @@ class CosmosModel(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """Device of the weights."""
         return self.dit.device
 
     @property
@@ -94,7 +94,7 @@ class CosmosModel(nn.Module):
         observer: BlockObserver | None = None,
         trace: CallTrace | None = None,
     ) -> Tensor:
-        """Return the estimate of the clean latents (float32) from latents with noise `sigma`; given frames stay given."""
+        """Return the estimate of the clean latents (float32) from latents with noise `sigma`; given frames are kept."""
         t = torch.tensor(flow_time(sigma), dtype=torch.float32, device=noisy.device)
         net_input = mask * given + (1 - mask) * ((1 - t) * noisy)
         times = t * (1 - mask[:, 0, :, 0, 0])
@@ -117,7 +117,8 @@ class CosmosModel(nn.Module):
     ) -> Tensor:
         """Return the clean latent video (1, channel, frame, row, column) float32.
 
-        given: as from `given_latents`. text: (1, position, text width). seed: of the noise, made by numpy's legacy generator.
+        given: from `given_latents`. text: (1, position, text width). seed: of the noise, made by numpy's legacy
+        generator.
         """
         config = self.config
         noise = torch.from_numpy(seeded_noise(seed, config.latent_shape)).to(self.device)

@@ -1,4 +1,4 @@
-"""What is taken out of one network evaluation: rows of the recorded frame's queries, and what they add to the stream."""
+"""Observer of one network evaluation: rows of the recorded frame's queries, and their updates."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from vla_attention.capture.recording.contributions import Projection
 
 
 def projection(output_weight: Tensor, gate: Tensor) -> Projection:
-    """Return the map from mixed values (any, head · dim) to the gated update (any, width), in float32; gate is (1, width)."""
+    """Return the map from mixed values (any, head · dim) to the gated update (any, width); gate: (1, width)."""
     weight, factor = output_weight.float(), gate.float()
     return lambda mixed: F.linear(mixed, weight) * factor
 
 
 @dataclass
 class CallObserver:
-    """Passes what one network evaluation shows of the queries of `query_frame` on to the recorders of the sites.
+    """Passes rows and updates of the queries of `query_frame` on to the recorders of the sites.
 
-    Rows and contributions come from the very probabilities that the model uses; nothing is computed twice.
+    Rows and contributions come from the probabilities that the model itself uses; nothing is computed twice.
     """
 
     denoise_step: int
     query_frame: int
     tokens_per_frame: int
     recorders: Mapping[str, RowCollector]
-    #: site -> the values and the output weight of the block at hand; kept until its gates are known
+    #: site -> values and output weight of the current block, until its gates are known
     _seen: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict, init=False, repr=False)
 
     @property
@@ -45,7 +45,7 @@ class CallObserver:
         return {site: sink for site, sink in found.items() if sink is not None}
 
     def rows(self, site: str, layer: int, frame: int, attention: Attention, value: Tensor) -> RowSink | None:
-        """Return what takes the rows of these queries, or None when nobody wants them."""
+        """Return the function that takes the rows of these queries, or None if they are not recorded."""
         recorder = self.recorders.get(site)
         if frame != self.query_frame or recorder is None:
             return None
@@ -54,11 +54,11 @@ class CallObserver:
         return recorder.sink(layer, self.denoise_step, self._queries)
 
     def wants_updates(self, layer: int) -> bool:
-        """Say whether some site's contributions are wanted of this block."""
+        """Return whether contributions of this block are recorded at any site."""
         return bool(self._update_sinks(layer))
 
     def updates(self, layer: int, updates: dict[str, Tensor], gates: dict[str, Tensor], block_input: Tensor) -> None:
-        """Pass values, projection and update of the recorded queries on."""
+        """Pass values, projection and update of the recorded queries on to the recorders."""
         for site, sink in self._update_sinks(layer).items():
             value, weight = self._seen.pop(site)
             sink(value, projection(weight, gates[site][0, self.query_frame]), updates[site][:, self.query_frame])

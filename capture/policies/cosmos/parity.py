@@ -1,4 +1,4 @@
-"""Run a Cosmos parity case and say, stage by stage, how far our numbers are from the reference's and where it begins."""
+"""Run a Cosmos parity case, and compare our numbers with the reference's stage by stage."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from vla_attention.capture.recording.contributions import part_contributions
 
 @dataclass(frozen=True)
 class Tolerance:
-    """What passes: |difference| <= atol + rtol · |expected|."""
+    """The largest difference that passes: atol + rtol · |expected|."""
 
     rtol: float
     atol: float
@@ -34,7 +34,7 @@ class Tolerance:
 OUTPUTS = Tolerance(rtol=1e-4, atol=2e-5)
 PROBABILITIES = Tolerance(rtol=0.0, atol=1e-5)
 ACTIONS = Tolerance(rtol=0.0, atol=1e-5)
-#: The absolute part is for contributions that nearly vanish, whose last bits no relative bound can hold.
+#: The absolute part is for contributions near 0, for which a relative bound would be below rounding.
 NORMS = Tolerance(rtol=1e-5, atol=1e-6)
 #: Grey levels: other versions of Pillow decode JPEG a little differently.
 PICTURES = Tolerance(rtol=0.0, atol=2.0)
@@ -43,7 +43,7 @@ EXACT = Tolerance(rtol=0.0, atol=0.0)
 
 @dataclass(frozen=True)
 class StageDifference:
-    """One stage: the largest difference, and the largest share of what is allowed (above 1 = beyond; nan counts as beyond)."""
+    """One stage: the largest difference, and its largest share of the tolerance. Above 1, or NaN, does not pass."""
 
     stage: str
     largest: float
@@ -75,7 +75,7 @@ class ParityReport:
         return next((stage.stage for stage in self.stages if not stage.passed), None)
 
     def compare(self, stage: str, ours: np.ndarray | Tensor, expected: np.ndarray, tolerance: Tolerance) -> None:
-        """Add a stage."""
+        """Compare one stage and add it to the report."""
         found = np.asarray(ours.detach().cpu().numpy() if isinstance(ours, Tensor) else ours, dtype=np.float64)
         wanted = np.asarray(expected, dtype=np.float64)
         if found.shape != wanted.shape:
@@ -89,7 +89,7 @@ class ParityReport:
         self.stages.append(StageDifference(stage, float(difference.max()), float(shares.max()), tolerance))
 
     def as_json(self) -> dict[str, Any]:
-        """Return the report as plain JSON values; what is not a number is null."""
+        """Return the report as plain JSON values, with null for NaN and infinity."""
 
         return {
             "case": self.case,
@@ -112,9 +112,9 @@ class ParityReport:
 
 @dataclass
 class EverythingObserver:
-    """Keeps the rows of all queries, the norms of the updates and of each frame's contribution, for all blocks.
+    """Keeps the rows of all queries, and the norms of updates and of each frame's contribution, for all blocks.
 
-    Only for the small sizes of cases: what is kept is token x token.
+    For the small sizes of cases only: it keeps token x token arrays.
     """
 
     _rows: dict[tuple[str, int], list[Tensor]] = field(default_factory=dict)
@@ -123,7 +123,7 @@ class EverythingObserver:
     contribution_norms: dict[int, Tensor] = field(default_factory=dict)
 
     def rows(self, site: str, layer: int, frame: int, attention: Attention, value: Tensor) -> RowSink:
-        """Return what takes the rows of these queries."""
+        """Return the function that takes the rows of these queries."""
 
         def take(rows: Tensor) -> None:
             self._rows.setdefault((site, layer), []).append(rows)
@@ -131,18 +131,19 @@ class EverythingObserver:
                 tokens = rows.shape[2]
                 spans = [slice(start, start + tokens) for start in range(0, rows.shape[3], tokens)]
                 weight = attention.output_proj.weight
-                ungated = projection(weight, torch.ones(1, len(weight), device=rows.device))  # the gate comes later
+                # A gate of 1: the block's own gate is applied in `updates`.
+                ungated = projection(weight, torch.ones(1, len(weight), device=rows.device))
                 parts = torch.stack([part_contributions(rows[b], value[b], spans, ungated) for b in range(len(rows))])
                 self._contributions.setdefault(layer, []).append(parts)
 
         return take
 
     def wants_updates(self, layer: int) -> bool:
-        """Every block's."""
+        """Return True: updates of every block."""
         return True
 
     def updates(self, layer: int, updates: dict[str, Tensor], gates: dict[str, Tensor], block_input: Tensor) -> None:
-        """Take norms: (batch, token, 4) of the updates and the input, (batch, token, frame + 1) of the contributions."""
+        """Keep the norms (batch, token, 4) of updates and input, and (batch, token, frame + 1) of contributions."""
         norms = [tensor.norm(dim=-1).flatten(1) for tensor in (*updates.values(), block_input)]
         self.residual_norms[layer] = torch.stack(norms, dim=-1)
         frames = torch.stack(self._contributions.pop(layer), dim=1)  # batch, frame of query, query, span, width
@@ -160,7 +161,7 @@ class EverythingObserver:
 
 
 def run_case(folder: str | Path, *, device: str = "cpu") -> ParityReport:
-    """Run a case of either kind; `UnusableCase` when it cannot be run at all."""
+    """Run a case of either kind; `UnusableCase` if it cannot be run."""
     case = read_case(folder)
     with torch.no_grad():
         return _run_forward(case, device) if case.kind == "dit_forward" else _run_policy(case, device)
@@ -209,7 +210,7 @@ def _run_policy(case: CosmosCase, device: str) -> ParityReport:
     pictures = [model_picture(inputs[name], config.image_size) for name in ("wrist_image", "primary_image")]
     compare("preprocessed_images", np.stack(pictures), PICTURES)
     if case.facts.get("pillow") != PIL.__version__ and "preprocessed_images" in expected:
-        pictures = list(expected["preprocessed_images"])  # what follows shall not depend on another JPEG decoder
+        pictures = list(expected["preprocessed_images"])  # so that later stages do not depend on the JPEG decoder
     statistics = make_statistics(inputs, f"of the case '{case.name}'", config.action_dim, config.proprio_dim)
     proprio = statistics.normalise_proprio(inputs["proprio"])
     compare("proprio_normalized", proprio, OUTPUTS)
@@ -237,7 +238,7 @@ def _run_policy(case: CosmosCase, device: str) -> ParityReport:
 def _sample(
     case: CosmosCase, model: CosmosModel, given: Tensor, trace: CallTrace, observers: list[EverythingObserver]
 ) -> Tensor:
-    """Like the model's own sampling, with an observer that keeps everything where the case has it."""
+    """Sample as the model does, with an observer that keeps all rows if the case has them."""
     noise = torch.from_numpy(seeded_noise(case.fact("sampler_seed"), model.config.latent_shape)).to(model.device)
     mask = condition_mask(model.config).to(model.device)
     text = torch.from_numpy(case.inputs["text_embedding"]).to(model.device)
@@ -270,7 +271,7 @@ def _compare_call(
 
 
 def describe(report: ParityReport) -> str:
-    """Return the report as text: one line a stage, and where a difference begins."""
+    """Return the report as text: one line per stage, and the first stage beyond its tolerance."""
     begins = report.begins
     verdict = "within the limits" if report.passed else f"BEYOND THE LIMITS, first at '{begins}'"
     lines = [f"{report.case} ({report.kind}): {verdict}", "  largest     of allowed  stage"]

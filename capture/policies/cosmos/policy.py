@@ -1,4 +1,4 @@
-"""Cosmos Policy as the rollout sees it: observation in, action chunk out, two sites with their layouts."""
+"""Cosmos Policy behind the policy interface: from observation to action chunk, with the layouts of its two sites."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ACTION_FRAME, VALUE_FRAME = "action", "value"
 
 @dataclass(frozen=True)
 class Prediction:
-    """What one policy call gives: actions (step, dim) in the robot's units, and the value that the policy expects, 0..1."""
+    """Result of one policy call: actions (step, dim) in the robot's units, and the expected value, 0..1."""
 
     actions: NDArray[np.float64]
     value: float
@@ -41,7 +41,7 @@ class CosmosPolicy:
     """Transformer, image encoder, text embeddings and statistics, for LIBERO-like observations.
 
     query_frame: the latent frame whose tokens' rows are recorded: `action`, `curr_last`, `frameN` or a frame's name.
-    open_loop_steps: actions of a chunk that are executed before the policy is asked again.
+    open_loop_steps: actions of a chunk that are executed before the next policy call.
     """
 
     def __init__(
@@ -57,8 +57,8 @@ class CosmosPolicy:
         config = model.config
         if not 1 <= open_loop_steps <= config.chunk_size:
             raise BadArgument(
-                f"Cannot use --num-open-loop-steps {open_loop_steps}: the policy gives {config.chunk_size} actions a call; "
-                f"expected 1 to {config.chunk_size}."
+                f"Cannot use --num-open-loop-steps {open_loop_steps}: the policy gives {config.chunk_size} actions a "
+                f"call; expected 1 to {config.chunk_size}."
             )
         self.model = model
         self.text = text
@@ -86,14 +86,14 @@ class CosmosPolicy:
         return np.array([flow_time(level) for level in self.model.levels])
 
     def replan_noise_seed(self, run_seed: int, task_id: int, episode_index: int, replan: int) -> int:
-        """Return the seed of a replan's noise: the run's own, always, as in the reference.
+        """Return the seed of a replan's noise: always the run's seed, as in the reference.
 
         Every replan starts from the same noise, so that differences between replans come from their inputs only.
         """
         return run_seed
 
     def action_shares(self) -> NDArray[np.float64]:
-        """Return what each recorded query stands for, (query, step, dim); only the action frame's queries do."""
+        """Return the shares (query, step, dim) of action numbers in each recorded query of the action frame."""
         if self.query_frame != ACTION_FRAME:
             raise BadArgument(
                 f"Queries of latent frame '{self.query_frame}' do not stand for action steps; use --query-frame action."
@@ -124,8 +124,8 @@ class CosmosPolicy:
     def prepare(self, observation: Observation, instruction: str) -> PolicyInput:
         """Turn an observation and an instruction into the model's input (batch 1).
 
-        state: the 9 numbers of proprioception, not normalised. The prompt's pieces are keys of `cross`. tensors: `given`
-        (1, channel, frame, row, column) latents and `text` (1, position, width).
+        state: the 9 numbers of proprioception, not normalised. The prompt's pieces are keys of `cross`. tensors:
+        `given` (1, channel, frame, row, column) latents and `text` (1, position, width).
         """
         config = self.config
         frames = {
@@ -137,7 +137,8 @@ class CosmosPolicy:
         expected = (1, config.text_length, config.dit.text_dim)
         if tuple(encoded.embedding.shape) != expected:
             raise BadArgument(
-                f"The text embedding of '{instruction}' has shape {tuple(encoded.embedding.shape)}, but the policy reads {expected}."
+                f"The text embedding of '{instruction}' has shape {tuple(encoded.embedding.shape)}, but the policy "
+                f"reads {expected}."
             )
         normalised = self.statistics.normalise_proprio(proprio)
         return PolicyInput(
@@ -157,7 +158,7 @@ class CosmosPolicy:
         noise_seed: int,
         recorders: Mapping[str, RowCollector] | None = None,
     ) -> NDArray[np.float64]:
-        """Return the action chunk (horizon, 7) for the environment; nothing of it depends on what is recorded."""
+        """Return the action chunk (horizon, 7) for the environment; it does not depend on the recorders."""
         return self.predict(policy_input, noise_seed, recorders).actions
 
     def predict(

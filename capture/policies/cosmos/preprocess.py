@@ -1,4 +1,4 @@
-"""From camera pictures and joint readings to what the networks take, and from their actions to the robot's."""
+"""Preprocessing of camera pictures and proprioception for the networks, and of their actions for the robot."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class StatisticsNotFound(UserError, FileNotFoundError):
 
 
 class BadStatistics(UserError, ValueError):
-    """The dataset statistics lack something or do not fit the policy."""
+    """The dataset statistics lack an entry or do not fit the policy."""
 
 
 def upright(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the simulator's picture with its rows reversed, and nothing else: columns stay."""
+    """Return the simulator's picture with its rows reversed; the columns stay."""
     return np.ascontiguousarray(picture[::-1])
 
 
@@ -59,13 +59,13 @@ def crop_and_enlarge(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def model_picture(picture: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
-    """Return an upright picture as the model sees it: JPEG, bicubic resize, middle crop, back to (size, size, 3) uint8."""
+    """Return the model's image (size, size, 3) uint8 of an upright picture: JPEG, bicubic resize, middle crop."""
     resized = Image.fromarray(compress(picture)).resize((size, size))
     return crop_and_enlarge(np.asarray(resized))
 
 
 def visible_area() -> float:
-    """Side of what the model sees of a camera picture, as a share of the picture's side, around its middle."""
+    """Return the side of the visible middle of a camera picture, as a share of the picture's side."""
     return crop_size(224) / 224
 
 
@@ -103,7 +103,9 @@ _FIELDS = ("actions_min", "actions_max", "proprio_min", "proprio_max")
 
 
 def make_statistics(content: Mapping[str, object], where: str, action_dim: int, proprio_dim: int) -> Statistics:
-    """Check ranges read from somewhere; `BadStatistics` names what is missing or of the wrong length."""
+    """Check ranges and return them; `BadStatistics` names the entry that is missing or of the wrong length.
+
+    where: completes the sentence "The dataset statistics ..." in an error."""
     arrays = {}
     for name in _FIELDS:
         if name not in content:
@@ -130,8 +132,8 @@ def read_statistics(path: str | Path, action_dim: int = 7, proprio_dim: int = 9)
     path = Path(path)
     if not path.is_file():
         raise StatisticsNotFound(
-            f"There are no dataset statistics at '{path}'; give --dataset-stats-path (libero_dataset_statistics.json of the "
-            "checkpoint)."
+            f"There are no dataset statistics at '{path}'; give --dataset-stats-path (libero_dataset_statistics.json "
+            "of the checkpoint)."
         )
     try:
         content = json.loads(path.read_text())

@@ -1,7 +1,7 @@
-"""The reference's sampler: noise levels, a second-order multistep solver, and the answer of a last evaluation.
+"""The reference's sampler: noise levels, a second-order multistep solver, and a last evaluation that gives the result.
 
-With K requested evaluations, K - 1 solver steps lead from sigma_max to sigma_min, and one clean evaluation there gives the
-answer. Quirk, kept: K = 2 makes only one evaluation, at sigma_max, like K = 1.
+With K requested evaluations, K - 1 solver steps lead from sigma_max to sigma_min, and one evaluation there gives
+the result. As in the reference, K = 2 makes only one evaluation, at sigma_max, like K = 1.
 """
 
 from __future__ import annotations
@@ -36,7 +36,10 @@ def flow_time(sigma: float) -> float:
 
 
 def seeded_noise(seed: int, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return the reference's standard normal noise: numpy's legacy generator. Larger seeds than it takes are split in words."""
+    """Return the reference's standard normal noise, from numpy's legacy generator.
+
+    Seeds above 32 bits are split into words of 32 bits.
+    """
     words = seed if seed < 2**32 else [seed & 0xFFFFFFFF, seed >> 32]
     return np.random.RandomState(words).standard_normal(shape).astype(np.float32)
 
@@ -55,7 +58,7 @@ def sample(denoise: Denoiser, noise: Tensor, levels: NDArray[np.float64]) -> Ten
 def _advance(
     x: Tensor, estimate: Tensor, previous: tuple[Tensor, float] | None, level: float, following: float
 ) -> Tensor:
-    """One step of the second-order Adams-Bashforth solver in log-sigma; the first is of first order."""
+    """One step of the second-order Adams-Bashforth solver in log-sigma; the first step is of first order."""
     if previous is None:
         return (1 - following / level) * estimate + following / level * x
     last_estimate, last_level = previous

@@ -1,4 +1,4 @@
-"""Encoding an instruction that was not precomputed, with T5's encoder from the transformers library."""
+"""T5's encoder from the transformers library, for instructions without a precomputed embedding."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ class EncoderUnusable(UserError, ValueError):
 class T5Encoder:
     """T5's encoder (`google-t5/t5-11b` for the published policies) from a local folder, in float32.
 
-    Loaded when first needed: it is many times as large as the policy, and most runs have all their embeddings.
+    Loaded at the first use: it is many times as large as the policy, and most runs need precomputed embeddings only.
     """
 
     def __init__(self, folder: str | Path):
         self.folder = Path(folder).expanduser()
         if not (self.folder / "config.json").is_file():
             raise EncoderUnusable(
-                f"There is no T5 encoder at '{self.folder}'; give --t5-encoder a folder with config.json, the weights and "
-                f"{T5_TOKENIZER}."
+                f"There is no T5 encoder at '{self.folder}'; give --t5-encoder a folder with config.json, the weights "
+                f"and {T5_TOKENIZER}."
             )
         self._model: Any = None
 
     def encode(self, ids: list[int], positions: int, width: int) -> Tensor:
-        """Return the embedding (1, position, width) bfloat16 of token ids, the end token included; the rest is exactly 0."""
+        """Return the embedding (1, position, width) bfloat16 of token ids with the end token; other positions are 0."""
         if len(ids) > positions:
             raise BadArgument(
                 f"The instruction has {len(ids)} tokens, but the policy reads {positions}; shorten the instruction."
@@ -41,8 +41,8 @@ class T5Encoder:
         model = self._load()
         if model.config.d_model != width:
             raise EncoderUnusable(
-                f"The T5 encoder at '{self.folder}' gives {model.config.d_model} numbers a position, but the policy reads "
-                f"{width}: it is another size of T5."
+                f"The T5 encoder at '{self.folder}' gives {model.config.d_model} numbers a position, but the policy "
+                f"reads {width}: it is another size of T5."
             )
         with torch.no_grad():
             hidden = model(input_ids=torch.tensor([ids])).last_hidden_state
@@ -56,8 +56,8 @@ class T5Encoder:
                 library = import_module("transformers")
             except ImportError as error:
                 raise MissingDependency(
-                    f"--t5-encoder needs the transformers library ({error}); install it with `pip install transformers`, or "
-                    "precompute the embeddings elsewhere and give --t5-text-embeddings-path."
+                    f"--t5-encoder needs the transformers library ({error}); install it with `pip install "
+                    "transformers`, or precompute the embeddings elsewhere and give --t5-text-embeddings-path."
                 ) from error
             try:
                 self._model = library.T5EncoderModel.from_pretrained(

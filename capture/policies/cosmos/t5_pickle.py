@@ -1,4 +1,4 @@
-"""Reading precomputed T5 embeddings from their pickle, without running anything that the file says."""
+"""Precomputed T5 embeddings, read from their pickle without executing any code of the file."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class BadEmbeddings(UserError, ValueError):
 
 
 def _load_storage(content: bytes) -> Any:
-    """What the pickle's `_load_from_bytes` becomes: PyTorch's own restricted reader, on the CPU."""
+    """Read a storage with PyTorch's own restricted reader, on the CPU; replaces the pickle's `_load_from_bytes`."""
     return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
 
 
-#: The only things that such a file may ask for.
+#: The only functions that such a file may call.
 _ALLOWED: dict[tuple[str, str], Callable[..., Any]] = {
     ("collections", "OrderedDict"): collections.OrderedDict,
     ("torch._utils", "_rebuild_tensor_v2"): torch._utils._rebuild_tensor_v2,
@@ -42,17 +42,17 @@ _ALLOWED: dict[tuple[str, str], Callable[..., Any]] = {
 
 
 class _RestrictedUnpickler(pickle.Unpickler):
-    """Knows tensors and nothing else; whatever else a file names is refused before it could do anything."""
+    """Reads tensors only; any other object is refused before it is created."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return one of the allowed functions, or refuse."""
+        """Return one of the allowed functions; `RefusedPickle` for any other."""
         allowed = _ALLOWED.get((module, name))
         if allowed is None:
             raise RefusedPickle(f"it asks for {module}.{name}")
         return allowed
 
     def persistent_load(self, identifier: Any) -> NoReturn:
-        """Refuse: a file of embeddings refers to nothing outside itself."""
+        """Raise `RefusedPickle`: a file of embeddings needs nothing outside itself."""
         raise RefusedPickle("it refers to something outside itself")
 
 
@@ -71,26 +71,29 @@ class TextEmbeddings:
         return positions, width
 
     def find(self, instruction: str) -> Tensor:
-        """Return the embedding of an instruction; the error names the nearest ones that there are."""
+        """Return the embedding of an instruction; `UnknownName` lists the nearest instructions."""
         if instruction in self.by_instruction:
             return self.by_instruction[instruction]
         near = difflib.get_close_matches(instruction, list(self.by_instruction), n=3, cutoff=0.5)
         nearest = listing(f"'{name}'" for name in near) if near else "none of them is near"
         raise UnknownName(
-            f"There is no text embedding of '{instruction}' among the {len(self.by_instruction)} of '{self.path}'; nearest: "
-            f"{nearest}. Precompute it and give the file as --t5-text-embeddings-path, or give --t5-encoder PATH."
+            f"There is no text embedding of '{instruction}' among the {len(self.by_instruction)} of '{self.path}'; "
+            f"nearest: {nearest}. Precompute it and give the file as --t5-text-embeddings-path, or give --t5-encoder "
+            "PATH."
         )
 
 
 def read_embeddings(path: str | Path) -> TextEmbeddings:
     """Read a pickle of text embeddings.
 
-    Raises `EmbeddingsNotFound`, `BadEmbeddings`, or `RefusedPickle` (nothing was executed) when it holds more than tensors.
+    Raises `EmbeddingsNotFound`, `BadEmbeddings`, or `RefusedPickle` (nothing was executed) when it holds more than
+    tensors.
     """
     path = Path(path)
     if not path.is_file():
         raise EmbeddingsNotFound(
-            f"There are no text embeddings at '{path}'; give --t5-text-embeddings-path (libero_t5_embeddings.pkl of the checkpoint)."
+            f"There are no text embeddings at '{path}'; give --t5-text-embeddings-path (libero_t5_embeddings.pkl of "
+            "the checkpoint)."
         )
     content = path.read_bytes()
     try:
@@ -114,8 +117,8 @@ def _checked(found: Any, path: Path) -> dict[str, Tensor]:
     for name, value in found.items():
         if not isinstance(name, str) or not isinstance(value, Tensor) or value.ndim != 3 or value.shape[0] != 1:
             raise BadEmbeddings(
-                f"'{path}' should hold instruction -> tensor (1, position, width), but has an entry for {name!r} that is "
-                f"{tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__}."
+                f"'{path}' should hold instruction -> tensor (1, position, width), but has an entry for {name!r} that "
+                f"is {tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__}."
             )
         shapes.add(tuple(value.shape))
     if len(shapes) > 1:

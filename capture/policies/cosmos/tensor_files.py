@@ -1,4 +1,4 @@
-"""Reading files of tensors without running anything that a file says: PyTorch's own format and safetensors."""
+"""Files of tensors, in PyTorch's format or as safetensors, read without executing any code of the file."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ class TensorFileNotFound(UserError, FileNotFoundError):
 
 
 class UnreadableTensors(UserError, ValueError):
-    """A file of tensors is damaged, or holds something else."""
+    """A file of tensors is damaged, or holds no tensors."""
 
 
 class RefusedPickle(UnreadableTensors):
-    """A pickle asks for something other than tensors; nothing of it was executed."""
+    """A pickle needs more than tensors; nothing of it was executed."""
 
 
-#: What Transformer Engine's extra state is pickled as. Bytes only: nothing that does anything.
+#: Types in the pickle of Transformer Engine's extra state: plain bytes.
 _HARMLESS: list[Any] = [io.BytesIO, bytes, _codecs.encode]
 #: Some writers wrap the tensors in a dictionary under one of these names.
 _WRAPPERS = ("model", "state_dict")
@@ -38,7 +38,7 @@ _WRAPPERS = ("model", "state_dict")
 def read_tensors(path: str | Path) -> dict[str, Any]:
     """Read a `.pt`, `.pth` or `.safetensors` file: name -> tensor (or extra state, which carries no weights).
 
-    Raises `TensorFileNotFound`, `UnreadableTensors`, or `RefusedPickle` when the file asks for code to be run.
+    Raises `TensorFileNotFound`, `UnreadableTensors`, or `RefusedPickle` if the file would execute code.
     """
     path = Path(path)
     if not path.is_file():
@@ -76,11 +76,12 @@ def _read_torch(path: Path) -> Any:
 
 def _unreadable(path: Path, error: Exception) -> UnreadableTensors:
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    # PyTorch says which name it did not accept; the other lines advise how to run it nevertheless.
+    # One line of PyTorch's message names what it refused; the others advise how to execute it nevertheless.
     refused = [line for line in lines if "GLOBAL" in line]
     if refused:
         return RefusedPickle(
-            f"'{path}' was refused: it asks for more than tensors ({refused[0].rstrip('.')}), and nothing of it was executed."
+            f"'{path}' was refused: it asks for more than tensors ({refused[0].rstrip('.')}), and nothing of it was "
+            "executed."
         )
     first = lines[0].rstrip(".") if lines else type(error).__name__
     return UnreadableTensors(f"'{path}' cannot be read as tensors ({first}): the file is damaged or something else.")

@@ -1,4 +1,4 @@
-"""An instruction as the policy reads it: its embedding, what each text position is, and the words that positions spell."""
+"""An instruction for the policy: its embedding, the role of each text position, and its word pieces."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class TokenizerUnusable(UserError, ValueError):
 
 @dataclass(frozen=True)
 class EncodedText:
-    """An instruction for the model: embedding (1, position, width), roles (position,) uint8, and the prompt with its pieces."""
+    """An instruction for the model: embedding (1, position, width), roles (position,) uint8, prompt with pieces."""
 
     embedding: Tensor
     roles: NDArray[np.uint8]
@@ -37,13 +37,13 @@ class EncodedText:
 
 
 class TextSource(Protocol):
-    """Whatever turns instructions into embeddings."""
+    """Turns instructions into embeddings."""
 
     def encode(self, instruction: str) -> EncodedText:
-        """Return the embedding of an instruction and what its positions are."""
+        """Return the embedding of an instruction, and the role of each position."""
 
     def provenance(self) -> dict[str, Any]:
-        """Return what identifies the source, as plain JSON values."""
+        """Return plain JSON values that identify the source."""
 
 
 class PieceTokenizer:
@@ -78,10 +78,10 @@ class PieceTokenizer:
 
 
 def text_roles(is_real: NDArray[np.bool_], num_pieces: int | None) -> NDArray[np.uint8]:
-    """Return the role of each position: padded ones are an exact null sink.
+    """Return the role code of each position, (position,) uint8. Padded positions are `null`: they contribute exactly 0.
 
-    With known pieces the instruction's are `instruction` and what follows (T5's end token) is `template`; without, every
-    real position is `text`.
+    If the pieces are known, their positions are `instruction`, and the position after them (T5's end token) is
+    `template`. Else every real position is `text`.
     """
     roles = np.full(len(is_real), Role.NULL, dtype=ROLE_DTYPE)
     if num_pieces is None:
@@ -93,9 +93,9 @@ def text_roles(is_real: NDArray[np.bool_], num_pieces: int | None) -> NDArray[np
 
 
 class PrecomputedText:
-    """Embeddings from a file, and T5's tokenizer when it is at hand: without it, no position can be told to be a word.
+    """Embeddings from a file. T5's tokenizer is optional; without it no position is known as a word.
 
-    With an encoder (and the tokenizer), instructions that the file lacks are encoded.
+    With an encoder and the tokenizer, instructions that the file lacks are encoded.
     """
 
     def __init__(
@@ -117,24 +117,24 @@ class PrecomputedText:
         return self._encoded[instruction]
 
     def encode(self, instruction: str) -> EncodedText:
-        """Return the stored embedding; `UnknownName` names near instructions, `TokenizerUnusable` a tokenizer that disagrees."""
+        """Return the embedding and its roles; `UnknownName` or `TokenizerUnusable` if either does not fit."""
         embedding = self._embedding(instruction)
         is_real = embedding[0].ne(0).any(dim=-1).numpy()
         count = int(is_real.sum())
         if not is_real[:count].all():
             raise BadEmbeddings(
-                f"The text embedding of '{instruction}' in '{self.embeddings.path}' has zero positions between real ones; expected "
-                "the real tokens first and zeros after them."
+                f"The text embedding of '{instruction}' in '{self.embeddings.path}' has zero positions between real "
+                "ones; expected the real tokens first and zeros after them."
             )
         whole = (0, len(instruction))
         if self.tokenizer is None:
             return EncodedText(embedding, text_roles(is_real, None), Prompt(instruction, (), whole))
         pieces = self.tokenizer.pieces(instruction)
-        # An all-zero embedding is a text left out on purpose.
+        # An embedding of zeros only is a text that was left out on purpose.
         if count and count != len(pieces) + END_TOKENS:
             raise TokenizerUnusable(
-                f"The tokenizer '{self.tokenizer.path}' cuts '{instruction}' into {len(pieces)} pieces and an end token, but its "
-                f"embedding has {count} real positions: it is another model's tokenizer."
+                f"The tokenizer '{self.tokenizer.path}' cuts '{instruction}' into {len(pieces)} pieces and an end "
+                f"token, but its embedding has {count} real positions: it is another model's tokenizer."
             )
         known = pieces if count else ()
         return EncodedText(embedding, text_roles(is_real, len(known)), Prompt(instruction, known, whole))
@@ -150,7 +150,7 @@ class PrecomputedText:
 
 
 class SeededText:
-    """Made-up embeddings for untrained policies: every piece has a random vector of its own, whatever the instruction."""
+    """Made-up embeddings for untrained policies: every piece has a random vector, the same in all instructions."""
 
     def __init__(self, tokenizer: PieceTokenizer, positions: int, width: int, seed: int):
         self.tokenizer = tokenizer

@@ -1,8 +1,8 @@
-"""Pictures to latent frames: the encoder of the Wan2.1 video VAE, whose code is diffusers'.
+"""From pictures to latent frames: the encoder of the Wan2.1 video VAE, with diffusers' code.
 
-The VAE is causal in time, so latents of later frames are never needed for earlier ones: of the 33 pixel frames that the
-reference encodes only the first 13 are (blank, proprio's place, wrist, primary). The first five of those are always black;
-what they leave behind in the causal convolutions is computed once.
+The VAE is causal in time: a latent frame does not depend on later pixel frames. So only the first 13 of the 33 pixel
+frames that the reference encodes are computed (blank, the place of proprioception, wrist, primary). The first five of
+them are always black, and the state of the causal convolutions after them is computed once.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ BLACK = -1.0
 
 
 def _build_wan(config: VaeConfig) -> Any:
-    """Return diffusers' AutoencoderKLWan, whose types mypy cannot follow."""
+    """Return diffusers' AutoencoderKLWan, which has no types for mypy."""
     try:
         library = import_module("diffusers.models.autoencoders.autoencoder_kl_wan")
     except ImportError as error:
         raise MissingDependency(
-            f"Cosmos policies need diffusers for their image encoder ({error}); install it with `pip install 'vla-attention[cosmos]'`."
+            f"Cosmos policies need diffusers for their image encoder ({error}); install it with `pip install "
+            "'vla-attention[cosmos]'`."
         ) from error
     return library.AutoencoderKLWan(
         base_dim=config.base_dim,
@@ -97,7 +98,7 @@ def expected_vae_shapes(config: VaeConfig) -> Shapes:
 
 
 def infer_vae_config(state: Mapping[str, Any], base: VaeConfig | None = None) -> VaeConfig:
-    """Return the sizes of a stored VAE: its base width; everything else is that of `base`, which loading then checks."""
+    """Return the sizes of a stored VAE: its own base width, and the rest from `base`, which loading then checks."""
     base = base or VaeConfig()
     first = state.get("encoder.conv1.weight")
     return VaeConfig(
@@ -110,7 +111,7 @@ def infer_vae_config(state: Mapping[str, Any], base: VaeConfig | None = None) ->
 
 
 class CausalEncoder(nn.Module):
-    """The encoder half of the VAE: pictures to normalised latent frames. The decoder is checked when loading, then dropped."""
+    """The encoder half of the VAE, from pictures to normalised latent frames."""
 
     mean: Tensor
     std: Tensor
@@ -134,20 +135,20 @@ class CausalEncoder(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """Device of the weights."""
         device: torch.device = self.encoder.conv_in.weight.device
         return device
 
     def _encode_chunk(self, frames: Tensor, cache: list[Tensor | None]) -> Tensor:
-        """Encode pixel frames that make one latent frame; `cache` holds, and gets, what the convolutions saw before."""
+        """Encode the pixel frames of one latent frame; `cache`: state of the causal convolutions, read and updated."""
         moments = self.quant_conv(self.encoder(frames, feat_cache=cache, feat_idx=[0]))
         mean = moments.chunk(2, dim=1)[0]
-        # The moments come in the weights' precision, and so do the reference's constants.
+        # The moments have the precision of the weights, and so have the reference's constants.
         normalised: Tensor = (mean - self.mean.to(mean.dtype)) / self.std.to(mean.dtype)
         return normalised.float()
 
     def _after_black(self, height: int, width: int) -> tuple[list[Tensor], list[Tensor | None]]:
-        """The two latents of the five black frames, and what the convolutions remember of them: always the same."""
+        """The two latents of the five black frames, and the state of the convolutions after them."""
         if self._black_size != (height, width):
             cache: list[Tensor | None] = [None] * sum(1 for _ in self.encoder.modules())
             latents = []
@@ -159,13 +160,13 @@ class CausalEncoder(nn.Module):
 
     @torch.no_grad()
     def encode(self, pictures: list[Tensor]) -> Tensor:
-        """Return (1, channel, 2 + pictures, row, column) float32: blank, the place of proprioception, then the pictures.
+        """Return (1, channel, 2 + pictures, row, column) float32: blank, place of proprioception, then the pictures.
 
-        Each picture is (1, 3, 1, height, width) in -1..1, and shown for four pixel frames.
+        Each picture is (1, 3, 1, height, width) in -1..1, and is repeated for four pixel frames.
         """
         height, width = pictures[0].shape[-2:]
         black, cache = self._after_black(height, width)
-        # In order: every picture's convolutions go on from what the one before left in the cache.
+        # In this order, because the convolutions of a picture continue from the cache of the picture before it.
         shown = [self._encode_chunk(picture.expand(-1, -1, FRAMES_PER_LATENT, -1, -1), cache) for picture in pictures]
         return torch.cat([*black, *shown], dim=2)
 

@@ -1,1 +1,1 @@
-"""pi0 and pi0.5 in plain torch: models, checkpoints, prompts, preprocessing, and a small policy that comes along."""
+"""pi0 and pi0.5 in plain torch: models, checkpoints, prompts, preprocessing, and a small untrained policy."""

@@ -1,4 +1,4 @@
-"""From what a user names on the command line to a pi policy."""
+"""Build a pi policy from the options of the command line."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ def build_pi_policy(
     action_expert_variant: str | None = None,
     num_image_tokens: int | None = None,
 ) -> PiPolicy:
-    """Build the policy and hold it against what the user says about it.
+    """Build the policy and check the options against it.
 
-    `checkpoint` is a folder, a name on a hub, or one of the two untrained policies that come with the package: `embedded`,
-    `dummy`. Raises `BadArgument` when a variant or the number of image tokens contradicts the policy.
+    `checkpoint` is a folder, a name on a hub, or one of the two untrained policies that come with the package:
+    `embedded`, `dummy`. Raises `BadArgument` if a variant or the number of image tokens contradicts the policy.
     """
     wanted = {
         "--paligemma-variant": find_variant(paligemma_variant) if paligemma_variant else None,
@@ -50,17 +50,17 @@ def build_pi_policy(
         dtype=find_dtype(dtype) if dtype else None,
     )
     if config_name is not None:
-        find_config(config_name)  # a name that does not exist is said before anything is fetched
+        find_config(config_name)  # an unknown name is reported before any download
     if checkpoint in _UNTRAINED:
         if dataclasses.replace(options, dtype=None) != CheckpointOptions() or options.dtype == torch.bfloat16:
             raise BadArgument(
-                f"The policy '{checkpoint}' comes with the program, in float32; --checkpoint-format, --config-name, --model-config, "
-                "--discrete-state-input and --dtype bfloat16 are for checkpoints."
+                f"The policy '{checkpoint}' comes with the program, in float32; --checkpoint-format, --config-name, "
+                "--model-config, --discrete-state-input and --dtype bfloat16 are for checkpoints."
             )
         policy = _UNTRAINED[checkpoint](device=device)
     else:
         path = find_checkpoint(checkpoint)
-        detect_format(path, options.checkpoint_format)  # a folder that is no checkpoint is the first thing to say
+        detect_format(path, options.checkpoint_format)  # a folder without a checkpoint is reported first
         policy = load_pi_policy(path, find_tokenizer(path, tokenizer), options=options, device=device)
     config = policy.model.config
     for option, given, actual in (
@@ -69,13 +69,13 @@ def build_pi_policy(
     ):
         if given is not None and given != actual:
             raise BadArgument(
-                f"{option} contradicts the policy '{checkpoint}', whose part has {_sizes(actual)}, not {_sizes(given)}; "
-                "leave the option out."
+                f"{option} contradicts the policy '{checkpoint}', whose part has {_sizes(actual)}, not "
+                f"{_sizes(given)}; leave the option out."
             )
     if num_image_tokens is not None and num_image_tokens != config.siglip.num_tokens:
         raise BadArgument(
-            f"--num-image-tokens {num_image_tokens} contradicts the layout: each of the cameras {listing(config.cameras)} has "
-            f"{config.siglip.num_tokens} keys; leave the option out."
+            f"--num-image-tokens {num_image_tokens} contradicts the layout: each of the cameras "
+            f"{listing(config.cameras)} has {config.siglip.num_tokens} keys; leave the option out."
         )
     return policy
 

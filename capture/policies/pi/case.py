@@ -1,6 +1,6 @@
-"""Parity cases: a small folder with a checkpoint, inputs, and what a reference implementation made of them.
+"""Parity cases of the pi models: checkpoints, inputs, and the results of a reference implementation.
 
-case.json states the sizes that no checkpoint states about itself; it also serves a checkpoint that lies beside it.
+case.json states the sizes that no checkpoint states. It is also used for a checkpoint in a folder beside it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 
 CaseFormat = Literal["orbax", "openpi", "lerobot"]
 
-#: Folder of the checkpoint in each format that a case may carry, and the loader's name for the format.
+#: For each format of a case: the folder of the checkpoint, and the loader's name of the format.
 CHECKPOINT_FOLDERS: dict[CaseFormat, tuple[str, CheckpointFormat]] = {
     "orbax": ("checkpoint", "openpi_jax"),
     "openpi": ("checkpoint_openpi_torch", "openpi_torch"),
@@ -48,11 +48,11 @@ class Case:
 
     @property
     def formats(self) -> tuple[CaseFormat, ...]:
-        """The formats that the case carries a checkpoint in."""
+        """The formats of the case's checkpoints."""
         return tuple(name for name, (folder, _) in CHECKPOINT_FOLDERS.items() if (self.folder / folder).is_dir())
 
     def checkpoint(self, case_format: CaseFormat) -> tuple[Path, CheckpointFormat]:
-        """Return the folder of the checkpoint in a format; the error names the formats that are there."""
+        """Return the folder of the checkpoint in a format; `UnusableCase` lists the existing formats."""
         if case_format not in self.formats:
             raise UnusableCase(
                 f"The case '{self.folder}' carries no checkpoint in the format '{case_format}' (folder "
@@ -63,7 +63,7 @@ class Case:
 
 
 def find_case_format(name: str) -> CaseFormat:
-    """Return the format of that name; the error lists the three."""
+    """Return the format of that name; `UnknownName` lists the three."""
     for known in CHECKPOINT_FOLDERS:
         if known == name:
             return known
@@ -79,8 +79,9 @@ def read_config(path: Path) -> PiConfig:
         return _config(content)
     except (KeyError, TypeError) as error:
         raise UnusableCase(
-            f"'{path}' does not state the sizes of a pi model: {error!s} is missing or wrong; expected 'model' (pi0 or pi05) and "
-            "'config' with paligemma, action_expert, siglip, vocab_size, action_dim, action_horizon, max_token_len, num_steps."
+            f"'{path}' does not state the sizes of a pi model: {error!s} is missing or wrong; expected 'model' (pi0 or "
+            "pi05) and 'config' with paligemma, action_expert, siglip, vocab_size, action_dim, action_horizon, "
+            "max_token_len, num_steps."
         ) from error
 
 
@@ -110,7 +111,7 @@ def _config(content: Mapping[str, Any]) -> PiConfig:
 
 
 def read_case(folder: str | Path) -> Case:
-    """Read a case folder; `UnusableCase` says which file or array is missing or of the wrong shape."""
+    """Read a case folder; `UnusableCase` names the file or array that is missing or of the wrong shape."""
     folder = Path(folder)
     content = read_case_file(folder)
     config = read_config(folder / CASE_FILE)
@@ -130,7 +131,7 @@ def _input_shapes(config: PiConfig, inputs: Mapping[str, np.ndarray]) -> Wanted:
     batch = len(inputs["noise"]) if "noise" in inputs and inputs["noise"].ndim else 1
     size = config.siglip.image_size
     text = (batch, config.max_token_len)
-    # The noise first: the batch is read off it.
+    # The noise is checked first, because the batch size comes from it.
     wanted: Wanted = {"noise": (batch, config.action_horizon, config.action_dim), "num_steps": ()}
     wanted |= {f"image_{camera}": (batch, size, size, 3) for camera in config.cameras}
     wanted |= {f"image_mask_{camera}": (batch,) for camera in config.cameras}

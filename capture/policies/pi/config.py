@@ -1,4 +1,4 @@
-"""Sizes of the pi models: what a checkpoint does not say about itself, and the layout that follows from it."""
+"""Sizes of the pi models, and the lengths of the key and query axes that follow from them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from vla_attention.capture.policies.pi.flow_time import MAX_PERIOD, MIN_PERIOD, TimeConvention
 from vla_attention.schemas.errors import BadArgument, unknown_name
 
-#: openpi's camera slots, in the order of their keys. Which camera fills which slot is the preprocessing's business.
+#: openpi's camera slots, in the order of their keys. The preprocessing assigns cameras to slots.
 CAMERA_SLOTS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")
 
 #: Vocabulary of PaliGemma's tokenizer.
@@ -53,7 +53,7 @@ GEMMA_VARIANTS: dict[str, GemmaConfig] = {
     "gemma_300m": GemmaConfig(width=1024, depth=18, mlp_dim=4096),
     # openpi's own test size
     "dummy": GemmaConfig(width=64, depth=4, mlp_dim=128, head_dim=16),
-    # the policy that comes with this package: the reference's depth and heads, so that its layer numbers exist
+    # the policy that comes with this package; depth and heads of the reference, so that its layer numbers exist
     "embedded": GemmaConfig(width=128, depth=18, mlp_dim=256, head_dim=32),
     "embedded_expert": GemmaConfig(width=96, depth=18, mlp_dim=192, head_dim=32),
 }
@@ -68,11 +68,10 @@ def find_variant(name: str) -> GemmaConfig:
 
 @dataclass(frozen=True)
 class PiConfig:
-    """Everything that fixes the shape of a pi0 (`pi05=False`) or pi0.5 model.
+    """Everything that determines the shapes of a pi0 (`pi05=False`) or pi0.5 model.
 
-    `discrete_state_input`: the prompt carries the robot's state as digits. openpi's released LIBERO policy does not do
-    so; a table of "which tokens are state" follows from this flag, not from the model family. `float32_vision`: in
-    bfloat16 the image encoder and its projector stay in float32 (LeRobot's precision, not openpi's).
+    discrete_state_input: the prompt contains the robot's state as digits; openpi's released LIBERO policy has False.
+    float32_vision: in bfloat16 the image encoder and its projector stay in float32, as in LeRobot and not in openpi.
     """
 
     paligemma: GemmaConfig
@@ -126,7 +125,7 @@ class PiConfig:
         return self.prefix_len + self.suffix_len
 
 
-#: Full-size models by openpi's names for the configurations that a LIBERO policy is trained with.
+#: Full-size models by openpi's names for its LIBERO configurations.
 NAMED_CONFIGS: dict[str, PiConfig] = {
     "pi05_libero": PiConfig(
         paligemma=GEMMA_VARIANTS["gemma_2b"],

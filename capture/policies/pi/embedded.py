@@ -1,7 +1,7 @@
-"""The policy that comes with this package: a small pi0.5 with seeded random weights, so that everything runs anywhere.
+"""The policy that comes with this package: a small pi0.5 with seeded random weights, which runs on any machine.
 
-It was never trained and solves nothing. It has the reference's depth, heads and token layout, and weights scaled such that
-its attention has structure: rows are neither uniform nor on one key, and depend on picture, words, noise and time.
+It is untrained and solves no task. It has the reference's depth, heads and token layout, and weights scaled such
+that its attention has structure: rows are neither uniform nor on one key, and depend on picture, words, noise and time.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ EMBEDDED_CONFIG = PiConfig(
     max_token_len=200,
 )
 
-#: The same code in milliseconds, for tests: 4 patches a camera. Prompts with the state, to exercise those too.
+#: For tests, runs in milliseconds: 4 patches per camera. Its prompts contain the state, so that tests cover these too.
 DUMMY_CONFIG = PiConfig(
     paligemma=GemmaConfig(width=32, depth=3, mlp_dim=48, head_dim=8),
     action_expert=GemmaConfig(width=24, depth=3, mlp_dim=32, head_dim=8),
@@ -51,8 +51,8 @@ DUMMY_CONFIG = PiConfig(
 )
 
 #: Made-up ranges of LIBERO's state and actions (not statistics of any data set): the hand above a table in metres, hand
-#: pointing down (axis-angle around pi), finger joints; pose changes well inside the controller's -1..1, gripper from open
-#: (-1) to closed (1).
+#: pointing down (axis-angle around pi), finger joints; pose changes well inside the controller's -1..1, gripper from
+#: open (-1) to closed (1).
 BUILTIN_STATS = {
     "state": {
         "q01": [-0.4, -0.35, 0.0, 2.4, -1.5, -1.2, 0.0, -0.04],
@@ -64,8 +64,8 @@ BUILTIN_STATS = {
     },
 }
 
-#: Spread of the logits of the sharpest and the flattest head of a block, were keys and queries independent: exp(-σ²/2) of
-#: the keys would effectively be looked at.
+#: Standard deviation σ of the logits of the sharpest and the flattest head of a block, for independent keys and
+#: queries. Attention then spreads over about exp(-σ²/2) of the keys.
 _SHARPEST, _FLATTEST = 2.6, 0.8
 
 
@@ -89,7 +89,7 @@ def random_weights(config: PiConfig, seed: int) -> dict[str, Tensor]:
 
 
 def _scaled(name: str, normal: np.ndarray, config: PiConfig) -> np.ndarray:
-    """Turn standard normal numbers into one tensor of the model, by what the tensor is for."""
+    """Turn standard normal numbers into one tensor of the model, according to its role."""
     if name.endswith("embed_tokens.weight"):
         return normal * np.float32(config.paligemma.width**-0.5)  # scaled up again by sqrt(width) when looked up
     if name.endswith("position_embedding.weight"):
@@ -100,12 +100,12 @@ def _scaled(name: str, normal: np.ndarray, config: PiConfig) -> np.ndarray:
     if name.endswith("bias"):
         bias = normal * np.float32(0.02)
         if ".dense." in name:
-            bias[2 * len(bias) // 3 :] += 0.5  # the gate: half open, so that every block adds something
+            bias[2 * len(bias) // 3 :] += 0.5  # the gate is 0.5 on average, so that every block has an update
         return bias
     fan_in = int(np.prod(normal.shape[1:]))
     weight = normal * np.float32(fan_in**-0.5)
     if name.endswith("patch_embedding.weight"):
-        # Pictures are smooth: without taking out a filter's mean, all patches would differ in brightness only.
+        # Pictures are smooth: with the mean of a filter, patches would differ in brightness only.
         contrast: np.ndarray = weight - np.float32(0.7) * weight.mean(axis=(1, 2, 3), keepdims=True)
         return contrast * np.float32(6.0)
     if "vision_tower" not in name and name.endswith("q_proj.weight"):

@@ -25,7 +25,8 @@ _EXAMPLES = """\
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     model = add_model_arguments(
         parser,
-        checkpoint="checkpoint folder of openpi (JAX or PyTorch) or LeRobot, ORG/NAME on the Hugging Face hub, or gs://...",
+        checkpoint="checkpoint folder of openpi (JAX or PyTorch) or LeRobot, ORG/NAME on the Hugging Face hub, or "
+        "gs://...",
         config_name="openpi's name for the configuration (pi05_libero, pi0_libero ...)",
         dtype_default="what a LeRobot checkpoint states, else float32",
     )

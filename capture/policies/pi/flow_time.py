@@ -1,7 +1,8 @@
-"""Flow times of the denoise steps and their embedding, in the two conventions that pi policies are run with.
+"""Flow times of the denoise steps and their embedding, in the two conventions of pi policies.
 
-The fastest wave of the embedding turns by 1571 rad over the unit interval, so that the rounding of a time or of a period shows
-in attention: about 1e-5 from float32 instead of float64 waves, up to 1e-4 from accumulated instead of stepped times.
+The fastest wave of the embedding turns by 1571 rad over the unit interval, so the rounding of a time or of a
+period changes attention: about 1e-5 from float32 instead of float64 waves, up to 1e-4 from accumulated instead of
+stepped times.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def embed_times(
 ) -> Tensor:
     """Return [sin, cos] waves of the times (denoise,) as (denoise, width) float32, with geometric periods.
 
-    Always on the CPU, because another device's rounding of the periods would show.
+    Computed on the CPU, because other devices round the periods differently.
     """
     dtype = torch.float64 if convention == "stepped" else torch.float32
     fraction = torch.linspace(0.0, 1.0, width // 2, dtype=dtype)

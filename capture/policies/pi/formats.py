@@ -1,4 +1,4 @@
-"""Recognise the format of a checkpoint folder from its files, and say of other folders what they are."""
+"""Recognise the format of a checkpoint folder from its files, and describe folders of other kinds."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from vla_attention.schemas.errors import listing, unknown_name
 CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot"]
 CHECKPOINT_FORMATS: tuple[CheckpointFormat, ...] = get_args(CheckpointFormat)
 
-#: How each format is called in messages, with the files that make it.
-SPOKEN: dict[CheckpointFormat, str] = {
+#: Name of each format in messages, with the files that it consists of.
+FORMAT_TITLES: dict[CheckpointFormat, str] = {
     "openpi_torch": "openpi's PyTorch format (config.json and model.safetensors)",
     "openpi_jax": "openpi's JAX format (params/_METADATA)",
     "lerobot": "LeRobot's format (config.json with a type, model.safetensors and policy_preprocessor.json)",
 }
 
-#: Words in the configuration of a transformers checkpoint that name the policy it belongs to.
+#: Words in the configuration of a transformers checkpoint, and the model that each of them names.
 _OTHER_FAMILIES = {
     "openvla": "OpenVLA",
     "gr00t": "GR00T",
@@ -32,7 +32,7 @@ _OTHER_FAMILIES = {
 
 
 def find_format(name: str) -> CheckpointFormat:
-    """Return the format of that name; the error lists the three."""
+    """Return the format of that name; `UnknownName` lists the three."""
     for known in CHECKPOINT_FORMATS:
         if known == name:
             return known
@@ -40,9 +40,9 @@ def find_format(name: str) -> CheckpointFormat:
 
 
 def detect_format(folder: str | Path, wanted: CheckpointFormat | None = None) -> CheckpointFormat:
-    """Say in which format a checkpoint folder is; `wanted` takes the decision when its files are there.
+    """Return the format of a checkpoint folder; it is `wanted`, if given and its files exist.
 
-    Raises `CheckpointNotFound`, `UnsupportedCheckpoint` (which says what the folder is instead) or `UnreadableCheckpoint`.
+    Raises `CheckpointNotFound`, `UnsupportedCheckpoint` (with a description of the folder) or `UnreadableCheckpoint`.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -52,7 +52,7 @@ def detect_format(folder: str | Path, wanted: CheckpointFormat | None = None) ->
     if wanted is not None:
         if not (has_params if wanted == "openpi_jax" else has_tensors):
             content = listing(sorted(path.name for path in folder.iterdir()))
-            raise UnsupportedCheckpoint(f"'{folder}' is not in {SPOKEN[wanted]}: it holds {content}.")
+            raise UnsupportedCheckpoint(f"'{folder}' is not in {FORMAT_TITLES[wanted]}: it holds {content}.")
         return wanted
     if has_params:
         return "openpi_jax"
@@ -88,7 +88,7 @@ def _transformers_family(config: dict[str, Any]) -> str | None:
 
 
 def _what_it_is(folder: Path) -> str:
-    """Say in one sentence why a folder is no pi checkpoint, and what to give instead where that can be seen."""
+    """Return a sentence: why a folder is no pi checkpoint, and if possible what to give instead."""
     names = sorted(path.name for path in folder.iterdir())
     if folder.name == "params" and "_METADATA" in names:
         return f"'{folder}' is the params folder of a checkpoint; give its parent '{folder.parent}'."
@@ -107,6 +107,6 @@ def _what_it_is(folder: Path) -> str:
     if any("cosmos" in name.casefold() for name in names):
         return f"'{folder}' is a checkpoint of another model family: Cosmos Policy, not pi0 or pi0.5."
     return (
-        f"'{folder}' is not a pi checkpoint: expected {SPOKEN['openpi_torch']}, {SPOKEN['openpi_jax']} or "
-        f"{SPOKEN['lerobot']}, found {listing(names)}."
+        f"'{folder}' is not a pi checkpoint: expected {FORMAT_TITLES['openpi_torch']}, {FORMAT_TITLES['openpi_jax']} "
+        f"or {FORMAT_TITLES['lerobot']}, found {listing(names)}."
     )

@@ -1,7 +1,7 @@
 """Gemma transformer of the pi models: norms (plain and adaptive), rotary positions, blocks with a joint key axis.
 
 The vision-language model and the action expert are two instances of `GemmaModel` that read the same keys: a block
-returns its own keys and values and is told which earlier ones come first. Module names are those of openpi's PyTorch
+returns its own keys and values, and takes the earlier ones as an argument. Module names are those of openpi's PyTorch
 checkpoints. Architecture: Gemma Team 2024; adaptive norm: Peebles & Xie 2023 (adaLN) with an RMS norm.
 """
 
@@ -35,7 +35,7 @@ class KeysValues:
         return KeysValues(torch.cat([self.keys, later.keys], 2), torch.cat([self.values, later.values], 2))
 
     def spread(self, positions: Tensor, length: int) -> KeysValues:
-        """Return `length` keys with these at `positions` (key,) and zeros elsewhere, for keys that a mask hides."""
+        """Return `length` keys with these at `positions` (key,) and zeros elsewhere, for masked keys."""
 
         def place(x: Tensor) -> Tensor:
             return x.new_zeros(*x.shape[:2], length, x.shape[3]).index_copy(2, positions, x)
@@ -78,19 +78,19 @@ class RMSNorm(nn.Module):
         self.weight = nn.Parameter(torch.zeros(width))
 
     def forward(self, x: Tensor, condition: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """Map (batch, token, width) to the same shape; the condition is not looked at."""
+        """Map (batch, token, width) to the same shape; the condition is not used."""
         return (rms_normalise(x) * (1.0 + self.weight.float())).to(x.dtype), None
 
 
 class AdaptiveRMSNorm(nn.Module):
-    """RMS norm with scale, shift and gate computed from the condition: rms(x)·(1 + scale) + shift (pi0.5's expert)."""
+    """RMS norm with scale, shift and gate from the condition: rms(x)·(1 + scale) + shift, of pi0.5's expert."""
 
     def __init__(self, width: int, condition_width: int):
         super().__init__()
         self.dense = nn.Linear(condition_width, 3 * width)
 
     def forward(self, x: Tensor, condition: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """Map (batch, token, width), condition (batch, condition width), to the normed x and the gate (batch, 1, width)."""
+        """Map x (batch, token, width), condition (batch, its width), to the normed x and the gate (batch, 1, width)."""
         if condition is None:
             raise ValueError("an adaptive norm needs the condition")
         scale, shift, gate = self.dense(condition.to(self.dense.weight.dtype))[:, None].chunk(3, dim=-1)
@@ -98,12 +98,12 @@ class AdaptiveRMSNorm(nn.Module):
 
 
 def gated(branch: Tensor, gate: Tensor | None) -> Tensor:
-    """Return branch · gate; no gate means 1."""
+    """Return branch · gate; None is a gate of 1."""
     return branch if gate is None else branch * gate
 
 
 def add_branch(x: Tensor, branch: Tensor, gate: Tensor | None) -> Tensor:
-    """Return x + branch · gate; no gate means 1."""
+    """Return x + branch · gate; None is a gate of 1."""
     return x + gated(branch, gate)
 
 
@@ -150,7 +150,7 @@ class GemmaMlp(nn.Module):
 
 
 def make_norm(width: int, condition_width: int | None) -> nn.Module:
-    """Return the plain norm, or the adaptive one when there is a condition."""
+    """Return the plain norm, or the adaptive one if there is a condition."""
     return RMSNorm(width) if condition_width is None else AdaptiveRMSNorm(width, condition_width)
 
 

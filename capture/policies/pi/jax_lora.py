@@ -1,8 +1,8 @@
-"""LoRA arrays of openpi's JAX checkpoints: which belong together, and merging them into the weights they adapt.
+"""LoRA arrays of openpi's JAX checkpoints: finding their pairs, and merging them into the weights that they adapt.
 
-openpi scales the update by alpha / rank, which is 1 in all its LoRA variants (gemma_2b_lora, gemma_300m_lora), so that the
-merged weight is w + a · b. The output projection of the attention is special: its equation sums over the heads in the
-first factor as well as in the second, so that every head's rows meet the sum of all heads' b.
+openpi scales the update by alpha / rank, which is 1 in all its LoRA variants (gemma_2b_lora, gemma_300m_lora), so that
+the merged weight is w + a · b. The output projection of the attention differs: its equation sums over the heads in
+both factors, so that the rows of every head are multiplied by the sum of all heads' b.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class LoraPair:
 
 
 def find_lora_pairs(paths: Iterable[str]) -> dict[str, LoraPair]:
-    """Return adapted leaf -> its pair. A factor alone, or one that adapts nothing here, is in no pair."""
+    """Return adapted leaf -> its pair. A single factor, or one without a leaf to adapt, is in no pair."""
     known = set(paths)
     pairs = {}
     for path in known:
@@ -50,7 +50,8 @@ def merge_lora(path: str, w: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.nda
     fits = w.shape[:-1] == a.shape[:-1] and (*w.shape[:-2], a.shape[-1], w.shape[-1]) == b.shape
     if not fits:
         raise CheckpointMismatch(
-            f"The LoRA arrays of {path} have shapes {a.shape} and {b.shape}, which do not fit its {w.shape} (one layer each)."
+            f"The LoRA arrays of {path} have shapes {a.shape} and {b.shape}, which do not fit its {w.shape} (one layer "
+            "each)."
         )
     a, b = np.asarray(a, dtype=np.float32), np.asarray(b, dtype=np.float32)
     update = np.einsum("nhl,ld->nhd", a, b.sum(axis=0)) if "/attn_vec_einsum" in path else a @ b

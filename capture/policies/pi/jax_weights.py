@@ -1,7 +1,7 @@
-"""openpi's JAX parameter leaves to the names and shapes of the torch model. Pure: arrays in, arrays out.
+"""Conversion of openpi's JAX parameter leaves to the names and shapes of the torch model. No I/O.
 
 A leaf is named by its path in the parameter tree joined by "/", without the leading "params" and the trailing "value".
-Leaves of the transformers carry all layers on their first axis (they are scanned over).
+Leaves of the transformers carry all layers on their first axis (openpi scans over them).
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ EXPERT = "paligemma_with_expert.gemma_expert.model."
 
 Convert = Callable[[np.ndarray], np.ndarray]
 
-#: What to say when the arrays that make a pi model are not there.
+#: Appended to the error if the arrays of a pi model are missing.
 OTHER_OPENPI_MODEL = (
-    " It has no action expert of a pi0 or pi0.5 model: it is of another model family (openpi's pi0-FAST, which writes actions as "
-    "text, or PaliGemma alone)."
+    " It has no action expert of a pi0 or pi0.5 model: it is of another model family (openpi's pi0-FAST, which writes "
+    "actions as text, or PaliGemma alone)."
 )
 
 
@@ -142,9 +142,9 @@ _PROJECTION = re.compile(r"((?:action|state|time)\w*)/(kernel|bias)")
 
 @dataclass(frozen=True)
 class LeafPlan:
-    """What becomes of one JAX leaf: every torch tensor made from it, as (name, conversion).
+    """Conversion of one JAX leaf: every torch tensor that is made from it, as (name, conversion).
 
-    `layers` is the torch prefix of the layers when the leaf is stacked (its first axis are the layers), else None.
+    layers: the torch prefix of the layers if the leaf is stacked (its first axis is the layer), else None.
     """
 
     targets: tuple[tuple[str, Convert], ...]
@@ -161,13 +161,13 @@ class LeafPlan:
         return {name: array for i, one in enumerate(leaf) for name, array in self.layer(i, one).items()}
 
     def shapes(self, leaf_shape: tuple[int, ...]) -> Shapes:
-        """Return the names and shapes of the tensors that a leaf of this shape gives, without any memory."""
+        """Return names and shapes of the tensors that a leaf of this shape gives, without allocating any."""
         empty = np.broadcast_to(np.float32(0), leaf_shape)
         return {name: tuple(array.shape) for name, array in self.whole(empty).items()}
 
 
 def plan_leaf(path: str) -> LeafPlan | None:
-    """Return what becomes of a JAX leaf of this path, or None for a leaf that no pi model has."""
+    """Return the conversion of a JAX leaf by its path, or None for a leaf that no pi model has."""
     image_block, image, language = "PaliGemma/img/Transformer/encoderblock/", "PaliGemma/img/", "PaliGemma/llm/"
     if path.startswith(image_block):
         found = _IMAGE_BLOCK.get(path.removeprefix(image_block))
@@ -191,9 +191,9 @@ def _single(before: str, found: tuple[str, Convert] | None) -> LeafPlan | None:
 
 
 def plan_leaves(paths: Iterable[str]) -> tuple[dict[str, LeafPlan], dict[str, LoraPair]]:
-    """Return what becomes of every leaf of a checkpoint, and which leaves are LoRA pairs to be merged into another.
+    """Return the conversion of every leaf of a checkpoint, and the LoRA pairs that are merged into leaves.
 
-    `CheckpointMismatch` lists the leaves that no pi model has; LoRA leaves that are no pair belong to those.
+    `CheckpointMismatch` lists the leaves that no pi model has; these include LoRA leaves without a pair.
     """
     paths = list(paths)
     pairs = find_lora_pairs(paths)
@@ -211,10 +211,10 @@ def plan_leaves(paths: Iterable[str]) -> tuple[dict[str, LeafPlan], dict[str, Lo
 
 
 def from_jax_flat(leaves: Mapping[str, np.ndarray], config: PiConfig) -> dict[str, Tensor]:
-    """Return the state dict (float32) of a `PiModel(config)` from all leaves of a JAX checkpoint; LoRA pairs are merged.
+    """Return the state dict (float32) of a `PiModel(config)` from a JAX checkpoint's leaves; LoRA pairs are merged.
 
-    Raises `CheckpointMismatch` that lists every leaf that is unknown, and every tensor that is missing or of another shape
-    than the configuration says.
+    Raises `CheckpointMismatch` that lists every leaf that is unknown, and every tensor that is missing or does not have
+    the shape of the configuration.
     """
     plans, pairs = plan_leaves(leaves)
     state: dict[str, Tensor] = {}

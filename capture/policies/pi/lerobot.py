@@ -1,7 +1,7 @@
 """Load LeRobot's pi0 and pi0.5 checkpoints: config.json, model.safetensors, and the saved pipelines.
 
-LeRobot computes times and their waves in float64 and steps time as 1 + step · dt; its policies run that way here too. In
-bfloat16 its image encoder stays in float32.
+LeRobot computes times and their waves in float64 and steps time as 1 + step · dt; its policies do so here too.
+In bfloat16 its image encoder stays in float32.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from pathlib import Path
 import torch
 
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch
-from vla_attention.capture.policies.pi.checkpoint import TensorFile, open_tensors
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.formats import detect_format
 from vla_attention.capture.policies.pi.lerobot_config import LerobotConfig, read_lerobot_config
 from vla_attention.capture.policies.pi.lerobot_pipeline import read_lerobot_pipeline
 from vla_attention.capture.policies.pi.lerobot_processing import LerobotProcessing, slots
 from vla_attention.capture.policies.pi.model import PiModel
+from vla_attention.capture.policies.pi.openpi_torch import TensorFile, open_tensors
 from vla_attention.capture.policies.pi.sizes import infer_config, is_pi05
 from vla_attention.capture.policies.precision import DTYPES
 
@@ -30,10 +30,9 @@ def load_lerobot_weights(
     dtype: torch.dtype | None = None,
     device: str | torch.device = "cpu",
 ) -> PiModel:
-    """Load the weights of a LeRobot checkpoint; `config` replaces what config.json and the tensors say about the model.
+    """Load the weights of a LeRobot checkpoint; `config` replaces the sizes of config.json and the tensors.
 
-    Without `dtype` the model runs in the precision that config.json names. Features that are not supported are refused in
-    either case.
+    Without `dtype` the model has the precision of config.json. Unsupported features are refused in either case.
     """
     folder = Path(folder)
     detect_format(folder, "lerobot")
@@ -51,10 +50,10 @@ def load_lerobot(
     dtype: torch.dtype | None = None,
     device: str | torch.device = "cpu",
 ) -> tuple[PiModel, LerobotProcessing]:
-    """Load a LeRobot checkpoint with everything that its files say about images, prompts, normalisation and steps.
+    """Load a LeRobot checkpoint: the model, and the processing of images, prompts, states and actions.
 
-    `sizes`: states the widths and heads that config.json cannot say (it knows full-size models only); of it the sizes of the
-    transformers and of the image encoder are used, and nothing else.
+    sizes: widths and heads, which config.json does not state because it is for full-size models. Only the sizes of
+    the transformers and of the image encoder are taken from it.
     """
     folder = Path(folder)
     detect_format(folder, "lerobot")
@@ -70,12 +69,13 @@ def load_lerobot(
 def model_config(
     stated: LerobotConfig, tensors: TensorFile, rename: dict[str, str], sizes: PiConfig | None
 ) -> PiConfig:
-    """Put together the model's configuration: sizes of the tensors, everything else from config.json."""
+    """Return the model's configuration: sizes from the tensors, everything else from config.json."""
     shapes = tensors.shapes
     if is_pi05(shapes) != stated.pi05:
         names = {True: "pi05", False: "pi0"}
         raise CheckpointMismatch(
-            f"The checkpoint's config.json says type '{names[stated.pi05]}', but its tensors are those of {names[not stated.pi05]}."
+            f"The checkpoint's config.json says type '{names[stated.pi05]}', but its tensors are those of "
+            f"{names[not stated.pi05]}."
         )
     base = sizes or infer_config(shapes, stated.raw, action_horizon="chunk_size", action_dim="max_action_dim")
     if base.siglip.image_size != stated.image_size:

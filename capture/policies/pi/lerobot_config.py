@@ -1,6 +1,6 @@
-"""LeRobot's config.json for pi0 and pi0.5: everything that inference needs, and a refusal of everything else.
+"""LeRobot's config.json for pi0 and pi0.5: its fields for inference. Unsupported features are refused.
 
-A feature that is switched on and not known here is refused by its name, never ignored: it could change what the policy does.
+A feature that is switched on and unknown here is an error with its name: it could change the actions of the policy.
 """
 
 from __future__ import annotations
@@ -33,12 +33,13 @@ _OFF: dict[str, Any] = {
     "n_obs_steps": 1,
 }
 
-#: Fields of training, of the hub, of where and how fast a model runs: they change nothing of what a policy computes, or
-#: (exclusions of relative actions, sizes of memories) nothing while the feature they belong to is off.
+#: Fields of training, the hub, the device and speed, which do not change the actions of a policy. Some (exclusions of
+#: relative actions, sizes of memories) belong to a feature that is refused if it is on.
 _HARMLESS = {
-    "device", "use_amp", "push_to_hub", "repo_id", "private", "tags", "license", "pretrained_path", "pretrained_revision",
-    "compile_model", "compile_mode", "gradient_checkpointing", "freeze_vision_encoder", "train_expert_only",
-    "relative_exclude_joints", "action_feature_names", "memory_frames", "memory_stride", "memory_temporal_attention_every",
+    "device", "use_amp", "push_to_hub", "repo_id", "private", "tags", "license", "pretrained_path",
+    "pretrained_revision", "compile_model", "compile_mode", "gradient_checkpointing", "freeze_vision_encoder",
+    "train_expert_only", "relative_exclude_joints", "action_feature_names", "memory_frames", "memory_stride",
+    "memory_temporal_attention_every",
 }  # fmt: skip
 _HARMLESS_BEGINNINGS = ("optimizer_", "scheduler_", "time_sampling_")
 
@@ -47,12 +48,12 @@ IMAGES = "observation.images."
 
 
 class UnsupportedLerobotFeature(UnsupportedCheckpoint):
-    """The checkpoint asks for something that this program does not do."""
+    """The checkpoint uses a feature that is not supported here."""
 
 
 @dataclass(frozen=True)
 class LerobotConfig:
-    """What config.json says about inference. `cameras` are the visual features in order, the empty ones included."""
+    """Fields of config.json for inference. cameras: visual features in order, including empty ones."""
 
     pi05: bool
     dtype: str
@@ -69,12 +70,12 @@ class LerobotConfig:
     state_dim: int
     action_dim: int
     normalization: dict[str, str]
-    #: as `infer_config` wants to read them
+    #: the whole content, for `infer_config`
     raw: dict[str, Any]
 
 
 def read_lerobot_config(folder: Path) -> LerobotConfig:
-    """Read a checkpoint's config.json; `UnsupportedLerobotFeature` names what is not supported."""
+    """Read a checkpoint's config.json; `UnsupportedLerobotFeature` names an unsupported feature."""
     path = folder / "config.json"
     content = read_json_object(path)
     where = f"'{path}'"

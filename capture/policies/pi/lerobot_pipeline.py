@@ -1,7 +1,7 @@
 """LeRobot's saved pre- and postprocessing: policy_preprocessor.json, policy_postprocessor.json and their state files.
 
-Steps are found by the names they are registered under; their numbers differ between versions and between pi0 and pi0.5. A step
-that is not known is refused by its name: it could change what the policy sees or does.
+Steps are found by their registered names, because their numbers differ between versions and between pi0 and pi0.5. An
+unknown step is an error with its name: it could change the inputs or actions of the policy.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.
 _RENAME, _NORMALIZE, _UNNORMALIZE = "rename_observations_processor", "normalizer_processor", "unnormalizer_processor"
 _NEW_LINE, _STATE_PROMPT = "pi0_new_line_processor", "pi05_prepare_state_tokenizer_processor_step"
 _TOKENIZE, _RELATIVE, _ABSOLUTE = "tokenizer_processor", "relative_actions_processor", "absolute_actions_processor"
-#: Batching, and moving to a device: nothing to do here.
+#: Steps without effect here: batching, moving to a device.
 _NOTHING = {"to_batch_processor", "device_processor"}
 _BEFORE = _NOTHING | {_RENAME, _NORMALIZE, _NEW_LINE, _STATE_PROMPT, _TOKENIZE, _RELATIVE}
 _AFTER = _NOTHING | {_UNNORMALIZE, _ABSOLUTE}
 
-#: Statistics that each mode of normalisation needs.
+#: Statistics of each mode of normalisation.
 _NEEDED = {"IDENTITY": (), "MEAN_STD": ("mean", "std"), "QUANTILES": ("q01", "q99")}
 
 
@@ -43,8 +43,8 @@ _NEEDED = {"IDENTITY": (), "MEAN_STD": ("mean", "std"), "QUANTILES": ("q01", "q9
 class LerobotNormaliser:
     """Normalisation of one vector as LeRobot computes it, in float32.
 
-    mode: IDENTITY, MEAN_STD ((x - mean)/(std + eps), inverse x·std + mean) or QUANTILES (2(x - q01)/(q99 - q01) - 1, where a
-    range of 0 counts as eps). statistics: each (dim,) float32.
+    mode: IDENTITY, MEAN_STD ((x - mean)/(std + eps), inverse x·std + mean) or QUANTILES (2(x - q01)/(q99 - q01) - 1,
+    where a range of 0 counts as eps). statistics: each (dim,) float32.
     """
 
     mode: str
@@ -76,7 +76,7 @@ class LerobotNormaliser:
 
 @dataclass(frozen=True)
 class LerobotPipeline:
-    """What the two saved pipelines say: names, prompt format, normalisation of state and action."""
+    """Content of the two saved pipelines: camera names, prompt format, normalisation of state and action."""
 
     rename: dict[str, str]
     state_in_prompt: bool
@@ -87,7 +87,7 @@ class LerobotPipeline:
 
 
 def read_lerobot_pipeline(folder: Path, config: LerobotConfig) -> LerobotPipeline:
-    """Read both pipelines of a checkpoint folder; what is not supported is refused by its name."""
+    """Read both pipelines of a checkpoint folder; an error names an unsupported step or setting."""
     before, after = _steps(folder, PREPROCESSOR, _BEFORE), _steps(folder, POSTPROCESSOR, _AFTER)
     for steps, name, where in ((before, _RELATIVE, PREPROCESSOR), (after, _ABSOLUTE, POSTPROCESSOR)):
         if steps.get(name, {}).get("config", {}).get("enabled"):
@@ -97,8 +97,9 @@ def read_lerobot_pipeline(folder: Path, config: LerobotConfig) -> LerobotPipelin
     state_in_prompt, new_line = _STATE_PROMPT in before, _NEW_LINE in before
     if state_in_prompt != config.pi05 or (new_line and config.pi05):
         raise UnsupportedLerobotFeature(
-            f"'{folder / PREPROCESSOR}' makes its prompt with {listing(n for n in (_NEW_LINE, _STATE_PROMPT) if n in before)}, "
-            f"but a {'pi05' if config.pi05 else 'pi0'} policy has {_STATE_PROMPT if config.pi05 else _NEW_LINE}."
+            f"'{folder / PREPROCESSOR}' makes its prompt with "
+            f"{listing(n for n in (_NEW_LINE, _STATE_PROMPT) if n in before)}, but a "
+            f"{'pi05' if config.pi05 else 'pi0'} policy has {_STATE_PROMPT if config.pi05 else _NEW_LINE}."
         )
     return LerobotPipeline(
         rename=dict(before.get(_RENAME, {}).get("config", {}).get("rename_map") or {}),
@@ -114,8 +115,8 @@ def _steps(folder: Path, name: str, known: set[str]) -> dict[str, dict[str, Any]
     path = folder / name
     if not path.is_file():
         raise UnsupportedCheckpoint(
-            f"'{folder}' has no {name}, which says how a LeRobot policy normalises; a checkpoint saved before LeRobot kept its "
-            "pipelines must be migrated with LeRobot's script first."
+            f"'{folder}' has no {name}, which says how a LeRobot policy normalises; a checkpoint saved before LeRobot "
+            "kept its pipelines must be migrated with LeRobot's script first."
         )
     steps = read_json_object(path).get("steps")
     found: dict[str, dict[str, Any]] = {}
@@ -131,7 +132,7 @@ def _steps(folder: Path, name: str, known: set[str]) -> dict[str, dict[str, Any]
 
 
 def _tokenizer_cuts(folder: Path, steps: Mapping[str, Mapping[str, Any]], config: LerobotConfig) -> bool:
-    """Check the tokenizer step's settings and say whether it cuts prompts that are too long."""
+    """Check the tokenizer step's settings; returns whether it cuts prompts that are too long."""
     given = steps.get(_TOKENIZE, {}).get("config", {})
     wanted = {
         "max_length": config.tokenizer_max_length,
@@ -172,8 +173,8 @@ def _normaliser(
     for key, values in statistics.items():
         if values.shape != (dim,):
             raise UnusableNormStats(
-                f"The statistics '{feature}.{key}' of '{folder / str(step.get('state_file'))}' have shape {values.shape}; "
-                f"{dim} numbers are needed."
+                f"The statistics '{feature}.{key}' of '{folder / str(step.get('state_file'))}' have shape "
+                f"{values.shape}; {dim} numbers are needed."
             )
     return LerobotNormaliser(mode, statistics, float(settings.get("eps", 1e-8)))
 
@@ -184,7 +185,7 @@ def _statistics(
     if not needed:
         return {}
     path = folder / str(state_file)
-    # A name with folders in it could point anywhere.
+    # A name with folders in it could lead out of the checkpoint.
     if not isinstance(state_file, str) or Path(state_file).name != state_file or not path.is_file():
         raise UnusableNormStats(f"The statistics of '{feature}' should be in '{path}', which is not there.")
     try:

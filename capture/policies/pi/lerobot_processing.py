@@ -1,7 +1,7 @@
 """LeRobot's LIBERO preprocessing: images, state, cameras, and actions back to the environment.
 
-Formulas: LeRobot's LiberoProcessorStep, the policies' own image preparation and the saved pipelines; checked against arrays
-that LeRobot computed.
+Formulas: LeRobot's LiberoProcessorStep, the policies' own image preparation and the saved pipelines; checked against
+arrays that LeRobot computed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from vla_attention.capture.policies.pi.processing import STATE_DIM
 from vla_attention.capture.policies.pi.tokenizer import PromptFormat
 from vla_attention.schemas.errors import listing
 
-#: LeRobot's names for the pictures of its LIBERO environment, and the simulator's cameras behind them.
+#: LeRobot's names for the pictures of its LIBERO environment -> the simulator's cameras.
 LIBERO_CAMERAS = {IMAGES + "image": "agentview", IMAGES + "image2": "robot0_eye_in_hand"}
 
 
@@ -46,22 +46,22 @@ def lerobot_image(frame: NDArray[np.uint8], size: int) -> Tensor:
 def slots(config: LerobotConfig, rename: Mapping[str, str]) -> dict[str, str | None]:
     """Return slot of the model -> environment camera, in the order of the model's keys.
 
-    Slots are named by their feature without "observation.images."; those that the environment fills come first, the others
-    (None) are black and masked.
+    Slots have the names of their features without "observation.images."; slots with an environment camera come
+    first, the others (None) are black and masked.
     """
     source = {rename.get(feature, feature): camera for feature, camera in LIBERO_CAMERAS.items()}
     present = [feature for feature in config.cameras if feature in source]
     absent = [feature for feature in config.cameras if feature not in source]
     if not present:
         raise UnsupportedLerobotFeature(
-            f"The policy's cameras are {listing(config.cameras)}, and the environment offers {listing(source)}: no picture would "
-            "reach the policy."
+            f"The policy's cameras are {listing(config.cameras)}, and the environment offers {listing(source)}: no "
+            "picture would reach the policy."
         )
     return {feature.removeprefix(IMAGES): source.get(feature) for feature in [*present, *absent]}
 
 
 class LerobotProcessing:
-    """What a LeRobot policy does outside its model, as its checkpoint says."""
+    """Processing of a LeRobot policy outside its model, from its checkpoint."""
 
     def __init__(self, config: LerobotConfig, pipeline: LerobotPipeline):
         for what, given, needed in (
@@ -70,8 +70,8 @@ class LerobotProcessing:
         ):
             if given != needed:
                 raise UnsupportedLerobotFeature(
-                    f"The policy has {what}s of {given} numbers, and those of the environments have {needed}: it was made for "
-                    "another robot."
+                    f"The policy has {what}s of {given} numbers, and those of the environments have {needed}: it was "
+                    "made for another robot."
                 )
         self.pipeline = pipeline
         self.default_replan_steps = config.n_action_steps
@@ -88,13 +88,13 @@ class LerobotProcessing:
         )
 
     def model_picture(self, frame: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], Tensor]:
-        """Resize in float32; the picture to keep is the same, rounded to whole grey levels."""
+        """Resize in float32; the stored picture is the same, rounded to whole grey levels."""
         image = lerobot_image(frame, size)
         kept = ((image[0].permute(1, 2, 0) + 1.0) * 127.5).round().clamp(0, 255).to(torch.uint8)
         return kept.numpy(), image
 
     def normalise_state(self, state: NDArray[np.float64]) -> NDArray[np.floating]:
-        """Normalise in float32, in which LeRobot's states are."""
+        """Normalise in float32, the dtype of LeRobot's states."""
         return self.pipeline.state.normalise(state)
 
     def environment_actions(
@@ -104,7 +104,7 @@ class LerobotProcessing:
         return self.pipeline.action.unnormalise(model_actions[..., :ENVIRONMENT_ACTION_DIM]).astype(np.float64)
 
     def provenance(self) -> dict[str, Any]:
-        """Return the ecosystem, the normalisation and what actions mean."""
+        """Return the ecosystem, the normalisation, and whether actions are relative."""
         return {
             "processing": "lerobot",
             "normalisation": f"state {self.pipeline.state.mode}, action {self.pipeline.action.mode}",

@@ -1,4 +1,4 @@
-"""Load a pi model, or a whole policy, from a checkpoint folder in whichever format it is."""
+"""Load a pi model, or a whole policy, from a checkpoint folder of any format."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import torch
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.parity_case import CASE_FILE
 from vla_attention.capture.policies.pi.case import read_config
-from vla_attention.capture.policies.pi.checkpoint import load_openpi_torch
 from vla_attention.capture.policies.pi.config import PiConfig, find_config
 from vla_attention.capture.policies.pi.formats import CheckpointFormat, detect_format
 from vla_attention.capture.policies.pi.lerobot import load_lerobot, load_lerobot_weights
 from vla_attention.capture.policies.pi.model import PiModel
-from vla_attention.capture.policies.pi.orbax import implied_config_name, list_leaves, load_openpi_jax
+from vla_attention.capture.policies.pi.openpi_jax import implied_config_name, list_leaves, load_openpi_jax
+from vla_attention.capture.policies.pi.openpi_torch import load_openpi_torch
 from vla_attention.capture.policies.pi.policy import PiPolicy
 from vla_attention.capture.policies.pi.preprocess import read_norm_stats
 from vla_attention.capture.policies.pi.processing import OpenpiProcessing, Processing
@@ -31,7 +31,7 @@ def load_pi_model(
     dtype: torch.dtype = torch.float32,
     device: str | torch.device = "cpu",
 ) -> tuple[PiModel, CheckpointFormat]:
-    """Return the model and the format it was found in; `config` overrides what the checkpoint says or implies."""
+    """Return the model and the format of the folder; `config` overrides the sizes of the checkpoint."""
     found = detect_format(folder, checkpoint_format)
     load = {"openpi_torch": load_openpi_torch, "openpi_jax": load_openpi_jax, "lerobot": load_lerobot_weights}[found]
     return load(folder, config=config, dtype=dtype, device=device), found
@@ -39,10 +39,10 @@ def load_pi_model(
 
 @dataclasses.dataclass(frozen=True)
 class CheckpointOptions:
-    """What a user may say about a checkpoint that it does not say itself; None leaves it to the checkpoint.
+    """A user's choices for a checkpoint; None takes the checkpoint's own value.
 
-    config_name: one of openpi's names. model_config: a file like case.json. discrete_state_input: openpi's pi0.5 with the
-    state in the prompt.
+    config_name: one of openpi's names. model_config: a file like case.json. discrete_state_input: openpi's pi0.5 with
+    the state in the prompt.
     """
 
     checkpoint_format: CheckpointFormat | None = None
@@ -62,7 +62,7 @@ def load_pi_policy(
 ) -> PiPolicy:
     """Load a policy from a checkpoint folder of any of the three formats and a tokenizer file.
 
-    `config` fixes the model's configuration for library callers; the command line names one in `options`.
+    config: the model's configuration, for library callers; the command line names one in `options`.
     """
     folder, options = Path(checkpoint), options or CheckpointOptions()
     found = detect_format(folder, options.checkpoint_format)
@@ -72,7 +72,7 @@ def load_pi_policy(
         config, configuration = choose_config(folder, found, options)
     if options.discrete_state_input and config is not None:
         _check_state_input(config)
-    # The cheap files first: a missing tokenizer should not cost the minutes that the weights take.
+    # Small files first: if the tokenizer is missing, the minutes for loading the weights are saved.
     prompt_tokenizer = PromptTokenizer(tokenizer)
     processing: Processing
     if found == "lerobot":
@@ -85,7 +85,8 @@ def load_pi_policy(
             _check_state_input(model.config)
             model.config = dataclasses.replace(model.config, discrete_state_input=True)
         pi05 = model.config.pi05
-        # openpi's LIBERO configurations: pi0.5 quantiles and plain actions, pi0 z-scores and actions relative to the state.
+        # openpi's LIBERO configurations: pi0.5 quantiles and plain actions, pi0 z-scores and actions relative to the
+        # state.
         processing = OpenpiProcessing(
             model.config, norm_stats, normalisation="quantile" if pi05 else "z-score", relative_actions=not pi05
         )
@@ -100,15 +101,16 @@ def load_pi_policy(
 
 
 def choose_config(folder: Path, found: CheckpointFormat, options: CheckpointOptions) -> tuple[PiConfig | None, str]:
-    """Return the configuration that the user or a case.json beside the checkpoint states, and where it comes from.
+    """Return the configuration of the options or of a case.json beside the checkpoint, and its source.
 
-    None: the checkpoint's own files say what there is to say.
+    The configuration is None if the checkpoint's own files determine it.
     """
     if options.config_name is not None and options.model_config is not None:
         raise BadArgument("Give --config-name or --model-config, not both.")
     if found == "lerobot" and (options.config_name is not None or options.discrete_state_input):
         raise BadArgument(
-            "A LeRobot checkpoint states its configuration in config.json; leave --config-name and --discrete-state-input out."
+            "A LeRobot checkpoint states its configuration in config.json; leave --config-name and "
+            "--discrete-state-input out."
         )
     if options.config_name is not None:
         return find_config(options.config_name), f"openpi's {options.config_name}"

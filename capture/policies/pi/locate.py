@@ -1,7 +1,7 @@
-"""Find a checkpoint and a tokenizer: on disk, in the caches of openpi and the Hugging Face hub, or by their own clients.
+"""Find a checkpoint and a tokenizer: on disk, in the caches of openpi and the Hugging Face hub, or by download.
 
-Downloads go where the ecosystem's own tools put them, so that nothing is fetched twice. Without a network, or without a
-client, the error says what to fetch and where to put it.
+Downloads go into the caches of the ecosystem's own tools, so that nothing is downloaded twice. Without a network or a
+client, the error names the files and the place for them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from vla_attention.capture.policies.hub import (
 )
 from vla_attention.schemas.errors import BadArgument, MissingDependency, listing
 
-#: What a policy needs of a hub repository; nothing else is fetched.
+#: Files of a hub repository that a policy needs; only these are downloaded.
 HUB_FILES = (
     "config.json",
     "model.safetensors",
@@ -30,19 +30,19 @@ HUB_FILES = (
     "tokenizer/**",
     "*.model",
 )
-#: What a policy needs of an openpi checkpoint; training states are several times as large.
+#: Folders of an openpi checkpoint that a policy needs; training states are several times as large.
 OPENPI_FOLDERS = ("params", "assets")
 
 TOKENIZER_NAME = "paligemma_tokenizer.model"
 TOKENIZER_URL = "gs://big_vision/paligemma_tokenizer.model"
-#: LeRobot's policies name this hub repository, whose files need a licence to be accepted.
+#: Hub repository of the tokenizer in LeRobot's policies; its licence has to be accepted before a download.
 TOKENIZER_REPOSITORY = "google/paligemma-3b-pt-224"
 
 
 def find_checkpoint(name: str) -> Path:
     """Return the folder of a checkpoint: a local folder, `gs://...` in openpi's cache, or `ORG/NAME` of the hub.
 
-    What is not in the cache is downloaded; `CheckpointUnavailable` or `MissingDependency` say what to do when that fails.
+    A folder that is not in the cache is downloaded; `CheckpointUnavailable` or `MissingDependency` if that fails.
     """
     if name.startswith("gs://"):
         return _from_openpi_cache(name.rstrip("/"))
@@ -53,7 +53,7 @@ def find_checkpoint(name: str) -> Path:
 
 
 def openpi_cache() -> Path:
-    """The folder that openpi downloads to: OPENPI_DATA_HOME, else ~/.cache/openpi."""
+    """Return the folder that openpi downloads to: OPENPI_DATA_HOME, else ~/.cache/openpi."""
     return Path(os.environ.get("OPENPI_DATA_HOME", "~/.cache/openpi")).expanduser()
 
 
@@ -74,8 +74,8 @@ def _from_openpi_cache(url: str) -> Path:
         import gcsfs
     except ImportError as error:
         raise MissingDependency(
-            f"'{url}' is not in openpi's cache at '{target}', and gcsfs, which could download it, is not installed; {how}, or "
-            "`pip install gcsfs`."
+            f"'{url}' is not in openpi's cache at '{target}', and gcsfs, which could download it, is not installed; "
+            f"{how}, or `pip install gcsfs`."
         ) from error
     partial = target.with_name(target.name + ".partial")
     try:
@@ -88,7 +88,7 @@ def _from_openpi_cache(url: str) -> Path:
 
 
 def _download(files: Any, url: str, partial: Path) -> None:
-    """Copy the folders that a policy needs; the caller moves them into place when all are there."""
+    """Download the folders that a policy needs; the caller moves them into place when all are complete."""
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     source = url.removeprefix("gs://")
@@ -100,7 +100,7 @@ def _download(files: Any, url: str, partial: Path) -> None:
 
 
 def find_tokenizer(checkpoint: Path, given: str | None) -> Path:
-    """Return the sentencepiece model: the one named, else the checkpoint's own, else that of openpi's or the hub's cache."""
+    """Return the sentencepiece model: the given one, else of the checkpoint, else of openpi's or the hub's cache."""
     if given is not None:
         return Path(given).expanduser()
     places = [
@@ -115,6 +115,7 @@ def find_tokenizer(checkpoint: Path, given: str | None) -> Path:
         if place.is_file():
             return place
     raise BadArgument(
-        f"The checkpoint '{checkpoint}' needs PaliGemma's tokenizer and none was found at {listing(places)} or in '{snapshots}'; "
-        f"fetch {TOKENIZER_NAME} ({TOKENIZER_URL}) or tokenizer.model of {TOKENIZER_REPOSITORY}, and give --tokenizer PATH."
+        f"The checkpoint '{checkpoint}' needs PaliGemma's tokenizer and none was found at {listing(places)} or in "
+        f"'{snapshots}'; fetch {TOKENIZER_NAME} ({TOKENIZER_URL}) or tokenizer.model of {TOKENIZER_REPOSITORY}, and "
+        "give --tokenizer PATH."
     )

@@ -1,7 +1,7 @@
 """pi0 and pi0.5: a vision-language model and an action expert that share their attention, sampled by flow matching.
 
-Sources: Black et al. 2024 (pi0), Physical Intelligence 2025 (pi0.5); the numbers follow openpi's JAX models. One replan is
-one prefix pass (images and text through the vision-language model, which leaves keys and values in a cache) and one
+Sources: Black et al. 2024 (pi0), Physical Intelligence 2025 (pi0.5); the numbers follow openpi's JAX models. One replan
+is one prefix pass (images and text through the vision-language model, which leaves keys and values in a cache) and one
 suffix pass (state and noisy actions through the expert) for each denoise step. Only suffix passes have action queries.
 """
 
@@ -23,7 +23,7 @@ from vla_attention.capture.recording.attention import RowCollector
 
 @dataclass(frozen=True)
 class Prefix:
-    """What the suffix passes need of the prefix: one cache entry per block, and which keys are real.
+    """Result of the prefix pass for the suffix passes: one cache entry per block, and which keys are valid.
 
     cache: per block, keys and values (batch, kv_head, prefix key, dim). valid: (batch, prefix key) bool.
     """
@@ -75,8 +75,8 @@ class PiModel(nn.Module):
     With `dtype=torch.bfloat16` these stay in float32, as in openpi's PyTorch model: patch and position embedding, all
     Gemma norms with the dense layers of the adaptive ones, and the projections of state, action and time; with the
     configuration's `float32_vision` (LeRobot) the whole image encoder and its projector too. Unlike there,
-    attention logits and the rotary embedding are float32 too (as in the JAX reference), so that recorded rows are not
-    made of logits with 8 bits.
+    attention logits and the rotary embedding are float32 too, as in the JAX reference: logits with 8 bits would show in
+    the recorded rows.
     """
 
     def __init__(self, config: PiConfig, dtype: torch.dtype = torch.float32):
@@ -125,15 +125,15 @@ class PiModel(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """Device of the weights."""
         return self.action_in_proj.weight.device
 
     def embed_prefix(
         self, images: Mapping[str, Tensor], image_masks: Mapping[str, Tensor], tokens: Tensor, token_mask: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the prefix (batch, prefix key, width) and which of its keys are real (batch, prefix key) bool.
+        """Return the prefix (batch, prefix key, width) and which of its keys are valid, (batch, prefix key) bool.
 
-        A masked camera is still encoded and still owns its keys. Text is scaled by sqrt(width), images are not.
+        A masked camera is encoded too and has its keys. Text is scaled by sqrt(width), images are not.
         """
         cameras = self.config.cameras
         batch = tokens.shape[0]
@@ -146,11 +146,11 @@ class PiModel(nn.Module):
         return torch.cat([*patches.unbind(0), text], dim=1), torch.cat([*valid, token_mask], dim=1)
 
     def encode_prefix(self, embedded: Tensor, valid: Tensor) -> Prefix:
-        """Run images and text through the vision-language model once; every key is cached, the invalid ones too.
+        """Run images and text through the vision-language model once; all keys are cached, also the invalid ones.
 
-        Positions count valid keys only. Nothing reads the prefix's outputs but its keys and values, so the last block
-        stops after those. One sample alone leaves its invalid tokens out of the computation, which is nearly half of
-        it in LIBERO: nothing ever attends to them, so that their cached keys may as well be zeros.
+        Positions count valid keys only. Only keys and values of the prefix are used later, so the last block stops
+        after them. With a batch of one, invalid tokens are left out of the computation, which saves nearly half of it
+        in LIBERO. Their cached keys are zeros; no query attends to them.
         """
         if embedded.shape[0] == 1 and not bool(valid.all()):
             real = valid[0].nonzero()[:, 0]
@@ -175,7 +175,7 @@ class PiModel(nn.Module):
         """
         tokens = self.action_in_proj(actions)
         if self.config.pi05:
-            # The SiLU after the second layer is openpi's, not a slip.
+            # openpi has a SiLU after the second layer too.
             condition = F.silu(self.time_mlp_out(F.silu(self.time_mlp_in(waves))))
             return tokens, condition.expand(actions.shape[0], -1)
         mixed = torch.cat([tokens, waves.expand_as(tokens)], dim=-1)
@@ -183,7 +183,7 @@ class PiModel(nn.Module):
         return torch.cat([self.state_proj(state)[:, None], tokens], dim=1), None
 
     def _suffix_mask(self, prefix_valid: Tensor) -> Tensor:
-        """Return (batch, suffix query, key) bool: all see the prefix, pi0's state token does not see the actions."""
+        """Return (batch, suffix query, key) bool: all attend to the prefix; pi0's state token not to the actions."""
         batch, queries = prefix_valid.shape[0], self.config.suffix_len
         among = torch.ones(queries, queries, dtype=torch.bool, device=prefix_valid.device)
         among[: self.config.first_action_query, self.config.first_action_query :] = False
@@ -210,8 +210,8 @@ class PiModel(nn.Module):
             state: (batch, action dim) float32, normalised and padded; pi0.5 does not read it.
             noise: (batch, horizon, action dim) float32, the actions at t = 1.
             num_steps: number of denoise steps; None takes the configuration's.
-            recorder: asked at every block and denoise step of the expert where its rows shall go; all suffix queries
-                come, and it is told which of them are actions.
+            recorder: receives the rows of every block and denoise step of the expert, with all suffix queries and the
+                positions of the action queries among them.
 
         Returns:
             (batch, horizon, action dim) float32, still normalised.

@@ -1,4 +1,4 @@
-"""Run a parity case and measure how far our actions and attention are from the reference's."""
+"""Run a parity case, and compare our actions and attention with the reference's."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ from vla_attention.capture.policies.precision import dtype_name
 from vla_attention.capture.recording.attention import RowCollector
 from vla_attention.schemas.errors import BadArgument, listing
 
-#: Largest difference of attention and actions that passes, by the precision of the case. In float32 the reference itself
-#: moves by 1.6e-5 between its compiled and its eager run; in bfloat16 it moves attention by up to 0.05 from float32.
+#: Largest difference of attention and actions that passes, by the precision of the case. In float32 the reference
+#: itself moves by 1.6e-5 between its compiled and its eager run; in bfloat16 it moves attention by up to 0.05 from
+#: float32.
 LIMITS = {torch.float32: 5e-5, torch.bfloat16: 0.1}
 
 
@@ -42,7 +43,7 @@ class Parity:
 
     @property
     def passed(self) -> bool:
-        """Whether nothing is beyond the limit; something that is not a number is."""
+        """Whether all differences are within the limit; NaN is beyond it."""
         return bool(self.actions <= self.limit and (self.attention <= self.limit).all())
 
     def as_json(self) -> dict[str, Any]:
@@ -59,16 +60,16 @@ class Parity:
 
 
 class AllRows(RowCollector):
-    """A row collector that compares every row with the expected ones as it comes, and keeps the largest difference."""
+    """A row collector that compares every row with the expected one and keeps the largest difference."""
 
     def __init__(self, expected: np.ndarray):
         self._expected = expected
         steps, layers = expected.shape[:2]
-        #: (layer, denoise); not a number where no rows came
+        #: (layer, denoise); NaN where no rows came
         self.largest = np.full((layers, steps), np.nan)
 
     def sink(self, layer: int, denoise_step: int, action_queries: slice) -> Callable[[Tensor], None]:
-        """Return what takes the rows (batch, head, query, key) of this call."""
+        """Return the function that takes the rows (batch, head, query, key) of this call."""
 
         def take(rows: Tensor) -> None:
             difference = np.abs(rows.cpu().numpy().astype(np.float64) - self._expected[denoise_step, layer])
@@ -107,9 +108,9 @@ def run_case(case: Case, model: PiModel, collector: AllRows | None = None) -> np
 
 
 def measure(case: Case, case_format: CaseFormat, *, limit: float | None = None, device: str = "cpu") -> Parity:
-    """Load the case's checkpoint of that format, run it, and compare with what is expected.
+    """Load the case's checkpoint of that format, run it, and compare with the expected results.
 
-    Cases are made by openpi's JAX model, so its conventions of time are used whatever the format is.
+    Cases are made by openpi's JAX model, so its time convention is used for every format.
     """
     if limit is not None and not limit > 0:
         raise BadArgument(f"Cannot use a limit of {limit}; expected a positive number.")
@@ -156,7 +157,7 @@ def describe(case: Case, result: Parity) -> str:
 def run_parity(
     folder: Path, case_format: str | None, *, limit: float | None = None, as_json: bool = False, device: str = "cpu"
 ) -> int:
-    """Measure a case in one format, or in all that it carries; print the results and return 0 when all pass, else 1."""
+    """Compare a case in one format, or in all of its formats; print the results, return 0 if all pass, else 1."""
     case = read_case(folder)
     formats = case.formats if case_format is None else (find_case_format(case_format),)
     if not formats:

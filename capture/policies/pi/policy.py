@@ -1,4 +1,4 @@
-"""The pi policies as the rollout sees them: observation in, action chunk out, layout stated."""
+"""The pi policies behind the policy interface: from observation to action chunk, with the layout of the keys."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def site_layout(config: PiConfig) -> SiteLayout:
 
 
 def patch_grid(config: PiConfig) -> PatchGrid:
-    """Return how the patches of any camera tile its model image."""
+    """Return how the patches of each camera tile its model image."""
     siglip = config.siglip
     return PatchGrid(siglip.grid, siglip.grid, siglip.image_size, siglip.image_size)
 
@@ -89,7 +89,7 @@ class PiPolicy:
         return np.eye(self.num_action_queries)
 
     def replan_noise_seed(self, run_seed: int, task_id: int, episode_index: int, replan: int) -> int:
-        """Return a seed of its own for every replan."""
+        """Return a different seed for every replan."""
         return noise_seed(run_seed, task_id, episode_index, replan)
 
     def denoise_times(self) -> NDArray[np.float64]:
@@ -155,7 +155,7 @@ class PiPolicy:
         )
 
     def _warn_of_cut(self, tokenized: TokenizedPrompt, instruction: str) -> None:
-        """Say once per instruction that its prompt was cut; the store shows it too, as a text longer than its pieces."""
+        """Warn once per instruction that its prompt was cut. In the store, the text is longer than its pieces."""
         if not tokenized.num_cut or instruction in self._warned:
             return
         self._warned.add(instruction)
@@ -163,7 +163,8 @@ class PiPolicy:
         lost = tokenized.prompt.text[pieces[-1].stop if pieces else 0 :]
         print(
             f"Warning: the prompt of '{instruction}' has {tokenized.num_cut} tokens more than the policy's "
-            f"{len(tokenized.ids)} slots; they are cut as the reference implementation does, and the policy never reads {lost!r}.",
+            f"{len(tokenized.ids)} slots; they are cut as the reference implementation does, and the policy never "
+            f"reads {lost!r}.",
             file=sys.stderr,
             flush=True,
         )

@@ -1,7 +1,7 @@
 """openpi's LIBERO preprocessing: images, state, normalisation statistics, and actions back to the environment.
 
-Pure functions on arrays, and the reading of norm_stats.json. Formulas: openpi `examples/libero/main.py` (images, state)
-and `transforms.py` (normalisation); every one is checked against arrays that openpi computed.
+Pure functions on arrays, and a reader of norm_stats.json. Formulas: openpi `examples/libero/main.py` (images, state)
+and `transforms.py` (normalisation); each is checked against arrays that openpi computed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from vla_attention.schemas.errors import UserError, listing
 
 NormalisationMode = Literal["quantile", "z-score"]
 
-#: Keeps constant dimensions from dividing by zero (openpi's value).
+#: Prevents a division by zero for constant dimensions (openpi's value).
 NORMALISATION_EPS = 1e-6
 
 #: Action dimensions that a LIBERO or robosuite arm takes: translation, rotation, gripper.
@@ -29,15 +29,15 @@ ENVIRONMENT_ACTION_DIM = 7
 
 
 class NormStatsNotFound(UserError, FileNotFoundError):
-    """The checkpoint brings no normalisation statistics."""
+    """The checkpoint has no normalisation statistics."""
 
 
 class UnusableNormStats(UserError, ValueError):
-    """The normalisation statistics are damaged, or lack what the mode needs."""
+    """The normalisation statistics are damaged, or incomplete for the mode."""
 
 
 def model_image(frame: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
-    """Return the image the model sees, (size, size, 3), of a raw camera frame (height, width, 3).
+    """Return the model's image (size, size, 3) of a raw camera frame (height, width, 3).
 
     Rotated by 180°, resized by PIL's bilinear filter with the aspect ratio kept, centred on black.
     """
@@ -61,7 +61,7 @@ def resize_with_pad(image: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
 def axis_angle(quaternion: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return axis times angle (3,) of a unit quaternion xyzw (4,): xyz · 2 arccos(w) / sqrt(1 - w²).
 
-    The sign of the quaternion is left as it is, as in openpi (and robosuite): w < 0 gives angles above pi.
+    The sign of the quaternion is not changed, as in openpi and robosuite: w < 0 gives angles above pi.
     """
     w = min(1.0, max(-1.0, float(quaternion[3])))
     sine = math.sqrt(1.0 - w * w)
@@ -122,9 +122,9 @@ class NormStats:
     actions: Statistics
 
     def check(self, mode: NormalisationMode, state_dim: int, padded_dim: int) -> None:
-        """Raise `UnusableNormStats` unless they are those of the state and the environment's actions in this mode.
+        """Raise `UnusableNormStats` unless they fit the state and the environment's actions in this mode.
 
-        Older checkpoints hold statistics padded to the model's `padded_dim`; any other length is another robot's.
+        Older checkpoints hold statistics padded to the model's `padded_dim`; any other length belongs to another robot.
         """
         for name, statistics, needed in (
             ("state", self.state, state_dim),
@@ -132,8 +132,8 @@ class NormStats:
         ):
             if len(statistics.mean) not in (needed, padded_dim):
                 raise UnusableNormStats(
-                    f"The normalisation statistics of '{name}' have {len(statistics.mean)} numbers; {needed} are needed "
-                    f"(or {padded_dim}, padded)."
+                    f"The normalisation statistics of '{name}' have {len(statistics.mean)} numbers; {needed} are "
+                    f"needed (or {padded_dim}, padded)."
                 )
             if mode == "quantile" and (statistics.q01 is None or statistics.q99 is None):
                 raise UnusableNormStats(f"The normalisation statistics of '{name}' lack q01 and q99 for quantile mode.")
@@ -154,7 +154,7 @@ def environment_actions(
     """Return environment actions (..., horizon, 7) of model outputs (..., horizon, action dim).
 
     `relative_to` (..., 8) is the unnormalised state for policies trained on differences to it (openpi's pi0_libero):
-    its first 6 numbers are added, the gripper is left alone.
+    its first 6 numbers are added; the gripper is absolute.
     """
     actions = stats.actions.unnormalise(model_actions, mode)[..., :ENVIRONMENT_ACTION_DIM]
     if relative_to is not None:
@@ -180,21 +180,21 @@ def _statistics(groups: Mapping[str, Any], name: str, where: str) -> Statistics:
         try:
             arrays[key] = None if given is None else np.asarray(given, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise UnusableNormStats(f"{where} has something else than numbers as '{key}' of '{name}'.") from error
+            raise UnusableNormStats(f"{where} has other values than numbers as '{key}' of '{name}'.") from error
     lengths = {array.shape for array in arrays.values() if array is not None}
     if len(lengths) != 1 or len(next(iter(lengths))) != 1:
         raise UnusableNormStats(f"{where} has statistics of unequal lengths for '{name}': {listing(sorted(lengths))}.")
     mean, std = arrays["mean"], arrays["std"]
-    # checked above; this tells the type checker
+    # checked above; for mypy
     assert mean is not None
     assert std is not None
     return Statistics(mean=mean, std=std, q01=arrays["q01"], q99=arrays["q99"])
 
 
 def read_norm_stats(checkpoint: str | Path) -> NormStats:
-    """Read the statistics that a checkpoint folder brings in assets/<asset id>/norm_stats.json.
+    """Read the statistics of a checkpoint folder, assets/<asset id>/norm_stats.json.
 
-    The asset id may be several folders deep. None, or more than one, is an error: which to take is not guessed.
+    The asset id may be several folders deep. No file, or more than one, is an error.
     """
     assets = Path(checkpoint) / "assets"
     found = sorted(assets.rglob("norm_stats.json"))

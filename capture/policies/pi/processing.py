@@ -1,7 +1,7 @@
-"""Between the environment and the model: what differs between the ecosystems that pi policies come from.
+"""Processing between the environment and the model, which differs between the ecosystems of pi policies.
 
 openpi and LeRobot resize with different filters, normalise with different formulas, write different prompts and execute
-different numbers of actions. A `Processing` is all of that for one policy; `PiPolicy` is the same for both.
+different numbers of actions. A `Processing` does this for one policy; `PiPolicy` is the same for both.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.preprocess import NormalisationMode, NormStats, environment_actions, model_image
 from vla_attention.capture.policies.pi.tokenizer import PromptFormat
 
-#: Which environment camera fills which slot (openpi's LIBERO inputs); other slots are black and masked.
+#: Slot -> environment camera (openpi's LIBERO inputs); other slots are black and masked.
 CAMERA_OF_SLOT = {"base_0_rgb": "agentview", "left_wrist_0_rgb": "robot0_eye_in_hand"}
 
-#: The state that LIBERO's inputs build in both ecosystems: position, axis-angle, two finger joints.
+#: Numbers of the state in both ecosystems: position, axis-angle, two finger joints.
 STATE_DIM = 8
 
 #: Actions that openpi's LIBERO client executes of each chunk.
@@ -29,11 +29,11 @@ OPENPI_REPLAN_STEPS = 5
 
 
 class Processing(Protocol):
-    """What a policy does to observations and actions outside the model."""
+    """Processing of observations and actions outside the model."""
 
     @property
     def prompt_format(self) -> PromptFormat:
-        """How instruction and state become text."""
+        """Format of the prompt, made of instruction and state."""
 
     @property
     def cut_long_prompts(self) -> bool:
@@ -41,14 +41,14 @@ class Processing(Protocol):
 
     @property
     def environment_cameras(self) -> Mapping[str, str]:
-        """Slot of the model -> camera of the environment; slots that are not here are black and masked."""
+        """Slot of the model -> camera of the environment; other slots are black and masked."""
 
     @property
     def default_replan_steps(self) -> int:
         """Actions that the ecosystem's own evaluation executes of each chunk."""
 
     def model_picture(self, frame: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], Tensor]:
-        """Return the model's image of a raw camera frame: (size, size, 3) uint8 to keep, (1, 3, size, size) in [-1, 1]."""
+        """Return the model's image of a raw frame: (size, size, 3) uint8 for the store, (1, 3, size, size) in -1..1."""
 
     def normalise_state(self, state: NDArray[np.float64]) -> NDArray[np.floating]:
         """Return the state (state,) in the model's range, not padded."""
@@ -59,7 +59,7 @@ class Processing(Protocol):
         """Return the actions (horizon, 7) for the environment of the model's (horizon, action dim)."""
 
     def provenance(self) -> dict[str, Any]:
-        """Return what identifies the processing, as plain JSON values."""
+        """Return plain JSON values that identify the processing."""
 
 
 class OpenpiProcessing:
@@ -109,7 +109,7 @@ class OpenpiProcessing:
         )
 
     def provenance(self) -> dict[str, Any]:
-        """Return the ecosystem, the normalisation and what actions mean."""
+        """Return the ecosystem, the normalisation, and whether actions are relative."""
         return {
             "processing": "openpi",
             "normalisation": self.normalisation,

@@ -1,7 +1,7 @@
-"""SigLIP, the image encoder of PaliGemma: patches of one image to as many tokens.
+"""SigLIP, the image encoder of PaliGemma: one token per patch of an image.
 
-Module names are those of openpi's PyTorch checkpoints. Architecture: Zhai et al. 2023 (SigLIP), So400m/14 shape, without
-class token and pooling.
+Module names are those of openpi's PyTorch checkpoints. Architecture: Zhai et al. 2023 (SigLIP), So400m/14 shape,
+without class token and pooling.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ LAYER_NORM_EPS = 1e-6
 
 
 class PatchEmbeddings(nn.Module):
-    """Cut an image into patches, project them and add a learned position each."""
+    """Cut an image into patches, project them and add learned positions."""
 
     def __init__(self, config: SiglipConfig):
         super().__init__()
@@ -30,8 +30,8 @@ class PatchEmbeddings(nn.Module):
         weight, bias = self.patch_embedding.weight, self.patch_embedding.bias
         size = weight.shape[-1]
         pixels = torch.unflatten(torch.unflatten(images, 3, (-1, size)), 2, (-1, size))
-        # (image, 3, row, y, column, x) -> (image, row · column, 3 · y · x): patches do not overlap, so the convolution is
-        # one matrix product. Convolutions on a GPU are rounded to TF32 unless a global switch says otherwise.
+        # (image, 3, row, y, column, x) -> (image, row · column, 3 · y · x): patches do not overlap, so the convolution
+        # is one matrix product. Convolutions on a GPU are rounded to TF32 unless a global switch says otherwise.
         patches = pixels.permute(0, 2, 4, 1, 3, 5).flatten(3).flatten(1, 2)
         return F.linear(patches.to(weight.dtype), weight.flatten(1), bias) + self.position_embedding.weight
 
@@ -81,9 +81,9 @@ class SiglipBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (image, patch, width) to the same shape."""
-        x = x + self.self_attn(self.layer_norm1(x))
-        x = x + self.mlp(self.layer_norm2(x))
-        return x
+        attended: Tensor = x + self.self_attn(self.layer_norm1(x))
+        updated: Tensor = attended + self.mlp(self.layer_norm2(attended))
+        return updated
 
 
 class SiglipEncoder(nn.Module):
@@ -101,7 +101,7 @@ class SiglipEncoder(nn.Module):
 
 
 class SiglipVisionModel(nn.Module):
-    """Patches, blocks and a last norm. Patches and positions stay in float32 in every precision, as in the reference."""
+    """Patches, blocks and a last norm. Patches and positions are always float32, as in the reference."""
 
     def __init__(self, config: SiglipConfig):
         super().__init__()

@@ -1,4 +1,4 @@
-"""Work out a model's sizes from the shapes of its tensors, by their names in the torch model."""
+"""Infer a model's sizes from the shapes of its tensors."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ VISION = PALIGEMMA + "model.vision_tower.vision_model."
 TABLE = PALIGEMMA + "model.language_model.embed_tokens.weight"
 EXPERT = "paligemma_with_expert.gemma_expert.model."
 
-#: Text slots when nothing else is said (openpi's model defaults).
+#: Default text slots by `pi05` (openpi's model defaults).
 MAX_TOKEN_LEN = {True: 200, False: 48}
 
 
 def is_pi05(shapes: Shapes) -> bool:
-    """Tell pi0.5 from pi0 by the tensors that only one of them has; anything else is a `CheckpointMismatch`."""
+    """Return whether the tensors are pi0.5's; `CheckpointMismatch` if they are neither pi0.5's nor pi0's."""
     if "time_mlp_in.weight" in shapes:
         return True
     if "state_proj.weight" in shapes:
@@ -35,17 +35,18 @@ def infer_config(
     action_horizon: str = "action_horizon",
     action_dim: str = "action_dim",
 ) -> PiConfig:
-    """Work out a configuration from tensor shapes and the checkpoint's config.json.
+    """Infer a configuration from tensor shapes and the checkpoint's config.json.
 
-    `action_horizon` and `action_dim` are the names under which config.json states these. One key/value head is taken for
-    granted (all released models), and the image encoder's heads are known for So400m's width only. A named Gemma variant
-    whose sizes are not those of the tensors raises `CheckpointMismatch`.
+    `action_horizon` and `action_dim` are the names under which config.json states these. One key/value head is assumed
+    (true for all released models), and the image encoder's heads are known for So400m's width only. A named Gemma
+    variant whose sizes are not those of the tensors raises `CheckpointMismatch`.
     """
     pi05 = is_pi05(shapes)
     for name in (action_dim, action_horizon):
         if not isinstance(config_json.get(name), int):
             raise CheckpointMismatch(
-                f"The checkpoint's config.json should state '{name}' as a whole number, but has {config_json.get(name)!r}."
+                f"The checkpoint's config.json should state '{name}' as a whole number, but has "
+                f"{config_json.get(name)!r}."
             )
     vlm = _gemma_sizes(shapes, PALIGEMMA + "model.language_model.")
     expert = _gemma_sizes(shapes, EXPERT)
@@ -97,8 +98,8 @@ def _siglip_sizes(shapes: Shapes) -> SiglipConfig:
     width, so400m = _size(shapes, patch, 0), SiglipConfig()
     if width != so400m.width:
         raise CheckpointMismatch(
-            f"The image encoder is {width} wide; its number of heads is known for width {so400m.width} (So400m) only, so this "
-            "checkpoint needs an explicit configuration: a case.json beside its folder, or --model-config PATH."
+            f"The image encoder is {width} wide; its number of heads is known for width {so400m.width} (So400m) only, "
+            "so this checkpoint needs an explicit configuration: a case.json beside its folder, or --model-config PATH."
         )
     patch_size = _size(shapes, patch, 2)
     tokens = _size(shapes, VISION + "embeddings.position_embedding.weight", 0)

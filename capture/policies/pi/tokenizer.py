@@ -1,7 +1,7 @@
-"""Instruction (and state) to prompt tokens, with the role of every token and the characters it stands for.
+"""Tokenize instruction and state into a prompt, with the role and the characters of every token.
 
 Prompt formats are openpi's and LeRobot's, whose tokenizer is PaliGemma's sentencepiece model. Roles come from character
-offsets, never from searching token ids: an instruction may well contain the word "State".
+offsets, not from a search for token ids, because an instruction may contain the word "State".
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ from vla_attention.capture.policies.pi.config import PALIGEMMA_VOCABULARY
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.layout import ROLE_DTYPE, Piece, Prompt, Role
 
-#: Pieces of Gemma's vocabulary, which PaliGemma's begins with.
+#: Pieces of Gemma's vocabulary, the first part of PaliGemma's.
 GEMMA_VOCABULARY = 256_000
 
-#: `instruction-newline`: openpi without state, "\n" encoded on its own. `task-state-action`: pi0.5 with the state as digits,
-#: "Task: {instruction}, State: {bins};\nAction: ", in both ecosystems. `raw-instruction-newline` and `raw-instruction`:
-#: LeRobot's pi0, the instruction as the task says it, encoded in one go with or without "\n" at its end.
+#: `instruction-newline`: openpi without state, "\n" encoded on its own. `task-state-action`: pi0.5 with the state as
+#: digits, "Task: {instruction}, State: {bins};\nAction: ", in both ecosystems. `raw-instruction-newline` and
+#: `raw-instruction`: LeRobot's pi0, the unchanged instruction, encoded as one string with or without "\n" at its
+#: end.
 PromptFormat = Literal["instruction-newline", "task-state-action", "raw-instruction-newline", "raw-instruction"]
 
 
 class TokenizerNotFound(UserError, FileNotFoundError):
-    """There is no tokenizer file where it should be."""
+    """There is no tokenizer file."""
 
 
 class UnreadableTokenizer(UserError, ValueError):
@@ -39,11 +40,11 @@ class UnreadableTokenizer(UserError, ValueError):
 
 @dataclass(frozen=True)
 class TokenizedPrompt:
-    """A prompt as the model reads it, padded to its text slots.
+    """A prompt for the model, padded to its text slots.
 
     ids: (text,) int64; mask: (text,) bool, True = a real token; roles: (text,) uint8 codes of `Role`; prompt: the text
-    given to the model, its pieces with their keys, and the range of the instruction. num_cut: tokens that did not fit and
-    were cut off; the prompt's text is whole, and its last pieces are missing.
+    given to the model, its pieces with their keys, and the range of the instruction. num_cut: number of tokens that
+    were cut off; the prompt's text is complete, and its last pieces are missing.
     """
 
     ids: NDArray[np.int64]
@@ -73,7 +74,7 @@ class _Token:
 
 
 def clean_instruction(instruction: str) -> str:
-    """Return the instruction as openpi cleans it: strip, then "_" and newlines become spaces, nothing else changes."""
+    """Return the instruction as openpi cleans it: stripped, with spaces for "_" and newlines."""
     return _not_empty(instruction.strip().replace("_", " ").replace("\n", " "))
 
 
@@ -86,7 +87,7 @@ def _not_empty(text: str) -> str:
 def digitise_state(state: NDArray[np.floating]) -> NDArray[np.int64]:
     """Return the bin of each normalised state value, (state,): 0..255 over [-1, 1), 255 above, -1 below.
 
-    The -1 is what openpi's formula gives, so it occurs in the prompts that its policies were trained on.
+    openpi's formula gives -1, so its policies were trained with it.
     """
     bins: NDArray[np.int64] = np.digitize(state, np.linspace(-1, 1, 256 + 1)[:-1]) - 1
     return bins
@@ -128,14 +129,14 @@ class PromptTokenizer:
         prompt_format: PromptFormat | None = None,
         cut: bool = False,
     ) -> TokenizedPrompt:
-        """Tokenize an instruction, and the state too when the format has it.
+        """Tokenize an instruction, and the state if the format contains it.
 
         Args:
-            instruction: as the task says it; it is cleaned here where the format does so.
+            instruction: of the task; cleaned if the format does so.
             max_token_len: text slots of the model.
             first_key: key of the first text slot, for the pieces.
             state: (state,) normalised, unpadded.
-            prompt_format: None takes openpi's: with the state when there is one.
+            prompt_format: None takes openpi's, with the state if there is one.
             cut: cut a longer prompt as the reference implementations do, instead of refusing it as a `BadArgument`.
         """
         if prompt_format is None:
@@ -145,8 +146,8 @@ class PromptTokenizer:
         num_cut = max(0, 1 + len(tokens) - max_token_len)
         if num_cut and not cut:
             raise BadArgument(
-                f"The prompt of the instruction '{instruction}' has {1 + len(tokens)} tokens, but the model has room for "
-                f"{max_token_len}; shorten the instruction."
+                f"The prompt of the instruction '{instruction}' has {1 + len(tokens)} tokens, but the model has room "
+                f"for {max_token_len}; shorten the instruction."
             )
         text = "".join(section.text for section in sections)
         role_of_character = [section.role for section in sections for _ in section.text]
@@ -167,7 +168,7 @@ class PromptTokenizer:
         return TokenizedPrompt(ids=ids, mask=mask, roles=roles, prompt=prompt, num_cut=num_cut)
 
     def _encode(self, sections: Sequence[_Section]) -> list[_Token]:
-        """Encode the sections, joined except where one is to be encoded alone; offsets are into the whole text."""
+        """Encode the sections together, except those that are encoded alone; offsets refer to the whole text."""
         calls: list[str] = []
         for section in sections:
             if section.encode_alone or not calls:
@@ -183,7 +184,7 @@ class PromptTokenizer:
 
     def _encode_one(self, text: str) -> list[_Token]:
         """Encode one string without BOS; offsets count characters."""
-        # sentencepiece 0.2.3 replaced its proto objects, and its new ones want the protobuf package.
+        # sentencepiece 0.2.3 replaced its proto objects; the new ones need the protobuf package.
         if hasattr(self._processor, "EncodeAsOffsetMapping"):
             found = self._processor.EncodeAsOffsetMapping(text)
             tokens = [
@@ -219,7 +220,7 @@ def _sections(instruction: str, state: NDArray[np.floating] | None, prompt_forma
 
 
 def _spread_bytes(tokens: list[_Token]) -> list[_Token]:
-    """Give every byte of a character the whole character: sentencepiece gives it to the last byte only."""
+    """Give every byte token the whole character; sentencepiece gives it to the last byte only."""
     spread: list[_Token] = []
     for token in reversed(tokens):
         empty = token.start == token.stop
@@ -231,7 +232,7 @@ def _spread_bytes(tokens: list[_Token]) -> list[_Token]:
 
 
 def _role(token: _Token, text: str, role_of_character: list[Role]) -> Role:
-    """Return the role that most of the token's visible characters have; one of spaces only goes by its first."""
+    """Return the role of most visible characters of the token; for spaces only, of the first character."""
     characters = range(token.start, token.stop) or range(token.start, token.start + 1)
     visible = [i for i in characters if i < len(text) and not text[i].isspace()]
     found = [role_of_character[i] for i in visible] or [role_of_character[min(token.start, len(text) - 1)]]
@@ -239,12 +240,16 @@ def _role(token: _Token, text: str, role_of_character: list[Role]) -> Role:
 
 
 def check_vocabulary(tokenizer: PromptTokenizer, table_rows: int, model: str) -> None:
-    """Raise `BadArgument` when the tokenizer cannot be the model's: more pieces than its table, or not PaliGemma's for one
-    of full size (256000 pieces of Gemma, perhaps with the locations and segments that pi never reads)."""
+    """Raise `BadArgument` if the tokenizer cannot be the model's.
+
+    It has more pieces than the model's table, or the model has full size and the tokenizer is not PaliGemma's: 256000
+    pieces of Gemma, with or without the locations and segments, which pi does not use.
+    """
     pieces = tokenizer.vocab_size
     if pieces > table_rows:
         raise BadArgument(
-            f"The tokenizer has {pieces} pieces, but the model '{model}' knows {table_rows}: it is another model's tokenizer."
+            f"The tokenizer has {pieces} pieces, but the model '{model}' has {table_rows}: it is another model's "
+            "tokenizer."
         )
     if table_rows == PALIGEMMA_VOCABULARY and pieces < GEMMA_VOCABULARY:
         raise BadArgument(

@@ -12,8 +12,8 @@ from tests.kit.cosmos_checkpoint import WEIGHTS_NAME
 from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, make_observation
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnsupportedCheckpoint
 from vla_attention.capture.policies.cosmos.build import build_cosmos_policy
-from vla_attention.capture.policies.cosmos.checkpoint import CosmosOptions, load_cosmos_policy
 from vla_attention.capture.policies.cosmos.embedded import TOKENIZER_PATH, random_policy
+from vla_attention.capture.policies.cosmos.loading import CosmosOptions, load_cosmos_policy
 from vla_attention.capture.policies.cosmos.locate import (
     EMBEDDINGS_NAME,
     POLICY_REPOSITORY,
@@ -45,7 +45,7 @@ def folder(dummy_folder, tmp_path):
 def test_a_folder_gives_the_policy_that_was_written(folder, dummy, capsys):
     policy = load_cosmos_policy(str(folder), options=SMALL)
     assert policy.config == dummy.config
-    assert "T5's tokenizer (spiece.model) is not at hand" in capsys.readouterr().err
+    assert "T5's tokenizer (spiece.model) was not found" in capsys.readouterr().err
     observation = make_observation(0)
     ours = policy.act(policy.prepare(observation, INSTRUCTION), 195)
     assert np.array_equal(ours, dummy.act(dummy.prepare(observation, INSTRUCTION), 195))

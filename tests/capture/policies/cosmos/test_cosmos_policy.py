@@ -61,7 +61,7 @@ def test_queries_are_pooled_by_action_step(dummy, prepared):
     rows = recorder.finish().rows
     assert rows.shape == (1, 1, 2, 16 * 7, 144)
     np.testing.assert_allclose(rows[0, 0], pools @ keep.rows[1, 0][0].numpy(), atol=1e-6)
-    with pytest.raises(BadArgument, match="do not stand for action steps"):
+    with pytest.raises(BadArgument, match="have no weights per action step"):
         dummy.act(prepared, 195, {"self": AttentionRecorder(plan, dummy.sites[0].num_keys)})
 
 

@@ -11,11 +11,11 @@ from safetensors.torch import load_file, save_file
 
 from tests.kit.pi_golden import GOLDEN, KeepAll, load_case, read_manifest
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch, CheckpointNotFound, UnreadableCheckpoint
-from vla_attention.capture.policies.pi.checkpoint import load_openpi_torch, model_names
 from vla_attention.capture.policies.pi.config import NAMED_CONFIGS, SiglipConfig, find_config, find_variant
 from vla_attention.capture.policies.pi.jax_weights import from_jax_flat, plan_leaves
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.model_weights import expected_shapes
+from vla_attention.capture.policies.pi.openpi_torch import load_openpi_torch, model_names
 from vla_attention.capture.policies.pi.sizes import infer_config
 from vla_attention.capture.policies.strict_loading import check_shapes
 from vla_attention.schemas.errors import BadArgument, UnknownName, UserError

@@ -17,7 +17,7 @@ from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, random_weig
 from vla_attention.capture.policies.pi.jax_lora import merge_lora
 from vla_attention.capture.policies.pi.jax_weights import from_jax_flat
 from vla_attention.capture.policies.pi.loading import load_pi_model
-from vla_attention.capture.policies.pi.orbax import OpenLeaf, list_leaves, load_openpi_jax, read_leaf
+from vla_attention.capture.policies.pi.openpi_jax import OpenLeaf, list_leaves, load_openpi_jax, read_leaf
 from vla_attention.capture.policies.pi.preprocess import read_norm_stats
 
 pytest.importorskip("tensorstore")

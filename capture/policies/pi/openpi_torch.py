@@ -1,4 +1,4 @@
-"""Load pi0 and pi0.5 weights from safetensors: openpi's PyTorch format, and the file that LeRobot's format shares with it."""
+"""Load pi0 and pi0.5 weights from safetensors: openpi's PyTorch format, whose file LeRobot's format has too."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from vla_attention.capture.policies.pi.model_weights import build_model, expecte
 from vla_attention.capture.policies.pi.sizes import PALIGEMMA, TABLE, infer_config
 from vla_attention.capture.policies.strict_loading import Shapes, check_shapes
 
-#: The text table is tied to the language model's output layer, and safetensors keeps one name of tied tensors: this one.
+#: The text table is tied to the language model's output layer. safetensors keeps one name of tied tensors, this one.
 TIED_TABLE = PALIGEMMA + "lm_head.weight"
-#: The expert's output layer is never used and never trained: random numbers of 250 million parameters.
+#: The expert's output layer, 250 million parameters that are neither trained nor used.
 JUNK = "paligemma_with_expert.gemma_expert.lm_head.weight"
-#: LeRobot's policy wraps the model; files converted earlier lack the prefix.
+#: LeRobot's policy wraps the model. Files of earlier conversions lack the prefix.
 LEROBOT_PREFIX = "model."
 
 
 def model_names(stored: Iterable[str]) -> dict[str, str]:
     """Return model name -> stored name of a safetensors checkpoint.
 
-    LeRobot's prefix is taken off when every name has it. The text table is `embed_tokens` where the file has it, else the
-    language model's output layer, with which it is tied; the expert's output layer is left out.
+    LeRobot's prefix is removed if every name has it. The text table is `embed_tokens` if the file has it, else the
+    language model's output layer, which is tied to it. The expert's output layer is left out.
     """
     names = list(stored)
     prefix = LEROBOT_PREFIX if names and all(name.startswith(LEROBOT_PREFIX) for name in names) else ""
@@ -45,7 +45,7 @@ def model_names(stored: Iterable[str]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class TensorFile:
-    """An open model.safetensors: the shapes of its tensors by model name, and how to read one."""
+    """An open model.safetensors: shapes of its tensors by model name, and a way to read one of them."""
 
     names: dict[str, str]
     shapes: Shapes
@@ -57,14 +57,14 @@ class TensorFile:
         return tensor
 
     def build(self, config: PiConfig, *, dtype: torch.dtype, device: str | torch.device) -> PiModel:
-        """Build the model strictly: missing, extra and misshapen tensors are listed."""
+        """Build the model strictly; `CheckpointMismatch` lists missing, extra and misshapen tensors."""
         check_shapes(self.shapes, expected_shapes(config))
         return build_model(config, self.names, self.read, dtype=dtype, device=device)
 
 
 @contextmanager
 def open_tensors(folder: Path) -> Iterator[TensorFile]:
-    """Open a checkpoint's model.safetensors; a damaged file is an `UnreadableCheckpoint`, also while it is read."""
+    """Open a checkpoint's model.safetensors; `UnreadableCheckpoint` for a damaged file, also later while reading."""
     path = folder / "model.safetensors"
     try:
         with safe_open(path, framework="pt") as stored:
@@ -86,8 +86,8 @@ def load_openpi_torch(
 ) -> PiModel:
     """Load a checkpoint in openpi's PyTorch format.
 
-    Sizes, and whether it is pi0 or pi0.5, come from the tensors; `config` overrides all of that (some facts are in no
-    checkpoint: the number of text slots, denoise steps, whether the prompt carries the state).
+    Sizes, and whether it is pi0 or pi0.5, come from the tensors; `config` overrides them. Some facts are in no
+    checkpoint: the number of text slots, the number of denoise steps, and whether the prompt contains the state.
 
     Raises `CheckpointNotFound`, `UnsupportedCheckpoint`, `UnreadableCheckpoint` or `CheckpointMismatch`.
     """

@@ -1,8 +1,8 @@
 """Read openpi's JAX checkpoints (orbax, OCDBT) leaf by leaf with tensorstore; neither JAX nor orbax is needed.
 
-A checkpoint folder holds `params/` with `_METADATA` (JSON: the tree) and an OCDBT key-value store, in which every leaf is a
-zarr array under its path joined with ".". Stacked leaves are read layer by layer, largest leaves first, so that memory never
-holds much more than the model itself.
+A checkpoint folder holds `params/` with `_METADATA` (JSON: the tree) and an OCDBT key-value store, in which every leaf
+is a zarr array under its path joined with ".". Stacked leaves are read layer by layer, largest leaves first, so that
+memory never holds much more than the model itself.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class Leaf:
 
 
 def list_leaves(params: Path) -> list[Leaf]:
-    """Return the leaves of a `params` folder, by the names that `jax_weights` knows.
+    """Return the leaves of a `params` folder, with the names of `jax_weights`.
 
-    The saved tree starts with "params", and runs of openpi's training end every path with "value"; both are taken off.
+    The saved tree starts with "params", and runs of openpi's training end every path with "value"; both are removed.
     """
     metadata = read_json_object(params / "_METADATA")
     if not metadata.get("tree_metadata"):
@@ -60,7 +60,7 @@ def list_leaves(params: Path) -> list[Leaf]:
 
 
 class OpenLeaf:
-    """A leaf that is open for reading: its shape is known, its numbers are not in memory yet."""
+    """A leaf that is open for reading: its shape is known, its numbers are not in memory."""
 
     def __init__(self, params: Path, leaf: Leaf):
         self._what = f"The array '{leaf.path}' of '{params}' cannot be read: files are missing or damaged"
@@ -68,13 +68,13 @@ class OpenLeaf:
         self._spec = {
             "driver": leaf.driver,
             "kvstore": {"driver": "ocdbt", "base": f"file://{params.resolve()}/", "path": f"{leaf.store_key}/"},
-            # Where the checkpoint says that it stores every chunk, one that is not there is an error and not zeros.
+            # If the checkpoint declares that it stores every chunk, a missing chunk is an error, not zeros.
             "fill_missing_data_reads": not leaf.all_chunks_stored,
         }
         array = self._open(cache_bytes=0)
         self.shape: tuple[int, ...] = tuple(array.shape)
         rows_of_a_chunk = array.chunk_layout.read_chunk.shape[0] if array.rank else 1
-        #: One chunk often holds all layers, and is then kept for as long as its layers are read one by one.
+        #: One chunk often holds all layers; it is kept while its layers are read one by one.
         self._cache_bytes = 0
         if self.shape and rows_of_a_chunk > 1:
             self._cache_bytes = int(
@@ -113,7 +113,7 @@ class OpenLeaf:
 
 
 def import_tensorstore() -> Any:
-    """Return the tensorstore module, or say how to get it."""
+    """Return the tensorstore module; `MissingDependency` without it."""
     try:
         import tensorstore
     except ImportError as error:
@@ -138,9 +138,9 @@ def load_openpi_jax(
 ) -> PiModel:
     """Load a checkpoint in openpi's JAX format.
 
-    Such a checkpoint does not say which configuration it was trained with. Without `config` it is openpi's pi05_libero, or
-    pi0_libero when it has a state projection; all shapes are checked against it, but the action horizon shows in none.
-    LoRA arrays are merged into the weights that they adapt.
+    Such a checkpoint does not state its configuration. Without `config` openpi's pi05_libero is taken, or pi0_libero if
+    there is a state projection. All shapes are checked against it; the action horizon is in none of them. LoRA arrays
+    are merged into the weights that they adapt.
     """
     folder = Path(folder)
     detect_format(folder, "openpi_jax")
@@ -160,11 +160,11 @@ def load_openpi_jax(
 
     def keep(arrays: dict[str, np.ndarray]) -> None:
         for name, array in arrays.items():
-            tensor = torch.from_numpy(np.ascontiguousarray(array))  # copies what is transposed, and nothing else
-            # openpi's server restores every parameter as bfloat16, those too that are then used in float32.
+            tensor = torch.from_numpy(np.ascontiguousarray(array))  # copies transposed tensors only
+            # openpi's server restores every parameter as bfloat16, also those that it then uses in float32.
             state[name] = tensor.to(dtype).to(device=device, dtype=kept_as[name].dtype)
 
-    # The largest first: what reading one takes on top of itself is then taken while little else is there.
+    # The largest first: reading one takes extra memory, and little of the model is in memory then.
     for path in sorted(plans, key=lambda path: stored[path].size, reverse=True):
         plan = plans[path]
         if plan.layers is None:
@@ -190,6 +190,6 @@ def _shapes_of(shapes: Any, leaf: OpenLeaf) -> Shapes:
     try:
         found: Shapes = shapes(leaf.shape)
     except (ValueError, IndexError):
-        # An array with another number of axes than its conversion expects: say so by its JAX name.
+        # An array with another number of axes than its conversion expects is reported by its JAX name.
         found = {leaf.path: leaf.shape}
     return found

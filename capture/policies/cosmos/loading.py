@@ -1,4 +1,4 @@
-"""Load a Cosmos policy from a checkpoint folder as it is published: weights, statistics, text embeddings, image encoder."""
+"""Load a Cosmos policy from a published checkpoint: weights, statistics, text embeddings and image encoder."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from vla_attention.schemas.errors import BadArgument
 
 @dataclass(frozen=True)
 class CosmosOptions:
-    """What a user may say about a policy; None leaves it to the checkpoint and the named configuration.
+    """A user's choices for a policy; None takes the value of the checkpoint or of the named configuration.
 
     config_name: the reference's name for sizes, frames and noise levels. vae_path, statistics_path, embeddings_path,
-    t5_tokenizer: files that lie elsewhere than in the checkpoint's folder. t5_encoder: folder of a T5 for instructions that
-    were not precomputed. dtype: None takes bfloat16 on a GPU, as the reference runs, and float32 on a CPU. image_size: of
-    another checkpoint than the published one.
+    t5_tokenizer: files outside the checkpoint's folder. t5_encoder: folder of a T5 for instructions without a
+    precomputed embedding. dtype: None takes bfloat16 on a GPU, like the reference, and float32 on a CPU. image_size:
+    pixels of one side, for a checkpoint with another size than the published one.
     """
 
     config_name: str = DEFAULT_CONFIG_NAME
@@ -57,7 +57,7 @@ class CosmosOptions:
     image_size: int | None = None
 
     def apply(self, config: CosmosConfig) -> CosmosConfig:
-        """Return the configuration with what the user says."""
+        """Return the configuration with the user's choices."""
         changes: dict[str, Any] = {}
         if self.num_denoising_steps is not None:
             changes["sampler"] = dataclasses.replace(config.sampler, num_steps=self.num_denoising_steps)
@@ -68,7 +68,7 @@ class CosmosOptions:
         return dataclasses.replace(config, **changes)
 
     def open_loop_steps(self, config: CosmosConfig) -> int:
-        """Return how many actions of a chunk are executed: all, unless the user says otherwise."""
+        """Return how many actions of a chunk are executed; by default all of them."""
         return config.chunk_size if self.num_open_loop_steps is None else self.num_open_loop_steps
 
 
@@ -80,22 +80,22 @@ def load_cosmos_policy(
     Sizes of the networks come from their tensors; frames, noise levels and picture size from the named configuration.
     """
     options = options or CosmosOptions()
-    base = options.apply(find_config(options.config_name))  # mistakes in options are said before anything is fetched
+    base = options.apply(find_config(options.config_name))  # wrong options are reported before any download
     base.frames.index(options.query_frame)
     place = find_checkpoint(checkpoint)
-    # The cheap files first: a missing one should not cost the minutes that the weights take.
+    # Small files first: if one is missing, the minutes for loading the weights are saved.
     weights_path = find_weights(place)
     statistics = read_statistics(
         find_beside(place, options.statistics_path, STATISTICS_NAME), base.action_dim, base.proprio_dim
     )
     embeddings = read_embeddings(find_beside(place, options.embeddings_path, EMBEDDINGS_NAME))
     encoder = T5Encoder(options.t5_encoder) if options.t5_encoder is not None else None
-    # An encoder's folder has its tokenizer.
+    # The folder of an encoder also has the tokenizer.
     tokenizer_path = find_t5_tokenizer(place, options.t5_tokenizer or options.t5_encoder)
     if tokenizer_path is None:
         print(
-            "T5's tokenizer (spiece.model) is not at hand: the text's positions are recorded, but not which word each is; "
-            "give --t5-tokenizer to have words.",
+            "T5's tokenizer (spiece.model) was not found: the text's positions are recorded, but not the word of each; "
+            "give --t5-tokenizer to select words.",
             file=sys.stderr,
             flush=True,
         )
@@ -115,7 +115,7 @@ def load_cosmos_policy(
     if width != config.dit.text_dim:
         raise BadArgument(
             f"The text embeddings of '{embeddings.path}' have {width} numbers a position, but the policy reads "
-            f"{config.dit.text_dim}: they are another model's."
+            f"{config.dit.text_dim}: they belong to another model."
         )
     model = CosmosModel(
         config,
