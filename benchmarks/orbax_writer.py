@@ -37,16 +37,16 @@ def write_orbax(
     params.mkdir(parents=True)
     tree = {}
     for path, shape in shapes.items():
-        parts = ["params", *path.split("/"), *(["value"] if value_suffix else [])]
-        tree[str(tuple(parts))] = {
-            "key_metadata": [{"key": part, "key_type": 2} for part in parts],
+        names = ["params", *path.split("/"), *(["value"] if value_suffix else [])]
+        tree[str(tuple(names))] = {
+            "key_metadata": [{"key": name, "key_type": 2} for name in names],
             "value_metadata": {"value_type": "jax.Array", "skip_deserialize": False, "write_shape": list(shape)},
         }
         chunks = [1, *shape[1:]] if chunk_per_layer else list(shape)
         array = tensorstore.open(
             {
                 "driver": "zarr",
-                "kvstore": {"driver": "ocdbt", "base": f"file://{params.resolve()}/", "path": ".".join(parts) + "/"},
+                "kvstore": {"driver": "ocdbt", "base": f"file://{params.resolve()}/", "path": ".".join(names) + "/"},
                 "metadata": {
                     "shape": list(shape),
                     "chunks": chunks,
@@ -54,12 +54,14 @@ def write_orbax(
                     "compressor": {"id": "zstd", "level": 1},
                 },
                 "store_data_equal_to_fill_value": True,
+                "context": {"file_io_sync": False},
             },
             create=True,
         ).result()
         if chunk_per_layer:
-            for i in range(shape[0]):
-                array[i].write(layer_of(path, i).astype(array.dtype.numpy_dtype)).result()
+            parts = (layer_of(path, i).astype(array.dtype.numpy_dtype) for i in range(shape[0]))
+            for written in [array[i].write(part) for i, part in enumerate(parts)]:
+                written.result()
         else:
             whole = np.empty(shape, dtype=array.dtype.numpy_dtype)
             for i in range(shape[0]):
