@@ -55,7 +55,7 @@ check: .venv/capture-installed
 unit: .venv/capture-installed
 	$(BIN)/pytest -n $(WORKERS) $(ARGS)
 
-# Ten times as many random examples. Takes an hour; for changes of formulas, file formats and readers.
+# Ten times as many random examples; for changes of formulas, file formats and readers.
 test-thorough: .venv/capture-installed
 	$(BIN)/pytest -n $(WORKERS) --hypothesis-profile thorough -m "not simulator" $(ARGS)
 

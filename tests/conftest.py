@@ -1,4 +1,4 @@
-"""Fixtures that several test folders share."""
+"""Fixtures that several test folders share, and how many random examples property tests try."""
 
 from __future__ import annotations
 
@@ -6,6 +6,14 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+from tests.kit.examples import PROFILES
+
+for _name, _count in PROFILES.items():
+    settings.register_profile(_name, max_examples=_count, deadline=None)
+# `pytest --hypothesis-profile thorough` loads the other one afterwards, and before test modules are imported.
+settings.load_profile("fast")
 
 
 @pytest.fixture(scope="session")

@@ -10,6 +10,7 @@ import numpy as np
 import zarr
 from hypothesis import HealthCheck, Phase, settings
 
+from tests.kit.examples import examples
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import resolve
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
@@ -18,7 +19,10 @@ from vla_attention.testing.tokens import valid_keys
 
 #: Every example writes a store: shrinking one would take minutes.
 FEW = settings(
-    max_examples=6, phases=[Phase.explicit, Phase.generate], deadline=None, suppress_health_check=[HealthCheck.too_slow]
+    max_examples=examples(4),
+    phases=[Phase.explicit, Phase.generate],
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
 )
 
 

@@ -15,6 +15,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
+from tests.kit.examples import examples
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.export.labelled_arrays import masses_array, rows_array, rows_size, write_netcdf
@@ -227,7 +228,7 @@ def test_the_error_of_a_folder_that_cannot_be_written_names_it(store, tmp_path, 
 
 
 @settings(
-    max_examples=12,
+    max_examples=examples(5),
     phases=[Phase.explicit, Phase.generate],
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow],

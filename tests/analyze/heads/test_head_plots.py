@@ -41,6 +41,8 @@ CASES = {
     ),
     "ten steps": ({"denoise_steps": tuple(range(10)), "layers": (1, 2), "heads": (0, 1)}, default_grouping()),
 }
+#: Cases that are drawn as PDF too.
+AS_PDF = ("some infinite", "many groups")
 
 
 def heads_of(steps: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
@@ -62,7 +64,7 @@ def heads_of(steps: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
     return heads_table(per.group_by(keys).agg(*columns).sort(keys), grouping)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [pytest.param(case, marks=[pytest.mark.pdf] * (case in AS_PDF)) for case in CASES])
 def test_every_picture_of_every_case_is_drawn_without_a_warning(case, tmp_path):
     wanted, grouping = CASES[case]
     steps = make_steps(**({"grouping": grouping} | wanted))

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 from scipy import stats
 
+from tests.kit.examples import examples
 from tests.kit.questions import question_about
 from vla_attention.analyze.heads import command as heads_command
 from vla_attention.analyze.heads.head_measures import ranked_heads
@@ -31,7 +32,7 @@ from vla_attention.testing.strategies import episode_tokens
 from vla_attention.testing.tokens import valid_keys
 
 QUICK = settings(
-    max_examples=12,
+    max_examples=examples(4),
     phases=[Phase.explicit, Phase.generate],
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
@@ -296,6 +297,7 @@ def test_the_summary_without_sinks_names_the_keys_and_takes_a_folder_of_its_own(
 # --- the command ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.pdf
 def test_the_command_writes_tables_and_pictures_and_names_the_nearest_key(tmp_path, capsys):
     from vla_attention.analyze.__main__ import main
 

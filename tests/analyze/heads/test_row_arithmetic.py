@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from tests.kit.examples import examples
 from vla_attention.analyze.heads.depth import depth_centre
 from vla_attention.analyze.heads.entropy import effective_keys, entropies, top_mass
 from vla_attention.analyze.heads.head_measures import dispersion, finite_mean
@@ -126,7 +127,7 @@ def test_dispersion_is_that_of_numpy_over_finite_heads(values):
 
 
 @given(seed=st.integers(0, 2**16), layers=st.integers(1, 18))
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 def test_depth_is_a_weighted_mean_of_blocks(seed, layers):
     generator = np.random.default_rng(seed)
     blocks = np.sort(generator.choice(28, layers, replace=False))

@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
+from tests.kit.examples import examples
 from tests.kit.questions import question_about
 from vla_attention.analyze.measures.selected import load_tokens, vocabulary_of
 from vla_attention.analyze.measures.steps import steps_table
@@ -30,7 +31,7 @@ from vla_attention.testing.strategies import episode_tokens, groupings
 
 #: Every example writes a store (and flushes it to disk): shrinking one would take minutes.
 QUICK = settings(
-    max_examples=25,
+    max_examples=examples(8),
     phases=[Phase.explicit, Phase.generate],
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow],

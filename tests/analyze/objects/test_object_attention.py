@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
 from tests.kit.bowl_scene import CAMERAS, bowl_coverage, bowl_tokens, write_bowl_store
+from tests.kit.examples import examples
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.objects.object_attention import ObjectTables, object_tables
@@ -32,7 +33,7 @@ from vla_attention.testing.stores import StoreSpec, root_attributes, write_store
 from vla_attention.testing.tokens import OBJECTS, random_rows
 
 QUICK = settings(
-    max_examples=6, phases=[Phase.explicit, Phase.generate], deadline=None,
+    max_examples=examples(4), phases=[Phase.explicit, Phase.generate], deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
 )  # fmt: skip
 CLASS_OF = {"akita_black_bowl_1": "of interest", "plate_1": "of interest", "wooden_cabinet_1": "other objects"}
@@ -278,6 +279,7 @@ def test_sites_are_chosen_by_what_they_hold():
         site_of_words(root, "self")
 
 
+@pytest.mark.pdf
 def test_the_command_prints_writes_and_draws(follower_store, tmp_path, capsys):
     arguments = ["objects", str(follower_store), "--output", str(tmp_path), "--per-head", "--save-steps", "--task", "1"]
     assert main(arguments) == 0

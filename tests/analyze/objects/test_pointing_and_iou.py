@@ -11,6 +11,7 @@ import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.kit.examples import examples
 from vla_attention.analyze.objects.pointing_and_iou import (
     centre_of_mass,
     distance_in_pictures,
@@ -27,7 +28,7 @@ from vla_attention.analyze.objects.pointing_and_iou import (
 )
 
 SIZES = st.tuples(st.integers(1, 6), st.integers(1, 6))
-QUICK = settings(max_examples=60, deadline=None)
+QUICK = settings(max_examples=examples(30), deadline=None)
 
 
 @st.composite
@@ -138,7 +139,7 @@ def test_otsu_separates_two_clusters_whatever_else_the_axes_hold():
     assert np.array_equal(otsu_regions(maps), np.broadcast_to(np.arange(26) >= 20, maps.shape))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(st.integers(1, 9), st.data())
 def test_chance_iou_is_the_mean_over_all_regions_of_that_size(total, data):
     from itertools import combinations

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.kit.examples import examples
 from tests.kit.published_results import (
     cosmos_episodes,
     pi_episodes,
@@ -284,7 +285,7 @@ def test_a_single_episode_need_not_be_in_a_list(tmp_path):
 MASSES = st.tuples(*[st.one_of(st.just(0.0), st.just(1e-9), st.floats(1e-6, 1.0))] * 3)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 @given(data=st.data())
 def test_any_masses_give_the_numbers_of_numpy(data):
     layers, replans = data.draw(st.integers(2, 3)), data.draw(st.integers(1, 5))

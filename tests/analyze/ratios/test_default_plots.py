@@ -48,9 +48,11 @@ CASES = {
         default_grouping(),
     ),
 }
+#: Cases that are drawn as PDF too.
+AS_PDF = ("some infinite", "many groups")
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [pytest.param(case, marks=[pytest.mark.pdf] * (case in AS_PDF)) for case in CASES])
 def test_every_picture_of_every_case_is_drawn_without_a_warning(case, tmp_path):
     steps, grouping = CASES[case]()
     replans = add_layers_avg(per_replan(steps, grouping), grouping)
@@ -85,6 +87,7 @@ def test_data_beside_the_picture_are_those_of_the_picture(tmp_path):
     assert data["ratio"].to_list() == pytest.approx(replans["ratio"].to_list())
 
 
+@pytest.mark.pdf
 def test_same_data_give_the_same_file(tmp_path):
     grouping = default_grouping()
     tasks = tasks_table(

@@ -111,6 +111,7 @@ def test_what_a_store_says_is_text_and_never_markup(html: str) -> None:
     assert html.count("<script>") == 1
 
 
+@pytest.mark.pdf
 def test_the_page_is_small_and_the_same_twice(analysis: Analysis, html: str) -> None:
     assert len(html.encode()) < 3_000_000
     assert report_html(analysis) == html

@@ -26,6 +26,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 from zarr.storage import LocalStore
 
+from tests.kit.examples import examples
 from vla_attention.capture.store.durable_files import StoreWriteFailed
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument, UserError
@@ -554,6 +555,6 @@ def test_writers_and_crashes(tmp_path, monkeypatch):
     run_state_machine_as_test(
         WritersAndCrashes,
         settings=settings(
-            max_examples=8, stateful_step_count=8, deadline=None, suppress_health_check=list(HealthCheck)
+            max_examples=examples(3), stateful_step_count=8, deadline=None, suppress_health_check=list(HealthCheck)
         ),
     )

@@ -17,6 +17,7 @@ import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.kit.examples import examples
 from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.capture.store.codecs import replans_per_block, write_whole
 from vla_attention.capture.store.recorded_rows import RecordedRows
@@ -115,7 +116,7 @@ def test_unusual_recordings(tmp_path, spec):
     check_equals_spec(write_store(tmp_path / "a.zarr", spec=spec), spec)
 
 
-@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(5), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(tokens=episode_tokens(), bits=st.sampled_from([4, 10, 23]))
 def test_random_layouts_are_read_back(tmp_path_factory, tokens, bits):
     spec = StoreSpec(tokens=tokens, mantissa_bits=bits, tasks=(0,), episodes=1)

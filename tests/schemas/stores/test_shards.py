@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from zarr.codecs import BloscCodec, Crc32cCodec
 
+from tests.kit.examples import examples
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.shards import ShardedLayers
 from vla_attention.schemas.stores.store_format import CorruptEpisode
@@ -38,7 +39,7 @@ def reader_of(folder: Path) -> ShardedLayers | None:
     return ShardedLayers.of(folder, json.loads((folder / "zarr.json").read_text()))
 
 
-@settings(max_examples=15, deadline=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+@settings(max_examples=examples(8), deadline=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
 @given(
     shape=st.tuples(*(st.integers(1, high) for high in (9, 3, 2, 2, 2, 17))),
     block=st.integers(1, 10),

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.kit.examples import examples
 from vla_attention.analyze.__main__ import main
 from vla_attention.capture.store.episode_writer import EpisodeWriter
 from vla_attention.capture.store.store_writer import open_run
@@ -276,7 +277,7 @@ def victim(original, tmp_path_factory) -> tuple[StoredEpisode, Path, dict[str, n
     return episode, copy, {name: episode.read(name) for name in episode.attributes.arrays}
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(data=st.data())
 def test_a_random_bit_flip_is_noticed_or_changes_nothing(victim, data):
     _, path, values = victim

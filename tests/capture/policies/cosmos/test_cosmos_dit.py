@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.kit.cosmos_helpers import GOLDEN
+from tests.kit.examples import examples
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch
 from vla_attention.capture.policies.cosmos.config import DitConfig, VaeConfig
 from vla_attention.capture.policies.cosmos.dit import Dit, rotate
@@ -215,7 +216,7 @@ def networks_and_batches(draw):
     return config, inputs, lengths
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(case=networks_and_batches())
 def test_any_network_on_any_batch(case):
     config, inputs, lengths = case

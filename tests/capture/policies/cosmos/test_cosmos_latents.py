@@ -11,6 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.kit.examples import examples
 from vla_attention.capture.policies.cosmos.config import CosmosConfig, SamplerConfig
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG
 from vla_attention.capture.policies.cosmos.latents import (
@@ -28,7 +29,7 @@ def test_a_frame_repeats_its_numbers_and_cuts_the_last_copy():
     assert filled.tolist() == [float(k % 9) for k in range(24)]
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(chunk=st.integers(1, 6), dim=st.integers(1, 4), extra=st.integers(0, 5))
 def test_actions_written_as_copies_are_read_back(chunk, dim, extra):
     actions = torch.arange(float(chunk * dim)).reshape(chunk, dim)
