@@ -70,7 +70,7 @@ def uninterrupted(tmp_path_factory) -> dict[str, bytes]:
 
 @contextmanager
 def before_call(kind: str, number: int, action: Callable[[], None]):
-    """Act before the number-th (from 0) call of a kind: `set` (a file), `fsync`, `rename`; "renamed": after a rename."""
+    """Act before the number-th (from 0) call of a kind: `set` (a file), `fsync`, `rename`; "renamed": after one."""
     owner: Any = {"set": LocalStore, "fsync": os, "rename": Path, "renamed": Path}[kind]
     name = kind.removesuffix("d")
     original = getattr(owner, name)

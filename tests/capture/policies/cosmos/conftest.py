@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from tests.kit.cosmos_checkpoint import write_dummy_folder
-from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, make_observation
+from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION
+from tests.kit.policy_inputs import make_observation
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, dummy_policy
 
 

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from tests.kit.cosmos_checkpoint import WEIGHTS_NAME
-from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, make_observation
+from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION
+from tests.kit.policy_inputs import make_observation
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnsupportedCheckpoint
 from vla_attention.capture.policies.cosmos.build import build_cosmos_policy
 from vla_attention.capture.policies.cosmos.embedded import TOKENIZER_PATH, random_policy

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, KeepAll, make_observation, recorders_of
+from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, recorders_of
+from tests.kit.policy_inputs import KeepAll, make_observation
 from vla_attention.capture.policies.cosmos.build import build_cosmos_policy
 from vla_attention.capture.policies.cosmos.calls import select_call
 from vla_attention.capture.policies.cosmos.config import LIBERO_FRAMES, CosmosConfig, FrameConfig

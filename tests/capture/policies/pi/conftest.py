@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.kit.pi_golden import GOLDEN, LARGE_GOLDEN, GoldenCase, load_case, make_observation
+from tests.kit.pi_golden import GOLDEN, LARGE_GOLDEN, GoldenCase, load_case
+from tests.kit.policy_inputs import make_observation
 from vla_attention.capture.environments.base import Observation
 from vla_attention.capture.policies.pi.embedded import dummy_policy, embedded_policy
 

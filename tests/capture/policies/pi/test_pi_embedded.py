@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.kit.pi_golden import make_observation
+from tests.kit.policy_inputs import make_observation
 from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, build_random_model, builtin_stats
 from vla_attention.capture.policies.pi.policy import site_layout
 from vla_attention.capture.policies.weights import weights_digest

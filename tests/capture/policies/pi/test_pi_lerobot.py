@@ -8,7 +8,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from tests.kit.pi_golden import GOLDEN, make_observation
+from tests.kit.pi_golden import GOLDEN
+from tests.kit.policy_inputs import make_observation
 from tests.kit.small_tokenizer import train_small_tokenizer
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint, UnsupportedCheckpoint
 from vla_attention.capture.policies.pi.lerobot_config import UnsupportedLerobotFeature, read_lerobot_config

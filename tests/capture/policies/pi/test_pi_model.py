@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.kit.pi_golden import KeepAll, read_manifest, read_manifest_dtypes
+from tests.kit.pi_golden import read_manifest, read_manifest_dtypes
+from tests.kit.policy_inputs import KeepAll
 from vla_attention.capture.policies.pi.config import find_config
 from vla_attention.capture.policies.pi.flow_time import denoise_times, embed_times
 from vla_attention.capture.policies.pi.model import PiModel

@@ -8,7 +8,8 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from tests.kit.pi_golden import GOLDEN, make_observation
+from tests.kit.pi_golden import GOLDEN
+from tests.kit.policy_inputs import make_observation
 from vla_attention.capture.environments.base import Observation
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.noise import initial_noise
