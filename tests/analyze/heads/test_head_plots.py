@@ -36,7 +36,7 @@ CASES = {
         many_groups(22)[0],
     ),
     "many of everything": (
-        {"layers": tuple(range(60)), "heads": tuple(range(40)), "num_tasks": 1, "num_episodes": 2, "num_replans": 2},
+        {"layers": tuple(range(40)), "heads": tuple(range(32)), "num_tasks": 1, "num_episodes": 2, "num_replans": 2},
         default_grouping(),
     ),
     "ten steps": ({"denoise_steps": tuple(range(10)), "layers": (1, 2), "heads": (0, 1)}, default_grouping()),
