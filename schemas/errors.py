@@ -14,7 +14,8 @@ class UserError(Exception):
     """A mistake in what was given: arguments, files, selections. Never a defect of the program."""
 
     def __str__(self) -> str:
-        # KeyError and FileNotFoundError format their arguments in their own ways; ours is always the plain sentence.
+        # KeyError and FileNotFoundError format their arguments in their own ways; this class always gives the sentence
+        # itself.
         return str(self.args[0]) if self.args else type(self).__name__
 
 
@@ -43,7 +44,7 @@ def did_you_mean(given: str, existing: Iterable[str]) -> str:
     """Return " Did you mean 'x'?" for the nearest existing name, or an empty string when nothing is near."""
     by_folded = {name.casefold(): name for name in existing}
     folded = given.casefold()
-    # Half a name is the commonest slip ('base' for 'base_0_rgb'), and too short for the similarity measure.
+    # The most frequent mistake is half a name ('base' for 'base_0_rgb'), which is too short for the similarity measure.
     near = [name for name in by_folded if len(folded) > 2 and name.startswith(folded)]
     near = near or difflib.get_close_matches(folded, list(by_folded), n=1, cutoff=0.6)
     near = near or [name for name in by_folded if len(folded) > 2 and folded in name]

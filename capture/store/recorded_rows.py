@@ -1,4 +1,4 @@
-"""What the recorder hands to the store. This module needs numpy only, so that a store can be written without torch."""
+"""What the recorder gives to the store writer. Needs numpy only, so that a store can be written without torch."""
 
 from __future__ import annotations
 

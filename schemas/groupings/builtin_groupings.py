@@ -76,7 +76,7 @@ def instruction(vocabulary: Vocabulary) -> Grouping:
 
 
 def cameras(vocabulary: Vocabulary) -> Grouping:
-    """One group per camera that the policy really sees."""
+    """One group per camera that is not masked."""
     others = _others(vocabulary)
     views = {camera: (f"camera:{camera} & role:image",) for camera in vocabulary.cameras}
     return Grouping(
@@ -105,13 +105,12 @@ def objects(vocabulary: Vocabulary) -> Grouping:
 
 
 def reference(vocabulary: Vocabulary) -> Grouping:
-    """The published scripts' key ranges on our rows, to compare with old numbers. The groups are not what their names
-    say.
+    """The published scripts' key ranges on our rows, to compare with old numbers.
 
-    pi: "visual" is the first camera, "linguistic" the next keys, as many as the prompt has slots (they are patches of
-    the next camera), "action" all the rest. Cosmos: frame `curr_last` over frame `frame0`, a blank picture. The
-    scripts' queries differ too: theirs is one token of the prefix pass for pi, and for Cosmos they sum over the
-    queries, whereas our rows are means.
+    The groups are not what their names say. pi: "visual" is the first camera, "linguistic" the next keys, as many as
+    the prompt has slots (they are patches of the next camera), "action" all the rest. Cosmos: frame `curr_last` over
+    frame `frame0`, a blank picture. The scripts' queries differ too: theirs is one token of the prefix pass for pi, and
+    for Cosmos they sum over the queries, whereas our rows are means.
     """
     spans = vocabulary.layout.spans if vocabulary.layout is not None else ()
     if any(span.kind == "latent" for span in spans):

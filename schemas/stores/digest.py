@@ -1,4 +1,4 @@
-"""The digest that a store keeps of every array: sha256 over its values in C order, little endian."""
+"""The digest of an array in a store: sha256 over its values in C order, little endian."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 class ArrayDigest:
-    """Digest of an array that arrives in consecutive blocks along its first axis."""
+    """Digest of an array that is given in consecutive blocks along its first axis."""
 
     def __init__(self) -> None:
         self._hash = hashlib.sha256()

@@ -227,7 +227,7 @@ def _lost_chunk(episode: StoredEpisode, name: str) -> CorruptEpisode:
 
 
 def _holds_missing(values: NDArray[Any]) -> bool:
-    """Whether the values contain the fill value that zarr gives for a missing chunk (of pictures and roles: never)."""
+    """Whether floats or signed integers contain the fill value that zarr gives for a missing chunk."""
     if values.dtype.kind == "i":
         return bool((values == -1).any())
     if values.dtype.kind != "f" or not np.isnan(values.sum()):

@@ -6,7 +6,7 @@ import tomllib
 import jsonschema
 import pytest
 
-from tests.kit.synthetic import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps
+from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps
 from vla_attention.analyze.measures.aggregate import add_layers_avg, per_replan
 from vla_attention.analyze.published.results_file import write_results_of_suites
 from vla_attention.schemas.groupings.vocabulary import SceneObject

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps
 from tests.kit.questions import question_about
 from tests.kit.raw_rows import FEW, raw_episodes, weights_of
-from tests.kit.synthetic import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps
 from vla_attention.analyze.heads.denoise import denoise_table
 from vla_attention.analyze.heads.depth import depth_table
 from vla_attention.analyze.heads.head_study import study_heads

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tests.kit.synthetic import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups
+from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups
 from vla_attention.analyze.heads.denoise import denoise_table
 from vla_attention.analyze.heads.head_measures import heads_table
 from vla_attention.analyze.heads.layer_time import layer_time_table

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tests.kit.synthetic import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps
+from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps
 from vla_attention.analyze.heads import plot_layer_time as layer_time
 from vla_attention.analyze.measures.aggregate import (
     LAYERS_AVG,

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.kit.examples import examples
+from tests.kit.made_up_steps import default_grouping, make_steps
 from tests.kit.published_results import (
     cosmos_episodes,
     pi_episodes,
@@ -22,7 +23,6 @@ from tests.kit.published_results import (
     published_episode,
     write_published,
 )
-from tests.kit.synthetic import default_grouping, make_steps
 from vla_attention.analyze.measures.aggregate import add_layers_avg, per_replan
 from vla_attention.analyze.published.results_file import write_results_of_suites
 from vla_attention.analyze.published.results_reader import find_results, read_results_file

@@ -8,7 +8,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from tests.kit.synthetic import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups
+from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups
 from vla_attention.analyze.measures.aggregate import LAYERS_AVG, add_layers_avg, episodes_table, per_replan, tasks_table
 from vla_attention.analyze.ratios.plot_attention_fractions import plot_attention_fractions
 from vla_attention.analyze.ratios.plot_ratio_distribution import plot_ratio_distribution

@@ -3,7 +3,7 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from tests.kit.synthetic import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups
+from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups
 from vla_attention.analyze.measures.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
 from vla_attention.analyze.ratios.summary import AnalysedRun, summary_text, verdict, write_summary
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.kit.synthetic import many_groups
+from tests.kit.made_up_steps import many_groups
 from vla_attention.analyze.show.plot_axes import label_positions, legend_above, ratio_axis, share_ticks, uniform_line
 from vla_attention.analyze.show.plot_colours import FIXED_COLORS, group_styles
 from vla_attention.analyze.show.plot_style import new_figure

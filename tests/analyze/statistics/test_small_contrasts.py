@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
 
-from tests.kit.synthetic import default_grouping, make_steps
+from tests.kit.made_up_steps import default_grouping, make_steps
 from vla_attention.analyze.statistics.autocorrelation import autocorrelation_table, autocovariances, effective_count
 from vla_attention.analyze.statistics.bootstrap import resample_episodes
 from vla_attention.analyze.statistics.effect_sizes import cliffs_delta, contrast, contrast_row, hedges_g
