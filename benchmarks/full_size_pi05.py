@@ -118,8 +118,8 @@ def load_and_run(folder: Path, checkpoint_format: str, dtype: str) -> dict[str, 
     """Load the policy and run one replan with the default recording; seconds, and peak resident memory in GB."""
     from vla_attention.capture.environments.base import Observation
     from vla_attention.capture.policies.pi import loading
-    from vla_attention.capture.policies.pi.embedded import TOKENIZER_PATH
     from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
+    from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
     from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
 
     class FullSizeTokenizer(PromptTokenizer):
@@ -130,7 +130,7 @@ def load_and_run(folder: Path, checkpoint_format: str, dtype: str) -> dict[str, 
     loading.PromptTokenizer = FullSizeTokenizer  # type: ignore[misc]
     begun = time.perf_counter()
     options = loading.CheckpointOptions(checkpoint_format=checkpoint_format, dtype=getattr(torch, dtype))
-    policy = loading.load_pi_policy(folder, TOKENIZER_PATH, options=options)
+    policy = loading.load_pi_policy(folder, EMBEDDED_TOKENIZER, options=options)
     loaded, peak_loading = time.perf_counter() - begun, peak_memory()
     frame = np.random.default_rng(0).integers(0, 255, (256, 256, 3), dtype=np.uint8)
     observation = Observation(

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import sentencepiece
 
-OUTPUT = Path(__file__).parent.parent / "capture/policies/pi/embedded/tokenizer.model"
+OUTPUT = Path(__file__).parent.parent / "capture/policies/embedded/tokenizer.model"
 VOCABULARY = 768
 LANGUAGE_FIELD = re.compile(r"\(:language\s+([^)]*)\)")
 OTHER_INSTRUCTIONS = (

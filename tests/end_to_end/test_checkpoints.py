@@ -1,4 +1,4 @@
-"""Checkpoints through the real command line: each format drives the simulator, and each mistake ends with one sentence."""
+"""Checkpoints through the real command line: each format in the simulator, and one sentence for each mistake."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save_file
 from tests.kit.small_tokenizer import train_small_tokenizer
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.capture.policies.pi.embedded import TOKENIZER_PATH
+from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.schemas.errors import listing
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "pi"
@@ -153,17 +153,20 @@ TORCH, JAX, LEROBOT = "pi05_batch2/checkpoint_openpi_torch", "pi0_batch2/checkpo
         (JAX, lambda c: drop_largest(c / "params"), ["files are missing or damaged"]),
         (JAX, lambda c: (c / "params/manifest.ocdbt").unlink(), ["files are missing or damaged"]),
         (TORCH, lambda c: misname(c / "model.safetensors"),
-         ["1 missing: time_mlp_in.bias", "1 extra: something.else", "1 of the wrong shape: action_in_proj.bias is (5,)"]),
+         ["1 missing: time_mlp_in.bias", "1 extra: something.else",
+          "1 of the wrong shape: action_in_proj.bias is (5,)"]),
         (TORCH, lambda c: shorten(c / STATS), ["'state' have 7 numbers; 8 are needed"]),
         (JAX, lambda c: (c / STATS).unlink(), ["no norm_stats.json"]),
         (LEROBOT, lambda c: edit_json(c / "config.json", lambda j: j.update(use_peft=True)), ["use_peft True"]),
-        (LEROBOT, lambda c: edit_json(c / "config.json", lambda j: j.update(type="smolvla")), ["another model family", "smolvla"]),
+        (LEROBOT, lambda c: edit_json(c / "config.json", lambda j: j.update(type="smolvla")),
+         ["another model family", "smolvla"]),
         (TORCH, lambda c: edit_json(c / "config.json", lambda j: j.update(model_type="openvla")), ["OpenVLA"]),
         (LEROBOT, lambda c: (c / "policy_preprocessor.json").unlink(), ["no policy_preprocessor.json"]),
         (TORCH, lambda c: (c / "model.safetensors").unlink(), ["is not a pi checkpoint", "found assets, config.json"]),
         (TORCH, lambda c: (c.parent / "case.json").unlink(), ["32 wide", "--model-config PATH"]),
         (JAX, lambda c: (c.parent / "case.json").unlink(), ["tensors are not those of the model"]),
-        (JAX, lambda c: edit_json(c.parent / "case.json", lambda j: j["config"]["paligemma"].update(width=128)), ["wrong shape"]),
+        (JAX, lambda c: edit_json(c.parent / "case.json", lambda j: j["config"]["paligemma"].update(width=128)),
+         ["wrong shape"]),
     ],
 )  # fmt: skip
 def test_spoiled_checkpoints(name, spoil, expected, small_tokenizer, tmp_path, capsys):
@@ -187,7 +190,7 @@ def test_spoiled_checkpoints(name, spoil, expected, small_tokenizer, tmp_path, c
         (["--model-config", "none.json"], "There is no 'none.json'"),
         (["--discrete-state-input"], "is for pi0.5"),
         (["--tokenizer", "none.model"], "There is no tokenizer file"),
-        (["--tokenizer", str(TOKENIZER_PATH)], "the model 'pi0' has 300: it is another model's tokenizer"),
+        (["--tokenizer", str(EMBEDDED_TOKENIZER)], "the model 'pi0' has 300: it is another model's tokenizer"),
         (["--replan-steps", "8"], "expected 1 to 7"),
     ],
 )

@@ -1,4 +1,4 @@
-"""A checkpoint folder as it is published, with small random weights: the published command, and what can be wrong with its files."""
+"""A published checkpoint folder with small random weights: the published command, and faults of its files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Write a checkpoint folder of random weights laid out as the published repository, for trying out what reads those."""
+"""Write a checkpoint folder with the files of the published repository, and random weights."""
 
 from __future__ import annotations
 
@@ -15,14 +15,10 @@ import torch
 
 from vla_attention.capture.policies.cosmos.config import CosmosConfig
 from vla_attention.capture.policies.cosmos.dit_weights import COUNTER_PREFIX, EXTRA_STATE, PREFIX
-from vla_attention.capture.policies.cosmos.embedded import (
-    BUILTIN_RANGES,
-    TOKENIZER_PATH,
-    random_dit_weights,
-    random_vae_weights,
-)
+from vla_attention.capture.policies.cosmos.embedded import BUILTIN_RANGES, random_dit_weights, random_vae_weights
 from vla_attention.capture.policies.cosmos.locate import EMBEDDINGS_NAME, STATISTICS_NAME, VAE_NAME
 from vla_attention.capture.policies.cosmos.text import PieceTokenizer, SeededText
+from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 
 WEIGHTS_NAME = "Cosmos-Policy-Dummy.pt"
 
@@ -37,7 +33,7 @@ def write_dummy_folder(
     with_vae: bool = True,
     with_tokenizer: bool = False,
 ) -> Path:
-    """Write weights, statistics, text embeddings of the instructions and, beside them, the image encoder; returns the folder.
+    """Write weights, statistics, text embeddings of the instructions and the image encoder; returns the folder.
 
     The transformer's file has the published one's prefix, training counters and extra state. `with_vae` adds
     `tokenizer/tokenizer.pth`, which is published in another repository; `with_tokenizer` adds `spiece.model`.
@@ -54,7 +50,7 @@ def write_dummy_folder(
         },
     }
     (folder / STATISTICS_NAME).write_text(json.dumps(statistics, indent=1))
-    text = SeededText(PieceTokenizer(TOKENIZER_PATH), config.text_length, config.dit.text_dim, seed)
+    text = SeededText(PieceTokenizer(EMBEDDED_TOKENIZER), config.text_length, config.dit.text_dim, seed)
     embeddings = {instruction: text.encode(instruction).embedding for instruction in instructions}
     with open(folder / EMBEDDINGS_NAME, "wb") as file:
         pickle.dump(embeddings, file)
@@ -63,7 +59,7 @@ def write_dummy_folder(
         (folder / VAE_NAME).parent.mkdir(exist_ok=True)
         torch.save(vae, folder / VAE_NAME)
     if with_tokenizer:
-        shutil.copyfile(TOKENIZER_PATH, folder / "spiece.model")
+        shutil.copyfile(EMBEDDED_TOKENIZER, folder / "spiece.model")
     return folder
 
 

@@ -1,4 +1,4 @@
-"""A third policy family, as a user would add one: a tiny attention model in one module, with an entry for the registry."""
+"""A third policy family, as a user would add it: a tiny attention model, and an entry for the registry."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def _build(arguments: argparse.Namespace, device: str) -> Any:
 
 
 def make_toy_policy(checkpoint: str, size: int) -> Any:
-    """One attention layer with two heads over four patches of a picture and three words; trained on nothing."""
+    """Return a policy of one attention layer: two heads over four patches of a picture and three words."""
     import numpy as np
     import torch
 

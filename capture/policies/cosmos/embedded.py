@@ -9,7 +9,6 @@ rows are neither uniform nor on one key, and depend on pictures, words, noise an
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -23,10 +22,8 @@ from vla_attention.capture.policies.cosmos.preprocess import Statistics, make_st
 from vla_attention.capture.policies.cosmos.text import PieceTokenizer, SeededText
 from vla_attention.capture.policies.cosmos.vae import build_encoder, expected_vae_shapes
 from vla_attention.capture.policies.identity import PolicySource
+from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.capture.policies.weights import random_tensor
-
-#: The small sentencepiece model that comes with this package.
-TOKENIZER_PATH = Path(__file__).parents[1] / "pi" / "embedded" / "tokenizer.model"
 
 EMBEDDED_CONFIG = CosmosConfig(
     dit=DitConfig(width=96, num_blocks=28, num_heads=4, mlp_dim=192, text_dim=48, adaln_dim=16),
@@ -131,7 +128,7 @@ def random_policy(
     query_frame: str = ACTION_FRAME,
 ) -> CosmosPolicy:
     """Build an untrained policy of any size; the seed draws its weights."""
-    text = SeededText(PieceTokenizer(TOKENIZER_PATH), config.text_length, config.dit.text_dim, seed)
+    text = SeededText(PieceTokenizer(EMBEDDED_TOKENIZER), config.text_length, config.dit.text_dim, seed)
     return CosmosPolicy(
         build_random_model(config, seed, device),
         text,
@@ -140,13 +137,3 @@ def random_policy(
         open_loop_steps=config.chunk_size if open_loop_steps is None else open_loop_steps,
         query_frame=query_frame,
     )
-
-
-def embedded_policy(seed: int = 0, device: str | torch.device = "cpu") -> CosmosPolicy:
-    """Build the policy that `vla-capture cosmos` runs without a checkpoint."""
-    return random_policy("embedded", EMBEDDED_CONFIG, seed, device)
-
-
-def dummy_policy(seed: int = 0, device: str | torch.device = "cpu") -> CosmosPolicy:
-    """Build the policy of test size."""
-    return random_policy("dummy", DUMMY_CONFIG, seed, device)

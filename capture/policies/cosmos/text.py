@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import sentencepiece
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from vla_attention.capture.policies.cosmos.t5_encoder import T5Encoder
 from vla_attention.capture.policies.cosmos.t5_pickle import BadEmbeddings, TextEmbeddings
+from vla_attention.capture.policies.sentencepiece_model import SentencepieceModel
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.layout import ROLE_DTYPE, Piece, Prompt, Role
 
@@ -24,7 +23,7 @@ END_TOKENS = 1
 
 
 class TokenizerUnusable(UserError, ValueError):
-    """The file is no sentencepiece model, or not the one that the embeddings were made with."""
+    """The tokenizer is not the one that the embeddings were made with, or an encoder lacks it."""
 
 
 @dataclass(frozen=True)
@@ -47,34 +46,22 @@ class TextSource(Protocol):
 
 
 class PieceTokenizer:
-    """A sentencepiece model: a text's pieces and the characters that each covers."""
+    """T5's sentencepiece model: a text's pieces and the characters of each."""
 
     def __init__(self, path: str | Path):
-        path = Path(path)
-        if not path.is_file():
-            raise TokenizerUnusable(f"There is no tokenizer file at '{path}'; give T5's spiece.model.")
-        content = path.read_bytes()
-        self.path = str(path)
+        self.model = SentencepieceModel(path, "give T5's spiece.model")
+        self.path = self.model.path
         #: SHA-256 (hex) of the file
-        self.digest = hashlib.sha256(content).hexdigest()
-        self._processor = sentencepiece.SentencePieceProcessor()
-        try:
-            self._processor.LoadFromSerializedProto(content)
-        except (RuntimeError, OSError) as error:
-            raise TokenizerUnusable(f"'{path}' is not a sentencepiece model, or it is damaged.") from error
+        self.digest = self.model.digest
 
     def token_ids(self, text: str) -> list[int]:
         """Return the ids of a text's pieces, and T5's end token."""
-        return [*(int(token) for token in self._processor.encode(text)), int(self._processor.eos_id())]
+        return [*(token.id for token in self.model.encode(text)), self.model.eos_id]
 
     def pieces(self, text: str) -> tuple[Piece, ...]:
         """Return the pieces of a text, keys counted from 0, without the end token."""
-        if hasattr(self._processor, "EncodeAsOffsetMapping"):
-            found = self._processor.EncodeAsOffsetMapping(text)
-            spans = zip(found["pieces"], found["offsets"], strict=True)
-            return tuple(Piece(key, piece, start, stop) for key, (piece, (start, stop)) in enumerate(spans))
-        encode = getattr(self._processor, "EncodeAsImmutableProto")  # noqa: B009 - newer type stubs lack it
-        return tuple(Piece(key, p.piece, p.begin, p.end) for key, p in enumerate(encode(text).pieces))
+        tokens = self.model.encode(text)
+        return tuple(Piece(key, token.piece, token.start, token.stop) for key, token in enumerate(tokens))
 
 
 def text_roles(is_real: NDArray[np.bool_], num_pieces: int | None) -> NDArray[np.uint8]:

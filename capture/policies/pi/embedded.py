@@ -6,8 +6,6 @@ that its attention has structure: rows are neither uniform nor on one key, and d
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -20,10 +18,9 @@ from vla_attention.capture.policies.pi.policy import PiPolicy
 from vla_attention.capture.policies.pi.preprocess import NormStats, Statistics
 from vla_attention.capture.policies.pi.processing import OPENPI_REPLAN_STEPS, OpenpiProcessing
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
+from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.capture.policies.strict_loading import Shapes
 from vla_attention.capture.policies.weights import random_tensor
-
-TOKENIZER_PATH = Path(__file__).parent / "embedded" / "tokenizer.model"
 
 #: Rows of the token table; the tokenizer has fewer.
 _VOCABULARY = 1024
@@ -129,7 +126,7 @@ def _random_policy(
 ) -> PiPolicy:
     return PiPolicy(
         build_random_model(config, seed, device),
-        PromptTokenizer(TOKENIZER_PATH),
+        PromptTokenizer(EMBEDDED_TOKENIZER),
         OpenpiProcessing(config, builtin_stats(), normalisation="quantile", replan_steps=replan_steps),
         PolicySource(name=name, checkpoint=f"random weights, seed {seed}", checkpoint_format="seeded", untrained=True),
     )

@@ -6,18 +6,17 @@ offsets, not from a search for token ids, because an instruction may contain the
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import sentencepiece
 from numpy.typing import NDArray
 
 from vla_attention.capture.policies.pi.config import PALIGEMMA_VOCABULARY
-from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.capture.policies.sentencepiece_model import SentencepieceModel, Token, UnreadableTokenizer
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import ROLE_DTYPE, Piece, Prompt, Role
 
 #: Pieces of Gemma's vocabulary, the first part of PaliGemma's.
@@ -28,14 +27,6 @@ GEMMA_VOCABULARY = 256_000
 #: `raw-instruction`: LeRobot's pi0, the unchanged instruction, encoded as one string with or without "\n" at its
 #: end.
 PromptFormat = Literal["instruction-newline", "task-state-action", "raw-instruction-newline", "raw-instruction"]
-
-
-class TokenizerNotFound(UserError, FileNotFoundError):
-    """There is no tokenizer file."""
-
-
-class UnreadableTokenizer(UserError, ValueError):
-    """The file is no sentencepiece model, or not one for pi."""
 
 
 @dataclass(frozen=True)
@@ -63,16 +54,6 @@ class _Section:
     encode_alone: bool = False
 
 
-@dataclass(frozen=True)
-class _Token:
-    """One encoded token: id, vocabulary piece, and its characters [start, stop) of the prompt."""
-
-    id: int
-    piece: str
-    start: int
-    stop: int
-
-
 def clean_instruction(instruction: str) -> str:
     """Return the instruction as openpi cleans it: stripped, with spaces for "_" and newlines."""
     return _not_empty(instruction.strip().replace("_", " ").replace("\n", " "))
@@ -97,27 +78,19 @@ class PromptTokenizer:
     """A sentencepiece model and openpi's prompt formats."""
 
     def __init__(self, model_path: str | Path):
-        path = Path(model_path)
-        if not path.is_file():
-            raise TokenizerNotFound(
-                f"There is no tokenizer file at '{path}'; pi policies need PaliGemma's sentencepiece model "
-                "(paligemma_tokenizer.model)."
-            )
-        content = path.read_bytes()
+        needed = "pi policies need PaliGemma's sentencepiece model (paligemma_tokenizer.model)"
+        self.model = SentencepieceModel(model_path, needed)
         #: SHA-256 (hex) of the file
-        self.digest = hashlib.sha256(content).hexdigest()
-        self._processor = sentencepiece.SentencePieceProcessor()
-        try:
-            self._processor.LoadFromSerializedProto(content)
-        except (RuntimeError, OSError) as error:
-            raise UnreadableTokenizer(f"'{path}' is not a sentencepiece model, or it is damaged.") from error
-        if self._processor.bos_id() < 0:
-            raise UnreadableTokenizer(f"The tokenizer '{path}' has no BOS token, which every pi prompt starts with.")
+        self.digest = self.model.digest
+        if self.model.bos_id < 0:
+            raise UnreadableTokenizer(
+                f"The tokenizer '{model_path}' has no BOS token, which every pi prompt starts with."
+            )
 
     @property
     def vocab_size(self) -> int:
         """Number of ids; the model's table must have at least as many rows."""
-        return int(self._processor.get_piece_size())
+        return self.model.vocab_size
 
     def tokenize(
         self,
@@ -156,7 +129,7 @@ class PromptTokenizer:
         ids = np.zeros(max_token_len, dtype=np.int64)
         mask = np.arange(max_token_len) < length
         roles = np.full(max_token_len, Role.PADDING, dtype=ROLE_DTYPE)
-        ids[0], roles[0] = self._processor.bos_id(), Role.BOS
+        ids[0], roles[0] = self.model.bos_id, Role.BOS
         ids[1:length] = [token.id for token in tokens]
         roles[1:length] = [_role(token, text, role_of_character) for token in tokens]
         pieces = tuple(
@@ -167,7 +140,7 @@ class PromptTokenizer:
         prompt = Prompt(text, pieces, (start, start + role_of_character.count(Role.INSTRUCTION)))
         return TokenizedPrompt(ids=ids, mask=mask, roles=roles, prompt=prompt, num_cut=num_cut)
 
-    def _encode(self, sections: Sequence[_Section]) -> list[_Token]:
+    def _encode(self, sections: Sequence[_Section]) -> list[Token]:
         """Encode the sections together, except those that are encoded alone; offsets refer to the whole text."""
         calls: list[str] = []
         for section in sections:
@@ -175,27 +148,13 @@ class PromptTokenizer:
                 calls.append(section.text)
             else:
                 calls[-1] += section.text
-        tokens: list[_Token] = []
+        tokens: list[Token] = []
         offset = 0
         for call in calls:
-            tokens += [_Token(t.id, t.piece, t.start + offset, t.stop + offset) for t in self._encode_one(call)]
+            encoded = _spread_bytes(self.model.encode(call))
+            tokens += [Token(t.id, t.piece, t.start + offset, t.stop + offset) for t in encoded]
             offset += len(call)
         return tokens
-
-    def _encode_one(self, text: str) -> list[_Token]:
-        """Encode one string without BOS; offsets count characters."""
-        # sentencepiece 0.2.3 replaced its proto objects; the new ones need the protobuf package.
-        if hasattr(self._processor, "EncodeAsOffsetMapping"):
-            found = self._processor.EncodeAsOffsetMapping(text)
-            tokens = [
-                _Token(id_, piece, start, stop)
-                for id_, piece, (start, stop) in zip(found["ids"], found["pieces"], found["offsets"], strict=True)
-            ]
-        else:
-            encode = getattr(self._processor, "EncodeAsImmutableProto")  # noqa: B009 - newer type stubs lack it
-            pieces = encode(text).pieces
-            tokens = [_Token(p.id, p.piece, p.begin, p.end) for p in pieces]
-        return _spread_bytes(tokens)
 
 
 def _sections(instruction: str, state: NDArray[np.floating] | None, prompt_format: PromptFormat) -> list[_Section]:
@@ -219,19 +178,19 @@ def _sections(instruction: str, state: NDArray[np.floating] | None, prompt_forma
     ]
 
 
-def _spread_bytes(tokens: list[_Token]) -> list[_Token]:
+def _spread_bytes(tokens: list[Token]) -> list[Token]:
     """Give every byte token the whole character; sentencepiece gives it to the last byte only."""
-    spread: list[_Token] = []
+    spread: list[Token] = []
     for token in reversed(tokens):
         empty = token.start == token.stop
         following = spread[-1] if spread else None
         if empty and following is not None and following.start == token.start:
-            token = _Token(token.id, token.piece, following.start, following.stop)
+            token = Token(token.id, token.piece, following.start, following.stop)
         spread.append(token)
     return spread[::-1]
 
 
-def _role(token: _Token, text: str, role_of_character: list[Role]) -> Role:
+def _role(token: Token, text: str, role_of_character: list[Role]) -> Role:
     """Return the role of most visible characters of the token; for spaces only, of the first character."""
     characters = range(token.start, token.stop) or range(token.start, token.start + 1)
     visible = [i for i in characters if i < len(text) and not text[i].isspace()]

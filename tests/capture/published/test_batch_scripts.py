@@ -1,4 +1,4 @@
-"""The batch scripts without SLURM: what their variables mean, and that a mistake is one sentence and leaves nothing behind."""
+"""The batch scripts without SLURM: the meaning of their variables, and one sentence without leftovers for a mistake."""
 
 from __future__ import annotations
 

@@ -8,12 +8,12 @@ import torch
 from tests.kit.cosmos_checkpoint import write_dummy_folder
 from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION
 from tests.kit.policy_inputs import make_observation
-from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, dummy_policy
+from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, random_policy
 
 
 @pytest.fixture(scope="package", autouse=True)
 def one_thread():
-    """Threads that wait for each other on busy cores make these small models ten times slower."""
+    """Several threads make these small models ten times slower on busy cores."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -23,7 +23,7 @@ def one_thread():
 @pytest.fixture(scope="session")
 def dummy():
     pytest.importorskip("diffusers")
-    return dummy_policy()
+    return random_policy("dummy", DUMMY_CONFIG)
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ from vla_attention.capture.policies.pi.embedded import dummy_policy, embedded_po
 
 @pytest.fixture(scope="package", autouse=True)
 def one_thread():
-    """Threads that wait for each other on busy cores make these small models ten times slower, and timings a lottery."""
+    """Several threads make these small models ten times slower on busy cores, and timings random."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

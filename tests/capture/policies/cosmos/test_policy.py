@@ -96,7 +96,7 @@ def test_words_and_pictures_and_noise_change_the_actions(dummy, prepared):
 
 
 def test_text_reaches_the_action_only_through_cross_attention(dummy, prepared):
-    """With all-zero text every cross-attention row is uniform over exact nothing; swapping such texts changes nothing."""
+    """With a text of zeros every cross-attention row is uniform, and the actions do not depend on the instruction."""
     silent = type(prepared)(
         **{**vars(prepared), "tensors": dict(prepared.tensors, text=torch.zeros_like(prepared.tensors["text"]))}
     )

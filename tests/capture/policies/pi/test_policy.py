@@ -14,13 +14,14 @@ from vla_attention.capture.environments.base import Observation
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.noise import initial_noise
 from vla_attention.capture.policies.pi.config import find_config
-from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, TOKENIZER_PATH, build_random_model, builtin_stats
+from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, build_random_model, builtin_stats
 from vla_attention.capture.policies.pi.loading import load_pi_policy
 from vla_attention.capture.policies.pi.policy import PiPolicy, site_layout
 from vla_attention.capture.policies.pi.preprocess import model_image
 from vla_attention.capture.policies.pi.processing import OpenpiProcessing
-from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, TokenizerNotFound, check_vocabulary
+from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, check_vocabulary
 from vla_attention.capture.policies.policy import Policy
+from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER, TokenizerNotFound
 from vla_attention.capture.policies.weights import weights_digest
 from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
 from vla_attention.schemas.errors import BadArgument, UnknownName
@@ -52,7 +53,7 @@ def dummy_pi0():
     config = dataclasses.replace(DUMMY_CONFIG, pi05=False, discrete_state_input=False, max_token_len=48)
     return PiPolicy(
         build_random_model(config, 0),
-        PromptTokenizer(TOKENIZER_PATH),
+        PromptTokenizer(EMBEDDED_TOKENIZER),
         OpenpiProcessing(config, builtin_stats(), normalisation="z-score", relative_actions=True),
         PolicySource("dummy-pi0", "random weights, seed 0", "seeded", untrained=True),
     )
@@ -244,7 +245,7 @@ def test_policy_from_a_checkpoint_folder(tmp_path, observation):
     stats = tmp_path / "assets" / "physical-intelligence" / "libero" / "norm_stats.json"
     stats.parent.mkdir(parents=True)
     stats.write_text((GOLDEN / "libero_preproc" / "norm_stats.json").read_text())
-    policy = load_pi_policy(tmp_path, TOKENIZER_PATH, config=config)
+    policy = load_pi_policy(tmp_path, EMBEDDED_TOKENIZER, config=config)
     assert policy.identity().digest == weights_digest(model)
     assert policy.identity().untrained is False
     assert policy.name == "pi05"

@@ -1,4 +1,4 @@
-"""Contributions of Cosmos's two sites: add up to what the model computed, meet the reference, and are nothing without text."""
+"""Contributions of Cosmos's two sites: their sum is the update, they agree with the reference, padding adds nothing."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_padded_text_contributes_exactly_nothing(dummy, prepared):
 
 
 def test_norms_of_frames_are_those_of_the_reference():
-    """Root mean squares over a frame's queries from the recorded Gram matrix, against the reference's norm of each query."""
+    """Root mean squares over a frame's queries, from the Gram matrix, against the reference's norm of each query."""
     case = read_case(GOLDEN / "dit_batch2_T5_rect")
     dit, tokens, frames = case.build_dit("cpu"), 15, 5
     parts = np.repeat(np.eye(frames, dtype=bool), tokens, axis=0)

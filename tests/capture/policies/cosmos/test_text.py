@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from tests.kit.cosmos_helpers import INSTRUCTION
-from vla_attention.capture.policies.cosmos.embedded import TOKENIZER_PATH
 from vla_attention.capture.policies.cosmos.t5_encoder import EncoderUnusable, T5Encoder
 from vla_attention.capture.policies.cosmos.t5_pickle import (
     BadEmbeddings,
@@ -25,6 +24,7 @@ from vla_attention.capture.policies.cosmos.tensor_files import (
     read_tensors,
 )
 from vla_attention.capture.policies.cosmos.text import PieceTokenizer, PrecomputedText, SeededText, TokenizerUnusable
+from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER, UnreadableTokenizer
 from vla_attention.schemas.errors import BadArgument, MissingDependency, UnknownName
 from vla_attention.schemas.groupings.words import words_of
 from vla_attention.schemas.layout import Role
@@ -140,7 +140,7 @@ def test_without_a_tokenizer_positions_are_text_or_nothing():
 
 
 def test_with_a_tokenizer_words_have_positions():
-    tokenizer = PieceTokenizer(TOKENIZER_PATH)
+    tokenizer = PieceTokenizer(EMBEDDED_TOKENIZER)
     count = len(tokenizer.pieces(INSTRUCTION))
     table = TextEmbeddings("x", {INSTRUCTION: made_up(count + 1, count + 4), "wrong": made_up(1, count + 4)}, "")
     encoded = PrecomputedText(table, tokenizer).encode(INSTRUCTION)
@@ -154,7 +154,7 @@ def test_with_a_tokenizer_words_have_positions():
 
 def test_an_empty_text_is_all_null():
     table = TextEmbeddings("x", {INSTRUCTION: made_up(0)}, "")
-    for tokenizer in (None, PieceTokenizer(TOKENIZER_PATH)):
+    for tokenizer in (None, PieceTokenizer(EMBEDDED_TOKENIZER)):
         encoded = PrecomputedText(table, tokenizer).encode(INSTRUCTION)
         assert (encoded.roles == Role.NULL).all()
         assert encoded.prompt.pieces == ()
@@ -168,7 +168,7 @@ def test_zeros_between_real_positions_are_refused():
 
 
 def test_made_up_embeddings_depend_on_the_words():
-    text = SeededText(PieceTokenizer(TOKENIZER_PATH), 16, 4, seed=0)
+    text = SeededText(PieceTokenizer(EMBEDDED_TOKENIZER), 16, 4, seed=0)
     one, two = text.encode(INSTRUCTION), text.encode(INSTRUCTION + "s")
     assert torch.equal(one.embedding, text.encode(INSTRUCTION).embedding)
     assert not torch.equal(one.embedding, two.embedding)
@@ -178,7 +178,7 @@ def test_made_up_embeddings_depend_on_the_words():
 
 def test_a_tokenizer_that_is_none(tmp_path):
     (tmp_path / "spiece.model").write_bytes(b"nothing")
-    with pytest.raises(TokenizerUnusable, match="not a sentencepiece model"):
+    with pytest.raises(UnreadableTokenizer, match="not a sentencepiece model"):
         PieceTokenizer(tmp_path / "spiece.model")
 
 
@@ -198,7 +198,7 @@ class StubEncoder:
 
 
 def test_what_the_file_lacks_is_encoded_once_and_what_it_has_is_not():
-    tokenizer, encoder = PieceTokenizer(TOKENIZER_PATH), StubEncoder()
+    tokenizer, encoder = PieceTokenizer(EMBEDDED_TOKENIZER), StubEncoder()
     count = len(tokenizer.pieces(INSTRUCTION)) + 1
     text = PrecomputedText(TextEmbeddings("x", {INSTRUCTION: made_up(count, 32)}, ""), tokenizer, encoder)
     text.encode(INSTRUCTION)

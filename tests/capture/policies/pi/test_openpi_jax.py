@@ -113,7 +113,10 @@ def test_lora_is_merged_as_openpi_s_equations_say():
         return generator.normal(size=shape)
 
     cases = [
-        ("attn/q_einsum/w", "BTD,NDH->BTNH", "BTD,NDL->BTNL", "BTNL,NLH->BTNH", x, of(4, 6, 3), of(4, 6, 2), of(4, 2, 3)),
+        (
+            "attn/q_einsum/w", "BTD,NDH->BTNH", "BTD,NDL->BTNL", "BTNL,NLH->BTNH",
+            x, of(4, 6, 3), of(4, 6, 2), of(4, 2, 3),
+        ),
         (
             "attn/kv_einsum_1/w", "BSD,cKDH->cBSKH", "BSD,cKDL->cBSKL", "cBSKL,cKLH->cBSKH",
             x, of(2, 1, 6, 3), of(2, 1, 6, 2), of(2, 1, 2, 3),
@@ -122,7 +125,10 @@ def test_lora_is_merged_as_openpi_s_equations_say():
             "attn/attn_vec_einsum/w", "BTNH,NHD->BTD", "BTNH,NHL->BTL", "BTL,NLD->BTD",
             heads, of(4, 3, 6), of(4, 3, 2), of(4, 2, 6),
         ),
-        ("mlp/gating_einsum", "BTD,cDF->cBTF", "BTD,cDL->cBTL", "cBTL,cLF->cBTF", x, of(2, 6, 7), of(2, 6, 2), of(2, 2, 7)),
+        (
+            "mlp/gating_einsum", "BTD,cDF->cBTF", "BTD,cDL->cBTL", "cBTL,cLF->cBTF",
+            x, of(2, 6, 7), of(2, 6, 2), of(2, 2, 7),
+        ),
     ]  # fmt: skip
     for path, plain, first, second, given, w, a, b in cases:
         wanted = np.einsum(plain, given, w) + np.einsum(second, np.einsum(first, given, a), b)

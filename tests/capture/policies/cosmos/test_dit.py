@@ -185,7 +185,7 @@ def test_latents_must_be_whole_patches_within_the_positions():
 
 @st.composite
 def networks_and_batches(draw):
-    """Any sizes: odd numbers of frames, rectangles, batches whose entries differ in masks, times and lengths of text."""
+    """Any sizes: odd numbers of frames, rectangles, batches with different masks, times and lengths of text."""
     heads, head_dim = draw(st.integers(1, 4)), draw(st.sampled_from([12, 14, 16, 18, 20, 32]))
     channels = draw(st.sampled_from([4, 16]))
     config = DitConfig(

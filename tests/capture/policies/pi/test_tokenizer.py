@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from tests.kit.pi_golden import GOLDEN
-from vla_attention.capture.policies.pi.embedded import TOKENIZER_PATH
-from vla_attention.capture.policies.pi.tokenizer import (
-    PromptTokenizer,
+from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, clean_instruction
+from vla_attention.capture.policies.sentencepiece_model import (
+    EMBEDDED_TOKENIZER,
     TokenizerNotFound,
     UnreadableTokenizer,
-    clean_instruction,
 )
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import Role
@@ -36,12 +35,12 @@ AWKWARD = [
 
 @pytest.fixture(scope="module")
 def tokenizer():
-    return PromptTokenizer(TOKENIZER_PATH)
+    return PromptTokenizer(EMBEDDED_TOKENIZER)
 
 
 @pytest.fixture(scope="module")
 def processor(tokenizer):
-    return tokenizer._processor
+    return tokenizer.model._processor
 
 
 @pytest.mark.parametrize("entry", json.loads((GOLDEN / "libero_preproc" / "prompts.json").read_text()))
@@ -162,7 +161,7 @@ def test_an_empty_instruction_is_refused(tokenizer, instruction):
 def test_missing_and_damaged_files(tmp_path):
     with pytest.raises(TokenizerNotFound, match=r"no tokenizer file.*paligemma_tokenizer\.model"):
         PromptTokenizer(tmp_path / "tokenizer.model")
-    for content in (b"", b"not a model", TOKENIZER_PATH.read_bytes()[:3000]):
+    for content in (b"", b"not a model", EMBEDDED_TOKENIZER.read_bytes()[:3000]):
         (tmp_path / "tokenizer.model").write_bytes(content)
         with pytest.raises(UnreadableTokenizer, match="not a sentencepiece model"):
             PromptTokenizer(tmp_path / "tokenizer.model")

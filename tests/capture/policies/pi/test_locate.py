@@ -7,13 +7,13 @@ import pytest
 
 from tests.kit.pi_golden import GOLDEN
 from vla_attention.capture.policies.hub import CheckpointUnavailable, hub_cache
-from vla_attention.capture.policies.pi.embedded import TOKENIZER_PATH
 from vla_attention.capture.policies.pi.locate import (
     HUB_FILES,
     find_checkpoint,
     find_tokenizer,
     openpi_cache,
 )
+from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.schemas.errors import BadArgument, MissingDependency, UserError
 
 URL = "gs://openpi-assets/checkpoints/pi05_libero"
@@ -141,7 +141,7 @@ def test_tokenizers_are_looked_for_in_the_checkpoint_and_the_caches(tmp_path):
         place.parent.mkdir(parents=True, exist_ok=True)
         place.touch()
         assert find_tokenizer(checkpoint, None) == place
-    assert find_tokenizer(checkpoint, str(TOKENIZER_PATH)) == TOKENIZER_PATH
+    assert find_tokenizer(checkpoint, str(EMBEDDED_TOKENIZER)) == EMBEDDED_TOKENIZER
 
 
 def test_a_stub_is_no_tokenizer():

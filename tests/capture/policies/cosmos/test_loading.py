@@ -13,7 +13,7 @@ from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION
 from tests.kit.policy_inputs import make_observation
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnsupportedCheckpoint
 from vla_attention.capture.policies.cosmos.build import build_cosmos_policy
-from vla_attention.capture.policies.cosmos.embedded import TOKENIZER_PATH, random_policy
+from vla_attention.capture.policies.cosmos.embedded import random_policy
 from vla_attention.capture.policies.cosmos.loading import CosmosOptions, load_cosmos_policy
 from vla_attention.capture.policies.cosmos.locate import (
     EMBEDDINGS_NAME,
@@ -25,6 +25,7 @@ from vla_attention.capture.policies.cosmos.locate import (
 from vla_attention.capture.policies.cosmos.preprocess import StatisticsNotFound
 from vla_attention.capture.policies.cosmos.t5_pickle import EmbeddingsNotFound
 from vla_attention.capture.policies.hub import CheckpointUnavailable
+from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.layout import Role
 
@@ -75,7 +76,7 @@ def test_bfloat16_stays_close(folder, dummy):
 
 
 def test_with_t5s_tokenizer_the_words_are_known(folder):
-    shutil.copyfile(TOKENIZER_PATH, folder / "spiece.model")
+    shutil.copyfile(EMBEDDED_TOKENIZER, folder / "spiece.model")
     policy = load_cosmos_policy(str(folder), options=SMALL)
     prepared = policy.prepare(make_observation(0), OTHER_INSTRUCTION)
     assert (prepared.key_role["cross"] == Role.INSTRUCTION).sum() == len(prepared.prompt.pieces) > 0

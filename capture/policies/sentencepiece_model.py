@@ -1,0 +1,75 @@
+"""sentencepiece models: the pieces of a text, with their ids and characters."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import sentencepiece
+
+from vla_attention.schemas.errors import UserError
+
+#: The small model of the untrained policies that come with this package.
+EMBEDDED_TOKENIZER = Path(__file__).parent / "embedded" / "tokenizer.model"
+
+
+class TokenizerNotFound(UserError, FileNotFoundError):
+    """There is no tokenizer file."""
+
+
+class UnreadableTokenizer(UserError, ValueError):
+    """The file is no sentencepiece model, or not one for the policy."""
+
+
+@dataclass(frozen=True)
+class Token:
+    """One encoded token: id, vocabulary piece, and its characters [start, stop) of the text."""
+
+    id: int
+    piece: str
+    start: int
+    stop: int
+
+
+class SentencepieceModel:
+    """A sentencepiece model from a file. `needed`: ends the error message if there is no file."""
+
+    def __init__(self, path: str | Path, needed: str):
+        path = Path(path)
+        if not path.is_file():
+            raise TokenizerNotFound(f"There is no tokenizer file at '{path}'; {needed}.")
+        content = path.read_bytes()
+        self.path = str(path)
+        #: SHA-256 (hex) of the file
+        self.digest = hashlib.sha256(content).hexdigest()
+        self._processor = sentencepiece.SentencePieceProcessor()
+        try:
+            self._processor.LoadFromSerializedProto(content)
+        except (RuntimeError, OSError) as error:
+            raise UnreadableTokenizer(f"'{path}' is not a sentencepiece model, or it is damaged.") from error
+
+    @property
+    def vocab_size(self) -> int:
+        """Number of ids."""
+        return int(self._processor.get_piece_size())
+
+    @property
+    def bos_id(self) -> int:
+        """Id of the token that begins a text; negative if there is none."""
+        return int(self._processor.bos_id())
+
+    @property
+    def eos_id(self) -> int:
+        """Id of the token that ends a text; negative if there is none."""
+        return int(self._processor.eos_id())
+
+    def encode(self, text: str) -> list[Token]:
+        """Encode a text, without tokens for its begin and end; offsets count characters."""
+        # sentencepiece 0.2.3 replaced its proto objects; the new ones need the protobuf package.
+        if hasattr(self._processor, "EncodeAsOffsetMapping"):
+            found = self._processor.EncodeAsOffsetMapping(text)
+            parts = zip(found["ids"], found["pieces"], found["offsets"], strict=True)
+            return [Token(int(id_), piece, start, stop) for id_, piece, (start, stop) in parts]
+        encode = getattr(self._processor, "EncodeAsImmutableProto")  # noqa: B009 - newer type stubs lack it
+        return [Token(p.id, p.piece, p.begin, p.end) for p in encode(text).pieces]
