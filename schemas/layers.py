@@ -13,7 +13,7 @@ CALL_NUMBERED_FAMILIES = ("pi0", "pi05")
 
 @dataclass(frozen=True)
 class LayerSelection:
-    """Blocks to use, and the number that the user typed for each; `note`: a line to print if numbers were translated."""
+    """Blocks to use, and the number that the user typed for each; `note`: printed if numbers were translated."""
 
     blocks: tuple[int, ...]
     labels: tuple[int, ...]

@@ -10,7 +10,6 @@ them is found in the copy too.
 from __future__ import annotations
 
 import errno
-import hashlib
 import json
 import os
 import re
@@ -22,7 +21,9 @@ from typing import Any
 
 from vla_attention.schemas.errors import BadArgument, unknown_name
 from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.stores.digest import document_digest
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
+from vla_attention.schemas.stores.root import episode_folders
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
     PARTIAL_SUFFIX,
@@ -105,11 +106,11 @@ def copy_store(
 def _copy(store: Store, target: Path, without: tuple[str, ...], progress: Callable[[int], object] | None) -> Copied:
     building = target.with_name(target.name + PARTIAL_SUFFIX) / f"copy-{os.getpid()}"
     root = _root_document(store, without)
-    run = hashlib.sha256(root).hexdigest()
+    run = document_digest(root)
     building.mkdir(parents=True)
     try:
         _ensure_root(store, target, root, building)
-        present = {entry.name for entry in (target / EPISODES_GROUP).iterdir() if entry.is_dir()}
+        present = {folder.name for folder in episode_folders(target)}
         added = copied = left = 0
         for episode in store.episodes:
             if episode.name not in present:
@@ -162,7 +163,7 @@ def _copy_episode(episode: StoredEpisode, folder: Path, without: tuple[str, ...]
             if file == "zarr.json":
                 content = _with_attributes(content, to_json(replace(attributes, arrays=kept)))
             place.write_bytes(content)
-            digests[file] = hashlib.sha256(content).hexdigest()
+            digests[file] = document_digest(content)
         copied += place.stat().st_size
     for name in kept:
         if f"{name}/zarr.json" not in digests:
@@ -190,7 +191,7 @@ def _root_document(store: Store, without: tuple[str, ...]) -> bytes:
     everything = [name for name in PARTS if name in without or name in before.split(", ")]
     provenance = dict(root.provenance) | {"copied_without": ", ".join(everything)}
     # A copy of a copy names the store that was captured, not the copy.
-    provenance.setdefault("copied_from", hashlib.sha256(content).hexdigest())
+    provenance.setdefault("copied_from", document_digest(content))
     changed: RootAttributes = replace(root, recording=recording, provenance=provenance)
     return _with_attributes(content, to_json(changed))
 

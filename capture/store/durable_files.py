@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
 import os
 import shutil
 import socket
@@ -114,8 +113,3 @@ def _flush(path: Path) -> None:
             raise
     finally:
         os.close(handle)
-
-
-def file_digest(file: Path) -> str:
-    """sha256 (hex) of a file's bytes."""
-    return hashlib.sha256(file.read_bytes()).hexdigest()

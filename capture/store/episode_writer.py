@@ -12,14 +12,14 @@ import zarr
 from numpy.typing import NDArray
 
 from vla_attention.capture.store.codecs import write_whole
-from vla_attention.capture.store.durable_files import file_digest, naming_the_failure, publish
+from vla_attention.capture.store.durable_files import naming_the_failure, publish
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.site_writer import SiteWriter
 from vla_attention.capture.store.store_root import check_same_run, read_existing_root
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import Prompt
-from vla_attention.schemas.stores.digest import ArrayDigest
+from vla_attention.schemas.stores.digest import ArrayDigest, document_digest
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
@@ -204,8 +204,8 @@ class EpisodeWriter:
     def _write_seal(self) -> None:
         """Note the digest of every piece of metadata: chunks have checksums, and JSON has none of its own."""
         files = sorted(self.folder.rglob("zarr.json"))
-        digests = {file.relative_to(self.folder).as_posix(): file_digest(file) for file in files}
-        seal = EpisodeSeal(run=file_digest(self.store / "zarr.json"), files=digests)
+        digests = {file.relative_to(self.folder).as_posix(): document_digest(file.read_bytes()) for file in files}
+        seal = EpisodeSeal(run=document_digest((self.store / "zarr.json").read_bytes()), files=digests)
         self.group.create_group(SEAL_GROUP, attributes=to_json(seal))
 
     def _read_back(self) -> None:

@@ -1,4 +1,4 @@
-"""The digest of an array in a store: sha256 over its values in C order, little endian."""
+"""The digests in a store: of an array (sha256 over its values in C order, little endian), and of a `zarr.json`."""
 
 from __future__ import annotations
 
@@ -22,3 +22,8 @@ class ArrayDigest:
     def hexdigest(self) -> str:
         """The digest so far, in hexadecimal."""
         return self._hash.hexdigest()
+
+
+def document_digest(content: bytes) -> str:
+    """The digest of a `zarr.json`: sha256 of its bytes, in hexadecimal."""
+    return hashlib.sha256(content).hexdigest()

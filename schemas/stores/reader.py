@@ -6,7 +6,6 @@ is opened.
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.jsonable import from_json
+from vla_attention.schemas.stores.digest import document_digest
 from vla_attention.schemas.stores.root import episode_folders, group_attributes, read_root
 from vla_attention.schemas.stores.store_format import (
     SEAL_GROUP,
@@ -73,7 +73,7 @@ class StoredEpisode:
             content = (self.folder / file).read_bytes()
         except OSError as error:
             raise CorruptEpisode(f"Episode {self.name} lacks its {file} ({error.strerror}).") from None
-        if hashlib.sha256(content).hexdigest() != self.seal.files.get(file):
+        if document_digest(content) != self.seal.files.get(file):
             raise CorruptEpisode(f"Episode {self.name} is damaged: its {file} does not agree with its seal.")
         return content
 
@@ -81,7 +81,7 @@ class StoredEpisode:
     def is_of_this_run(self) -> bool:
         """Whether the `zarr.json` of the store is, to the byte, the one under which the episode was recorded."""
         run = self.folder.parents[1] / "zarr.json"
-        return hashlib.sha256(run.read_bytes()).hexdigest() == self.seal.run
+        return document_digest(run.read_bytes()) == self.seal.run
 
     @cached_property
     def _opened(self) -> dict[str, zarr.Array[Any]]:
