@@ -58,7 +58,7 @@ class ReplanRecord:
 
 @dataclass(frozen=True)
 class EpisodeStart:
-    """The attributes of an episode that are known before its first replan."""
+    """The fields of `EpisodeAttributes` that are known before the first replan."""
 
     task_id: int
     task_name: str
@@ -67,7 +67,7 @@ class EpisodeStart:
     initial_state_index: int
     initial_state_digest: str
     objects: tuple[SceneObject, ...]
-    provenance: Mapping[str, str]
+    provenance: dict[str, str]
 
 
 class EpisodeWriter:
@@ -145,19 +145,12 @@ class EpisodeWriter:
 
     def _attributes(self, success: bool, num_steps: int) -> EpisodeAttributes:
         return EpisodeAttributes(
-            task_id=self.start.task_id,
-            task_name=self.start.task_name,
-            instruction=self.start.instruction,
-            episode_index=self.start.episode_index,
-            initial_state_index=self.start.initial_state_index,
-            initial_state_digest=self.start.initial_state_digest,
+            **vars(self.start),
             success=success,
             num_steps=num_steps,
             num_replans=len(self.records),
             prompts=tuple(self.prompts),
             segments={name: site.segments for name, site in self.sites.items()},
-            objects=self.start.objects,
-            provenance=dict(self.start.provenance),
             arrays=dict(sorted(self.digests.items())),
         )
 
