@@ -28,7 +28,16 @@ PACKAGE = "vla_attention"
 #: Folders of the checkout that are no part of its source.
 LEFT_OUT = shutil.ignore_patterns(".*", "build", "dist", "*.egg-info", "__pycache__", "runs", "results")
 #: What stands at the top of the source distribution.
-TOP_OF_SDIST = {"LICENSE", "PKG-INFO", "README.md", "pyproject.toml", "setup.cfg", PACKAGE, f"{PACKAGE}.egg-info"}
+TOP_OF_SDIST = {
+    PACKAGE,
+    f"{PACKAGE}.egg-info",
+    "LICENSE",
+    "MANIFEST.in",
+    "PKG-INFO",
+    "README.md",
+    "pyproject.toml",
+    "setup.cfg",
+}
 #: Run in an environment, outside the checkout; prints the version. Imports of the folders' own names must fail.
 CHECK_IMPORTS = """
 import importlib.util, sys
@@ -39,6 +48,18 @@ bare = [name for name in ("analyze", "capture", "schemas", "tests") if importlib
 assert not bare, f"these names can be imported beside vla_attention: {bare}"
 assert all(hasattr(va, name) for name in va.__all__), va.__all__
 print(va.__version__, va.__file__)
+"""
+
+
+#: Makes a store of known content where there is neither torch nor hypothesis, and reads it back.
+CHECK_TESTING_KIT = """
+import sys
+from pathlib import Path
+import vla_attention as va
+from vla_attention.testing import StoreSpec, assert_whole, write_store
+path = write_store(Path(sys.argv[1]), spec=StoreSpec(tasks=(0, 2)))
+assert_whole(path)
+assert va.open(path).episodes["task_id"].unique().sort().to_list() == [0, 2]
 """
 
 
@@ -126,9 +147,10 @@ def use_packages(laptop: Path, node: Path, folder: Path) -> None:
         for script in project["scripts"]:
             run(commands / script, "--help", cwd=folder, quiet=True)
 
-    store, output = folder / "store.zarr", folder / "results"
-    for old in (store, output):
+    made, store, output = folder / "made.zarr", folder / "store.zarr", folder / "results"
+    for old in (made, store, output):
         shutil.rmtree(old, ignore_errors=True)
+    run(laptop / "python", "-c", CHECK_TESTING_KIT, made, cwd=folder, quiet=True)
     short = ("--task-id", 0, "--num-episodes", 1, "--replan-steps", 4, "--max-steps", 8)
     capture = (node / "python", "-m", f"{PACKAGE}.capture", "pi", "--checkpoint", "dummy", "--task-suite", "robosuite")
     run(*capture, *short, "--store", store, cwd=folder, quiet=True)

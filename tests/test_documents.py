@@ -43,7 +43,8 @@ def test_links_lead_to_files(document):
 def test_paths_in_backticks_exist(document):
     folders = "|".join(re.escape(name) for name in TOP_FOLDERS if name not in MADE)
     for path in re.findall(rf"`((?:{folders})/[\w./-]*)`", text_of(document)):
-        assert (ROOT / path).exists(), path
+        written = re.sub(r"[^/]*\b(NAME|FOLDER)\b.*", "", path)  # the folder above a placeholder
+        assert (ROOT / written).exists(), path
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)

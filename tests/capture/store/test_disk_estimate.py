@@ -15,8 +15,8 @@ from vla_attention.capture.store.disk_estimate import (
     bytes_per_number,
     describe,
     estimate_disk,
+    format_bytes,
 )
-from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import PatchGrid, SiteLayout, Span
 from vla_attention.testing.stores import StoreSpec, root_attributes, write_store

@@ -10,7 +10,13 @@ import numpy as np
 import pytest
 
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.schemas.stores.store_format import CorruptEpisode, FormatTooNew, StoreError, StoreNotFound
+from vla_attention.schemas.stores.store_format import (
+    FORMAT_VERSION,
+    CorruptEpisode,
+    FormatTooNew,
+    StoreError,
+    StoreNotFound,
+)
 from vla_attention.testing.stores import StoreSpec, episode_records, root_attributes, write_store
 
 SPEC = StoreSpec(tasks=(1, 12), episodes=2, replans=2)
@@ -108,8 +114,9 @@ def change_root(path: Path, **changes: object) -> None:
 
 
 def test_a_later_format(path):
-    change_root(path, format_version=2, something_new={"a": 1})
-    with pytest.raises(FormatTooNew, match="format version 2, and this program reads up to version 1; install"):
+    change_root(path, format_version=FORMAT_VERSION + 1, something_new={"a": 1})
+    expected = f"format version {FORMAT_VERSION + 1}, and this program reads up to version {FORMAT_VERSION}; install"
+    with pytest.raises(FormatTooNew, match=expected):
         open_store(path)
 
 
