@@ -30,9 +30,7 @@ def run_capture_of_family(arguments: argparse.Namespace, termination: Terminatio
     device = choose_device(arguments.device)
     family: PolicyFamily = arguments.family
     policy = family.build(arguments, device)
-    results = run_capture(settings, policy, device, termination)
-    solved = sum(result.success for result in results)
-    say(f"{len(results)} episodes added, {solved} solved. Store: {settings.store}")
+    run_capture(settings, policy, device, termination)
     if arguments.output_dir is None and not arguments.save_viz:
         say(f"Next: vla-analyze {settings.store}")
         return 0

@@ -84,11 +84,19 @@ def _denoise_steps(words: Sequence[str], count: int) -> tuple[int, ...]:
 def run_capture(
     settings: RunSettings, policy: Policy, device: str, termination: Termination | None = None
 ) -> list[EpisodeResult]:
-    """Record every missing episode of the settings; returns the episodes that this process added.
+    """Record every missing episode of the settings, and print how many; returns the episodes that this process added.
 
     Raises:
         Terminated: SIGTERM was received; the episode in progress was dropped.
     """
+    results = _record_missing(settings, policy, device, termination or Termination())
+    say(f"{len(results)} episodes added, {sum(result.success for result in results)} solved. Store: {settings.store}")
+    return results
+
+
+def _record_missing(
+    settings: RunSettings, policy: Policy, device: str, termination: Termination
+) -> list[EpisodeResult]:
     protocol = Protocol(
         suite=settings.suite.name,
         seed=settings.seed,
@@ -144,7 +152,7 @@ def run_capture(
         worker=worker,
         record=record,
         machine=machine,
-        termination=termination or Termination(),
+        termination=termination,
     )
     return loop.record_all(todo)
 

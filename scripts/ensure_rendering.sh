@@ -1,6 +1,6 @@
 #!/bin/sh
 # MuJoCo draws without a display through EGL, and OpenCV (which robosuite imports) needs two libraries of its own.
-# Checks that they can be loaded; installs Debian's packages when run as root, and otherwise says which ones are missing.
+# Checks that they can be loaded. As root it installs Debian's packages; otherwise it prints the missing libraries.
 set -eu
 
 missing() {
@@ -21,7 +21,8 @@ libraries=$(missing | tr '\n' ' ')
 if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
   echo "Installing system libraries for headless rendering: $packages"
   # shellcheck disable=SC2086
-  apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $packages >/dev/null
+  apt-get update -qq &&
+    DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $packages >/dev/null
   libraries=$(missing | tr '\n' ' ')
   [ -z "$libraries" ] && exit 0
 fi

@@ -1,15 +1,15 @@
 #!/usr/bin/env bash
-# Submit an array job with one task of the suite per job, all into one store, and a job that analyses when all of them are done.
+# Submit an array job, one task of the suite per job, all into one store, and a job that analyses after all of them.
 #
 #   scripts/submit_attention_ratio.sh --dry-run                  print the two commands, and submit nothing
 #   scripts/submit_attention_ratio.sh                            pi0 / pi0.5
 #   scripts/submit_attention_ratio.sh cosmos                     Cosmos Policy
-#   TASK_SUITE=all scripts/submit_attention_ratio.sh --gpus=1    four suites; further words go to sbatch for the array
+#   TASK_SUITE=all scripts/submit_attention_ratio.sh --gpus=1    four suites; other options go to sbatch for the array
 #   scripts/submit_attention_ratio.sh --array=0,3,5%2            some tasks only, two at a time
 #
 # Takes the environment variables of the script that it submits, and
-#   ANALYSIS_OPTIONS   words for sbatch for the analysis, which needs no GPU, as in ANALYSIS_OPTIONS="--partition=cpu --mem=8G"
-# Submitting the same again continues with what is missing.
+#   ANALYSIS_OPTIONS   options of sbatch for the analysis, which needs no GPU: "--partition=cpu --mem=8G"
+# Submitting the same again continues with the missing episodes.
 set -euo pipefail
 
 folder=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
@@ -41,13 +41,14 @@ if [ -z "$array" ]; then
     set -eu
   fi
   command -v "$capture" >/dev/null || capture=.venv/bin/vla-capture
-  command -v "$capture" >/dev/null || die "vla-capture is neither on PATH nor in $PWD/.venv/bin; activate an environment in SETUP, or give --array=0-9."
+  command -v "$capture" >/dev/null ||
+    die "vla-capture is neither on PATH nor in $PWD/.venv/bin; activate an environment in SETUP, or give --array=0-9."
   array=--array=$("$capture" tasks "${TASK_SUITE:-libero_10}" --array) || exit 2
 fi
 
 captures=(env STAGE=capture sbatch --parsable "$array" "${options[@]}" "$folder/$script")
-# The analysis starts when every task of the array ended well, and is dropped when one ended otherwise. It needs no GPU.
-# shellcheck disable=SC2206 # a list of words
+# The analysis starts if every task of the array succeeded, and is dropped if one failed. It needs no GPU.
+# shellcheck disable=SC2206 # a list of options
 analysis_options=(${ANALYSIS_OPTIONS:-})
 analyse=(env -u SBATCH_GPUS -u SBATCH_GRES -u SBATCH_GPUS_PER_NODE -u SBATCH_GPUS_PER_TASK STAGE=analyze
   sbatch --parsable --kill-on-invalid-dep=yes "${analysis_options[@]}")
@@ -58,9 +59,12 @@ if [ -n "$dry_run" ]; then
   echo
   exit 0
 fi
-command -v sbatch >/dev/null || die "there is no sbatch here; run it on a login node, see the commands with --dry-run, or run scripts/$script without SLURM."
+command -v sbatch >/dev/null ||
+  die "there is no sbatch here; run it on a login node, see the commands with --dry-run," \
+    "or run scripts/$script without SLURM."
 job=$("${captures[@]}")
 job=${job%%;*} # on federated clusters: JOB;CLUSTER
 analysis=$("${analyse[@]}" --dependency="afterok:$job" "$folder/$script") ||
   die "job $job was submitted, and its analysis was not; when the job is done, run: STAGE=analyze bash scripts/$script"
-echo "Job $job captures ($array), job ${analysis%%;*} analyses when all of it is done. See: squeue --me, and vla-capture status STORE"
+echo "Job $job captures ($array), job ${analysis%%;*} analyses when all of it is done." \
+  "See: squeue --me, and vla-capture status STORE"

@@ -187,9 +187,7 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], termination: T
     for job in jobs:
         if len(jobs) > 1:
             say(f"Suite {job.settings.suite.name}:")
-        results = run_capture(job.settings, policy, device, termination)
-        solved = sum(result.success for result in results)
-        say(f"{len(results)} episodes added, {solved} solved. Store: {job.settings.store}")
+        run_capture(job.settings, policy, device, termination)
 
 
 def _analyze(job: _Job, script: PublishedScript) -> int:
