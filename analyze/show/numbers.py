@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from vla_attention.schemas.command_line import format_bytes as format_bytes  # also counts bytes at capture
+from vla_attention.schemas.command_line import format_bytes as format_bytes  # capture prints byte counts with the same function
 
 
 def format_number(value: float | None) -> str:
