@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from vla_attention.schemas.command_line import format_bytes as format_bytes  # capture prints byte counts with the same function
+from vla_attention.schemas.command_line import format_bytes as format_bytes  # shared with capture
 
 
 def format_number(value: float | None) -> str:
