@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# pi0 / pi0.5: record the attention of a policy over a task suite, then analyse it; as a SLURM job, an array, or by hand:
+# pi0 / pi0.5: record the attention of a policy in a task suite, then analyse it; as a SLURM job, an array or by hand:
 #
 #   sbatch scripts/run_attention_ratio.sh
 #   TASK_SUITE=libero_spatial NUM_EPISODES=10 LAYERS="17 25 26 27" sbatch scripts/run_attention_ratio.sh

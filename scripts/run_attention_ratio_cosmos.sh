@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Cosmos Policy: record the attention of a policy over a task suite, then analyse it; as a SLURM job, an array, or by hand:
+# Cosmos Policy: record the attention of a policy in a task suite, then analyse it; as a SLURM job, an array or by hand:
 #
 #   sbatch scripts/run_attention_ratio_cosmos.sh
 #   QUERY_FRAME=action VISUAL_FRAME=curr_last TEXT_FRAME=frame0 sbatch scripts/run_attention_ratio_cosmos.sh

@@ -1,4 +1,4 @@
-"""What a person can get wrong: always one sentence, exit code 2, no traceback, and nothing half made."""
+"""Mistakes of a user: always one sentence, exit code 2, no traceback, and no partial output."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DUMMY = ["pi", "--checkpoint", "dummy", "--replan-steps", "4"]
 
 
 def run(command, arguments, capsys) -> str:
-    """Run in this process; return what was said on stderr, after checking the form of it."""
+    """Run in this process; check the form of the error on stderr and return it."""
     try:
         code = command([str(argument) for argument in arguments])
     except SystemExit as stopped:  # argparse

@@ -18,7 +18,7 @@ from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZE
 from vla_attention.schemas.errors import listing
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "pi"
-#: folder -> what the manifest says of it: format, prompt, normalisation, executed actions
+#: folder -> format, prompt and normalisation in the manifest
 CHECKPOINTS = {
     "pi0_batch2/checkpoint": ("openpi_jax", "instruction-newline", "z-score"),
     "pi0_batch2/checkpoint_lerobot": ("lerobot", "raw-instruction-newline", "state MEAN_STD, action MEAN_STD"),
@@ -93,7 +93,7 @@ def test_the_three_formats_of_one_model_have_one_digest(small_tokenizer):
     assert len(digests) == 1
 
 
-# --- what a person can get wrong
+# --- mistakes
 
 
 def refused(arguments, capsys) -> str:

@@ -1,4 +1,4 @@
-"""Cosmos through the real command lines: two sites in one store, never mixed."""
+"""Cosmos through the real command lines: two sites in one store, which are never mixed."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ PUBLISHED_SHAPE = replace(
     dit=DitConfig(width=24, num_blocks=28, num_heads=2, mlp_dim=48, text_dim=24, adaln_dim=8),
     vae=VaeConfig(base_dim=4),
 )
-#: The options of the issue's command, as typed.
+#: The options of the published command.
 PUBLISHED_OPTIONS = [
     *("--layers", "25", "26", "27", "--query-frame", "action"),
     *("--visual-frame", "curr_last", "--text-frame", "frame0"),
@@ -43,7 +43,7 @@ SHORT = ["--task-id", "1", "--num-episodes", "1", "--max-steps", "4", "--device"
 
 @pytest.fixture(scope="module", autouse=True)
 def alone() -> Iterator[None]:
-    """One thread (small models wait longer for each other than they compute), and no hub whose files could decide."""
+    """One thread, because several slow small models down, and no files of this machine's hub cache."""
     pytest.importorskip("diffusers")
     before, cache = torch.get_num_threads(), os.environ.get("HF_HUB_CACHE")
     torch.set_num_threads(1)
@@ -61,7 +61,7 @@ def alone() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def libero_run(libero_assets: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that `--output-dir` named: the store, and the results of the proxy that was asked for."""
+    """The folder of `--output-dir`: the store, and the results of the proxy."""
     folder = tmp_path_factory.mktemp("published")
     task = list_tasks(find_suite("libero_10"))[0]
     checkpoint = write_dummy_folder(
@@ -138,7 +138,7 @@ def test_default_and_reference_with_pictures(libero_store, tmp_path, capsys):
     last = steps.filter(denoise_step=4).sort("replan", "layer")["ratio"]
     np.testing.assert_allclose(last, proxy.sort("replan", "layer")["ratio"], rtol=1e-6)
     cross = pl.read_parquet(tmp_path / "default_cross/steps.parquet")
-    # Padded positions take attention, and are no language.
+    # Padded positions get attention and are no language.
     assert (cross["null_mass"] > 0).all()
     np.testing.assert_allclose(cross["linguistic_mass"] + cross["null_mass"], cross["row_sum"], rtol=1e-3)
     capsys.readouterr()
@@ -146,12 +146,12 @@ def test_default_and_reference_with_pictures(libero_store, tmp_path, capsys):
     assert "choose with --site" in capsys.readouterr().err
 
 
-# What can be wrong with the files: one sentence, exit code 2, and no store
+# Faults of the files: one sentence, exit code 2, and no store
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A checkpoint of test size; what is wrong with it is found before anything of its size matters."""
+    """A checkpoint of test size; its faults are found before its size matters."""
     return write_dummy_folder(tmp_path / "checkpoint", DUMMY_CONFIG, ["stack the red cube"], dtype=torch.float32)
 
 
@@ -162,7 +162,7 @@ def refused(folder: Path, capsys: pytest.CaptureFixture[str], *arguments: object
     capsys.readouterr()
     assert capture([str(argument) for argument in given]) == 2
     said = capsys.readouterr().err.strip()
-    # Loading may note on a line of its own that T5's tokenizer is absent; the mistake itself is one line.
+    # A note that T5's tokenizer is absent may be a line of its own; the error itself is one line.
     *notes, sentence = said.splitlines()
     assert all(note.startswith("T5's tokenizer") for note in notes)
     assert sentence.startswith("vla-capture: ")
@@ -189,7 +189,7 @@ def test_a_missing_file_is_named_with_what_to_do(folder, missing, expected, caps
 
 
 class Malicious:
-    """Makes a file when it is unpickled by something careless."""
+    """Creates a file when an unsafe reader unpickles it."""
 
     def __init__(self, trace: Path):
         self.trace = trace
@@ -229,7 +229,7 @@ def test_frames_and_calls_that_do_not_exist_name_those_that_do(folder, capsys):
 
 @pytest.mark.simulator
 def test_an_instruction_without_embedding_names_the_near_ones(folder, capsys):
-    """Found out at the first replan: the store exists by then, and has no episode."""
+    """The error comes at the first replan: the store exists then, without an episode."""
     store = folder.parent / "a.zarr"
     assert capture(["cosmos", "--ckpt-path", str(folder), *SHORT, "--store", str(store)]) == 2
     assert not list((store / "episodes").glob("task*"))

@@ -64,7 +64,7 @@ def write_dummy_folder(
 
 
 def published_state(config: CosmosConfig, seed: int, dtype: torch.dtype) -> dict[str, Any]:
-    """Return the transformer's state as the published file has it: prefixed, with counters and extra state."""
+    """Return the transformer's state with the published file's prefix, counters and extra state."""
     state: dict[str, Any] = collections.OrderedDict()
     for counter in ("video_sample_counter", "image_sample_counter", "iteration"):
         state[f"{PREFIX}{COUNTER_PREFIX}{counter}"] = torch.tensor(0)

@@ -25,13 +25,13 @@ class BlockObserver(Protocol):
 
     `rows`: returns the function that takes the float32 probabilities (batch, head, query of the frame, key), or None.
     `updates`: takes the block's gated updates, name -> (batch, frame, token, width), after the block.
-    `wants_updates`: whether `updates` is called.
+    `takes_updates`: whether `updates` is called.
     """
 
     def rows(self, site: str, layer: int, frame: int, attention: Attention, value: Tensor) -> RowSink | None:
         """Return the function that takes the rows of these queries; `value` is (batch, head, key, dim)."""
 
-    def wants_updates(self, layer: int) -> bool:
+    def takes_updates(self, layer: int) -> bool:
         """Return whether `updates` is called for this block."""
 
     def updates(self, layer: int, updates: dict[str, Tensor], gates: dict[str, Tensor], block_input: Tensor) -> None:
@@ -212,7 +212,7 @@ class Block(nn.Module):
                 update = self.mlp(modulated)
             gates[name], updates[name] = gate, gate * update
             x = x + updates[name]
-        if observer is not None and observer.wants_updates(layer):
+        if observer is not None and observer.takes_updates(layer):
             observer.updates(layer, updates, gates, block_input)
         return x
 

@@ -53,7 +53,7 @@ class CallObserver:
             self._seen[site] = value, attention.output_proj.weight
         return recorder.sink(layer, self.denoise_step, self._queries)
 
-    def wants_updates(self, layer: int) -> bool:
+    def takes_updates(self, layer: int) -> bool:
         """Return whether contributions of this block are recorded at any site."""
         return bool(self._update_sinks(layer))
 

@@ -138,7 +138,7 @@ class EverythingObserver:
 
         return take
 
-    def wants_updates(self, layer: int) -> bool:
+    def takes_updates(self, layer: int) -> bool:
         """Return True: updates of every block."""
         return True
 

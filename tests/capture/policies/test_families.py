@@ -1,4 +1,4 @@
-"""A third policy family: an entry in the registry is all that it takes, from the help text to the analysis."""
+"""A third policy family needs an entry in the registry only, from the help text to the analysis."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CAPTURE = Path(families.__file__).parents[1]
 
 
 class StubEnvironment:
-    """A picture of 4 x 4 pixels that changes with every step; nothing is ever solved."""
+    """A picture of 4 x 4 pixels that changes with every step; the task is never solved."""
 
     objects = (SceneObject("robot", "robot", False), SceneObject("background", "background", False))
     initial_state_digest = "d" * 64
@@ -68,7 +68,7 @@ def test_a_third_family_captures_and_is_analysed(tmp_path, capfd):
     episode = zarr.open_group(store / "episodes/task000_episode001", mode="r")
     assert episode["joint/rows"].shape == (3, 1, 1, 2, 1, 7)
     np.testing.assert_allclose(episode["joint/row_sum"][:], 1, rtol=1e-6)
-    # Its own default of the analysis: seen over read.
+    # The ratio is the family's own default of the analysis.
     steps = pl.read_parquet(tmp_path / "steps.parquet")
     assert steps.height == 6
     assert (tmp_path / "attention_ratio_results_robosuite.json").is_file()
@@ -106,7 +106,7 @@ def test_names_prefixes_and_programs_are_unique():
 
 
 def test_no_family_is_named_outside_its_folder():
-    """Strings of code, not comments and help: 'pi' and 'cosmos' stand in their folders and in the registry."""
+    """'pi' and 'cosmos' as strings of code, not in comments and help, are in their folders and the registry only."""
     named = re.compile(r"""["'](pi|pi0|pi05|cosmos)["']|policies\.(pi|cosmos)\b""")
     for path in CAPTURE.rglob("*.py"):
         place = path.relative_to(CAPTURE)

@@ -20,7 +20,7 @@ SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
 
 
 def run(script: str, folder: Path, *words: str, **variables: str) -> subprocess.CompletedProcess[str]:
-    """Run a script in an empty folder with nothing but these variables."""
+    """Run a script in an empty folder with these environment variables only."""
     environment = {"PATH": f"{Path(sys.executable).parent}:/usr/bin:/bin", "HOME": str(folder), **variables}
     return subprocess.run(
         ["bash", SCRIPTS / script, *words],
@@ -55,7 +55,7 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing(tmp_path, script, variable
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 
 
-def test_a_missing_installation_is_said(tmp_path):
+def test_a_missing_installation_is_reported(tmp_path):
     done = run("run_attention_ratio.sh", tmp_path, PATH="/usr/bin:/bin")
     assert done.returncode == 2
     assert "activate an environment in SETUP" in done.stderr
@@ -88,7 +88,7 @@ def test_the_helper_prints_what_it_would_submit(tmp_path):
     ],
 )
 def test_mistakes_of_the_helper(tmp_path, words, variables, expected):
-    # Without the folders in which an sbatch may be.
+    # Without folders that may contain an sbatch.
     (tmp_path / "bin").mkdir()
     for tool in ("bash", "dirname", "env"):
         (tmp_path / "bin" / tool).symlink_to(f"/usr/bin/{tool}")
@@ -126,7 +126,7 @@ def test_variables_become_the_options_that_they_name():
     assert arguments(COSMOS, TEXT_FRAME="frame0") == ["--text-frame", "frame0"]
 
 
-def test_a_job_with_a_real_checkpoint_wants_a_gpu():
+def test_a_job_with_a_real_checkpoint_needs_a_gpu():
     assert arguments(SLURM_JOB_ID="1") == ["--device", "cuda"]
     assert arguments(SLURM_JOB_ID="1", CHECKPOINT="dummy") == ["--checkpoint", "dummy"]
     assert arguments(SLURM_JOB_ID="1", DEVICE="cpu") == ["--device", "cpu"]

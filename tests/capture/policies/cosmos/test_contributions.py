@@ -25,7 +25,7 @@ def norm(gram, members):
 def test_parts_add_up_to_the_gated_update_of_each_site(dummy, prepared):
     for site, gram in grams_of(dummy, prepared).items():
         whole = gram.shape[-1] - 1
-        # The sum of the parts is the update itself, not only as long: their inner product is the update's square.
+        # The sum of the parts is the update, in length and direction: their inner product is the update's square.
         np.testing.assert_allclose(gram[..., :whole, whole].sum(axis=-1), gram[..., whole, whole], rtol=1e-4)
         np.testing.assert_allclose(norm(gram, range(whole)), norm(gram, [whole]), rtol=1e-4, err_msg=site)
 

@@ -236,6 +236,6 @@ def test_any_network_on_any_batch(case):
             torch.testing.assert_close(rows.sum(-1), torch.ones(rows.shape[:-1]), rtol=0, atol=1e-5)
         cross = observer.probabilities("cross", layer)
         for entry, length in enumerate(lengths):
-            # Padded positions are alike to every query, and a text of nothing else adds exactly nothing.
+            # All padded positions are equal for every query, and a text of padding only adds exactly nothing.
             assert (cross[entry, ..., length:] == cross[entry, ..., length : length + 1]).all()
             assert bool((observer.residual_norms[layer][entry, :, 1] == 0).all()) == (length == 0)

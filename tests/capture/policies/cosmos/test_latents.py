@@ -89,7 +89,7 @@ def test_two_steps_make_one_evaluation_as_in_the_reference(steps, evaluations):
 
 
 def test_the_solver_is_exact_where_the_estimate_is_constant():
-    """With a constant estimate x0, the exact path is x0 + sigma * eps, and the last evaluation is asked there."""
+    """With a constant estimate x0, the exact path is x0 + sigma * eps, and the last evaluation is on it."""
     target, noise = torch.tensor([0.3, -1.2]), torch.tensor([0.7, 0.4])
     visited = []
 

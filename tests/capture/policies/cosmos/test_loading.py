@@ -1,4 +1,4 @@
-"""A checkpoint folder laid out as the published repository: loaded, or refused with a sentence."""
+"""A checkpoint folder with the files of the published repository: it is loaded, or refused with one sentence."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZE
 from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.layout import Role
 
-#: The dummy's pictures are smaller than the published configuration says.
+#: The dummy's pictures are smaller than those of the published configuration.
 SMALL = CosmosOptions(image_size=64, num_denoising_steps=3)
 
 
 @pytest.fixture(autouse=True)
 def no_hub(monkeypatch, tmp_path):
-    """What is in this machine's own cache must not decide."""
+    """The tests must not depend on this machine's own cache."""
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
 
 

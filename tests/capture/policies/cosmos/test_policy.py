@@ -1,4 +1,4 @@
-"""The policy as the rollout sees it: two sites, layouts, and actions that do not depend on what is recorded."""
+"""The policy behind its interface: two sites, layouts, and actions that do not depend on the recording."""
 
 from __future__ import annotations
 
@@ -222,7 +222,7 @@ def test_options_that_cannot_be_are_one_sentence(options, message):
 
 
 def test_swapping_only_the_embedding_under_the_same_noise_changes_the_actions(dummy, prepared):
-    """Same pictures, proprioception and noise: whatever differs comes through cross-attention."""
+    """With equal pictures, proprioception and noise, every difference comes through cross-attention."""
     other = dummy.prepare(make_observation(0), OTHER_INSTRUCTION).tensors["text"]
     assert not torch.equal(other, prepared.tensors["text"])
     swapped = dataclasses.replace(prepared, tensors=dict(prepared.tensors, text=other))
@@ -231,6 +231,6 @@ def test_swapping_only_the_embedding_under_the_same_noise_changes_the_actions(du
     changed = dummy.act(swapped, 195, {"self": after})
     assert np.abs(changed - actions).max() > 1e-4
     assert np.array_equal(dummy.act(prepared, 195), actions)
-    # The first block's self-attention comes before any text: at the first call it cannot know of the swap.
+    # The first block's self-attention comes before any text: at the first call it does not depend on the embedding.
     assert torch.equal(before.rows[0, 0], after.rows[0, 0])
     assert not torch.equal(before.rows[1, 0], after.rows[1, 0])

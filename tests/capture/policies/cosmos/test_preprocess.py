@@ -118,7 +118,7 @@ def test_thirteen_frames_give_what_all_thirty_three_do(state):
     first = encoder.encode(shown[:2])
     assert first.shape == (1, 16, 4, 4, 4)
     torch.testing.assert_close(first, ((posterior - mean) / std)[:, :, :4], rtol=1e-4, atol=1e-5)
-    # What the black frames leave behind is kept, and not changed by what came after.
+    # The state of the convolutions after the black frames is kept, and later pictures do not change it.
     assert torch.equal(encoder.encode(shown[2:])[:, :, :2], first[:, :, :2])
     assert torch.equal(encoder.encode(shown[:2]), first)
 

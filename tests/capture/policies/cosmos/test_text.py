@@ -1,4 +1,4 @@
-"""Text embeddings: read without running anything, found by instruction, positions that are words or nothing."""
+"""Text embeddings: reading without execution of code, look-up by instruction, roles of positions."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from vla_attention.schemas.layout import Role
 
 
 class Malicious:
-    """Runs a command when it is unpickled by something careless."""
+    """Runs a command when an unsafe reader unpickles it."""
 
     def __init__(self, command):
         self.command = command
@@ -183,7 +183,7 @@ def test_a_tokenizer_that_is_none(tmp_path):
 
 
 class StubEncoder:
-    """Stands in for T5: every token's embedding is its id."""
+    """A replacement of T5: every token's embedding is its id."""
 
     folder = "t5"
 

@@ -1,4 +1,4 @@
-"""The embedded policy: reproducible, of the reference's layout, and with attention worth looking at."""
+"""The embedded policy: it is reproducible, has the reference's layout, and its attention has structure."""
 
 import time
 
@@ -14,7 +14,7 @@ from vla_attention.capture.recording.recorder import AttentionRecorder, Recordin
 from vla_attention.schemas.layout import Role
 
 INSTRUCTION = "put the black bowl on the plate"
-#: of EMBEDDED_CONFIG with seed 0; a change breaks comparisons with every store recorded before
+#: of EMBEDDED_CONFIG with seed 0; after a change, earlier stores cannot be compared with new ones
 DIGEST = "52e970b88c6dc94d0d9dbf2bd2c15b2c836c48cbd384238e8482666954ed798b"
 
 

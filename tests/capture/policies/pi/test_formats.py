@@ -1,4 +1,4 @@
-"""Which format a folder is in, and what is said of folders that are something else."""
+"""Formats of checkpoint folders, and the errors for other folders."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""LeRobot checkpoints: what their files decide, what is refused, and preprocessing against what LeRobot computed."""
+"""LeRobot checkpoints: settings from their files, refused features, and preprocessing against LeRobot's numbers."""
 
 import json
 import shutil
@@ -117,7 +117,7 @@ def test_pi0_prompt(tokenizer_path):
         assert got.prompt.text == TEXT["pi0_newline"]
         assert got.prompt.instruction_text == CASE["prompts"][0]
         assert got.roles[got.mask][-1] == Role.TEMPLATE
-    # neither stripped nor cleaned, and in one go
+    # neither stripped nor cleaned, and encoded as one string
     raw = tokenizer.tokenize("  put_the bowl ", max_token_len=48, prompt_format="raw-instruction-newline")
     assert raw.prompt.text == "  put_the bowl \n"
     assert tokenizer.tokenize("put", max_token_len=48, prompt_format="raw-instruction").prompt.text == "put"

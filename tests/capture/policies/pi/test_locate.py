@@ -1,4 +1,4 @@
-"""Names on hubs: the clients are called as they should be, and every way to fail ends with what to do."""
+"""Names on hubs: calls of the clients, and an error with instructions for every failure."""
 
 import sys
 import types
@@ -47,7 +47,7 @@ def test_a_hub_name_is_downloaded_by_the_hub_s_client(monkeypatch, tmp_path):
     module(monkeypatch, "huggingface_hub", snapshot_download=snapshot_download)
     assert find_checkpoint("lerobot/pi05_libero_finetuned") == tmp_path
     assert asked == [("lerobot/pi05_libero_finetuned", list(HUB_FILES))]
-    # safetensors and JSON: nothing that would have to be unpickled is ever fetched
+    # safetensors and JSON only: nothing that has to be unpickled is downloaded
     assert not [pattern for pattern in HUB_FILES if pattern.endswith((".bin", ".pt", ".pth", ".pkl"))]
 
 
@@ -75,7 +75,7 @@ def test_openpi_s_cache_is_used_when_the_checkpoint_is_there():
     assert find_checkpoint(URL + "/") == target
 
 
-def test_without_gcsfs_it_is_said_what_to_fetch_and_where_to_put_it(monkeypatch):
+def test_without_gcsfs_the_error_names_files_and_place(monkeypatch):
     monkeypatch.setitem(sys.modules, "gcsfs", None)
     target = openpi_cache() / "openpi-assets" / "checkpoints"
     with pytest.raises(MissingDependency) as caught:
@@ -85,7 +85,7 @@ def test_without_gcsfs_it_is_said_what_to_fetch_and_where_to_put_it(monkeypatch)
 
 
 class Bucket:
-    """A bucket as gcsfs shows it; `fails` breaks the download off in the middle."""
+    """A bucket of gcsfs; `fails` interrupts the download."""
 
     def __init__(self, fails=False, folders=("params", "assets", "train_state")):
         self.fails, self.folders, self.got = fails, folders, []
@@ -137,7 +137,7 @@ def test_tokenizers_are_looked_for_in_the_checkpoint_and_the_caches(tmp_path):
     ]
     with pytest.raises(BadArgument, match=r"gs://big_vision/paligemma_tokenizer\.model.*give --tokenizer PATH"):
         find_tokenizer(checkpoint, None)
-    for place in places:  # each later one comes before all earlier ones
+    for place in places:  # each later one takes precedence over the earlier ones
         place.parent.mkdir(parents=True, exist_ok=True)
         place.touch()
         assert find_tokenizer(checkpoint, None) == place

@@ -77,7 +77,7 @@ def test_bfloat16_stays_near_and_records_float32_rows_that_sum_to_one(golden_cas
 
 
 def test_recorder_is_told_which_queries_are_actions(golden_case):
-    """pi0's state token comes first and must not be taken for an action."""
+    """pi0's state token comes first and must not count as an action."""
     config = golden_case.config
     keep = KeepAll()
     one = golden_case.single(0)
@@ -134,7 +134,7 @@ def test_lerobot_steps_time_and_embeds_it_in_float64():
 
 
 def test_the_two_conventions_of_time_differ_by_what_was_measured(pi05_case):
-    """LeRobot's own code is 4.4e-5 away from the JAX numbers on this case, which is what its convention makes here."""
+    """LeRobot's own code differs from the JAX numbers by 4.4e-5 on this case, as its convention does here."""
     keep = KeepAll()
     config = dataclasses.replace(pi05_case.config, time_convention="stepped")
     actions = pi05_case.sample(model_from_state(config, pi05_case.weights), keep)

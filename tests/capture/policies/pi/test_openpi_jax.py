@@ -1,4 +1,4 @@
-"""openpi's JAX checkpoints, written by openpi and orbax themselves, read without either."""
+"""openpi's JAX checkpoints: written by openpi and orbax, and read without them."""
 
 import dataclasses
 import json
@@ -37,7 +37,7 @@ def pi0_case():
 
 
 def test_every_leaf_is_bit_identical(pi0_case):
-    """The loader's conversion, undone by code that shares nothing with it."""
+    """The loader's conversion is inverted by independent code."""
     leaves = list_leaves(STORED / "params")
     wanted = pi0_case.leaves
     assert {leaf.path for leaf in leaves} == set(wanted)
@@ -104,7 +104,7 @@ def lora_factors(leaves, generator, rank=3):
 
 
 def test_lora_is_merged_as_openpi_s_equations_say():
-    """openpi evaluates x·w + (x·a)·b by two einsums, whose letters decide what is summed over."""
+    """openpi evaluates x·w + (x·a)·b by two einsums; their letters determine the sums."""
     generator = np.random.default_rng(0)
     x = generator.normal(size=(2, 5, 6))
     heads = generator.normal(size=(2, 5, 4, 3))

@@ -1,4 +1,4 @@
-"""Reading checkpoints: what loads, and the one sentence that each thing that does not load ends with."""
+"""openpi's PyTorch checkpoints: loading, and one sentence for each checkpoint that cannot be loaded."""
 
 import dataclasses
 import json
@@ -195,7 +195,7 @@ def test_full_size_openpi_torch_keys_load_strictly(name):
 @pytest.mark.parametrize(("name", "kind"), [("lerobot_pi05", "pi05_libero"), ("lerobot_pi0", "pi0_libero")])
 @pytest.mark.parametrize("leave_out", ["", "embed_tokens.weight", "prefix"])
 def test_full_size_lerobot_keys_load_strictly(name, kind, leave_out):
-    """With and without the prefix "model." and the table's own name, as older files are."""
+    """With and without the prefix "model." and the table's own name, like older files."""
     manifest = read_manifest(name)
     if leave_out == "prefix":
         manifest = {key.removeprefix("model."): shape for key, shape in manifest.items()}

@@ -1,4 +1,4 @@
-"""`vla-capture parity`: cases pass in every format that they carry, and every way to spoil one is noticed."""
+"""`vla-capture parity`: cases pass in each of their formats, and every damaged case fails."""
 
 import json
 import shutil
@@ -99,7 +99,7 @@ def test_spoiled_weights_fail(case, capsys):
 
 @pytest.mark.parametrize("masks", [[[True, False, True], [False, True, True]], [[False] * 3, [True] * 3]])
 def test_cases_with_other_masks_run(case, capsys, masks):
-    """Their expected numbers would come from the reference; here, that they run and differ."""
+    """There are no expected numbers for them; the test checks that they run and differ."""
 
     def change(arrays):
         for i, slot in enumerate(("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")):

@@ -1,4 +1,4 @@
-"""The adapter: layout, roles and tensors that agree with each other, and actions that recording does not touch."""
+"""The pi policy behind its interface: consistent layout, roles and tensors, and actions independent of recording."""
 
 import dataclasses
 import json
@@ -33,7 +33,7 @@ INSTRUCTION = "put the black bowl on the plate"
 
 
 def typed(policy: PiPolicy) -> Policy:
-    """The type checker reads this: the adapter fulfils the protocol."""
+    """For the type checker: the class fulfils the protocol."""
     return policy
 
 
@@ -204,7 +204,7 @@ def test_a_tokenizer_larger_than_the_table_is_refused(dummy):
 
 
 def test_a_tokenizer_of_another_full_size_model_is_refused(dummy):
-    """Llama's 32000 pieces would fit into PaliGemma's table, and every word would be another."""
+    """Llama's 32000 pieces fit into PaliGemma's table, but with other words."""
 
     class Pieces:
         def __init__(self, count):
@@ -217,7 +217,7 @@ def test_a_tokenizer_of_another_full_size_model_is_refused(dummy):
             check_vocabulary(Pieces(count), 257_152, "pi05")
 
 
-def test_a_prompt_that_is_cut_is_said_once_and_stays_visible(dummy, observation, capsys):
+def test_a_cut_prompt_is_reported_once_and_stays_visible(dummy, observation, capsys):
     config = dataclasses.replace(DUMMY_CONFIG, max_token_len=12)
     policy = PiPolicy(build_random_model(config, 0), dummy.tokenizer, dummy.processing, dummy.source)
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""Prompts: the strings openpi encodes, and which token is what, for instructions that try to confuse."""
+"""Prompts: the strings that openpi encodes, and the roles of tokens, also for confusing instructions."""
 
 import itertools
 import json
