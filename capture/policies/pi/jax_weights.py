@@ -7,18 +7,14 @@ Leaves of the transformers carry all layers on their first axis (openpi scans ov
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch
-from vla_attention.capture.policies.pi.config import PiConfig
-from vla_attention.capture.policies.pi.jax_lora import LoraPair, find_lora_pairs, merge_lora
-from vla_attention.capture.policies.pi.model_weights import expected_shapes
-from vla_attention.capture.policies.strict_loading import Shapes, check_shapes, shapes_of
+from vla_attention.capture.policies.pi.jax_lora import LoraPair, find_lora_pairs
+from vla_attention.capture.policies.strict_loading import Shapes
 
 VISION = "paligemma_with_expert.paligemma.model.vision_tower.vision_model."
 PROJECTOR = "paligemma_with_expert.paligemma.model.multi_modal_projector.linear."
@@ -208,23 +204,3 @@ def plan_leaves(paths: Iterable[str]) -> tuple[dict[str, LeafPlan], dict[str, Lo
     if "action_in_proj/kernel" not in found:
         raise CheckpointMismatch(f"The checkpoint has no action_in_proj.{OTHER_OPENPI_MODEL}")
     return {path: plan for path, plan in found.items() if plan is not None}, pairs
-
-
-def from_jax_flat(leaves: Mapping[str, np.ndarray], config: PiConfig) -> dict[str, Tensor]:
-    """Return the state dict (float32) of a `PiModel(config)` from a JAX checkpoint's leaves; LoRA pairs are merged.
-
-    Raises `CheckpointMismatch` that lists every leaf that is unknown, and every tensor that is missing or does not have
-    the shape of the configuration.
-    """
-    plans, pairs = plan_leaves(leaves)
-    state: dict[str, Tensor] = {}
-    for path, plan in plans.items():
-        leaf = np.asarray(leaves[path], dtype=np.float32)
-        if path in pairs:
-            pair = pairs[path]
-            leaf = np.stack(
-                [merge_lora(path, w, *ab) for w, *ab in zip(leaf, leaves[pair.a], leaves[pair.b], strict=True)]
-            )
-        state |= {name: torch.from_numpy(np.array(array, order="C")) for name, array in plan.whole(leaf).items()}
-    check_shapes(shapes_of(state), expected_shapes(config))
-    return state

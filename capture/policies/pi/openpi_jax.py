@@ -124,11 +124,6 @@ def import_tensorstore() -> Any:
     return tensorstore
 
 
-def read_leaf(params: Path, leaf: Leaf) -> np.ndarray:
-    """Read one leaf as float32, with the axes of the JAX model."""
-    return OpenLeaf(params, leaf).read()
-
-
 def load_openpi_jax(
     folder: str | Path,
     *,

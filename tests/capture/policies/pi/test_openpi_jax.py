@@ -10,14 +10,14 @@ import torch
 
 from benchmarks.orbax_writer import write_leaves
 from tests.kit.jax_leaves import to_jax_leaves
+from tests.kit.jax_state import from_jax_flat
 from tests.kit.pi_golden import GOLDEN, LARGE_GOLDEN, load_case
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint, UnsupportedCheckpoint
 from vla_attention.capture.policies.pi.config import GemmaConfig
 from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, random_weights
 from vla_attention.capture.policies.pi.jax_lora import merge_lora
-from vla_attention.capture.policies.pi.jax_weights import from_jax_flat
 from vla_attention.capture.policies.pi.loading import load_pi_model
-from vla_attention.capture.policies.pi.openpi_jax import OpenLeaf, list_leaves, load_openpi_jax, read_leaf
+from vla_attention.capture.policies.pi.openpi_jax import OpenLeaf, list_leaves, load_openpi_jax
 from vla_attention.capture.policies.pi.preprocess import read_norm_stats
 
 pytest.importorskip("tensorstore")
@@ -42,7 +42,7 @@ def test_every_leaf_is_bit_identical(pi0_case):
     wanted = pi0_case.leaves
     assert {leaf.path for leaf in leaves} == set(wanted)
     for leaf in leaves:
-        np.testing.assert_array_equal(read_leaf(STORED / "params", leaf), wanted[leaf.path])
+        np.testing.assert_array_equal(OpenLeaf(STORED / "params", leaf).read(), wanted[leaf.path])
         opened = OpenLeaf(STORED / "params", leaf)
         np.testing.assert_array_equal(np.stack(list(opened.layers())), wanted[leaf.path])
 

@@ -9,11 +9,12 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from tests.kit.jax_state import from_jax_flat
 from tests.kit.pi_golden import GOLDEN, load_case, read_manifest
 from tests.kit.policy_inputs import KeepAll
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch, CheckpointNotFound, UnreadableCheckpoint
 from vla_attention.capture.policies.pi.config import NAMED_CONFIGS, SiglipConfig, find_config, find_variant
-from vla_attention.capture.policies.pi.jax_weights import from_jax_flat, plan_leaves
+from vla_attention.capture.policies.pi.jax_weights import plan_leaves
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.model_weights import expected_shapes
 from vla_attention.capture.policies.pi.openpi_torch import load_openpi_torch, model_names
