@@ -35,6 +35,8 @@ SOURCES := vla_attention schemas capture analyze tests benchmarks scripts docs
 
 # Processes that share the tests; WORKERS=0 runs them in one, which a debugger needs.
 WORKERS ?= 2
+# One thread for each: threads of two processes on two cores wait for each other.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -n $(WORKERS) --dist worksteal
 
 .PHONY: capture analyze test test-slurm test-thorough check unit package setup setup-analyze schemas clean
 
@@ -53,11 +55,11 @@ check: .venv/capture-installed
 	$(BIN)/mypy
 
 unit: .venv/capture-installed
-	$(BIN)/pytest -n $(WORKERS) $(ARGS)
+	$(PYTEST) $(ARGS)
 
 # Ten times as many random examples; for changes of formulas, file formats and readers.
 test-thorough: .venv/capture-installed
-	$(BIN)/pytest -n $(WORKERS) --hypothesis-profile thorough -m "not simulator" $(ARGS)
+	$(PYTEST) --hypothesis-profile thorough -m "not simulator" $(ARGS)
 
 # Source distribution, wheel, and their use from environments outside the checkout.
 package: .venv/capture-installed

@@ -1,24 +1,33 @@
-"""Pictures of tests are drawn as PNG. As PDF, which takes longer, only in tests with the mark `pdf`."""
+"""Tests draw pictures as PNG of low resolution. As in the product, and as PDF, only tests with the mark `pdf` do."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from matplotlib.figure import Figure
 
+DRAW = Figure.savefig
+
+
+def draw_quickly(figure: Figure, file: Any, **options: Any) -> None:
+    """Write a PDF's header only: drawing it takes longer than drawing the PNG."""
+    if options.get("format") == "pdf":
+        Path(file).write_bytes(b"%PDF-1.4\n")
+    else:
+        DRAW(figure, file, **options | {"dpi": 50})
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _pictures_are_drawn_quickly() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", draw_quickly)
+        yield
+
 
 @pytest.fixture(autouse=True)
-def _pdf_files_are_headers_only(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def _pictures_are_drawn_as_they_are(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if request.node.get_closest_marker("pdf"):
-        return
-    draw = Figure.savefig
-
-    def save(figure: Figure, file: Any, **options: Any) -> None:
-        if options.get("format") == "pdf":
-            Path(file).write_bytes(b"%PDF-1.4\n")
-        else:
-            draw(figure, file, **options)
-
-    monkeypatch.setattr(Figure, "savefig", save)
+        monkeypatch.setattr(Figure, "savefig", DRAW)

@@ -111,7 +111,6 @@ def test_what_a_store_says_is_text_and_never_markup(html: str) -> None:
     assert html.count("<script>") == 1
 
 
-@pytest.mark.pdf
 def test_the_page_is_small_and_the_same_twice(analysis: Analysis, html: str) -> None:
     assert len(html.encode()) < 3_000_000
     assert report_html(analysis) == html
@@ -206,6 +205,7 @@ def test_a_store_of_infinite_ratios_still_gives_a_page_that_says_so(tmp_path: Pa
     assert "attention alone, on grey" in page.text
 
 
+@pytest.mark.pdf
 def test_a_single_episode_of_a_single_layer_and_a_grouping_without_ratio(tmp_path: Path) -> None:
     store = kit.write_store(tmp_path / "a.zarr", tasks=(0,), episodes=1, replans=1, layers=(1,), heads=(0,))
     path = tmp_path / "deep" / "b.html"
