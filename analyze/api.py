@@ -60,27 +60,36 @@ class OpenStores(Opened):
         return _frame(preview_groups(self.ask(**settings)), table)
 
     def heads(
-        self, table: Literal["heads", "dispersion", "depth", "denoise"] = "heads", **settings: Unpack[Settings]
+        self,
+        table: Literal["heads", "heads_groups", "dispersion", "depth", "denoise", "denoise_groups"] = "heads",
+        **settings: Unpack[Settings],
     ) -> pl.DataFrame:
         """Who looks and who reads: every head, how much heads differ, the profile over depth, over denoise steps.
+
+        "heads" and "denoise" hold ratios, "heads_groups" and "denoise_groups" the groups' fractions and lifts.
 
         >>> va.open(store).heads()["head"].unique().sort().to_list()
         [0, 1]
         """
         from vla_attention.analyze.heads.head_study import study_heads
 
-        check_name("table", table, ("heads", "dispersion", "depth", "denoise"))
-        return _frame(study_heads(self.ask(**settings)), table)
+        tables = study_heads(self.ask(**settings)).tables()
+        check_name("table", table, tables)
+        return tables[table]
 
-    def row_metrics(self, **settings: Unpack[Settings]) -> pl.DataFrame:
-        """Entropy, effective number of keys and top-k mass of every row (`vla_attention.analyze.heads.row_metrics`). Reads all rows.
+    def row_metrics(self, table: Literal["rows", "groups"] = "rows", **settings: Unpack[Settings]) -> pl.DataFrame:
+        """Entropy, effective number of keys and top-k mass of every row (`heads.row_metrics.row_tables`). Reads all rows.
+
+        "groups": entropy and effective keys inside each group; its column `row` is that of "rows".
 
         >>> va.open(store).row_metrics(layers=0, denoise="first", heads=1).height
         12
         """
-        from vla_attention.analyze.heads.row_metrics import row_metrics_table
+        from vla_attention.analyze.heads.row_metrics import row_metrics
 
-        return row_metrics_table(self.ask(**settings))
+        check_name("table", table, ("rows", "groups"))
+        level = row_metrics(self.ask(**settings))
+        return level.cells if table == "rows" else level.groups
 
     def sinks(self, **settings: Unpack[Settings]) -> pl.DataFrame:
         """Keys that take far more than their share in most rows (`vla_attention.analyze.measures.sinks`), per task. Reads all rows.

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Literal, Unpack
 
 import polars as pl
 
+from vla_attention.analyze.measures.frames import Tables
 from vla_attention.analyze.measures.question import AnalysisSettings, Question, ask
 from vla_attention.analyze.measures.settings import Settings, analysis_settings
 from vla_attention.analyze.ratios.analysis import Analysis, analyse
@@ -18,15 +19,10 @@ from vla_attention.schemas.stores.store_format import RootAttributes
 if TYPE_CHECKING:
     import xarray
 
-Level = Literal["tasks", "episodes", "replans", "steps"]
+LevelName = Literal["tasks", "episodes", "replans", "steps"]
 _LEVELS = ("tasks", "episodes", "replans", "steps")
 #: Answers that are kept, so that asking for tasks after episodes does not read everything again.
 _KEPT = 4
-_STEP_IDENTITY = (
-    "suite", "task_id", "instruction", "episode_index", "success", "num_steps", "replan", "env_step", "layer", "block",
-    "denoise_step", "denoise_time", "head", "row_sum", "num_valid",
-)  # fmt: skip
-_GROUP_MEASURES = ("mass", "fraction", "keys", "density", "lift")
 
 
 class Opened:
@@ -89,8 +85,8 @@ class Opened:
             self._answers.popitem(last=False)
         return self._answers[wanted]
 
-    def ratios(self, level: Level = "tasks", **settings: Unpack[Settings]) -> pl.DataFrame:
-        """Masses, fractions, lifts and ratios as `vla-analyze ratios` gives them.
+    def ratios(self, level: LevelName = "tasks", **settings: Unpack[Settings]) -> pl.DataFrame:
+        """Ratios as `vla-analyze ratios` gives them: one row per cell. Masses of the groups are in `masses`.
 
         `level`: "tasks" (per task and over all, with intervals), "episodes", "replans" or "steps" (every replan, layer, denoise step).
         Columns: `vla_attention.analyze.measures.aggregate` and `vla_attention.analyze.measures.steps`.
@@ -102,33 +98,21 @@ class Opened:
         3
         """
         check_name("level", level, _LEVELS)
-        table: pl.DataFrame = getattr(self.analysis(**settings), level)
-        return table
+        table: Tables = getattr(self.analysis(**settings), level)
+        return table.cells
 
-    def masses(self, **settings: Unpack[Settings]) -> pl.DataFrame:
-        """The steps table in long form: one row per (episode, replan, layer, denoise step[, head], group).
+    def masses(self, level: LevelName = "steps", **settings: Unpack[Settings]) -> pl.DataFrame:
+        """Masses, fractions, densities and lifts of the groups: one row per cell of `ratios` and group.
 
-        Columns beside the identity: group, mass, fraction, keys, density, lift.
+        `level`: as in `ratios`. `masses.pivot("group", index=[...], values=["mass", "fraction"])` makes a column per group of it.
 
         >>> masses = va.open(store).masses(grouping="instruction", per_head=True)
         >>> masses.group_by("group").agg(pl.col("keys").mean()).filter(group="linguistic")["keys"].to_list()
         [5.0]
         """
-        analysis = self.analysis(**settings)
-        identity = [column for column in _STEP_IDENTITY if column in analysis.steps.columns]
-        parts = [
-            analysis.steps.select(
-                *identity,
-                pl.lit(name).alias("group"),
-                *(
-                    pl.col(f"{name}_{measure}").alias(measure)
-                    for measure in _GROUP_MEASURES
-                    if f"{name}_{measure}" in analysis.steps.columns
-                ),
-            )
-            for name in analysis.grouping.names
-        ]
-        return pl.concat(parts)
+        check_name("level", level, _LEVELS)
+        table: Tables = getattr(self.analysis(**settings), level)
+        return table.groups
 
     def summary(self, **settings: Unpack[Settings]) -> str:
         """The text that `vla-analyze STORE` prints.
@@ -194,7 +178,7 @@ class Opened:
         )
 
 
-def check_name(what: str, given: str, known: Sequence[str]) -> None:
+def check_name(what: str, given: str, known: Collection[str]) -> None:
     """Raise `BadArgument` unless a name is one of those that exist."""
     if given not in known:
         raise BadArgument(f"Unknown {what} '{given}'.{did_you_mean(given, known)} Existing: {listing(known)}.")

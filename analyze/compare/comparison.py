@@ -19,7 +19,9 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.compare.runs import Run, check_comparable, noted_differences
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG, episodes_table
+from vla_attention.analyze.measures.aggregate import measured_episode_tables
+from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables
+from vla_attention.analyze.measures.steps import measure_episodes
 from vla_attention.analyze.statistics.bootstrap import (
     POSITIVE,
     SHARE,
@@ -28,12 +30,9 @@ from vla_attention.analyze.statistics.bootstrap import (
     ends,
     geometric_mean_over_episodes,
     mean_over_episodes,
-    named_interval,
     resample_episodes,
-    values_with_intervals,
 )
 from vla_attention.analyze.statistics.effect_sizes import contrast
-from vla_attention.analyze.time.time_courses import replans_of
 from vla_attention.schemas.groupings.grouping import Grouping
 
 LOG2_RATIO, SUCCESS = "log2_ratio", "success"
@@ -49,13 +48,13 @@ class Comparison:
         names: the runs, the first one being what the others are compared with.
         grouping: groups of the comparison.
         quantities: what is compared, in order.
-        estimates: one row per (run, suite, layer): `ratio` (geometric mean), every fraction and the success rate, each with
-            `_low` and `_high`; `uniform_ratio`; `num_tasks`, `num_episodes`; `episodes_without_ratio` (no finite
-            positive ratio in any replan) and `num_nonfinite` (replans without a finite ratio).
+        estimates: one row per (run, suite, layer, quantity): `num_tasks`, `num_episodes`, `value`, `low`, `high`. Quantities are
+            `ratio` (geometric mean), `ratio_lift`, every fraction and `success`. On rows of the ratio also `uniform_ratio`,
+            `episodes_without_ratio` (no finite positive ratio in any replan) and `num_nonfinite` (replans without a finite ratio).
         differences: one row per (run, scope, layer, quantity) for every run but the first: scope "task", "suite" (only
             when there are several) or "all"; `paired`; `num_pairs`, `num_first`, `num_other`, `num_tasks`; `mean_first`, `mean_other`,
             `difference`, `low`, `high`; `effect` (mean / standard deviation of the paired differences, or Hedges' g).
-        pairs: one row per (run, pair, layer): both episodes, and per quantity `X_first`, `X_other`, `X_difference`.
+        pairs: one row per (run, pair, layer, quantity): `episode_first`, `episode_other`, `first`, `other`, `difference`.
         unpaired: one row per episode that has no partner: `run`, `compared_with`, its suite, task and episode index.
         notes: lines on what differs between the runs and was allowed or does not matter.
     """
@@ -76,11 +75,6 @@ class Comparison:
         return tuple(name for name in self.names if name in known)
 
 
-def comparison_table(runs: Sequence[Run], allowed: Sequence[str] = ()) -> pl.DataFrame:
-    """The table `Comparison.differences` of some runs."""
-    return compare(runs, allowed).differences
-
-
 def compare(runs: Sequence[Run], allowed: Sequence[str] = (), seed: int | None = None) -> Comparison:
     """Compare every run with the first one.
 
@@ -96,8 +90,10 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = (), seed: int | None =
     notes += [line for run in runs for line in run.question.skipped]
     grouping = runs[0].question.grouping
     seed = runs[0].question.settings.seed if seed is None else seed
-    tables = [_episode_values(run, "seed" in allowed) for run in runs]
-    filled = [name for name in grouping.names if any((table[f"{name}_mass"] > 0).any() for table in tables)]
+    levels = [measured_episode_tables(measure_episodes(run.question), run.question.grouping) for run in runs]
+    having = {name for level in levels for name in level.groups_with_mass()}
+    filled = [name for name in grouping.names if name in having]
+    tables = [_episode_values(run, level, filled, "seed" in allowed) for run, level in zip(runs, levels, strict=True)]
     quantities = ((LOG2_RATIO,) if grouping.ratio else ()) + tuple(f"{name}_fraction" for name in filled) + (SUCCESS,)
     estimates = pl.concat(
         [_estimates(run.name, table, quantities, seed) for run, table in zip(runs, tables, strict=True)]
@@ -105,7 +101,7 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = (), seed: int | None =
     differences, pairs, unpaired = [], [], []
     for run, table in zip(runs[1:], tables[1:], strict=True):
         joined = _pair(tables[0], table, quantities)
-        pairs.append(joined.select(pl.lit(run.name).alias("run"), pl.all()))
+        pairs.append(_pairs_table(run.name, joined, quantities))
         unpaired += [_without_partner(tables[0], joined, "first", runs[0].name, run.name)]
         unpaired += [_without_partner(table, joined, "other", run.name, runs[0].name)]
         rows = _paired(joined, quantities, seed) if joined.height else _unpaired(tables[0], table, quantities, seed)
@@ -122,10 +118,12 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = (), seed: int | None =
     )
 
 
-def _episode_values(run: Run, ignore_seed: bool) -> pl.DataFrame:
-    """One row per (episode, layer) with every quantity and what pairs it; layers are named as block numbers."""
+def _episode_values(run: Run, episodes: Tables, groups: Sequence[str], ignore_seed: bool) -> pl.DataFrame:
+    """One row per (episode, layer) with a column per quantity, and what pairs it; layers are named as block numbers."""
     question = run.question
-    table = episodes_table(replans_of(question), question.grouping)
+    table = episodes.cells.with_columns(
+        episodes.of_group(name)["fraction"].alias(f"{name}_fraction") for name in groups
+    )
     origin = pl.DataFrame(
         [
             (
@@ -180,6 +178,22 @@ def _pair(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str]) -
     return joined.with_columns(
         (pl.col(f"{q}_other") - pl.col(f"{q}_first")).alias(f"{q}_difference") for q in quantities
     ).sort("suite", "task_id", "episode_first", "block", nulls_last=True)
+
+
+def _pairs_table(run: str, joined: pl.DataFrame, quantities: Sequence[str]) -> pl.DataFrame:
+    """The table `Comparison.pairs`, from `_pair`."""
+    values = {f"{quantity}_{end}" for quantity in quantities for end in ("first", "other", "difference")}
+    identity = [name for name in joined.columns if name not in values]
+    parts = [
+        joined.select(
+            pl.lit(run).alias("run"),
+            *identity,
+            pl.lit(quantity).alias("quantity"),
+            *(pl.col(f"{quantity}_{end}").alias(end) for end in ("first", "other", "difference")),
+        )
+        for quantity in quantities
+    ]
+    return pl.concat(parts)
 
 
 def _without_partner(table: pl.DataFrame, joined: pl.DataFrame, side: str, run: str, other: str) -> pl.DataFrame:
@@ -328,26 +342,29 @@ def _estimates(run: str, table: pl.DataFrame, quantities: Sequence[str], seed: i
         }
         if LOG2_RATIO in quantities:
             statistics["ratio_lift"] = mean_over_episodes(_numbers(part, "ratio_lift"), POSITIVE)
-        row: dict[str, Any] = {
-            "run": run,
-            "suite": part["suite"][0],
-            "layer": part["layer"][0],
-            "block": part["block"][0],
-        }
-        row |= {"num_tasks": len(set(tasks)), "num_episodes": part.height}
-        if LOG2_RATIO in quantities:
-            row["uniform_ratio"] = mean_over_episodes(_numbers(part, "uniform_ratio")).value
-            row["episodes_without_ratio"] = statistics["ratio"].num_left_out
-            row["num_nonfinite"] = int(part["num_nonfinite"].sum())
-        row |= values_with_intervals(statistics, resample_episodes(tasks, seed=seed))
-        # When all episodes end alike, all resamples do so too: that is no certainty about a success rate.
-        if row[SUCCESS] in (0.0, 1.0):
-            row |= named_interval(SUCCESS, row[SUCCESS], None)
-        rows.append(row)
-    text = dict.fromkeys(("run", "suite", "layer"), pl.String)
-    counts = ("block", "num_tasks", "num_episodes", "episodes_without_ratio", "num_nonfinite")
-    whole = dict.fromkeys(counts, pl.Int64)
-    return pl.DataFrame(rows, schema={name: {**text, **whole}.get(name, pl.Float64) for name in rows[0]})
+        names = {"run": run, "suite": part["suite"][0], "layer": part["layer"][0], "block": part["block"][0]}
+        counts = {"num_tasks": len(set(tasks)), "num_episodes": part.height}
+        intervals = bootstrap_intervals(list(statistics.values()), resample_episodes(tasks, seed=seed))
+        for (name, statistic), interval in zip(statistics.items(), intervals, strict=True):
+            # When all episodes end alike, all resamples do so too: that is no certainty about a success rate.
+            certain = name == SUCCESS and statistic.value in (0.0, 1.0)
+            low, high = ends(None if certain else interval)
+            row = {**names, **counts, "quantity": name, "value": statistic.value, "low": low, "high": high}
+            if name == "ratio":
+                row["uniform_ratio"] = mean_over_episodes(_numbers(part, "uniform_ratio")).value
+                row["episodes_without_ratio"] = statistic.num_left_out
+                row["num_nonfinite"] = int(part["num_nonfinite"].sum())
+            rows.append(row)
+    return pl.DataFrame(rows, schema=_ESTIMATE_SCHEMA)
+
+
+_ESTIMATE_SCHEMA = {
+    **dict.fromkeys(("run", "suite", "layer"), pl.String),
+    **dict.fromkeys(("block", "num_tasks", "num_episodes"), pl.Int64),
+    "quantity": pl.String,
+    **dict.fromkeys(("value", "low", "high", "uniform_ratio"), pl.Float64),
+    **dict.fromkeys(("episodes_without_ratio", "num_nonfinite"), pl.Int64),
+}
 
 
 def _tasks(part: pl.DataFrame) -> NDArray[np.int64]:

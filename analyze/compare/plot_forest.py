@@ -11,7 +11,7 @@ import polars as pl
 
 from vla_attention.analyze.compare.comparison import LOG2_RATIO, Comparison
 from vla_attention.analyze.compare.text import overall_layer_of
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG
+from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, ratio_axis
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, NOTE_COLOR
@@ -54,10 +54,10 @@ def plot_forest(comparison: Comparison, folder: Path, layer: str | None = None, 
     note = f"n counts episodes (pairs where runs are paired). Bars: {level:.0%} bootstrap intervals over tasks and episodes."
     if not comparison.differences["paired"].all():
         note += " Not every run is paired with the first one: those differences hold differences between scenes."
-    if rows[f"{shown}_low"].null_count():
+    if rows["low"].null_count():
         note += " No bar where fewer than two episodes take part."
     title(figure, f"Runs side by side: {named(comparison.grouping)}, {which}", note)
-    if rows[shown].null_count() == rows.height:
+    if rows["value"].null_count() == rows.height:
         explain(figure.subplots(), "No run has an episode with a finite ratio.")
         return save_figure(figure, folder, STEM, rows)
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=[3, 2])
@@ -74,9 +74,9 @@ def plot_forest(comparison: Comparison, folder: Path, layer: str | None = None, 
 
 def _rows(comparison: Comparison, layer: str, quantity: str, shown: str) -> pl.DataFrame:
     """One row per (suite, run), suites together, with the estimate and the difference to the first run in that suite."""
-    columns = ["suite", "run", "num_tasks", "num_episodes", shown, f"{shown}_low", f"{shown}_high"]
+    columns = ["suite", "run", "num_tasks", "num_episodes", "quantity", "value", "low", "high"]
     columns += ["uniform_ratio"] if shown == "ratio" else []
-    estimates = comparison.estimates.filter(pl.col("layer") == layer).select(columns)
+    estimates = comparison.estimates.filter(pl.col("layer") == layer, pl.col("quantity") == shown).select(columns)
     of_quantity = comparison.differences.filter(pl.col("layer") == layer, pl.col("quantity") == quantity)
     several = (of_quantity["scope"] == "suite").any()
     differences = of_quantity.filter(pl.col("scope") == ("suite" if several else "all")).select(
@@ -118,7 +118,7 @@ def _estimates_panel(
     axes: Axes, rows: pl.DataFrame, places: Sequence[float], comparison: Comparison, shown: str
 ) -> None:
     is_ratio = shown == "ratio"
-    columns = [shown, f"{shown}_low", f"{shown}_high"] + (["uniform_ratio"] if is_ratio else [])
+    columns = ["value", "low", "high"] + (["uniform_ratio"] if is_ratio else [])
     values = np.concatenate([rows[name].drop_nulls().to_numpy() for name in columns])
     if is_ratio:
         ratio_axis(axes.xaxis, values)
@@ -135,9 +135,9 @@ def _estimates_panel(
         _estimate(
             axes,
             place,
-            row[shown],
-            row[f"{shown}_low"],
-            row[f"{shown}_high"],
+            row["value"],
+            row["low"],
+            row["high"],
             run_style(comparison.names.index(row["run"])),
         )
         if is_ratio and row["uniform_ratio"] is not None:
@@ -170,11 +170,13 @@ def _differences_panel(
     from matplotlib.ticker import MaxNLocator
 
     is_ratio = quantity == LOG2_RATIO
-    scale = (lambda value: None if value is None else 2.0**value) if is_ratio else (lambda value: value)
+
+    def scale(value: float | None) -> float | None:
+        return 2.0**value if is_ratio and value is not None else value
+
     names = ("difference", "difference_low", "difference_high")
-    values = np.array(
-        [scale(value) for name in names for value in rows[name].drop_nulls()] + [1.0 if is_ratio else 0.0]
-    )
+    known = np.concatenate([rows[name].drop_nulls().to_numpy() for name in names])
+    values = np.append(2.0**known if is_ratio else known, 1.0 if is_ratio else 0.0)
     if is_ratio:
         factor_axis(axes.xaxis, values)
         axes.set_xlabel(f"ratio, as a factor of {wrapped(comparison.names[0], 20, 1)} (logarithmic)")

@@ -12,7 +12,7 @@ import polars as pl
 from vla_attention.analyze.compare.comparison import LOG2_RATIO, Comparison
 from vla_attention.analyze.compare.plot_forest import factor_axis
 from vla_attention.analyze.compare.text import overall_layer_of
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG
+from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.show.plot_colours import DATA_COLOR, NOTE_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
@@ -39,7 +39,7 @@ def plot_paired_differences(
     quantity = comparison.quantities[0]
     of_run = (pl.col("run") == name, pl.col("layer") == layer)
     rows = comparison.differences.filter(*of_run, pl.col("quantity") == quantity, pl.col("scope") != "suite")
-    pairs = comparison.pairs.filter(*of_run)
+    pairs = comparison.pairs.filter(*of_run, pl.col("quantity") == quantity)
     tasks = rows.filter(pl.col("scope") == "task")
     few = tasks.height <= _MANY
     figure = new_figure(9, 1.7 + (0.42 if few else 0.2) * (rows.height + 0.5))
@@ -58,7 +58,7 @@ def plot_paired_differences(
         explain(axes, "The runs have no task in common.")
         return save_figure(figure, folder, stem_of(name), rows)
     is_ratio = quantity == LOG2_RATIO
-    dots = pairs[f"{quantity}_difference"].drop_nulls().to_numpy()
+    dots = pairs["difference"].drop_nulls().to_numpy()
     values = np.concatenate([rows[column].drop_nulls().to_numpy() for column in ("difference", "low", "high")] + [dots])
     values = values[np.isfinite(values)]
     if not values.size:
@@ -88,7 +88,13 @@ def plot_paired_differences(
 
 
 def _draw_row(
-    axes: Axes, place: int, row: dict, pairs: pl.DataFrame, quantity: str, generator: np.random.Generator, few: bool
+    axes: Axes,
+    place: int,
+    row: dict[str, Any],
+    pairs: pl.DataFrame,
+    quantity: str,
+    generator: np.random.Generator,
+    few: bool,
 ) -> None:
     def scaled(values: Any) -> Any:
         return 2.0**values if quantity == LOG2_RATIO else values
@@ -98,7 +104,7 @@ def _draw_row(
         axes.axhspan(place - 0.5, place + 0.5, color="#F0F0F0", linewidth=0, zorder=0)
     else:
         own = pairs.filter((pl.col("suite") == row["suite"]) & (pl.col("task_id") == row["task_id"]))
-        values = own[f"{quantity}_difference"].drop_nulls().to_numpy()
+        values = own["difference"].drop_nulls().to_numpy()
         values = values[np.isfinite(values)]
         jitter = generator.uniform(-0.22, 0.22, len(values)) if len(values) > 1 else np.zeros(len(values))
         axes.scatter(
@@ -126,7 +132,7 @@ def _draw_row(
     axes.text(1.01, place, n, transform=axes.get_yaxis_transform(), va="center", size=7, color=NOTE_COLOR)
 
 
-def _label(row: dict, several: bool, few: bool) -> str:
+def _label(row: dict[str, Any], several: bool, few: bool) -> str:
     if row["scope"] == "all":
         return "all tasks"
     number = f"{row['suite']} {row['task_id']}" if several else str(row["task_id"])

@@ -9,7 +9,7 @@ import polars as pl
 
 from vla_attention.analyze.compare.comparison import LOG2_RATIO, SUCCESS, Comparison
 from vla_attention.analyze.compare.runs import Run
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG
+from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.show.numbers import format_interval, format_number
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.schemas.errors import listing
@@ -58,25 +58,28 @@ def _header(comparison: Comparison, runs: Sequence[Run], layer: str) -> str:
 
 
 def _estimates_section(comparison: Comparison, layer: str) -> str:
-    rows = comparison.estimates.filter(pl.col("layer") == layer)
+    parts = comparison.estimates.filter(pl.col("layer") == layer).partition_by("run", "suite", maintain_order=True)
+    estimates = [{row["quantity"]: row for row in part.iter_rows(named=True)} for part in parts]
     ratio = LOG2_RATIO in comparison.quantities
     header = ["run", "suite", "episodes", "success"] + (["ratio", "interval", "uniform", "lift"] if ratio else [])
     fractions = [name for name in comparison.quantities if name.endswith("_fraction")][: 2 if ratio else 5]
     header += [name.removesuffix("_fraction")[:14] for name in fractions]
     body = []
-    for row in rows.iter_rows(named=True):
-        cells = [row["run"][:24], row["suite"][:16], str(row["num_episodes"]), f"{100 * row[SUCCESS]:.0f}%"]
+    for of in estimates:
+        row = of[SUCCESS]
+        cells = [row["run"][:24], row["suite"][:16], str(row["num_episodes"]), f"{100 * row['value']:.0f}%"]
         if ratio:
-            cells += [format_number(row["ratio"]), format_interval(row["ratio_low"], row["ratio_high"])]
-            cells += [format_number(row["uniform_ratio"]), format_number(row["ratio_lift"])]
-        body.append(cells + [_percent(row[name]) for name in fractions])
+            row = of["ratio"]
+            cells += [format_number(row["value"]), format_interval(row["low"], row["high"])]
+            cells += [format_number(row["uniform_ratio"]), format_number(of["ratio_lift"]["value"])]
+        body.append(cells + [_percent(of[name]["value"]) for name in fractions])
     note = (
         "ratio: geometric mean over episodes; uniform: what uniform attention gives; lift: ratio / uniform."
         if ratio
         else ""
     )
     lines = [_title("EACH RUN"), text_table(header, body, left=(0, 1)), *_wrapped(note, "")]
-    for row in rows.iter_rows(named=True) if ratio else ():
+    for row in (of["ratio"] for of in estimates) if ratio else ():
         if row["num_nonfinite"] or row["episodes_without_ratio"]:
             lines += _wrapped(
                 f"{row['run']}, {row['suite']}: {row['num_nonfinite']} replans have no finite ratio and are in no ratio; "

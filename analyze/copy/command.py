@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vla_attention.analyze.show.numbers import format_bytes, format_percent, plural
-from vla_attention.schemas.command_line import command_parser
+from vla_attention.analyze.show.numbers import format_percent, plural
+from vla_attention.schemas.command_line import command_parser, format_bytes
 
 if TYPE_CHECKING:
     from vla_attention.schemas.stores.reader import Store

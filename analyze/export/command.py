@@ -5,13 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vla_attention.analyze.arguments import (
-    add_grouping,
-    add_selection,
-    add_stores,
-    output_folder,
-    settings_of,
-)
+from vla_attention.analyze.arguments import add_grouping, add_selection, add_stores, output_folder, settings_of
 from vla_attention.analyze.show.output_files import report_files
 from vla_attention.schemas.command_line import command_parser
 from vla_attention.schemas.errors import BadArgument

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,14 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
-from vla_attention.analyze.measures.steps import episode_masses
-from vla_attention.analyze.show.numbers import format_bytes
+from vla_attention.analyze.measures.steps import measure_episodes
 from vla_attention.analyze.show.output_files import replacing, writing
-from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.analyze.stores.rows import layer_rows
+from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, MissingDependency
-from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 from vla_attention.schemas.layout import Role, SiteLayout
 from vla_attention.schemas.precision import mass_error_bound
 
@@ -80,22 +77,11 @@ def masses_array(question: Question, progress: Callable[[int], object] | None = 
         MissingDependency: xarray is not installed.
     """
     xr = _needed("xarray")
-    selection = replace(question.selection, per_head=True)
-    resolved = resolve_all(question.grouping, question.selected, question.vocabulary)
-
-    def measure(pair: tuple[SelectedEpisode, ResolvedGrouping]) -> tuple[NDArray[Any], ...]:
-        mass, row_sum = episode_masses(*pair, selection, question.site)
-        keys, valid = pair[1].num_keys, pair[1].num_valid
-        # The last mass is that of all valid keys.
-        return (
-            mass[..., :-1],
-            row_sum,
-            np.broadcast_to(keys, (len(mass), keys.shape[1])),
-            np.broadcast_to(valid, len(mass)),
-        )
-
-    parts = map_episodes(measure, list(zip(question.selected, resolved, strict=True)), progress)
-    mass, row_sum, keys, valid = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    measured = measure_episodes(question, progress=progress, per_head=True)
+    mass = np.concatenate([one.mass for one in measured])
+    row_sum = np.concatenate([one.row_sum for one in measured])
+    keys = np.concatenate([np.broadcast_to(one.num_keys, (len(one.mass), one.num_keys.shape[1])) for one in measured])
+    valid = np.concatenate([np.broadcast_to(one.num_valid, len(one.mass)) for one in measured])
     cells = _MASS_DIMENSIONS[:-1]
     dataset: xarray.Dataset = xr.Dataset(
         {

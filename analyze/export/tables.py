@@ -7,6 +7,7 @@ from pathlib import Path
 
 import polars as pl
 
+from vla_attention.analyze.measures.frames import Tables, named_tables
 from vla_attention.analyze.ratios.analysis import Analysis
 from vla_attention.analyze.show.output_files import write_csv, write_parquet
 from vla_attention.schemas.errors import BadArgument
@@ -23,20 +24,20 @@ DEFAULT_TABLES = ("episodes", "tasks", "steps")
 
 
 def chosen_tables(analysis: Analysis, names: Sequence[str]) -> dict[str, pl.DataFrame]:
-    """Tables of an analysis by name.
+    """Tables of an analysis by the names of their files; steps, replans, episodes and tasks are two each, NAME and NAME_groups.
 
     Raises:
         BadArgument: contributions are wanted and were not recorded.
     """
     tables: dict[str, pl.DataFrame] = {}
     for name in names:
-        table: pl.DataFrame | None = getattr(analysis, name)
+        table: Tables | pl.DataFrame | None = getattr(analysis, name)
         if table is None:
             raise BadArgument(
                 "These stores hold no contributions, so that there is no such table; record them with vla-capture "
                 "--contributions, or choose other tables."
             )
-        tables[name] = table
+        tables |= named_tables(name, table) if isinstance(table, Tables) else {name: table}
     return tables
 
 

@@ -74,10 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     question = ask([open_store(path) for path in arguments.stores], settings_of(arguments))
     study = study_heads(question, options)
     folder = output_folder(arguments, "heads")
-    tables = {"heads": study.heads, "dispersion": study.dispersion, "depth": study.depth, "denoise": study.denoise}
-    if study.rows is not None and study.sinks is not None:
-        tables |= {"row_metrics": study.rows, "sinks": study.sinks}
-    files = write_parquet(folder, **tables)
+    files = write_parquet(folder, **study.tables())
     print(heads_text(study, arguments.top))
     if not arguments.no_plots:
         from vla_attention.analyze.heads.plot_denoise_profile import plot_denoise_profile

@@ -1,32 +1,34 @@
-"""Over the denoising of one replan: everything that is said of all denoise steps, for each of them alone."""
+"""Denoise steps: the numbers of every denoise step alone."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import (
-    add_layers_avg,
-    episodes_table,
-    overall_layer,
-    overall_rows,
-    per_replan,
-    tasks_table,
-)
+from vla_attention.analyze.measures.aggregate import measured_episode_tables, overall_layer, overall_rows, task_tables
+from vla_attention.analyze.measures.frames import Tables, concat_tables
+from vla_attention.analyze.measures.steps import MeasuredEpisode
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_SEED
 from vla_attention.schemas.groupings.grouping import Grouping
 
 
-def denoise_table(steps: pl.DataFrame, grouping: Grouping, seed: int = DEFAULT_SEED) -> pl.DataFrame:
-    """One row per denoise step, in the order of the steps: `denoise_step`, `denoise_time`, and the columns of `tasks_table`.
+def denoise_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping, seed: int = DEFAULT_SEED) -> Tables:
+    """Every denoise step: what the whole analysis gives over all tasks and layers when only this step is selected.
 
-    Each row is what the whole analysis would say of all tasks, all layers together, had only this step been selected.
+    Returns:
+        `denoise_step`, `denoise_time` (mean over episodes) and the columns of `aggregate.task_tables`, in the order of the steps.
     """
-    rows = []
-    for step in steps["denoise_step"].unique().sort():
-        part = steps.filter(pl.col("denoise_step") == step)
-        episodes = episodes_table(add_layers_avg(per_replan(part, grouping), grouping), grouping)
-        of_whole = tasks_table(episodes.filter(pl.col("layer") == overall_layer(episodes)), grouping, seed=seed)
-        time = pl.lit(part["denoise_time"].mean(), dtype=pl.Float64).alias("denoise_time")
-        number = pl.lit(step, dtype=pl.Int64).alias("denoise_step")
-        rows.append(overall_rows(of_whole).select(number, time, pl.all()))
-    return pl.concat(rows)
+    selection = measured[0].selection
+    parts = []
+    for position in np.argsort(selection.denoise_steps, kind="stable").tolist():
+        episodes = measured_episode_tables([one.at_denoise(position) for one in measured], grouping)
+        layer = overall_layer(episodes.cells)
+        whole = overall_rows(task_tables(episodes.filter(pl.col("layer") == layer), grouping, seed=seed))
+        times = [one.item.episode.read("denoise_time")[selection.denoise[position]] for one in measured]
+        time = pl.lit(float(np.mean(times)), dtype=pl.Float64).alias("denoise_time")
+        number = pl.lit(selection.denoise_steps[position], dtype=pl.Int64).alias("denoise_step")
+        cells, groups = (table.select(number, time, pl.all()) for table in (whole.cells, whole.groups))
+        parts.append(Tables(cells, groups))
+    return concat_tables(parts)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import polars as pl
 from numpy.typing import ArrayLike, NDArray
 
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG
-from vla_attention.analyze.measures.group_contributions import group_contribution_table
+from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
+from vla_attention.analyze.measures.group_contributions import group_contribution_tables
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_SEED, NO_LIMITS
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
-from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 
 
@@ -32,12 +31,11 @@ def depth_centre(amounts: ArrayLike, blocks: ArrayLike) -> NDArray[np.float64]:
     """
     amount, block = np.asarray(amounts, dtype=np.float64), np.asarray(blocks, dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return (amount * block).sum(axis=-1) / amount.sum(axis=-1)
+        centre: NDArray[np.float64] = (amount * block).sum(axis=-1) / amount.sum(axis=-1)
+    return centre
 
 
-def depth_table(
-    episodes: pl.DataFrame, grouping: Grouping, norms: pl.DataFrame | None = None, seed: int = DEFAULT_SEED
-) -> pl.DataFrame:
+def depth_table(episodes: Tables, norms: pl.DataFrame | None = None, seed: int = DEFAULT_SEED) -> pl.DataFrame:
     """One row per group that has any amount: the mean over episodes of its centre, with a two-level interval (95 %).
 
     Columns: group; of: "mass", or "contribution" (the norm of what the group's keys add to the residual stream; norms grow with
@@ -46,21 +44,14 @@ def depth_table(
     first_block, last_block, num_layers: the layers that it is a centre over.
 
     Args:
-        episodes: `aggregate.episodes_table`. A block that was named by two layer numbers counts once.
-        grouping: the groups.
-        norms: suite, task_id, episode_index, block and per group `{g}_norm` (see `contribution_norms`), where there are any.
+        episodes: `aggregate.episode_tables`. A block that was named by two layer numbers counts once.
+        norms: suite, task_id, episode_index, block, group, norm (see `contribution_norms`), where there are any.
         seed: of the bootstrap.
     """
-    single = episodes.filter(pl.col("layer") != LAYERS_AVG)
-    parts = [_centres(single, {name: f"{name}_mass" for name in grouping.names}, "mass")]
+    single = episodes.groups.filter(pl.col("layer") != LAYERS_AVG)
+    parts = [_centres(single, "mass", "mass")]
     if norms is not None:
-        parts.append(
-            _centres(
-                norms,
-                {name: f"{name}_norm" for name in grouping.names if f"{name}_norm" in norms.columns},
-                "contribution",
-            )
-        )
+        parts.append(_centres(norms, "norm", "contribution"))
     blocks = single["block"].unique().sort()
     # A single layer leaves a centre no room, and no interval could be widened inside of that.
     limits = (float(blocks[0]), float(blocks[-1])) if len(blocks) > 1 else NO_LIMITS
@@ -73,15 +64,14 @@ def depth_table(
     )
 
 
-def _centres(table: pl.DataFrame, columns: Mapping[str, str], of: str) -> pl.DataFrame:
-    """One row per (group, episode) with its centre, from one row per (episode, block)."""
-    keys = ("suite", "task_id", "episode_index")
-    once = table.unique([*keys, "block"], keep="first", maintain_order=True).sort(*keys, "block")
-    episodes = once.select(keys).unique(maintain_order=True)
+def _centres(table: pl.DataFrame, column: str, of: str) -> pl.DataFrame:
+    """One row per (group, episode) with its centre, from one row per (episode, block, group)."""
+    once = table.unique([*EPISODE_ID, "block", "group"], keep="first", maintain_order=True).sort(*EPISODE_ID, "block")
+    episodes = once.select(EPISODE_ID).unique(maintain_order=True)
     blocks = once["block"].unique().sort().to_numpy()
     rows = []
-    for name, column in columns.items():
-        amounts = once[column].fill_null(0.0).to_numpy().reshape(episodes.height, len(blocks))
+    for (name,), part in once.partition_by("group", as_dict=True, maintain_order=True).items():
+        amounts = part[column].fill_null(0.0).to_numpy().reshape(episodes.height, len(blocks))
         rows.append(
             episodes.select(
                 pl.all(),
@@ -94,9 +84,8 @@ def _centres(table: pl.DataFrame, columns: Mapping[str, str], of: str) -> pl.Dat
 
 
 def contribution_norms(question: Question, resolved: Sequence[ResolvedGrouping]) -> pl.DataFrame | None:
-    """`group_contributions.group_contribution_table`, mean over replans and denoise steps: one row per (episode, block)."""
-    table = group_contribution_table(question, resolved)
-    if table is None:
+    """Mean over replans and denoise steps of `group_contribution_tables`: one row per (episode, block, group)."""
+    tables = group_contribution_tables(question, resolved)
+    if tables is None:
         return None
-    norms = [f"{name}_norm" for name in question.grouping.names if f"{name}_norm" in table.columns]
-    return table.group_by("suite", "task_id", "episode_index", "block", maintain_order=True).agg(pl.col(norms).mean())
+    return tables.groups.group_by(*EPISODE_ID, "block", "group", maintain_order=True).agg(pl.col("norm").mean())

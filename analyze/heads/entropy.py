@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.analyze.measures.masses import weighted_sums
+
 _SMALLEST = np.finfo(np.float32).tiny
 
 
@@ -34,7 +36,7 @@ def entropies(rows: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArra
     surprise = np.maximum(rows, _SMALLEST)
     np.log(surprise, out=surprise)
     surprise *= rows
-    total, inner = _sums(rows, weights), _sums(surprise, weights)
+    total, inner = weighted_sums(rows, weights), weighted_sums(surprise, weights)
     with np.errstate(divide="ignore", invalid="ignore"):
         entropy = np.where(total > 0, np.log(total) - inner / total, np.nan)
     # float32 leaves some 1e-7 below zero where a single key has it all; fractions of keys may really be below zero.
@@ -44,7 +46,8 @@ def entropies(rows: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArra
 
 def effective_keys(entropy: NDArray[np.floating]) -> NDArray[np.floating]:
     """exp(H): the number of keys that, sharing evenly, would have the same entropy (the perplexity). Any shape."""
-    return np.exp(entropy)
+    keys: NDArray[np.floating] = np.exp(entropy)
+    return keys
 
 
 def top_mass(rows: NDArray[np.float32], valid: NDArray[np.bool_], counts: Sequence[int]) -> NDArray[np.float32]:
@@ -68,10 +71,3 @@ def top_mass(rows: NDArray[np.float32], valid: NDArray[np.bool_], counts: Sequen
     with np.errstate(invalid="ignore"):
         share = np.where(total > 0, held / total, np.nan)
     return np.minimum(share, 1.0).astype(np.float32)
-
-
-def _sums(values: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Weighted sums over keys: (replan, ..., key) and (replan or 1, key, group) give (replan, ..., group)."""
-    flat = values.reshape(len(values), -1, values.shape[-1])
-    product = flat.reshape(-1, flat.shape[-1]) @ weights[0] if len(weights) == 1 else np.matmul(flat, weights)
-    return product.reshape(*values.shape[:-1], weights.shape[2])

@@ -8,54 +8,50 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.masses import finite_mean, ratio
-from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.measures.frames import EPISODE_ID, Tables, head_axis, layer_axis, long_table
+from vla_attention.analyze.measures.masses import finite_mean, group_measures, ratio, sides, uniform_ratio
+from vla_attention.analyze.measures.steps import MeasuredEpisode
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_SEED, NO_LIMITS, POSITIVE, SHARE
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
-from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.groupings.grouping import Grouping
 
+_HEAD = ("layer", "block", "head")
 
-def head_values(
-    mass: NDArray[np.float64], num_keys: NDArray[np.float64], num_valid: NDArray[np.int64], grouping: Grouping
-) -> dict[str, NDArray[Any]]:
-    """Reduce one episode's masses over replans; the formulas are those of `vla_attention.analyze.measures.aggregate`, for each head alone.
+
+def episode_heads(measured: MeasuredEpisode, grouping: Grouping) -> Tables:
+    """Every (layer, head) of one episode: means over replans of measures of the masses, which are averaged over denoise steps.
 
     Args:
-        mass: (replan, layer, head, group + 1), the last that of all valid keys; mean over denoise steps.
-        num_keys: (replan or 1, group).
-        num_valid: (replan or 1,).
+        measured: the episode with heads kept apart.
         grouping: the groups, and the ratio if it has one.
 
     Returns:
-        Values of shape (layer, head) by name; NaN is undefined. With groups g `{g}_fraction` and `{g}_lift`, means over replans.
-        With a ratio also `numerator_fraction`, `denominator_fraction`, `numerator_mass` and `denominator_mass`; `log2_ratio`
-        and `log2_lift` (over the uniform ratio), means over the replans where they are finite; and `num_nonfinite`, the number of
-        replans whose ratio is infinite, undefined or 0.
+        cells: suite, task_id, episode_index, layer, block, head; with a ratio `numerator_fraction`, `denominator_fraction`,
+            `numerator_mass` and `denominator_mass`; `log2_ratio` and `log2_lift` (over the uniform ratio), means over the replans where
+            they are finite; and `num_nonfinite`, the number of replans whose ratio is infinite, undefined or 0.
+        groups: the same names, group, fraction and lift (see `masses.group_measures`).
     """
-    groups, valid = mass[..., :-1], mass[..., -1]
-    keys = num_keys[:, None, None, :]
-    total = groups.sum(axis=-1)
-    values: dict[str, NDArray[Any]] = {}
-    with np.errstate(divide="ignore", invalid="ignore"):
-        uniform_density = valid / num_valid[:, None, None]
-        for i, name in enumerate(grouping.names):
-            lift = np.where(keys[..., i] > 0, groups[..., i] / keys[..., i] / uniform_density, np.nan)
-            values[f"{name}_fraction"] = finite_mean(groups[..., i] / total)
-            values[f"{name}_lift"] = finite_mean(lift)
-        if grouping.ratio is not None:
-            top = [grouping.names.index(name) for name in grouping.ratio.numerator]
-            bottom = [grouping.names.index(name) for name in grouping.ratio.denominator]
-            above, below = groups[..., top].sum(axis=-1), groups[..., bottom].sum(axis=-1)
+    mass, valid_mass = measured.mass.mean(axis=2), measured.valid_mass.mean(axis=2)
+    measures = group_measures(mass, valid_mass, measured.num_keys, measured.num_valid)
+    cells: dict[str, NDArray[Any]] = {}
+    if grouping.ratio is not None:
+        above, below = sides(mass, grouping)
+        total = mass.sum(axis=-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
             log2 = np.log2(ratio(above, below))
-            uniform = np.log2(ratio(num_keys[:, top].sum(axis=1), num_keys[:, bottom].sum(axis=1)))
-            values["numerator_fraction"] = finite_mean(above / total)
-            values["denominator_fraction"] = finite_mean(below / total)
-            values["log2_ratio"] = finite_mean(log2)
-            values["log2_lift"] = finite_mean(log2 - uniform[:, None, None])
-            values["numerator_mass"], values["denominator_mass"] = above.mean(axis=0), below.mean(axis=0)
-            values["num_nonfinite"] = (~np.isfinite(log2)).sum(axis=0)
-    return values
+            uniform = np.log2(uniform_ratio(measured.num_keys, grouping))
+            cells["numerator_fraction"] = finite_mean(above / total)
+            cells["denominator_fraction"] = finite_mean(below / total)
+            cells["log2_ratio"] = finite_mean(log2)
+            cells["log2_lift"] = finite_mean(log2 - uniform[:, None, None])
+        cells["numerator_mass"], cells["denominator_mass"] = above.mean(axis=0), below.mean(axis=0)
+        cells["num_nonfinite"] = (~np.isfinite(log2)).sum(axis=0)
+    groups = {"fraction": finite_mean(measures.fraction), "lift": finite_mean(measures.lift)}
+    axes = [layer_axis(measured.selection), head_axis(measured.selection)]
+    return Tables(
+        long_table(measured.item, axes, cells),
+        long_table(measured.item, [*axes, {"group": grouping.names}], groups),
+    )
 
 
 def dispersion(values: NDArray[np.float64], axis: int = -1) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -73,84 +69,75 @@ def dispersion(values: NDArray[np.float64], axis: int = -1) -> tuple[NDArray[np.
         return std, np.where(mean != 0, std / mean, np.nan)
 
 
-def head_frame(item: SelectedEpisode, selection: Selection, values: dict[str, NDArray[Any]]) -> pl.DataFrame:
-    """One episode's `head_values` as rows: suite, task_id, episode_index, layer, block, head and the values."""
-    layers, heads = len(selection.layers), len(selection.heads)
-    columns: dict[str, NDArray[Any]] = {
-        "layer": np.repeat(np.array(selection.layer_labels, dtype=np.int64), heads),
-        "block": np.repeat(np.array(selection.blocks, dtype=np.int64), heads),
-        "head": np.tile(np.array(selection.head_numbers, dtype=np.int64), layers),
-        **{name: value.ravel() for name, value in values.items()},
-    }
-    attributes = item.episode.attributes
-    return pl.DataFrame(columns).select(
-        pl.lit(item.store.suite).alias("suite"),
-        pl.lit(attributes.task_id, dtype=pl.Int64).alias("task_id"),
-        pl.lit(attributes.episode_index, dtype=pl.Int64).alias("episode_index"),
-        pl.all().fill_nan(None),
-    )
+def heads_tables(episodes: Tables, grouping: Grouping, seed: int = DEFAULT_SEED) -> Tables:
+    """Every (layer, head), from `episode_heads` of all episodes: means over episodes with two-level intervals.
 
+    X_low and X_high bound X, and X_episodes says how many episodes have a finite value.
 
-def heads_table(episodes: pl.DataFrame, grouping: Grouping, seed: int = DEFAULT_SEED) -> pl.DataFrame:
-    """One row per (layer, head), from `head_frame` of all episodes: means over episodes with two-level intervals (95 %).
-
-    Columns: layer, block, head, num_episodes, num_tasks; bounded by X_low and X_high, with X_episodes saying how many episodes have
-    a finite value: `{g}_fraction`, `{g}_lift`, and with a ratio `numerator_fraction`, `log2_ratio` (two to its power is
-    the geometric mean that `tasks_table` has) and `log2_lift`; without bounds, with a ratio, `denominator_fraction`, `ratio_of_means`
-    (mean numerator mass / mean denominator mass) and `num_nonfinite`, the number of (episode, replan) left out of the logarithms.
+    Returns:
+        cells: layer, block, head, num_episodes, num_tasks; with a ratio, bounded, `numerator_fraction`, `log2_ratio` (two to its
+            power is the geometric mean that `task_tables` has) and `log2_lift`; without bounds `denominator_fraction`,
+            `ratio_of_means` (mean numerator mass / mean denominator mass) and `num_nonfinite`, the number of (episode, replan) left
+            out of the logarithms.
+        groups: layer, block, head, group, num_episodes, num_tasks; bounded, `fraction` and `lift`.
     """
-    bounded = {f"{name}_fraction": SHARE for name in grouping.names}
-    bounded |= {f"{name}_lift": POSITIVE for name in grouping.names}
-    plain: list[pl.Expr] = []
-    if grouping.ratio is not None:
-        bounded = {"log2_ratio": NO_LIMITS, "log2_lift": NO_LIMITS, "numerator_fraction": SHARE, **bounded}
-        above, below = pl.col("numerator_mass").mean(), pl.col("denominator_mass").mean()
-        plain = [
-            pl.col("denominator_fraction").mean(),
-            (above / below).fill_nan(None).alias("ratio_of_means"),
-            pl.col("num_nonfinite").sum(),
-        ]
-    by = ("layer", "block", "head")
-    ordered = episodes.sort("suite", "task_id", "episode_index", maintain_order=True)
-    means = means_with_intervals(ordered, by, bounded, seed)
-    if not plain:
-        return means
-    return means.join(ordered.group_by(by).agg(*plain), on=by, how="left", maintain_order="left")
+    ordered = Tables(
+        episodes.cells.sort(*EPISODE_ID, maintain_order=True), episodes.groups.sort(*EPISODE_ID, maintain_order=True)
+    )
+    groups = means_with_intervals(ordered.groups, (*_HEAD, "group"), {"fraction": SHARE, "lift": POSITIVE}, seed)
+    if grouping.ratio is None:
+        return Tables(groups.select(*_HEAD, "num_episodes", "num_tasks").unique(_HEAD, maintain_order=True), groups)
+    bounded = {"log2_ratio": NO_LIMITS, "log2_lift": NO_LIMITS, "numerator_fraction": SHARE}
+    above, below = pl.col("numerator_mass").mean(), pl.col("denominator_mass").mean()
+    plain = ordered.cells.group_by(_HEAD).agg(
+        pl.col("denominator_fraction").mean(),
+        (above / below).fill_nan(None).alias("ratio_of_means"),
+        pl.col("num_nonfinite").sum(),
+    )
+    means = means_with_intervals(ordered.cells, _HEAD, bounded, seed)
+    return Tables(means.join(plain, on=_HEAD, how="left", maintain_order="left"), groups)
 
 
-def dispersion_table(episodes: pl.DataFrame, grouping: Grouping, seed: int = DEFAULT_SEED) -> pl.DataFrame:
-    """How much the heads of a layer differ, one row per layer, from `head_frame` of all episodes.
+def dispersion_table(episodes: Tables, grouping: Grouping, seed: int = DEFAULT_SEED) -> pl.DataFrame:
+    """How much the heads of a layer differ, one row per layer, from `episode_heads` of all episodes.
 
-    Means over episodes with two-level intervals (95 %): `fraction_std` and `fraction_cv`, standard deviation and coefficient of
+    Means over episodes with two-level intervals: `fraction_std` and `fraction_cv`, standard deviation and coefficient of
     variation over heads of the numerator's fraction (without a ratio: of `main_group`'s); with a ratio `log2_ratio_std`, over the
     heads with a finite one. Further columns: layer, block, num_heads, num_episodes, num_tasks. Null with a single head.
     """
-    share = "numerator_fraction" if grouping.ratio is not None else f"{main_group(episodes, grouping)}_fraction"
-    names = [share, *(["log2_ratio"] if grouping.ratio is not None else [])]
-    by = ("suite", "task_id", "episode_index", "layer", "block")
+    cells = episodes.cells
+    if grouping.ratio is None:
+        cells = cells.with_columns(
+            episodes.of_group(main_group(episodes, grouping))["fraction"].alias("numerator_fraction")
+        )
+    measured = {"fraction": "numerator_fraction"} | ({"log2_ratio": "log2_ratio"} if grouping.ratio else {})
+    by = (*EPISODE_ID, "layer", "block")
     rows = []
-    for key, part in episodes.group_by(by, maintain_order=True):
+    for key, part in cells.group_by(by, maintain_order=True):
         row = dict(zip(by, key, strict=True)) | {"num_heads": part.height}
-        for name, column in zip(("fraction", "log2_ratio"), names, strict=False):
+        for name, column in measured.items():
             std, cv = dispersion(part[column].fill_null(float("nan")).to_numpy())
             row |= {f"{name}_std": float(std), f"{name}_cv": float(cv)}
         rows.append(row)
-    table = pl.DataFrame(rows).sort("suite", "task_id", "episode_index", maintain_order=True)
+    table = pl.DataFrame(rows).sort(*EPISODE_ID, maintain_order=True)
     values = {"fraction_std": POSITIVE, "fraction_cv": POSITIVE}
     values |= {"log2_ratio_std": POSITIVE} if grouping.ratio is not None else {}
     return means_with_intervals(table, ("layer", "block", "num_heads"), values, seed)
 
 
-def ranked_heads(heads: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
-    """The rows of `heads_table` from the most to the least on the numerator (without a ratio: on the first group that has mass).
+def ranked_heads(heads: Tables, grouping: Grouping) -> pl.DataFrame:
+    """The cells of `heads_tables` from the most to the least on the numerator (without a ratio: on `main_group`).
 
     By `log2_lift`, which is comparable where the numbers of keys differ, or the group's fraction. A head whose ratio is infinite at
     every replan comes first, one whose ratio is always 0 last; heads without any mass on either side are left out. A block
     that was named by two layer numbers is listed once.
     """
-    once = heads.unique(["block", "head"], keep="first", maintain_order=True)
+    cells = heads.cells
     if grouping.ratio is None:
-        return once.sort(f"{main_group(heads, grouping)}_fraction", "block", "head", descending=[True, False, False])
+        fraction = heads.of_group(main_group(heads, grouping))["fraction"]
+        once = cells.with_columns(fraction.alias("_order")).unique(["block", "head"], keep="first", maintain_order=True)
+        return once.sort("_order", "block", "head", descending=[True, False, False]).drop("_order")
+    once = cells.unique(["block", "head"], keep="first", maintain_order=True)
     above, below = pl.col("numerator_fraction") > 0, pl.col("denominator_fraction") > 0
     limit = pl.when(above & ~below).then(float("inf")).when(below & ~above).then(float("-inf"))
     # Without a uniform baseline (a side without keys) the order is that of the ratio.
@@ -163,7 +150,7 @@ def ranked_heads(heads: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
     )
 
 
-def main_group(table: pl.DataFrame, grouping: Grouping) -> str:
-    """The group that speaks for a grouping without a ratio: the first that has any mass."""
-    having = [name for name in grouping.names if (table[f"{name}_fraction"].fill_null(0.0) > 0).any()]
-    return having[0] if having else grouping.names[0]
+def main_group(heads: Tables, grouping: Grouping) -> str:
+    """The group by which heads are compared when the grouping has no ratio: the first that has any mass."""
+    having = set(heads.groups.filter(pl.col("fraction") > 0)["group"])
+    return next((name for name in grouping.names if name in having), grouping.names[0])

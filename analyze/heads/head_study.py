@@ -6,24 +6,26 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import polars as pl
-import polars.selectors as cs
-from numpy.typing import NDArray
 
-from vla_attention.analyze.heads.denoise import denoise_table
+from vla_attention.analyze.heads.denoise import denoise_tables
 from vla_attention.analyze.heads.depth import contribution_norms, depth_table
-from vla_attention.analyze.heads.head_measures import dispersion_table, head_frame, head_values, heads_table
-from vla_attention.analyze.heads.row_metrics import RowOptions, groups_with_valid_keys, measure_all_rows, row_table
-from vla_attention.analyze.measures.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
+from vla_attention.analyze.heads.head_measures import dispersion_table, episode_heads, heads_tables
+from vla_attention.analyze.heads.row_metrics import RowOptions, groups_with_valid_keys, measure_all_rows, row_tables
+from vla_attention.analyze.measures.aggregate import measured_episode_tables, replan_tables, task_tables
+from vla_attention.analyze.measures.frames import Tables, concat_tables, named_tables
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
+from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.analyze.measures.sinks import key_shares_table, sinks_of
-from vla_attention.analyze.measures.steps import episode_masses, episode_steps, row_sums, segment_weights, with_valid
+from vla_attention.analyze.measures.steps import (
+    MeasuredEpisode,
+    measure_episode,
+    measured_from,
+    row_sums,
+    segment_weights,
+    with_valid,
+)
 from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.parallel import map_episodes
-from vla_attention.schemas.groupings.resolve import ResolvedGrouping
-
-#: Columns of the steps table that follow from the masses: all that comes after begins with masses again.
-_DERIVED = ("_fraction", "_density", "_lift", "log2_ratio")
 
 
 @dataclass(frozen=True)
@@ -33,28 +35,36 @@ class HeadStudy:
     Attributes:
         question: what was asked.
         options: how rows were measured; None when they were not read.
-        replans: `aggregate.add_layers_avg`, mean over heads.
-        tasks: `aggregate.tasks_table`, mean over heads.
-        heads: `heads.heads_table`.
-        dispersion: `heads.dispersion_table`.
+        replans: `aggregate.replan_tables`, mean over heads.
+        tasks: `aggregate.task_tables`, mean over heads.
+        heads: `head_measures.heads_tables`.
+        dispersion: `head_measures.dispersion_table`.
         depth: `depth.depth_table`.
-        denoise: `denoise.denoise_table`.
-        rows: `row_metrics.row_frame` of all episodes, or None.
+        denoise: `denoise.denoise_tables`.
+        rows: `row_metrics.row_tables`, or None.
         key_shares: `sinks.key_shares_table`, or None.
         sinks: `sinks.sinks_of`, or None.
     """
 
     question: Question
     options: RowOptions | None
-    replans: pl.DataFrame
-    tasks: pl.DataFrame
-    heads: pl.DataFrame
+    replans: Tables
+    tasks: Tables
+    heads: Tables
     dispersion: pl.DataFrame
     depth: pl.DataFrame
-    denoise: pl.DataFrame
-    rows: pl.DataFrame | None
+    denoise: Tables
+    rows: Tables | None
     key_shares: pl.DataFrame | None
     sinks: pl.DataFrame | None
+
+    def tables(self) -> dict[str, pl.DataFrame]:
+        """What is written to files, by the files' names."""
+        tables = named_tables("heads", self.heads) | {"dispersion": self.dispersion, "depth": self.depth}
+        tables |= named_tables("denoise", self.denoise)
+        if self.rows is not None and self.sinks is not None:
+            tables |= {**named_tables("row_metrics", self.rows), "sinks": self.sinks}
+        return tables
 
 
 def study_heads(question: Question, options: RowOptions | None = None) -> HeadStudy:
@@ -74,48 +84,35 @@ def study_heads(question: Question, options: RowOptions | None = None) -> HeadSt
         ]
         measures = measure_all_rows(question, resolved, options, shown, with_masses=any(cut))
 
-    def measure(i: int) -> tuple[pl.DataFrame, pl.DataFrame]:
-        mass = measures[i].mass if measures is not None and cut[i] else None
-        return _steps_and_heads(question, question.selected[i], resolved[i], mass)
+    def measure(i: int) -> MeasuredEpisode:
+        item, groups, apart = question.selected[i], resolved[i], replace(selection, per_head=True)
+        if measures is None or not cut[i]:
+            return measure_episode(item, groups, apart, question.site)
+        mass = measures[i].mass
+        assert mass is not None
+        return measured_from(item, groups, apart, mass.astype(np.float64), row_sums(item, apart, question.site))
 
     with progress_bar(len(resolved), "episodes") as advance:
-        parts = map_episodes(measure, range(len(resolved)), advance)
-    steps, episode_heads = (pl.concat([part[i] for part in parts]) for i in range(2))
-    # The largest tables one after the other: this one before that of the rows is made.
-    denoise = denoise_table(steps, grouping, seed)
-    replans = add_layers_avg(per_replan(steps, grouping), grouping)
-    del steps, parts
-    episodes = episodes_table(replans, grouping)
+        measured = map_episodes(measure, range(len(resolved)), advance)
+    heads = concat_tables([episode_heads(episode, grouping) for episode in measured])
+    over_heads = [episode.over_heads() for episode in measured]
+    replans = replan_tables(over_heads, grouping)
+    episodes = measured_episode_tables(over_heads, grouping)
     rows = key_shares = sinks = None
     if options is not None and measures is not None:
-        rows = row_table(question.selected, measures, shown, selection, options)
-        key_shares = key_shares_table(question, [measured.shares for measured in measures])
+        rows = row_tables(question.selected, measures, shown, selection, options)
+        key_shares = key_shares_table(question, [of_episode.shares for of_episode in measures])
         sinks = sinks_of(key_shares, options.rule)
     return HeadStudy(
         question=question,
         options=options,
         replans=replans,
-        tasks=tasks_table(episodes, grouping, seed=seed),
-        heads=heads_table(episode_heads, grouping, seed),
-        dispersion=dispersion_table(episode_heads, grouping, seed),
-        depth=depth_table(episodes, grouping, contribution_norms(question, resolved), seed),
-        denoise=denoise,
+        tasks=task_tables(episodes, grouping, seed=seed),
+        heads=heads_tables(heads, grouping, seed),
+        dispersion=dispersion_table(heads, grouping, seed),
+        depth=depth_table(episodes, contribution_norms(question, resolved), seed),
+        denoise=denoise_tables(over_heads, grouping, seed),
         rows=rows,
         key_shares=key_shares,
         sinks=sinks,
     )
-
-
-def _steps_and_heads(
-    question: Question, item: SelectedEpisode, resolved: ResolvedGrouping, measured: NDArray[np.float32] | None
-) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """One episode's parts of the steps table (mean over heads) and of the table of heads, from masses that are there or are read."""
-    apart, together = replace(question.selection, per_head=True), replace(question.selection, per_head=False)
-    if measured is None:
-        mass, row_sum = episode_masses(item, resolved, apart, question.site)
-    else:
-        mass, row_sum = measured.astype(np.float64), row_sums(item, apart, question.site)
-    over_heads = mass.mean(axis=3, keepdims=True), row_sum.mean(axis=3, keepdims=True)
-    steps = episode_steps(item, resolved, question.grouping, together, *over_heads)
-    values = head_values(mass.mean(axis=2), resolved.num_keys, resolved.num_valid, question.grouping)
-    return steps.drop(cs.ends_with(*_DERIVED)), head_frame(item, apart, values)

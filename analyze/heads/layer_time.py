@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG, layer_order
+from vla_attention.analyze.measures.aggregate import layer_order
+from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
 from vla_attention.analyze.statistics.bootstrap import (
     DEFAULT_SEED,
     bootstrap_intervals,
@@ -18,11 +19,10 @@ from vla_attention.schemas.groupings.grouping import Grouping
 MOST_BINS = 20
 #: Of a grouping without a ratio, so many groups are followed.
 _MOST_GROUPS = 3
-_EPISODE = ("suite", "task_id", "episode_index")
 
 
 def layer_time_table(
-    replans: pl.DataFrame, grouping: Grouping, num_bins: int | None = None, seed: int = DEFAULT_SEED
+    replans: Tables, grouping: Grouping, num_bins: int | None = None, seed: int = DEFAULT_SEED
 ) -> pl.DataFrame:
     """Means over episodes with two-level intervals (95 %) for every layer and equal part of the episodes' time.
 
@@ -31,24 +31,27 @@ def layer_time_table(
     where a side has no keys and there is no uniform ratio); else the fraction `{g}_fraction` of each of the first groups with mass.
 
     Args:
-        replans: `aggregate.add_layers_avg` or `aggregate.per_replan`.
+        replans: `aggregate.replan_tables`.
         grouping: the groups.
         num_bins: parts of the time; `MOST_BINS` unless no episode has as many replans.
         seed: of the bootstrap.
     """
-    single = replans.filter(pl.col("layer") != LAYERS_AVG)
+    level = replans.filter(pl.col("layer") != LAYERS_AVG)
+    level = level if grouping.ratio is not None else level.kept()
+    single = level.cells
     if grouping.ratio is not None:
         quantities = ["log2_ratio" if single["uniform_ratio"].is_null().all() else "log2_lift"]
         single = single.with_columns(pl.col("ratio_lift").log(2.0).alias("log2_lift"))
     else:
-        having = [name for name in grouping.names if (single[f"{name}_mass"] > 0).any()] or list(grouping.names)
-        quantities = [f"{name}_fraction" for name in having[:_MOST_GROUPS]]
+        having = (level.groups_with_mass() or grouping.names)[:_MOST_GROUPS]
+        quantities = [f"{name}_fraction" for name in having]
+        single = single.with_columns(level.of_group(name)["fraction"].alias(f"{name}_fraction") for name in having)
     layers = [layer for layer in layer_order(single) if layer != LAYERS_AVG]
     blocks = dict(single.select("layer", "block").unique().iter_rows())
     bins = num_bins or min(MOST_BINS, int(single["replan"].to_numpy().max()) + 1)
     place = {layer: i for i, layer in enumerate(layers)}
     values, tasks = [], []
-    for key, part in single.sort(*_EPISODE, "replan").group_by(_EPISODE, maintain_order=True):
+    for key, part in single.sort(*EPISODE_ID, "replan").group_by(EPISODE_ID, maintain_order=True):
         at = part["replan"].rank("dense").to_numpy().astype(np.int64) - 1
         column = part["layer"].replace_strict(place, return_dtype=pl.Int64).to_numpy()
         table = np.full((at.max() + 1, len(layers), len(quantities)), np.nan)

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import polars as pl
 
+from vla_attention.analyze.measures.frames import Tables
+from vla_attention.analyze.ratios.profile_panels import FRACTION_COLUMNS, draw_profile, shown_groups
 from vla_attention.analyze.show.numbers import plural
-from vla_attention.analyze.show.plot_profile import draw_profile, shown_groups
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import named, title
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
@@ -17,8 +18,9 @@ STEM = "denoise_profile"
 
 
 @drawn_in_our_style
-def plot_denoise_profile(table: pl.DataFrame, grouping: Grouping, folder: Path) -> list[Path]:
-    """Draw from `metrics.denoise.denoise_table`; returns the paths of png, pdf and csv."""
+def plot_denoise_profile(denoise: Tables, grouping: Grouping, folder: Path) -> list[Path]:
+    """Draw from `denoise.denoise_tables`; returns the paths of png, pdf and csv."""
+    table = denoise.cells
     figure = new_figure(max(6.6, 3.6 + 0.45 * table.height), 3.2 if grouping.ratio is None else 5.1)
     note = f"Means over {plural(table['num_episodes'][0], 'episode')} of {plural(table['num_tasks'][0], 'task')} and over all layers."
     if table.height == 1:
@@ -27,10 +29,12 @@ def plot_denoise_profile(table: pl.DataFrame, grouping: Grouping, folder: Path) 
         note += f" {table['nonfinite_layers'].sum()} ratios of single layers are not finite and in no mean."
     title(figure, f"Denoise steps, {named(grouping)}", note)
     labels = [f"{step}\n({time:.3g})" for step, time in table.select("denoise_step", "denoise_time").iter_rows()]
-    draw_profile(figure, table, grouping, labels, "denoise step (in brackets its time, which ends at 0)", DEFAULT_LEVEL)
-    columns = [f"{name}_fraction{end}" for name in shown_groups(table, grouping) for end in ("", "_low", "_high")]
-    if grouping.ratio is not None:
-        columns = ["ratio_mean", "ratio_mean_low", "ratio_mean_high", "uniform_ratio", "num_nonfinite", *columns]
-    return save_figure(
-        figure, folder, STEM, table.select("denoise_step", "denoise_time", "num_episodes", "num_replans", *columns)
+    draw_profile(
+        figure, denoise, grouping, labels, "denoise step (in brackets its time, which ends at 0)", DEFAULT_LEVEL
     )
+    columns = ["denoise_step", "denoise_time", "num_episodes", "num_replans"]
+    if grouping.ratio is not None:
+        columns += ["ratio_mean", "ratio_mean_low", "ratio_mean_high", "uniform_ratio", "num_nonfinite"]
+    groups = denoise.groups.filter(pl.col("group").is_in(shown_groups(denoise, grouping)))
+    data = {"": table.select(columns), "_groups": groups.select("denoise_step", "group", *FRACTION_COLUMNS)}
+    return save_figure(figure, folder, STEM, data)

@@ -9,6 +9,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.heads.head_measures import main_group
+from vla_attention.analyze.measures.frames import Tables
 from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.show.plot_heat_map import draw_log2_map, label_axis, map_height
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
@@ -19,29 +20,31 @@ STEM = "head_grid"
 
 
 @drawn_in_our_style
-def plot_head_grid(heads: pl.DataFrame, grouping: Grouping, folder: Path) -> list[Path]:
-    """Draw from `metrics.heads.heads_table`; returns the paths of png, pdf and csv.
+def plot_head_grid(heads: Tables, grouping: Grouping, folder: Path) -> list[Path]:
+    """Draw from `head_measures.heads_tables`; returns the paths of png, pdf and csv.
 
     With a ratio its lift over the uniform ratio (the ratio itself where a side has no keys), else the lift of the first
     group that has mass. A dot: the 95 % interval of the head holds the uniform value.
     """
-    quantity = _quantity(heads, grouping)
-    layers = heads["layer"].unique(maintain_order=True).to_list()
-    numbers = heads["head"].unique(maintain_order=True).to_list()
+    cells = heads.cells
+    quantity = _quantity(cells, grouping)
+    shown = cells if grouping.ratio is not None else heads.of_group(main_group(heads, grouping))
+    layers = cells["layer"].unique(maintain_order=True).to_list()
+    numbers = cells["head"].unique(maintain_order=True).to_list()
     log2, low, high = (
-        _grid(heads, column, len(layers)) for column in (quantity, f"{quantity}_low", f"{quantity}_high")
+        _grid(shown, column, len(layers)) for column in (quantity, f"{quantity}_low", f"{quantity}_high")
     )
     label, about = "times uniform attention", f"{_name(grouping, heads)} relative to uniform attention"
     if quantity == "log2_ratio":
         label, about = "ratio", f"{_name(grouping, heads)} (no uniform baseline)"
-    if quantity.endswith("_lift") and quantity != "log2_lift":
+    if quantity == "lift":
         with np.errstate(divide="ignore"):
             log2, low, high = np.log2(log2), np.log2(low), np.log2(high)
     if grouping.ratio is not None:
-        log2 = _with_limits(heads, log2)
+        log2 = _with_limits(cells, log2)
     uncertain = (low <= 0) & (high >= 0)
     figure = new_figure(max(5.6, 2.4 + 0.34 * len(numbers)), max(2.6, 1.7 + map_height(len(layers), len(numbers))))
-    title(figure, f"Heads, {named(grouping)}: {about}", _note(heads, log2, bool((uncertain & np.isfinite(log2)).any())))
+    title(figure, f"Heads, {named(grouping)}: {about}", _note(cells, log2, bool((uncertain & np.isfinite(log2)).any())))
     axes = figure.subplots()
     if np.isnan(log2).all():
         explain(axes, f"No head has any attention on {_name(grouping, heads)}.")
@@ -51,18 +54,18 @@ def plot_head_grid(heads: pl.DataFrame, grouping: Grouping, folder: Path) -> lis
         label_axis(axes, "y", [str(layer) for layer in layers])
         axes.set_xlabel("head")
         axes.set_ylabel("layer")
-    return save_figure(figure, folder, STEM, heads)
+    return save_figure(figure, folder, STEM, {"": cells, "_groups": heads.groups})
 
 
-def _quantity(heads: pl.DataFrame, grouping: Grouping) -> str:
+def _quantity(cells: pl.DataFrame, grouping: Grouping) -> str:
     if grouping.ratio is None:
-        return f"{main_group(heads, grouping)}_lift"
+        return "lift"
     return (
-        "log2_ratio" if heads["log2_lift"].is_null().all() and heads["log2_ratio"].is_not_null().any() else "log2_lift"
+        "log2_ratio" if cells["log2_lift"].is_null().all() and cells["log2_ratio"].is_not_null().any() else "log2_lift"
     )
 
 
-def _name(grouping: Grouping, heads: pl.DataFrame) -> str:
+def _name(grouping: Grouping, heads: Tables) -> str:
     return main_group(heads, grouping) if grouping.ratio is None else ratio_name(grouping.ratio)
 
 

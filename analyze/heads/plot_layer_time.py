@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 
 from vla_attention.analyze.heads.layer_time import layer_time_table
+from vla_attention.analyze.measures.frames import Tables
 from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.show.plot_heat_map import draw_log2_map, label_axis, map_height
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
@@ -23,8 +24,8 @@ STEM = "layer_time"
 
 
 @drawn_in_our_style
-def plot_layer_time(replans: pl.DataFrame, grouping: Grouping, folder: Path, seed: int = DEFAULT_SEED) -> list[Path]:
-    """Draw from the table of replans (`aggregate.add_layers_avg`); returns the paths of png, pdf and csv.
+def plot_layer_time(replans: Tables, grouping: Grouping, folder: Path, seed: int = DEFAULT_SEED) -> list[Path]:
+    """Draw from `aggregate.replan_tables`; returns the paths of png, pdf and csv.
 
     With a ratio one map of its lift over the uniform ratio; else a map of fractions for each of the first groups. A dot: the 95 %
     interval of the cell holds the uniform value.
@@ -33,7 +34,7 @@ def plot_layer_time(replans: pl.DataFrame, grouping: Grouping, folder: Path, see
     quantities = table["quantity"].unique(maintain_order=True).to_list()
     layers, bins = table["layer"].unique(maintain_order=True).to_list(), table["bin"].n_unique()
     figure = new_figure(max(6.4, 3.6 * len(quantities) + 1.0), max(2.7, 1.6 + map_height(len(layers), bins)))
-    episodes = replans.select("suite", "task_id", "episode_index").unique()
+    episodes = replans.cells.select("suite", "task_id", "episode_index").unique()
     note = f"Means over {plural(episodes.height, 'episode')} of {plural(episodes.select('suite', 'task_id').n_unique(), 'task')}."
     shared = figure.subplots(1, len(quantities), squeeze=False, sharey=True)[0]
     undefined, dots = False, False

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.heads.entropy import effective_keys, entropies, top_mass
+from vla_attention.analyze.measures.frames import EPISODE_ID, Tables, denoise_axis, head_axis, layer_axis, long_table
 from vla_attention.analyze.measures.masses import masses
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
@@ -124,67 +124,71 @@ def measure_rows(
     out.shares.above[used], out.shares.held[used] = above / count, held / count
 
 
-def row_frame(
-    item: SelectedEpisode, shown: Sequence[str], selection: Selection, measures: RowMeasures, options: RowOptions
-) -> pl.DataFrame:
-    """One row per (replan, layer, denoise step, head) of an episode.
-
-    Columns: suite, task_id, episode_index, replan, layer, block, denoise_step, head; `entropy` (nats) and `effective_keys`
-    (its exp) over the valid keys; `top{k}_mass`, the share of the valid keys' mass on the k largest; `{g}_entropy` and
-    `{g}_effective_keys` inside each group, over its valid keys, null where it has no mass or none.
-    """
-    shape = measures.entropy.shape[:4]
-    attributes = item.episode.attributes
-
-    def along(values: Any, axis: int) -> NDArray[Any]:
-        expanded = np.asarray(values, dtype=np.int64).reshape([-1 if i == axis else 1 for i in range(4)])
-        return np.broadcast_to(expanded, shape).ravel()
-
-    columns: dict[str, NDArray[Any]] = {
-        "replan": along(np.arange(shape[0]), 0),
-        "layer": along(selection.layer_labels, 1),
-        "block": along(selection.blocks, 1),
-        "denoise_step": along(selection.denoise_steps, 2),
-        "head": along(selection.head_numbers, 3),
-    }
-    for i, prefix in ((len(shown), ""), *((i, f"{name}_") for i, name in enumerate(shown))):
-        entropy = measures.entropy[..., i].ravel()
-        columns[f"{prefix}entropy"], columns[f"{prefix}effective_keys"] = entropy, effective_keys(entropy)
-        if not prefix:
-            columns |= {f"top{k}_mass": measures.top[..., j].ravel() for j, k in enumerate(options.top)}
-    return pl.DataFrame(columns).select(
-        pl.lit(item.store.suite).alias("suite"),
-        pl.lit(attributes.task_id, dtype=pl.Int64).alias("task_id"),
-        pl.lit(attributes.episode_index, dtype=pl.Int64).alias("episode_index"),
-        pl.col("replan", "layer", "block", "denoise_step", "head"),
-        pl.col(pl.Float32).fill_nan(None),
-    )
-
-
-def row_table(
+def row_tables(
     items: Sequence[SelectedEpisode],
     measures: Sequence[RowMeasures],
     shown: Sequence[str],
     selection: Selection,
     options: RowOptions,
-) -> pl.DataFrame:
-    """`row_frame` of all episodes."""
-    return pl.concat(
-        row_frame(item, shown, selection, measured, options) for item, measured in zip(items, measures, strict=True)
+) -> Tables:
+    """Every row (episode, replan, layer, denoise step, head).
+
+    Returns:
+        cells: row (its number), suite, task_id, episode_index, replan, layer, block, denoise_step, head; `entropy` (nats) and
+            `effective_keys` (its exp) over the valid keys; `top{k}_mass`, the share of the valid keys' mass on the k largest.
+        groups: row, group, `entropy` and `effective_keys` inside each group, over its valid keys; null where it has no mass or no
+            such key. There are millions of them, so that they name their cell by its number alone.
+    """
+    axes_of = replace(selection, per_head=True)
+    cells = []
+    for item, measured in zip(items, measures, strict=True):
+        entropy = measured.entropy[..., len(shown)]
+        values = {"entropy": entropy, "effective_keys": effective_keys(entropy)}
+        values |= {f"top{k}_mass": measured.top[..., j] for j, k in enumerate(options.top)}
+        axes = [{"replan": range(len(entropy))}, layer_axis(axes_of), denoise_axis(axes_of), head_axis(axes_of)]
+        cells.append(long_table(item, axes, values))
+    table = pl.concat(cells).with_row_index("row")
+    of_groups = np.concatenate([measured.entropy[..., : len(shown)].ravel() for measured in measures])
+    groups = pl.DataFrame(
+        {
+            "row": np.repeat(np.arange(table.height, dtype=np.uint32), len(shown)),
+            "group": pl.Series(shown, dtype=pl.Enum(shown)).gather(np.tile(np.arange(len(shown)), table.height)),
+            "entropy": of_groups,
+            "effective_keys": effective_keys(of_groups),
+        }
     )
+    return Tables(table, groups.with_columns(pl.col(pl.Float32).fill_nan(None)))
 
 
-def episode_layer_means(rows: pl.DataFrame, items: Sequence[SelectedEpisode]) -> pl.DataFrame:
-    """Means of `row_table` (of these episodes) over replans, denoise steps and heads: one row per (episode, layer), float64."""
-    keys = ("suite", "task_id", "episode_index", "layer", "block")
-    measured = [name for name, kind in rows.schema.items() if kind == pl.Float32]
-    per_replan, start, parts = rows.height // sum(item.tokens.num_replans for item in items), 0, []
+def episode_layer_means(rows: Tables, items: Sequence[SelectedEpisode]) -> Tables:
+    """Means of `row_tables` (of these episodes) over replans, denoise steps and heads, float64.
+
+    Returns:
+        cells: suite, task_id, episode_index, layer, block and the measures; groups: the same names, group, entropy, effective_keys.
+    """
+    keys = (*EPISODE_ID, "layer", "block")
+    names = rows.groups["group"].unique(maintain_order=True).cast(pl.String).to_list()
+    per_replan, start = rows.cells.height // sum(item.tokens.num_replans for item in items), 0
+    cells, groups = [], []
+
+    def means(part: pl.DataFrame) -> pl.DataFrame:
+        measured = pl.col(pl.Float32).mean().cast(pl.Float64)
+        return part.group_by(keys, maintain_order=True).agg(measured)
+
     # A million rows grouped at once would take as much memory as all that came before.
     for item in items:
-        part = rows.slice(start, item.tokens.num_replans * per_replan)
-        parts.append(part.group_by(keys, maintain_order=True).agg(pl.col(measured).mean().cast(pl.Float64)))
+        part = rows.cells.slice(start, item.tokens.num_replans * per_replan)
+        cells.append(means(part))
+        of_part = rows.groups.slice(start * len(names), part.height * len(names))
+        for i, name in enumerate(names):
+            own = of_part.gather_every(len(names), i).select("entropy", "effective_keys")
+            groups.append(means(part.select(keys).hstack(own)).with_columns(pl.lit(name).alias("group")))
         start += part.height
-    return pl.concat(parts).sort("suite", "task_id", "episode_index", maintain_order=True)
+    empty = pl.DataFrame(schema={**cells[0].select(keys).schema, "group": pl.String})
+    return Tables(
+        pl.concat(cells).sort(EPISODE_ID, maintain_order=True),
+        (pl.concat(groups) if groups else empty).sort(EPISODE_ID, maintain_order=True),
+    )
 
 
 def groups_with_valid_keys(items: Sequence[SelectedEpisode], resolved: Sequence[ResolvedGrouping]) -> tuple[str, ...]:
@@ -214,10 +218,10 @@ def measure_all_rows(
     return room
 
 
-def row_metrics_table(question: Question, options: RowOptions | None = None) -> pl.DataFrame:
-    """Entropy, effective keys and top-k mass of every stored row, in the columns of `row_frame`."""
+def row_metrics(question: Question, options: RowOptions | None = None) -> Tables:
+    """Entropy, effective keys and top-k mass of every stored row; see `row_tables`."""
     chosen = options or RowOptions()
     resolved = resolve_all(question.grouping, question.selected, question.vocabulary)
     shown = groups_with_valid_keys(question.selected, resolved)
     measures = measure_all_rows(question, resolved, chosen, shown)
-    return row_table(question.selected, measures, shown, question.selection, chosen)
+    return row_tables(question.selected, measures, shown, question.selection, chosen)

@@ -11,12 +11,13 @@ import polars as pl
 from vla_attention.analyze.heads.head_measures import main_group, ranked_heads
 from vla_attention.analyze.heads.head_study import HeadStudy
 from vla_attention.analyze.heads.row_metrics import episode_layer_means
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG, overall_rows
+from vla_attention.analyze.measures.aggregate import overall_rows
+from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
 from vla_attention.analyze.measures.sinks import SinkRule, merged_sinks
 from vla_attention.analyze.show.headings import WIDTH
 from vla_attention.analyze.show.numbers import format_interval, format_number
 from vla_attention.analyze.show.text_table import text_table
-from vla_attention.analyze.statistics.bootstrap import POSITIVE
+from vla_attention.analyze.statistics.bootstrap import NO_LIMITS, POSITIVE
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
@@ -33,19 +34,23 @@ def heads_text(study: HeadStudy, top: int) -> str:
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def row_summary(study: HeadStudy) -> pl.DataFrame:
-    """Per layer the means over episodes, with two-level intervals, of what `rows` holds; one row per layer."""
+def row_summary(study: HeadStudy) -> Tables:
+    """Every layer: means over episodes, with two-level intervals, of what `rows` holds."""
     assert study.rows is not None
-    measured = [name for name, kind in study.rows.schema.items() if kind == pl.Float32]
     episodes = episode_layer_means(study.rows, study.question.selected)
-    limits = dict.fromkeys(measured, POSITIVE)
-    # Fractions of a key may be fewer than one, and their entropy below 0.
-    limits |= {name: (float("-inf"), float("inf")) for name in measured if name.endswith("entropy")}
-    order = study.tasks.filter(pl.col("layer") != LAYERS_AVG)["layer_number"].unique().sort().to_list()
-    table = means_with_intervals(episodes, ("layer", "block"), limits, study.question.settings.seed)
-    return table.sort(
-        pl.col("layer").replace_strict({layer: i for i, layer in enumerate(order)}, return_dtype=pl.Int64)
+    order = study.tasks.cells.filter(pl.col("layer") != LAYERS_AVG)["layer_number"].unique().sort().to_list()
+    position = pl.col("layer").replace_strict({layer: i for i, layer in enumerate(order)}, return_dtype=pl.Int64)
+    return Tables(
+        _row_means(episodes.cells, ("layer", "block"), study).sort(position, maintain_order=True),
+        _row_means(episodes.groups, ("layer", "block", "group"), study).sort(position, maintain_order=True),
     )
+
+
+def _row_means(episodes: pl.DataFrame, by: Sequence[str], study: HeadStudy) -> pl.DataFrame:
+    measured = [name for name in episodes.columns if name not in (*EPISODE_ID, *by)]
+    # A group may hold fewer than one key, and then its entropy is below 0.
+    limits = {name: NO_LIMITS if name == "entropy" else POSITIVE for name in measured}
+    return means_with_intervals(episodes, by, limits, study.question.settings.seed)
 
 
 def _header(study: HeadStudy) -> str:
@@ -63,7 +68,7 @@ def _header(study: HeadStudy) -> str:
     return "\n".join([*lines, *(part for line in told for part in textwrap.wrap(line, WIDTH))])
 
 
-def _measure_name(heads: pl.DataFrame, grouping: Grouping) -> str:
+def _measure_name(heads: Tables, grouping: Grouping) -> str:
     if grouping.ratio is None:
         return f"no ratio, so heads are compared by their fraction of '{main_group(heads, grouping)}'"
     return f"ratio = {' + '.join(grouping.ratio.numerator)} / {' + '.join(grouping.ratio.denominator)}"
@@ -94,7 +99,7 @@ def _ranking(study: HeadStudy, top: int) -> str:
             "ratio: geometric mean over replans and episodes. lift: ratio / uniform ratio, 1 = uniform attention. "
             + note
         )
-        left_out = int(study.heads.unique(["block", "head"])["num_nonfinite"].sum())
+        left_out = int(study.heads.cells.unique(["block", "head"])["num_nonfinite"].sum())
         if left_out:
             note += f" {left_out} (head, replan) ratios are infinite, undefined or 0 and in no geometric mean."
     return "\n".join([*lines, *textwrap.wrap(note, WIDTH)])
@@ -102,6 +107,7 @@ def _ranking(study: HeadStudy, top: int) -> str:
 
 def _head_rows(rows: pl.DataFrame, study: HeadStudy) -> str:
     grouping = study.question.grouping
+    of_group, group = study.heads.by_group("layer", "head"), main_group(study.heads, grouping)
     table = []
     for row in rows.iter_rows(named=True):
         cells = [str(row["layer"]), str(row["head"])]
@@ -116,12 +122,12 @@ def _head_rows(rows: pl.DataFrame, study: HeadStudy) -> str:
                 _percent(row["denominator_fraction"]),
             ]
         else:
-            name = main_group(study.heads, grouping)
+            own = of_group[row["layer"], row["head"], group]
             cells += [
-                _percent(row[f"{name}_fraction"]),
-                _percent_interval(row, f"{name}_fraction"),
-                format_number(row[f"{name}_lift"]),
-                _interval(row, f"{name}_lift"),
+                _percent(own["fraction"]),
+                _percent_interval(own, "fraction"),
+                format_number(own["lift"]),
+                _interval(own, "lift"),
             ]
         table.append(cells)
     header = ["layer", "head"]
@@ -155,17 +161,16 @@ def _dispersion(study: HeadStudy) -> str:
 
 def _layers(study: HeadStudy) -> str:
     grouping = study.question.grouping
-    rows = overall_rows(study.tasks).filter(pl.col("layer") != LAYERS_AVG).sort("layer_number")
-    return "\n".join(
-        [_title("LAYERS  mean over heads"), _profile(rows, "layer", [str(n) for n in rows["layer"]], grouping)]
-    )
+    level = overall_rows(study.tasks).filter(pl.col("layer") != LAYERS_AVG)
+    labels = [str(layer) for layer in level.cells["layer"]]
+    return "\n".join([_title("LAYERS  mean over heads"), _profile(level, "layer", "layer", labels, grouping)])
 
 
-def _profile(rows: pl.DataFrame, label: str, labels: Sequence[str], grouping: Grouping) -> str:
-    """Ratio or first fractions of rows of `tasks_table`."""
+def _profile(level: Tables, along: str, label: str, labels: Sequence[str], grouping: Grouping) -> str:
+    """Ratio or first fractions of cells of `task_tables`, which differ in the column `along`."""
     table = []
-    groups = [name for name in grouping.names if rows[f"{name}_fraction"].sum() > 0][:3]
-    for name, row in zip(labels, rows.iter_rows(named=True), strict=True):
+    of_group, groups = level.by_group(along), level.groups_with_mass()[:3]
+    for name, row in zip(labels, level.cells.iter_rows(named=True), strict=True):
         if grouping.ratio is not None:
             cells = [format_number(row["ratio_mean"]), _interval(row, "ratio_mean")]
             cells += [
@@ -176,8 +181,8 @@ def _profile(rows: pl.DataFrame, label: str, labels: Sequence[str], grouping: Gr
         else:
             cells = [
                 cell
-                for group in groups
-                for cell in (_percent(row[f"{group}_fraction"]), _percent_interval(row, f"{group}_fraction"))
+                for own in (of_group[row[along], group] for group in groups)
+                for cell in (_percent(own["fraction"]), _percent_interval(own, "fraction"))
             ]
         table.append([name, *cells])
     if grouping.ratio is not None:
@@ -220,14 +225,14 @@ def _depth(study: HeadStudy) -> str:
 
 
 def _denoise(study: HeadStudy) -> str:
-    rows = study.denoise
+    rows = study.denoise.cells
     if rows.height < 2:
         return ""
     labels = [f"{step} ({time:.3g})" for step, time in rows.select("denoise_step", "denoise_time").iter_rows()]
     return "\n".join(
         [
             _title("DENOISE STEPS  (and their times), mean over layers and heads"),
-            _profile(rows, "step", labels, study.question.grouping),
+            _profile(study.denoise, "denoise_step", "step", labels, study.question.grouping),
         ]
     )
 
@@ -235,11 +240,12 @@ def _denoise(study: HeadStudy) -> str:
 def _rows_by_layer(study: HeadStudy) -> str:
     assert study.options is not None
     summary = row_summary(study)
-    groups = [name for name in study.question.grouping.names if f"{name}_effective_keys" in summary.columns][:3]
+    of_group = summary.by_group("layer")
+    groups = summary.groups["group"].unique(maintain_order=True).to_list()[:3]
     header = ["layer", "entropy", "eff. keys", "interval", *(f"top {k}" for k in study.options.top)]
     header += [f"in {name[:14]}" for name in groups]
     rows = []
-    for row in summary.iter_rows(named=True):
+    for row in summary.cells.iter_rows(named=True):
         cells = [
             str(row["layer"]),
             format_number(row["entropy"]),
@@ -247,7 +253,7 @@ def _rows_by_layer(study: HeadStudy) -> str:
             _interval(row, "effective_keys"),
         ]
         cells += [_percent(row[f"top{k}_mass"]) for k in study.options.top]
-        cells += [format_number(row[f"{name}_effective_keys"]) for name in groups]
+        cells += [format_number(of_group[row["layer"], name]["effective_keys"]) for name in groups]
         rows.append(cells)
     keys = [item.valid.sum(axis=1).mean() for item in study.question.selected]
     note = (

@@ -8,24 +8,20 @@ self-attention may be divided by one of cross-attention.
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG
+from vla_attention.analyze.measures.frames import LAYERS_AVG, denoise_axis, layer_axis, long_table, replan_axis
 from vla_attention.analyze.measures.masses import ratio
-from vla_attention.analyze.ratios.summary import WIDTH
-from vla_attention.analyze.show.numbers import format_interval, format_number
-from vla_attention.analyze.show.text_table import text_table
+from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.statistics.bootstrap import POSITIVE, bootstrap_interval, mean_over_episodes
 from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.segments import Segment
-from vla_attention.schemas.stores.reader import Store, StoredEpisode
+from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.store_format import RootAttributes
 
 #: Roles on each side of the headline: what is seen now, and what is read.
@@ -40,28 +36,33 @@ def joint_norm(gram: NDArray[np.floating], chosen: NDArray[np.bool_]) -> NDArray
     """
     part = np.flatnonzero(chosen)
     squared = gram[..., part[:, None], part].sum(axis=(-2, -1), dtype=np.float64)
-    return np.sqrt(np.clip(squared, 0.0, None))
+    norm: NDArray[np.float64] = np.sqrt(np.clip(squared, 0.0, None))
+    return norm
 
 
-def contribution_table(chosen: Sequence[tuple[Store, StoredEpisode]], selection: Selection) -> pl.DataFrame | None:
+def contribution_table(selected: Sequence[SelectedEpisode], selection: Selection) -> pl.DataFrame | None:
     """Norms of both sides for every (episode, replan, layer, denoise step), or None when no contributions were recorded.
 
     Columns: suite, task_id, episode_index, replan, env_step, layer, block, denoise_step, visual_norm, linguistic_norm,
     contribution_ratio (visual / linguistic; infinite or null where the denominator is 0). A side is read at the site that has
     such keys: both at `joint` for pi, `self` and `cross` for Cosmos. None also when a run has no such keys at all.
     """
-    if not all(store.attributes.recording.contributions for store, _ in chosen):
+    if not all(item.store.attributes.recording.contributions for item in selected):
         return None
 
-    def measure(pair: tuple[Store, StoredEpisode]) -> pl.DataFrame | None:
-        store, episode = pair
-        sides = [_parts_of_side(store.attributes, episode, roles) for roles in (VISUAL_ROLES, LINGUISTIC_ROLES)]
+    def measure(item: SelectedEpisode) -> pl.DataFrame | None:
+        root, episode = item.store.attributes, item.episode
+        sides = [_parts_of_side(root, episode, roles) for roles in (VISUAL_ROLES, LINGUISTIC_ROLES)]
         grams = {site: selected_gram(episode, site, selection) for site in {side[0] for side in sides if side}}
         norms = [joint_norm(grams[side[0]], side[1]) for side in sides if side is not None]
-        return _episode_frame(store, episode, selection, norms[0], norms[1]) if len(norms) == len(sides) else None
+        if len(norms) < len(sides):
+            return None
+        visual, linguistic = norms
+        values = {"visual_norm": visual, "linguistic_norm": linguistic, "contribution_ratio": ratio(visual, linguistic)}
+        return long_table(item, [replan_axis(item), layer_axis(selection), denoise_axis(selection)], values)
 
-    frames = [frame for frame in map_episodes(measure, chosen) if frame is not None]
-    return pl.concat(frames) if len(frames) == len(chosen) else None
+    frames = [frame for frame in map_episodes(measure, selected) if frame is not None]
+    return pl.concat(frames) if len(frames) == len(selected) else None
 
 
 def selected_gram(episode: StoredEpisode, site: str, selection: Selection) -> NDArray[np.float32]:
@@ -83,36 +84,6 @@ def _parts_of_side(
     return None
 
 
-def _episode_frame(
-    store: Store,
-    episode: StoredEpisode,
-    selection: Selection,
-    visual: NDArray[np.float64],
-    linguistic: NDArray[np.float64],
-) -> pl.DataFrame:
-    def along(values: Any, axis: int) -> NDArray[Any]:
-        expanded = np.asarray(values).reshape([-1 if i == axis else 1 for i in range(3)])
-        return np.broadcast_to(expanded, visual.shape).ravel()
-
-    columns = {
-        "replan": along(np.arange(visual.shape[0]), 0),
-        "env_step": along(episode.read("env_step").astype(np.int64), 0),
-        "layer": along(np.array(selection.layer_labels, dtype=np.int64), 1),
-        "block": along(np.array(selection.blocks, dtype=np.int64), 1),
-        "denoise_step": along(np.array(selection.denoise_steps, dtype=np.int64), 2),
-        "visual_norm": visual.ravel(),
-        "linguistic_norm": linguistic.ravel(),
-        "contribution_ratio": ratio(visual, linguistic).ravel(),
-    }
-    attributes = episode.attributes
-    return pl.DataFrame(columns).select(
-        pl.lit(store.suite).alias("suite"),
-        pl.lit(attributes.task_id).cast(pl.Int64).alias("task_id"),
-        pl.lit(attributes.episode_index).cast(pl.Int64).alias("episode_index"),
-        pl.all().exclude("suite", "task_id", "episode_index").fill_nan(None),
-    )
-
-
 def contribution_rows(table: pl.DataFrame, seed: int) -> pl.DataFrame:
     """One row per layer and over all of them ("layers_avg"): mean norms over episodes, their ratio with a two-level interval (95 %).
 
@@ -128,25 +99,6 @@ def contribution_rows(table: pl.DataFrame, seed: int) -> pl.DataFrame:
     numbers = ("visual_norm", "linguistic_norm", "ratio", "ratio_low", "ratio_high")
     types = {"layer": pl.String, "layer_number": pl.Int64, **dict.fromkeys(numbers, pl.Float64)}
     return pl.DataFrame(rows, schema=types, orient="row")
-
-
-def summarise_contributions(table: pl.DataFrame, seed: int) -> str:
-    """The summary's section: `contribution_rows` as text."""
-    rows = [
-        [
-            row["layer"],
-            *(format_number(row[column]) for column in ("visual_norm", "linguistic_norm", "ratio")),
-            format_interval(row["ratio_low"], row["ratio_high"]),
-        ]
-        for row in contribution_rows(table, seed).iter_rows(named=True)
-    ]
-    title = "CONTRIBUTIONS  |visual| / |linguistic|, norms of what the keys add to the residual stream"
-    note = (
-        "Value-weighted, through output projection and gate; root mean square over action queries, mean over replans and denoise "
-        "steps. ratio: mean over episodes of the mean ratio of norms. Norms of different sites may be divided; masses may not."
-    )
-    header = ["layer", "|visual|", "|linguistic|", "ratio", "95% interval"]
-    return "\n".join([title, "-" * WIDTH, text_table(header, rows, left=(0,)), "", textwrap.fill(note, WIDTH), ""])
 
 
 def _summary_row(part: pl.DataFrame, label: str, number: int | None, seed: int) -> tuple[object, ...]:

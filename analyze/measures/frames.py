@@ -7,7 +7,7 @@ a table; infinite ratios stay infinite.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -153,50 +153,65 @@ class LayerAxis:
         return np.concatenate([values, np.expand_dims(average, axis)], axis=axis)
 
 
-@dataclass(frozen=True)
-class Level:
+class Tables:
     """Tables of one level: steps, replans, episodes or tasks.
 
     Attributes:
-        cells: one row per cell, with everything that is said of the whole row or of the ratio.
-        groups: one row per cell and group, in the order of the grouping; column `group`.
+        cells: one row per cell, with the measures of the whole row and of the ratio.
+        groups: one row per cell and group: cells in the same order as in `cells`, groups in that of the grouping; column `group`.
+            Of steps and replans it is made at every access, and not kept: it is several times as large as the masses.
     """
 
-    cells: pl.DataFrame
-    groups: pl.DataFrame
-    _known: dict[tuple[str, ...], dict[tuple[Any, ...], dict[str, Any]]] = field(default_factory=dict, repr=False)
+    def __init__(self, cells: pl.DataFrame, groups: pl.DataFrame | Callable[[], pl.DataFrame]) -> None:
+        self.cells = cells
+        self._groups = groups
 
-    def filter(self, *conditions: pl.Expr) -> Level:
+    @property
+    def groups(self) -> pl.DataFrame:
+        """See the class."""
+        return self._groups() if callable(self._groups) else self._groups
+
+    def kept(self) -> Tables:
+        """The same with `groups` made once and kept."""
+        return Tables(self.cells, self.groups)
+
+    def filter(self, *conditions: pl.Expr) -> Tables:
         """The cells for which conditions on the columns of both tables hold."""
-        return Level(self.cells.filter(*conditions), self.groups.filter(*conditions))
+        return Tables(self.cells.filter(*conditions), lambda: self.groups.filter(*conditions))
+
+    def values(self, measure: str) -> NDArray[np.float64]:
+        """A column of `groups` as an array (cell, group); NaN for null."""
+        column = self.groups[measure].cast(pl.Float64).fill_null(float("nan")).to_numpy()
+        return column.reshape(self.cells.height, -1)
+
+    def of_group(self, name: str) -> pl.DataFrame:
+        """The rows of one group, one per cell, in the order of the cells."""
+        return self.groups.filter(pl.col("group") == name)
 
     def groups_with_mass(self) -> tuple[str, ...]:
         """The groups that have mass in a cell, in the order of the grouping."""
-        return self._where("mass")
+        return self.groups_with("mass")
 
     def groups_with_keys(self) -> tuple[str, ...]:
         """The groups that have a key in a cell, or of which the number of keys is unknown, in the order of the grouping."""
         unknown = self.groups.filter(pl.col("keys").is_null())["group"].unique()
-        having = {*self._where("keys"), *unknown}
+        having = {*self.groups_with("keys"), *unknown}
         return tuple(name for name in self.groups["group"].unique(maintain_order=True) if name in having)
 
-    def _where(self, column: str) -> tuple[str, ...]:
+    def groups_with(self, column: str) -> tuple[str, ...]:
+        """The groups that have more than 0 in a column of a cell, in the order of the grouping."""
         return tuple(self.groups.filter(pl.col(column) > 0)["group"].unique(maintain_order=True))
 
     def by_group(self, *by: str) -> dict[tuple[Any, ...], dict[str, Any]]:
-        """Rows of `groups` as dictionaries, by the values of the columns `by` and the group: `level.by_group("layer")[layer, name]`."""
-        if by not in self._known:
-            rows = self.groups.iter_rows(named=True)
-            self._known[by] = {(*(row[name] for name in by), row["group"]): row for row in rows}
-        return self._known[by]
+        """Rows of `groups` by the values of the columns `by` and the group, as in `tables.by_group("layer")[layer, name]`."""
+        return {(*(row[name] for name in by), row["group"]): row for row in self.groups.iter_rows(named=True)}
 
 
-def concat_levels(parts: Sequence[Level]) -> Level:
-    """The rows of all parts, in order."""
-    return Level(pl.concat([part.cells for part in parts]), pl.concat([part.groups for part in parts]))
+def concat_tables(parts: Sequence[Tables]) -> Tables:
+    """The rows of all parts, in order; `groups` is made when it is asked for."""
+    return Tables(pl.concat([part.cells for part in parts]), lambda: pl.concat([part.groups for part in parts]))
 
 
-def wide(groups: pl.DataFrame, measures: Sequence[str]) -> pl.DataFrame:
-    """A table with a column `group` as one with a column `{measure}_{group}` (a single measure: `{group}`) for each."""
-    index = groups.columns[: groups.columns.index("group")]
-    return groups.pivot("group", index=index, values=list(measures), maintain_order=True)
+def named_tables(name: str, level: Tables) -> dict[str, pl.DataFrame]:
+    """The two tables of a level by the names of their files, NAME and NAME_groups."""
+    return {name: level.cells, f"{name}_groups": level.groups}

@@ -6,30 +6,32 @@ norm of a union of segments is sqrt(wᵀ G w). A group that takes part of a segm
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG
 from vla_attention.analyze.measures.contributions import joint_norm, selected_gram
+from vla_attention.analyze.measures.frames import (
+    EPISODE_ID,
+    LAYERS_AVG,
+    Tables,
+    concat_tables,
+    denoise_axis,
+    layer_axis,
+    long_table,
+    replan_axis,
+)
 from vla_attention.analyze.measures.masses import ratio
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.ratios.summary import WIDTH
-from vla_attention.analyze.show.numbers import format_interval, format_number
-from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.bootstrap import POSITIVE
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
 from vla_attention.analyze.stores.parallel import map_episodes
-from vla_attention.schemas.errors import listing
-from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 from vla_attention.schemas.segments import segment_members, weights_on_segments
-
-_EPISODE = ("suite", "task_id", "episode_index")
 
 
 def whole_segments(item: SelectedEpisode, resolved: ResolvedGrouping, site: str) -> dict[str, NDArray[np.bool_]]:
@@ -52,13 +54,16 @@ def whole_segments(item: SelectedEpisode, resolved: ResolvedGrouping, site: str)
     return parts
 
 
-def group_contribution_table(question: Question, resolved: Sequence[ResolvedGrouping]) -> pl.DataFrame | None:
+def group_contribution_tables(question: Question, resolved: Sequence[ResolvedGrouping]) -> Tables | None:
     """Norms for every (episode, replan, layer, denoise step), or None when nothing was recorded or every group cuts a segment.
 
-    Columns: suite, task_id, episode_index, replan, env_step, layer, block, denoise_step; `{group}_norm` for every group that is
-    made of whole segments in all episodes; and, when the grouping has a ratio of such groups, numerator_norm,
-    denominator_norm (of the vector sum of a side's groups) and contribution_ratio, their quotient. Norms are root mean
-    squares over the action queries.
+    Norms are root mean squares over the action queries.
+
+    Returns:
+        cells: suite, task_id, episode_index, replan, env_step, layer, block, denoise_step; when the grouping has a ratio of groups
+            that can be measured, numerator_norm, denominator_norm (of the vector sum of a side's groups) and contribution_ratio,
+            their quotient.
+        groups: the same names, group, norm; of every group that is made of whole segments in all episodes.
     """
     if not all(store.attributes.recording.contributions for store in question.stores):
         return None
@@ -69,86 +74,60 @@ def group_contribution_table(question: Question, resolved: Sequence[ResolvedGrou
     names = [name for name in question.grouping.names if all(name in parts for parts in chosen)]
     if not names:
         return None
-    return pl.concat(
+    return concat_tables(
         map_episodes(
-            lambda pair: _episode_frame(pair[0], {name: pair[1][name] for name in names}, question),
+            lambda pair: _episode_norms(pair[0], {name: pair[1][name] for name in names}, question),
             list(zip(question.selected, chosen, strict=True)),
         )
     )
 
 
-def _episode_frame(item: SelectedEpisode, parts: Mapping[str, NDArray[np.bool_]], question: Question) -> pl.DataFrame:
+def _episode_norms(item: SelectedEpisode, parts: Mapping[str, NDArray[np.bool_]], question: Question) -> Tables:
     selection, grouping = question.selection, question.grouping
     gram = selected_gram(item.episode, question.site, selection)
-    norms = {f"{name}_norm": joint_norm(gram, taken) for name, taken in parts.items()}
+    norms = np.stack([joint_norm(gram, taken) for taken in parts.values()], axis=-1)
+    sides: dict[str, NDArray[np.float64]] = {}
     if grouping.ratio is not None and {*grouping.ratio.numerator, *grouping.ratio.denominator} <= parts.keys():
         above, below = (
             joint_norm(gram, np.any([parts[name] for name in side], axis=0))
             for side in (grouping.ratio.numerator, grouping.ratio.denominator)
         )
-        norms |= {"numerator_norm": above, "denominator_norm": below, "contribution_ratio": ratio(above, below)}
-    replans, layers, steps = gram.shape[:3]
-    grid = {
-        "replan": np.repeat(np.arange(replans), layers * steps),
-        "env_step": np.repeat(item.episode.read("env_step").astype(np.int64), layers * steps),
-        "layer": np.tile(np.repeat(np.array(selection.layer_labels, dtype=np.int64), steps), replans),
-        "block": np.tile(np.repeat(np.array(selection.blocks, dtype=np.int64), steps), replans),
-        "denoise_step": np.tile(np.array(selection.denoise_steps, dtype=np.int64), replans * layers),
-    }
-    attributes = item.episode.attributes
-    frame = pl.DataFrame(grid | {name: values.ravel() for name, values in norms.items()}).fill_nan(None)
-    return frame.select(
-        pl.lit(item.store.suite).alias("suite"),
-        pl.lit(attributes.task_id, dtype=pl.Int64).alias("task_id"),
-        pl.lit(attributes.episode_index, dtype=pl.Int64).alias("episode_index"),
-        pl.all(),
+        sides = {"numerator_norm": above, "denominator_norm": below, "contribution_ratio": ratio(above, below)}
+    axes = [replan_axis(item), layer_axis(selection), denoise_axis(selection)]
+    return Tables(
+        long_table(item, axes, sides),
+        long_table(item, [*axes, {"group": list(parts)}], {"norm": norms}),
     )
 
 
-def summarise_group_contributions(table: pl.DataFrame | None, grouping: Grouping, site: str, seed: int) -> str:
-    """The summary's section: per layer the mean norms of the groups and the ratio of norms with a two-level interval (95 %)."""
-    title = f"CONTRIBUTIONS OF GROUPS  norms of what they add to the residual stream at site '{site}'"
-    measured = [name for name in grouping.names if table is not None and f"{name}_norm" in table.columns]
-    cut = [name for name in grouping.names if name not in measured]
-    note = (
-        f"Not of {listing(cut)}: contributions are stored for whole segments (a span's keys of one role), and "
-        f"{'this group takes' if len(cut) == 1 else 'these groups take'} parts of segments."
-        if cut
-        else ""
-    )
-    if table is None:
-        return "\n".join([title, "-" * WIDTH, *textwrap.wrap(note, WIDTH), ""])
-    shown = [name for name in measured if (table[f"{name}_norm"] > 0).any()]
-    nothing = [name for name in measured if name not in shown]
-    if nothing:
-        note = f"Exactly nothing is added by {listing(nothing)}. {note}".strip()
-    has_ratio = "contribution_ratio" in table.columns
-    rows = []
-    for row in _means_by_layer(table, shown, has_ratio, seed):
-        cells = [row["layer"], *(format_number(row[f"{name}_norm"]) for name in shown)]
-        if has_ratio:
-            bounds = format_interval(row["contribution_ratio_low"], row["contribution_ratio_high"])
-            cells += [format_number(row["contribution_ratio"]), bounds]
-        rows.append(cells)
-    header = ["layer", *(f"|{name}|" for name in shown), *(["ratio", "95% interval"] if has_ratio else [])]
-    lines = [title, "-" * WIDTH, text_table(header, rows, left=(0,))]
-    return "\n".join([*lines, *(["", *textwrap.wrap(note, WIDTH)] if note else []), ""])
+def _episode_means(table: pl.DataFrame, measure: pl.Expr, *by: str) -> pl.DataFrame:
+    """Means over replans and denoise steps, one row per (episode, layer or "layers_avg", `by`); `layer` is a string.
 
-
-def _means_by_layer(table: pl.DataFrame, shown: Sequence[str], has_ratio: bool, seed: int) -> list[dict]:
-    columns = [*(f"{name}_norm" for name in shown), *(["contribution_ratio"] if has_ratio else [])]
-    finite = [
-        pl.col(name).filter(pl.col(name).is_finite()).mean() if name == "contribution_ratio" else pl.col(name).mean()
-        for name in columns
-    ]
-    # A block that was named by two layer numbers counts once in the average over layers.
-    once = table.unique([*_EPISODE, "replan", "block", "denoise_step"], maintain_order=True)
-    together = pl.concat(
+    A block that was named by two layer numbers counts once in "layers_avg".
+    """
+    once = table.select("layer", "block").unique(maintain_order=True).unique("block", keep="first")["layer"]
+    layers = table.group_by(*EPISODE_ID, "layer", *by, maintain_order=True).agg(measure)
+    average = table.filter(pl.col("layer").is_in(once.implode())).group_by(*EPISODE_ID, *by, maintain_order=True)
+    return pl.concat(
         [
-            table.with_columns(pl.col("layer").cast(pl.String)),
-            once.with_columns(pl.lit(LAYERS_AVG).alias("layer")),
+            layers.with_columns(pl.col("layer").cast(pl.String)),
+            average.agg(measure).with_columns(pl.lit(LAYERS_AVG).alias("layer")).select(layers.columns),
         ]
     )
-    episodes = together.group_by(*_EPISODE, "layer", maintain_order=True).agg(finite)
-    values = dict.fromkeys(columns, POSITIVE)
-    return list(means_with_intervals(episodes, ["layer"], values, seed).iter_rows(named=True))
+
+
+def norms_by_layer(groups: pl.DataFrame) -> dict[tuple[str, str], float]:
+    """By (layer, group): mean over episodes of the mean norm."""
+    episodes = _episode_means(groups, pl.col("norm").mean(), "group")
+    means = episodes.group_by("layer", "group", maintain_order=True).agg(pl.col("norm").mean())
+    return {(layer, group): norm for layer, group, norm in means.iter_rows()}
+
+
+def ratios_by_layer(cells: pl.DataFrame, seed: int) -> dict[str, dict[str, Any]]:
+    """By layer: mean over episodes of the mean ratio of norms, with its interval; empty without a ratio."""
+    if "contribution_ratio" not in cells.columns:
+        return {}
+    finite = pl.col("contribution_ratio").filter(pl.col("contribution_ratio").is_finite())
+    episodes = _episode_means(cells, finite.mean())
+    means = means_with_intervals(episodes, ["layer"], {"contribution_ratio": POSITIVE}, seed)
+    return {row["layer"]: row for row in means.iter_rows(named=True)}

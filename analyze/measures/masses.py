@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.schemas.groupings.grouping import Grouping
+
 
 def masses(rows: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float64]:
     """Mass of each group: the sum over keys of probability x weight.
@@ -18,11 +20,18 @@ def masses(rows: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[n
     Returns:
         (replan, ..., group).
     """
-    replans, groups = rows.shape[0], weights.shape[2]
-    flat = rows.reshape(replans, -1, rows.shape[-1])
-    # One product per replan (or a single one for weights that never change); float32 sums err by about 3e-7.
-    product = flat.reshape(-1, rows.shape[-1]) @ weights[0] if len(weights) == 1 else np.matmul(flat, weights)
-    return product.reshape(*rows.shape[:-1], groups).astype(np.float64)
+    return weighted_sums(rows, weights).astype(np.float64)
+
+
+def weighted_sums(values: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Sums over keys of values (replan, ..., key) x weights (replan or 1, key, group), shape (replan, ..., group).
+
+    One product per replan, or a single one for weights that never change; float32 sums err by about 3e-7.
+    """
+    flat = values.reshape(values.shape[0], -1, values.shape[-1])
+    product = flat.reshape(-1, flat.shape[-1]) @ weights[0] if len(weights) == 1 else np.matmul(flat, weights)
+    sums: NDArray[np.float32] = product.reshape(*values.shape[:-1], weights.shape[2])
+    return sums
 
 
 @dataclass(frozen=True)
@@ -33,6 +42,11 @@ class GroupMeasures:
     fraction: NDArray[np.float64]
     density: NDArray[np.float64]
     lift: NDArray[np.float64]
+    keys: NDArray[np.float64]
+
+    def columns(self) -> dict[str, NDArray[np.float64]]:
+        """The measures by the names of their columns."""
+        return {name: getattr(self, name) for name in ("mass", "fraction", "keys", "density", "lift")}
 
 
 def group_measures(
@@ -63,13 +77,36 @@ def group_measures(
         fraction = mass / mass.sum(axis=-1, keepdims=True)
         density = np.where(keys > 0, mass / keys, np.nan)
         lift = density / (valid_mass[..., None] / valid)
-    return GroupMeasures(mass, fraction, density, lift)
+    return GroupMeasures(mass, fraction, density, lift, keys)
 
 
 def ratio(numerator: NDArray[np.float64], denominator: NDArray[np.float64]) -> NDArray[np.float64]:
     """numerator / denominator: infinite where only the denominator is 0, NaN (undefined) where both are."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return numerator / denominator
+
+
+def sides(values: NDArray[np.float64], grouping: Grouping) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Sums of values (..., group) over the groups of the ratio's numerator and of its denominator, (...) each."""
+    assert grouping.ratio is not None
+    top, bottom = (
+        [grouping.names.index(name) for name in side] for side in (grouping.ratio.numerator, grouping.ratio.denominator)
+    )
+    return values[..., top].sum(axis=-1), values[..., bottom].sum(axis=-1)
+
+
+def uniform_ratio(num_keys: NDArray[np.float64], grouping: Grouping) -> NDArray[np.float64]:
+    """The ratio that uniform attention gives: keys of the numerator / keys of the denominator.
+
+    num_keys: (replan or 1, group). Returns (replan or 1,); infinite or NaN as in `ratio`.
+    """
+    return ratio(*sides(num_keys, grouping))
+
+
+def relative_to_uniform(value: NDArray[np.float64], uniform: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """`ratio_lift`, the ratio / the uniform ratio, and `log2_ratio`, of arrays of one shape."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return {"ratio_lift": value / uniform, "log2_ratio": np.log2(value)}
 
 
 def finite_mean(values: NDArray[np.float64], axis: int | tuple[int, ...] = 0) -> NDArray[np.float64]:

@@ -12,13 +12,7 @@ from vla_attention.analyze.measures.frames import layer_name
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
 from vla_attention.analyze.show.headings import run_header
 from vla_attention.analyze.show.progress import progress_bar
-from vla_attention.analyze.stores.selection import (
-    Selection,
-    check_combinable,
-    choose_site,
-    select,
-    select_episodes,
-)
+from vla_attention.analyze.stores.selection import Selection, check_combinable, choose_site, select, select_episodes
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.builtin_groupings import find_grouping
 from vla_attention.schemas.groupings.grouping import Grouping, parse_group_argument, parse_ratio_argument, with_groups

@@ -1,16 +1,34 @@
-"""The steps table: one row per (episode, replan, layer, denoise step[, head]) with the measures of every group."""
+"""Masses of every selected episode, as arrays, and the tables of steps: one row per replan, layer, denoise step (and head)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
-import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.masses import group_measures, masses, ratio
+from vla_attention.analyze.measures.frames import (
+    EPISODE_KEYS,
+    Axis,
+    Tables,
+    concat_tables,
+    head_axis,
+    layer_axis,
+    long_table,
+    replan_axis,
+)
+from vla_attention.analyze.measures.masses import (
+    group_measures,
+    masses,
+    ratio,
+    relative_to_uniform,
+    sides,
+    uniform_ratio,
+)
+from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
+from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
@@ -19,47 +37,153 @@ from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 from vla_attention.schemas.segments import segment_members, weights_on_segments
 
 
-def steps_table(
-    selected: Sequence[SelectedEpisode],
-    grouping: Grouping,
-    selection: Selection,
-    site: str,
-    progress: Callable[[int], object] | None = None,
-    resolved: Sequence[ResolvedGrouping] | None = None,
-) -> pl.DataFrame:
-    """Measure every selected episode; `progress` is called with 1 after each.
+@dataclass(frozen=True)
+class MeasuredEpisode:
+    """What the groups of a grouping get in one episode. All further numbers follow from these arrays.
 
-    `resolved` is the grouping on every episode where it is known already; else it is resolved here.
+    Attributes:
+        item: the episode.
+        selection: which layers, denoise steps and heads the axes hold; with `per_head` false the axis of heads has length 1.
+        mass: (replan, layer, denoise, head, group), mean over the stored queries.
+        valid_mass: (replan, layer, denoise, head), mass of all valid keys.
+        row_sum: (replan, layer, denoise, head), sums of the rows before storage rounded them.
+        num_keys: (replan or 1, group), fractional where objects cover parts of patches.
+        num_valid: (replan or 1,), number of valid keys.
     """
-    resolved = resolve_all(grouping, selected) if resolved is None else resolved
 
-    def measure(pair: tuple[SelectedEpisode, ResolvedGrouping]) -> pl.DataFrame:
-        return _episode_steps(*pair, grouping, selection, site)
+    item: SelectedEpisode
+    selection: Selection
+    mass: NDArray[np.float64]
+    valid_mass: NDArray[np.float64]
+    row_sum: NDArray[np.float64]
+    num_keys: NDArray[np.float64]
+    num_valid: NDArray[np.int64]
 
-    return pl.concat(map_episodes(measure, list(zip(selected, resolved, strict=True)), progress))
+    def over_heads(self) -> MeasuredEpisode:
+        """The same with heads averaged."""
+        return replace(
+            self,
+            selection=replace(self.selection, per_head=False),
+            mass=self.mass.mean(axis=3, keepdims=True),
+            valid_mass=self.valid_mass.mean(axis=3, keepdims=True),
+            row_sum=self.row_sum.mean(axis=3, keepdims=True),
+        )
+
+    def at_denoise(self, position: int) -> MeasuredEpisode:
+        """One denoise step alone, by its position in the selection."""
+        part, selection = slice(position, position + 1), self.selection
+        return replace(
+            self,
+            selection=replace(selection, denoise=selection.denoise[part], denoise_steps=selection.denoise_steps[part]),
+            mass=self.mass[:, :, part],
+            valid_mass=self.valid_mass[:, :, part],
+            row_sum=self.row_sum[:, :, part],
+        )
 
 
-def episode_masses(
+def measure_episode(
     item: SelectedEpisode, resolved: ResolvedGrouping, selection: Selection, site: str
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Masses (replan, layer, denoise, head or 1, group + 1) and row sums (replan, layer, denoise, head or 1) of one episode.
+) -> MeasuredEpisode:
+    """Masses of one episode.
 
-    The last mass is that of all valid keys.
-
-    Averaged over the stored queries and, unless heads are kept apart, over the selected heads. Uses the stored segment
-    masses when the grouping does not cut through a segment, and reads rows otherwise.
+    Takes the stored segment masses when the grouping does not cut through a segment, and reads rows otherwise.
     """
     row_sum = row_sums(item, selection, site)
     weights = with_valid(resolved.weights, item.valid)
     of_segments = segment_weights(item, weights, site)
     if of_segments is not None:
         atoms = _cells(item.episode.read(f"{site}/atoms"), selection)
-        return masses(_reduce(atoms, selection, axis=-2), of_segments), row_sum
-    result = np.empty((*row_sum.shape, weights.shape[2]))
-    for part in layer_rows(item.episode, selection, site):
-        rows = part.rows if selection.per_head else part.rows.mean(axis=1, keepdims=True)
-        result[:, part.layer, part.denoise] = masses(rows, weights)
-    return result, row_sum
+        mass = masses(_reduce(atoms, selection, axis=-2), of_segments)
+    else:
+        mass = np.empty((*row_sum.shape, weights.shape[2]))
+        for part in layer_rows(item.episode, selection, site):
+            rows = part.rows if selection.per_head else part.rows.mean(axis=1, keepdims=True)
+            mass[:, part.layer, part.denoise] = masses(rows, weights)
+    return measured_from(item, resolved, selection, mass, row_sum)
+
+
+def measured_from(
+    item: SelectedEpisode,
+    resolved: ResolvedGrouping,
+    selection: Selection,
+    mass: NDArray[np.float64],
+    row_sum: NDArray[np.float64],
+) -> MeasuredEpisode:
+    """A `MeasuredEpisode` from masses (replan, layer, denoise, head, group + 1), the last one that of all valid keys."""
+    return MeasuredEpisode(
+        item, selection, mass[..., :-1], mass[..., -1], row_sum, resolved.num_keys, resolved.num_valid
+    )
+
+
+def measure_episodes(
+    question: Question,
+    resolved: Sequence[ResolvedGrouping] | None = None,
+    progress: Callable[[int], object] | None = None,
+    per_head: bool | None = None,
+) -> list[MeasuredEpisode]:
+    """Masses of every selected episode of a question. Shows progress at a terminal unless `progress` is given.
+
+    Args:
+        question: stores, selection and grouping.
+        resolved: the grouping on every episode, where it is known already.
+        progress: called with 1 after each episode.
+        per_head: keep heads apart; as the question says unless given.
+    """
+    known = resolved or resolve_all(question.grouping, question.selected, question.vocabulary)
+    selection = question.selection if per_head is None else replace(question.selection, per_head=per_head)
+
+    def measure(pair: tuple[SelectedEpisode, ResolvedGrouping]) -> MeasuredEpisode:
+        return measure_episode(*pair, selection, question.site)
+
+    pairs = list(zip(question.selected, known, strict=True))
+    if progress is not None:
+        return map_episodes(measure, pairs, progress)
+    with progress_bar(len(pairs), "episodes") as advance:
+        return map_episodes(measure, pairs, advance)
+
+
+def step_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Tables:
+    """Every (episode, replan, layer, denoise step[, head]).
+
+    Returns:
+        cells: `EPISODE_KEYS`, replan, env_step, layer, block, denoise_step, denoise_time, head (null where heads were averaged),
+            row_sum, valid_mass, num_valid; with a ratio numerator_mass, denominator_mass, ratio, uniform_ratio, ratio_lift (ratio /
+            uniform_ratio), log2_ratio.
+        groups: suite, task_id, episode_index, replan, layer, block, denoise_step, head, group, mass, fraction, keys, density,
+            lift (see `masses.group_measures`).
+    """
+    return concat_tables([_episode_steps(episode, grouping) for episode in measured])
+
+
+def _episode_steps(measured: MeasuredEpisode, grouping: Grouping) -> Tables:
+    item, selection, mass = measured.item, measured.selection, measured.mass
+    replans, layers, heads = replan_axis(item), layer_axis(selection), head_axis(selection)
+    times = item.episode.read("denoise_time")[list(selection.denoise)].astype(np.float64)
+    steps: Axis = {"denoise_step": selection.denoise_steps, "denoise_time": times}
+    cells = {
+        "row_sum": measured.row_sum,
+        "valid_mass": measured.valid_mass,
+        "num_valid": _per_replan(measured.num_valid),
+    }
+    if grouping.ratio is not None:
+        above, below = sides(mass, grouping)
+        value, uniform = ratio(above, below), _per_replan(uniform_ratio(measured.num_keys, grouping))
+        cells |= {"numerator_mass": above, "denominator_mass": below, "ratio": value, "uniform_ratio": uniform}
+        cells |= relative_to_uniform(value, uniform)
+    brief: list[Axis] = [{"replan": replans["replan"]}, layers, {"denoise_step": selection.denoise_steps}, heads]
+    return Tables(
+        long_table(item, [replans, layers, steps, heads], cells, EPISODE_KEYS),
+        lambda: long_table(
+            item,
+            [*brief, {"group": grouping.names}],
+            group_measures(mass, measured.valid_mass, measured.num_keys, measured.num_valid).columns(),
+        ),
+    )
+
+
+def _per_replan(values: NDArray[np.float64] | NDArray[np.int64]) -> NDArray[np.float64]:
+    """Values (replan or 1,) as (replan or 1, 1, 1, 1)."""
+    return values[:, None, None, None]  # type: ignore[return-value]
 
 
 def row_sums(item: SelectedEpisode, selection: Selection, site: str) -> NDArray[np.float64]:
@@ -91,89 +215,3 @@ def _reduce(values: NDArray[np.float32], selection: Selection, axis: int = -1) -
     """Average over queries (the given axis) and, unless heads are kept apart, over heads (the axis before it)."""
     values = values.mean(axis=axis)
     return values if selection.per_head else values.mean(axis=axis, keepdims=True)
-
-
-def _episode_steps(
-    item: SelectedEpisode, resolved: ResolvedGrouping, grouping: Grouping, selection: Selection, site: str
-) -> pl.DataFrame:
-    return episode_steps(item, resolved, grouping, selection, *episode_masses(item, resolved, selection, site))
-
-
-def episode_steps(
-    item: SelectedEpisode,
-    resolved: ResolvedGrouping,
-    grouping: Grouping,
-    selection: Selection,
-    mass: NDArray[np.float64],
-    row_sum: NDArray[np.float64],
-) -> pl.DataFrame:
-    """One episode's part of the steps table, from what `episode_masses` gives."""
-    mass, valid_mass = mass[..., :-1], mass[..., -1]
-    measures = group_measures(mass, valid_mass, resolved.num_keys, resolved.num_valid)
-    shape = row_sum.shape
-    attributes, episode = item.episode.attributes, item.episode
-
-    def along(values: Any, axis: int) -> NDArray[Any]:
-        expanded = np.asarray(values).reshape([-1 if i == axis else 1 for i in range(4)])
-        return np.broadcast_to(expanded, shape).ravel()
-
-    columns: dict[str, Any] = {
-        "suite": item.store.suite,
-        "task_id": attributes.task_id,
-        "instruction": attributes.instruction,
-        "episode_index": attributes.episode_index,
-        "success": attributes.success,
-        "num_steps": attributes.num_steps,
-        "replan": along(np.arange(shape[0]), 0),
-        "env_step": along(episode.read("env_step").astype(np.int64), 0),
-        "layer": along(np.array(selection.layer_labels, dtype=np.int64), 1),
-        "block": along(np.array(selection.blocks, dtype=np.int64), 1),
-        "denoise_step": along(np.array(selection.denoise_steps, dtype=np.int64), 2),
-        "denoise_time": along(episode.read("denoise_time")[list(selection.denoise)].astype(np.float64), 2),
-        "head": along(np.array(selection.head_numbers, dtype=np.int64), 3) if selection.per_head else None,
-        "row_sum": row_sum.ravel(),
-        "valid_mass": valid_mass.ravel(),
-        "num_valid": along(np.broadcast_to(resolved.num_valid, shape[:1]), 0),
-    }
-    for i, name in enumerate(grouping.names):
-        columns[f"{name}_mass"] = measures.mass[..., i].ravel()
-        columns[f"{name}_fraction"] = measures.fraction[..., i].ravel()
-        columns[f"{name}_keys"] = along(np.broadcast_to(resolved.num_keys[:, i], shape[:1]), 0)
-        columns[f"{name}_density"] = measures.density[..., i].ravel()
-        columns[f"{name}_lift"] = measures.lift[..., i].ravel()
-    if grouping.ratio is not None:
-        columns.update(_ratio_columns(grouping, measures.mass, resolved.num_keys, along))
-    frame = pl.DataFrame({name: values for name, values in columns.items() if isinstance(values, np.ndarray)})
-    return frame.select(_expression(name, values) for name, values in columns.items())
-
-
-def _expression(name: str, values: NDArray[Any] | str | bool | int | None) -> pl.Expr:
-    """A column of the steps table, from its numbers or the one value that all of its rows have."""
-    if not isinstance(values, np.ndarray):
-        dtype = pl.String if isinstance(values, str) else pl.Boolean if isinstance(values, bool) else pl.Int64
-        return pl.lit(values, dtype=dtype).alias(name)
-    # NaN stands for "undefined" in numpy; in tables that is null. Infinite ratios stay what they are.
-    return pl.col(name).fill_nan(None) if values.dtype == np.float64 else pl.col(name)
-
-
-def _ratio_columns(
-    grouping: Grouping,
-    mass: NDArray[np.float64],
-    num_keys: NDArray[np.float64],
-    along: Callable[[Any, int], NDArray[Any]],
-) -> dict[str, NDArray[Any]]:
-    assert grouping.ratio is not None
-    top = [grouping.names.index(name) for name in grouping.ratio.numerator]
-    bottom = [grouping.names.index(name) for name in grouping.ratio.denominator]
-    numerator, denominator = mass[..., top].sum(axis=-1), mass[..., bottom].sum(axis=-1)
-    value = ratio(numerator, denominator)
-    uniform = np.broadcast_to(ratio(num_keys[:, top].sum(axis=1), num_keys[:, bottom].sum(axis=1)), mass.shape[:1])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return {
-            "numerator_mass": numerator.ravel(),
-            "denominator_mass": denominator.ravel(),
-            "ratio": value.ravel(),
-            "uniform_ratio": along(uniform, 0),
-            "ratio_lift": (value / uniform[:, None, None, None]).ravel(),
-            "log2_ratio": np.log2(value).ravel(),
-        }

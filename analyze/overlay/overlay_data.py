@@ -9,12 +9,11 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.aggregate import add_layers_avg, overall_layer, per_replan
+from vla_attention.analyze.measures.aggregate import overall_layer, replans_of
 from vla_attention.analyze.measures.frames import Axis, long_table, rows_of_episode
 from vla_attention.analyze.measures.patch_maps import mean_rows, seen_cameras
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, check_replan
-from vla_attention.analyze.measures.steps import steps_table
 from vla_attention.analyze.overlay.colours import (
     Measure,
     Scale,
@@ -116,9 +115,8 @@ def outline_grouping(texts: Sequence[str]) -> Grouping | None:
 
 
 def ratios_of(question: Question, item: SelectedEpisode) -> pl.DataFrame:
-    """The table of replans (see `vla_attention.analyze.measures.aggregate`) of one episode."""
-    steps = steps_table([item], question.grouping, question.selection, question.site)
-    return add_layers_avg(per_replan(steps, question.grouping), question.grouping)
+    """The cells of `measures.aggregate.replan_tables` of one episode."""
+    return replans_of(replace(question, selected=(item,))).cells
 
 
 def episode_overlay(

@@ -186,12 +186,12 @@ def _draw_file(wanted: Sequence[str], folder: Path, label: str, table: ResultsTa
     if "distribution" in wanted:
         stem = plot_ratio_distribution.STEM + end
         written += plot_ratio_distribution.plot_ratio_distribution(
-            table.replans, table.grouping, folder, stem=stem, about=about, note=note
+            table.replans.cells, table.grouping, folder, stem=stem, about=about, note=note
         )
     if "per_task" in wanted:
         stem = plot_ratio_per_task.STEM + end
         written += plot_ratio_per_task.plot_ratio_per_task(
-            table.episodes, table.tasks, table.grouping, folder, stem=stem, about=about, note=note
+            table.episodes.cells, table.tasks.cells, table.grouping, folder, stem=stem, about=about, note=note
         )
     if "fractions" in wanted:
         stem = plot_attention_fractions.STEM + end

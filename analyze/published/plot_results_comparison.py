@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG, overall_layer, overall_rows
+from vla_attention.analyze.measures.aggregate import overall_layer, overall_rows
+from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.published.results_tables import ResultsTables
+from vla_attention.analyze.ratios.profile_panels import FRACTION_COLUMNS
 from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.show.plot_axes import ratio_axis
 from vla_attention.analyze.show.plot_colours import FIXED_COLORS, NOTE_COLOR
@@ -31,24 +33,27 @@ def comparison_table(tables: Sequence[ResultsTables], labels: Sequence[str]) -> 
     """One row per results file, over all its episodes, in the layer that speaks for it ("layers_avg", else the first).
 
     Columns: file, kind, layer, num_tasks, num_episodes, episodes_without_ratio, num_replans, num_nonfinite, success_rate,
-    ratio_mean with ratio_mean_low and ratio_mean_high (two-level bootstrap), ratio_std (over episodes) and, for every group of
-    `visual`, `linguistic`, `action` and `rest`, GROUP_fraction with its interval (null in a file without that group).
+    ratio_mean with ratio_mean_low and ratio_mean_high (two-level bootstrap), ratio_std (over episodes).
     """
     columns = ["num_tasks", "num_episodes", "episodes_without_ratio", "num_replans", "num_nonfinite", "success_rate"]
     columns += ["ratio_mean", "ratio_mean_low", "ratio_mean_high", "ratio_std"]
     rows = []
     for table, label in zip(tables, labels, strict=True):
-        layer = overall_layer(table.tasks)
-        row = overall_rows(table.tasks).filter(layer=layer).row(0, named=True)
-        fractions = {
-            f"{name}_fraction{end}": row.get(f"{name}_fraction{end}")
-            for name in _FRACTIONS
-            for end in ("", "_low", "_high")
-        }
+        layer = overall_layer(table.tasks.cells)
+        row = overall_rows(table.tasks).cells.filter(layer=layer).row(0, named=True)
         identity = {"file": label, "kind": table.grouping.description, "layer": layer}
-        rows.append({**identity, **{column: row[column] for column in columns}, **fractions})
-    floats = dict.fromkeys([*columns[6:], *fractions], pl.Float64)
+        rows.append({**identity, **{column: row[column] for column in columns}})
+    floats = dict.fromkeys(columns[6:], pl.Float64)
     return pl.DataFrame(rows, schema_overrides=floats, infer_schema_length=None)
+
+
+def fractions_table(tables: Sequence[ResultsTables], labels: Sequence[str]) -> pl.DataFrame:
+    """Mean fractions of the files' groups in the layer of `comparison_table`: file, group, fraction, fraction_low, fraction_high."""
+    parts = []
+    for table, label in zip(tables, labels, strict=True):
+        rows = overall_rows(table.tasks).filter(pl.col("layer") == overall_layer(table.tasks.cells)).groups
+        parts.append(rows.select(pl.lit(label).alias("file"), "group", *FRACTION_COLUMNS))
+    return pl.concat(parts)
 
 
 @drawn_in_our_style
@@ -71,13 +76,14 @@ def plot_results_comparison(tables: Sequence[ResultsTables], labels: Sequence[st
     title(figure, f"{plural(data.height, 'results file')}{of}, {which}", note)
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=[1.5, 1])
     _ratios(left, data, tables, kinds, few)
-    _stacked_fractions(right, data)
+    fractions = fractions_table(tables, labels)
+    _stacked_fractions(right, labels, fractions)
     figure.legend(handles=left.get_legend_handles_labels()[0], loc="outside lower left", ncols=min(len(kinds) + 1, 2))
     left.set_yticks(range(data.height), row_names(data, few))
     left.set_ylim(data.height - 0.4, -0.6)
     left.tick_params(axis="y", length=0)
     right.tick_params(axis="y", length=0)
-    return save_figure(figure, folder, STEM, data)
+    return save_figure(figure, folder, STEM, {"": data, "_groups": fractions})
 
 
 def row_names(data: pl.DataFrame, few: bool) -> list[str]:
@@ -116,7 +122,7 @@ def _clipped(text: str, most: int = 40) -> str:
 def _ratios(axes: Axes, data: pl.DataFrame, tables: Sequence[ResultsTables], kinds: list[str], few: bool) -> None:
     generator = np.random.default_rng(0)
     dots = [
-        table.episodes.filter(layer=layer)["ratio_mean"].drop_nulls().to_numpy()
+        table.episodes.cells.filter(layer=layer)["ratio_mean"].drop_nulls().to_numpy()
         for table, layer in zip(tables, data["layer"], strict=True)
     ]
     bounds = [data[f"ratio_mean{end}"].drop_nulls().to_numpy() for end in ("", "_low", "_high")]
@@ -152,14 +158,15 @@ def _ratios(axes: Axes, data: pl.DataFrame, tables: Sequence[ResultsTables], kin
     axes.set_xlabel("ratio of masses, visual / linguistic (logarithmic)")
 
 
-def _stacked_fractions(axes: Axes, data: pl.DataFrame) -> None:
-    start = np.zeros(data.height)
+def _stacked_fractions(axes: Axes, files: Sequence[str], fractions: pl.DataFrame) -> None:
+    start = np.zeros(len(files))
     for name in _FRACTIONS:
-        values = data[f"{name}_fraction"].fill_null(0.0).to_numpy()
-        if data[f"{name}_fraction"].null_count() == data.height:
+        known = dict(fractions.filter(group=name).drop_nulls("fraction").select("file", "fraction").iter_rows())
+        if not known:
             continue
+        values = np.array([known.get(file, 0.0) for file in files])
         label = "other" if name == "rest" else name
-        axes.barh(range(data.height), values, 0.6, start, color=FIXED_COLORS[name], edgecolor="white", label=label)
+        axes.barh(range(len(files)), values, 0.6, start, color=FIXED_COLORS[name], edgecolor="white", label=label)
         for position, (value, left) in enumerate(zip(values, start, strict=True)):
             if value >= 0.09:
                 axes.text(

@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import EPISODE_KEYS, LAYERS_AVG
+from vla_attention.analyze.measures.frames import EPISODE_KEYS, LAYERS_AVG, Tables
 from vla_attention.analyze.show.output_files import replacing
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.jsonable import MalformedDocument, from_json
@@ -21,10 +21,8 @@ _SIDES = ("visual", "linguistic")
 _RATIO = "visual_linguistic_ratio"
 
 
-def episode_documents(
-    replans: pl.DataFrame, grouping: Grouping, proxy: FrameProxy | None = None
-) -> Iterator[dict[str, Any]]:
-    """Episodes of one or more suites from the table of replans (`aggregate.add_layers_avg`), in its order, as JSON documents.
+def episode_documents(replans: Tables, grouping: Grouping, proxy: FrameProxy | None = None) -> Iterator[dict[str, Any]]:
+    """Episodes of one or more suites from `aggregate.replan_tables`, in their order, as JSON documents.
 
     visual is the sum of the ratio's numerator groups, linguistic that of its denominator groups; the fraction of either is
     its mass / sum of all groups' masses. With a `proxy` the numbers are those of the published Cosmos scripts instead: masses are
@@ -61,7 +59,7 @@ def episode_documents(
         }
 
 
-def episode_results(replans: pl.DataFrame, grouping: Grouping, proxy: FrameProxy | None = None) -> list[EpisodeResult]:
+def episode_results(replans: Tables, grouping: Grouping, proxy: FrameProxy | None = None) -> list[EpisodeResult]:
     """`episode_documents` as objects."""
     return from_json(list[EpisodeResult], list(episode_documents(replans, grouping, proxy)))
 
@@ -77,13 +75,13 @@ def write_results(path: Path, episodes: Iterable[dict[str, Any]]) -> None:
 
 
 def write_results_of_suites(
-    folder: Path, replans: pl.DataFrame, grouping: Grouping, proxy: FrameProxy | None = None
+    folder: Path, replans: Tables, grouping: Grouping, proxy: FrameProxy | None = None
 ) -> list[Path]:
-    """Write `attention_ratio_results_<suite>.json` for every suite of the table and return the paths."""
+    """Write `attention_ratio_results_<suite>.json` for every suite of the tables and return the paths."""
     paths = []
-    for (suite,), part in replans.partition_by("suite", as_dict=True, maintain_order=True).items():
-        path = folder / results_file_name(str(suite))
-        write_results(path, episode_documents(part, grouping, proxy))
+    for suite in replans.cells["suite"].unique(maintain_order=True):
+        path = folder / results_file_name(suite)
+        write_results(path, episode_documents(replans.filter(pl.col("suite") == suite).kept(), grouping, proxy))
         paths.append(path)
     return paths
 
@@ -108,15 +106,13 @@ def _refuse_constant(constant: str) -> NoReturn:
     )
 
 
-def _with_sides(replans: pl.DataFrame, grouping: Grouping, proxy: FrameProxy | None) -> pl.DataFrame:
+def _with_sides(replans: Tables, grouping: Grouping, proxy: FrameProxy | None) -> pl.DataFrame:
     """Add step, ratio (null where it is not finite), and the masses and fractions of the two sides."""
-    assert grouping.ratio is not None
-    visual = pl.sum_horizontal(f"{name}_mass" for name in grouping.ratio.numerator)
-    linguistic = pl.sum_horizontal(f"{name}_mass" for name in grouping.ratio.denominator)
+    cells = replans.cells
+    visual, linguistic = cells["numerator_mass"], cells["denominator_mass"]
     queries = 1 if proxy is None else proxy.num_queries
-    total = visual + linguistic if proxy else pl.sum_horizontal(f"{name}_mass" for name in grouping.names)
-    # What the table calls after a group may be the name of a side.
-    return replans.with_columns(
+    total = visual + linguistic if proxy else pl.Series(replans.values("mass").sum(axis=1))
+    table = cells.with_columns(
         pl.col("env_step").alias("step"),
         pl.when(pl.col("ratio").is_finite()).then(pl.col("ratio")).alias(_RATIO),
         (visual * queries).alias("visual_mass"),
@@ -124,6 +120,12 @@ def _with_sides(replans: pl.DataFrame, grouping: Grouping, proxy: FrameProxy | N
         (visual / total).fill_nan(None).alias("visual_fraction"),
         (linguistic / total).fill_nan(None).alias("linguistic_fraction"),
     )
+    if _ACTION in grouping.names:
+        of_action = replans.of_group(_ACTION)
+        table = table.with_columns(
+            of_action["mass"].alias(f"{_ACTION}_mass"), of_action["fraction"].alias(f"{_ACTION}_fraction")
+        )
+    return table
 
 
 def _summaries(episode: pl.DataFrame, kinds: Sequence[str]) -> pl.DataFrame:

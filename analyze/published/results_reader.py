@@ -23,7 +23,7 @@ from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG
+from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.results import (
     RESULTS_PREFIX,

@@ -13,7 +13,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG, episodes_table, layer_order, tasks_table
+from vla_attention.analyze.measures.aggregate import episode_tables, layer_order, task_tables
+from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
 from vla_attention.analyze.published.results_reader import Claim, ResultsFile, ResultsKind
 from vla_attention.analyze.statistics.bootstrap import SampleSummary, summarize
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
@@ -33,9 +34,9 @@ class ResultsTables:
     """Tables of one or several results files; column `suite` holds the files' labels, so that equal task ids stay apart."""
 
     grouping: Grouping
-    replans: pl.DataFrame
-    episodes: pl.DataFrame
-    tasks: pl.DataFrame
+    replans: Tables
+    episodes: Tables
+    tasks: Tables
 
 
 @dataclass(frozen=True)
@@ -84,8 +85,8 @@ def results_tables(files: Sequence[ResultsFile], labels: Sequence[str]) -> Resul
     rows = pl.concat([_rows(file, label) for file, label in zip(files, labels, strict=True)])
     grouping = _grouping(files[0].kind, rows)
     replans = _replans(rows, grouping)
-    episodes = episodes_table(replans, grouping)
-    return ResultsTables(grouping, replans, episodes, tasks_table(episodes, grouping))
+    episodes = episode_tables(replans, grouping)
+    return ResultsTables(grouping, replans, episodes, task_tables(episodes, grouping))
 
 
 def _rows(file: ResultsFile, label: str) -> pl.DataFrame:
@@ -108,7 +109,7 @@ def _defined(names: Sequence[str]) -> pl.Expr:
     return pl.all_horizontal(pl.col(f"{name}_fraction").is_not_null() for name in names)
 
 
-def _replans(rows: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
+def _replans(rows: pl.DataFrame, grouping: Grouping) -> Tables:
     names = [name for name in grouping.names if name != REST]
     if REST in grouping.names:
         rest = pl.when(_defined(names)).then(1 - pl.sum_horizontal(f"{name}_fraction" for name in names)).clip(0, 1)
@@ -124,12 +125,11 @@ def _replans(rows: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
         .sum()
         .over("suite", "task_id", "episode_index", "replan")
     )
-    return rows.with_columns(
+    table = rows.with_columns(
         pl.lit(None, dtype=pl.Int64).alias("block"),
         _UNKNOWN.alias("row_sum"),
         _UNKNOWN.alias("valid_mass"),
         _UNKNOWN.alias("num_valid"),
-        *(_UNKNOWN.alias(f"{name}_{kind}") for name in grouping.names for kind in ("keys", "density", "lift")),
         pl.col("visual_mass").alias("numerator_mass"),
         pl.col("linguistic_mass").alias("denominator_mass"),
         _UNKNOWN.alias("uniform_ratio"),
@@ -140,7 +140,20 @@ def _replans(rows: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
         .otherwise(not_finite)
         .cast(pl.Int64)
         .alias("nonfinite_layers"),
-    ).sort("suite", "task_id", "episode_index", "replan", "layer_number", nulls_last=True)
+    ).sort(*EPISODE_ID, "replan", "layer_number", nulls_last=True)
+    measures = [f"{name}_{kind}" for name in grouping.names for kind in ("mass", "fraction")]
+    groups = pl.concat(
+        table.select(
+            *EPISODE_ID, "replan", "env_step", "layer", "layer_number", "block",
+            pl.lit(name).alias("group"),
+            pl.col(f"{name}_mass").cast(pl.Float64).alias("mass"),
+            pl.col(f"{name}_fraction").cast(pl.Float64).alias("fraction"),
+            *(_UNKNOWN.alias(unknown) for unknown in ("keys", "density", "lift")),
+            pl.int_range(pl.len()).alias("_cell"),
+        )
+        for name in grouping.names
+    ).sort("_cell", maintain_order=True)  # fmt: skip
+    return Tables(table.drop(measures), groups.drop("_cell"))
 
 
 def layers_of(file: ResultsFile) -> list[str]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
+from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG, overall_rows
+from vla_attention.analyze.measures.aggregate import overall_rows
+from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.published.results_reader import ResultsFile
 from vla_attention.analyze.published.results_tables import (
     ResultsTables,
@@ -17,7 +19,8 @@ from vla_attention.analyze.published.results_tables import (
     layers_of,
     spread_of,
 )
-from vla_attention.analyze.ratios.summary import LINGUISTIC_BELOW, VISUAL_ABOVE, WIDTH, verdict
+from vla_attention.analyze.ratios.summary import WIDTH
+from vla_attention.analyze.ratios.verdict import LINGUISTIC_BELOW, VISUAL_ABOVE, verdict
 from vla_attention.analyze.show.numbers import format_interval, format_number
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
@@ -65,7 +68,7 @@ def summary_of_files(title: str, files: Sequence[ResultsFile], tables: ResultsTa
     return "\n".join(lines) + "\n"
 
 
-_BULLET: dict = {"initial_indent": "  - ", "subsequent_indent": "    ", "break_on_hyphens": False}
+_BULLET: dict[str, Any] = {"initial_indent": "  - ", "subsequent_indent": "    ", "break_on_hyphens": False}
 
 
 def _layers(files: Sequence[ResultsFile]) -> list[str]:
@@ -122,7 +125,7 @@ def _ratio(spread: Spread, layer: str) -> list[str]:
 
 def _over_episodes(tables: ResultsTables, layer: str) -> list[str]:
     """Replans of an episode are correlated: the interval is over episodes within tasks."""
-    rows = overall_rows(tables.tasks).filter(pl.col("layer") == layer)
+    rows = overall_rows(tables.tasks).cells.filter(pl.col("layer") == layer)
     if rows.is_empty() or rows["ratio_mean"][0] is None:
         return []
     row = rows.row(0, named=True)

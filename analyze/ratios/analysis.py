@@ -9,17 +9,18 @@ from pathlib import Path
 
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
-from vla_attention.analyze.measures.contributions import contribution_table, summarise_contributions
-from vla_attention.analyze.measures.group_contributions import group_contribution_table, summarise_group_contributions
+from vla_attention.analyze.measures.aggregate import measured_episode_tables, replan_tables, task_tables
+from vla_attention.analyze.measures.contributions import contribution_table
+from vla_attention.analyze.measures.frames import Tables, named_tables
+from vla_attention.analyze.measures.group_contributions import group_contribution_tables
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import resolve_all
-from vla_attention.analyze.measures.steps import steps_table
+from vla_attention.analyze.measures.steps import MeasuredEpisode, measure_episodes, step_tables
 from vla_attention.analyze.published.frame_proxy import frame_proxy
 from vla_attention.analyze.published.results_file import write_results_of_suites
+from vla_attention.analyze.ratios.contribution_text import contributions_section, group_contributions_section
 from vla_attention.analyze.ratios.summary import AnalysedRun, summary_text, write_summary
 from vla_attention.analyze.show.output_files import write_parquet
-from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.selection import Selection, heads_text
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.groupings.grouping import Grouping
@@ -29,33 +30,38 @@ from vla_attention.schemas.stores.store_format import RootAttributes
 
 @dataclass(frozen=True)
 class Analysis:
-    """The tables of one grouping over one selection of episodes.
+    """The tables of one grouping over one selection of episodes, as pairs of cells and groups (`frames.Tables`).
 
-    In `vla_attention.analyze.measures` it is described what they hold: `steps` in `tables`; `replans`, `episodes` and `tasks` in `aggregate`.
-    Contributions and the summary are computed when they are first asked for: who wants ratios need not wait for them.
+    `step_tables` and the functions of `measures.aggregate` list their columns. Steps, contributions and the summary are computed when they
+    are first asked for.
     """
 
     question: Question
     resolved: Sequence[ResolvedGrouping]
-    steps: pl.DataFrame
-    replans: pl.DataFrame
-    episodes: pl.DataFrame
-    tasks: pl.DataFrame
+    measured: Sequence[MeasuredEpisode]
+    replans: Tables
+    episodes: Tables
+    tasks: Tables
 
     @property
     def grouping(self) -> Grouping:
         """The groups of keys that everything is about."""
         return self.question.grouping
 
+    @property
+    def steps(self) -> Tables:
+        """See `measures.steps.step_tables`."""
+        return step_tables(self.measured, self.grouping)
+
     @cached_property
     def contributions(self) -> pl.DataFrame | None:
         """See `measures.contributions.contribution_table`; None when they were not recorded."""
-        return contribution_table(self.question.episodes, self.question.selection)
+        return contribution_table(self.question.selected, self.question.selection)
 
     @cached_property
-    def group_contributions(self) -> pl.DataFrame | None:
-        """See `measures.group_contributions.group_contribution_table`; None also when every group cuts a segment."""
-        return group_contribution_table(self.question, self.resolved)
+    def group_contributions(self) -> Tables | None:
+        """See `measures.group_contributions.group_contribution_tables`; None also when every group cuts a segment."""
+        return group_contribution_tables(self.question, self.resolved)
 
     @cached_property
     def summary(self) -> str:
@@ -63,9 +69,9 @@ class Analysis:
         question, grouping, seed = self.question, self.grouping, self.question.settings.seed
         parts = [summary_text(_described(question), grouping, self.episodes, self.tasks)]
         if self.contributions is not None:
-            parts.append(summarise_contributions(self.contributions, seed))
+            parts.append(contributions_section(self.contributions, seed))
         if all(store.attributes.recording.contributions for store in question.stores):
-            parts.append(summarise_group_contributions(self.group_contributions, grouping, question.site, seed))
+            parts.append(group_contributions_section(self.group_contributions, grouping, question.site, seed))
         return "\n".join(parts)
 
 
@@ -81,12 +87,11 @@ def analyse(question: Question) -> Analysis:
     """Compute the tables. Shows progress at a terminal when it takes longer than a moment."""
     grouping = question.grouping
     resolved = resolve_all(grouping, question.selected, question.vocabulary)
-    with progress_bar(len(question.selected), "episodes") as advance:
-        steps = steps_table(question.selected, grouping, question.selection, question.site, advance, resolved)
-    replans = add_layers_avg(per_replan(steps, grouping), grouping)
-    episodes = episodes_table(replans, grouping)
-    tasks = tasks_table(episodes, grouping, seed=question.settings.seed)
-    return Analysis(question, resolved, steps, replans, episodes, tasks)
+    measured = measure_episodes(question, resolved)
+    replans = replan_tables(measured, grouping)
+    episodes = measured_episode_tables(measured, grouping)
+    tasks = task_tables(episodes, grouping, seed=question.settings.seed)
+    return Analysis(question, resolved, measured, replans, episodes, tasks)
 
 
 def _described(question: Question) -> AnalysedRun:
@@ -105,9 +110,17 @@ def _described(question: Question) -> AnalysedRun:
 
 def write_tables(analysis: Analysis, folder: Path) -> WrittenFiles:
     """Write the results JSON (when the grouping has a ratio), the tables and the summary; each file appears whole."""
-    names = ("steps", "episodes", "tasks", "contributions", "group_contributions")
-    tables = {name: table for name in names if (table := getattr(analysis, name)) is not None}
-    written = WrittenFiles(folder, write_parquet(folder, **tables))
+    written = WrittenFiles(folder)
+    for name in ("steps", "episodes", "tasks"):
+        written.files += write_parquet(folder, **named_tables(name, getattr(analysis, name)))
+    further: dict[str, pl.DataFrame] = {}
+    if analysis.contributions is not None:
+        further["contributions"] = analysis.contributions
+    if analysis.group_contributions is not None:
+        further["group_contributions"] = analysis.group_contributions.groups
+        if "contribution_ratio" in analysis.group_contributions.cells.columns:
+            further["group_contribution_ratios"] = analysis.group_contributions.cells
+    written.files += write_parquet(folder, **further)
     try:
         if analysis.grouping.ratio is not None:
             question = analysis.question

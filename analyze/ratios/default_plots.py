@@ -24,11 +24,11 @@ def write_plots(analysis: Analysis, folder: Path, every_episode: bool) -> list[P
     grouping = analysis.grouping
     written = plot_attention_fractions(analysis.tasks, grouping, folder)
     if grouping.ratio is not None:
-        written += plot_ratio_distribution(analysis.replans, grouping, folder)
-        written += plot_ratio_per_task(analysis.episodes, analysis.tasks, grouping, folder)
+        written += plot_ratio_distribution(analysis.replans.cells, grouping, folder)
+        written += plot_ratio_per_task(analysis.episodes.cells, analysis.tasks.cells, grouping, folder)
     written += plot_layer_profile(analysis.tasks, grouping, folder)
     if every_episode:
-        pictures = analysis.episodes.height
+        pictures = analysis.episodes.cells.height
         with progress_bar(pictures, "pictures") as advance:
             written += plot_all_evolutions(analysis.replans, grouping, folder / EPISODES_FOLDER, progress=advance)
     return written

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG, layer_order, overall_layer, overall_rows
+from vla_attention.analyze.measures.aggregate import layer_order, overall_layer, overall_rows
+from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables
+from vla_attention.analyze.ratios.profile_panels import FRACTION_COLUMNS
 from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.show.plot_colours import group_styles
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
@@ -19,7 +22,7 @@ STEM = "attention_fractions"
 
 @drawn_in_our_style
 def plot_attention_fractions(
-    tasks: pl.DataFrame,
+    tasks: Tables,
     grouping: Grouping,
     folder: Path,
     *,
@@ -27,17 +30,18 @@ def plot_attention_fractions(
     about: str | None = None,
     note: str = "",
 ) -> list[Path]:
-    """Draw from `aggregate.tasks_table` (its rows over everything); returns the paths of png, pdf and csv.
+    """Draw from `aggregate.task_tables` (its rows over everything); returns the paths of png, pdf and csv.
 
     `stem`: the files' name. `about`: what the title says the fractions are of, the grouping unless given. `note`: a further sentence.
     Fractions are means over episodes; they sum to 1 also where groups overlap, because each is a share of the summed masses.
     """
-    rows = overall_rows(tasks)
+    level = overall_rows(tasks)
+    rows, of_group, with_keys = level.cells, level.by_group("layer"), level.groups_with_keys()
     layers = layer_order(rows)
     if len(layers) == 2 and LAYERS_AVG in layers:
         layers.remove(LAYERS_AVG)
     by_layer = {row["layer"]: row for row in rows.iter_rows(named=True)}
-    fractions = np.array([[by_layer[layer][f"{name}_fraction"] or 0.0 for name in grouping.names] for layer in layers])
+    fractions = np.array([[of_group[layer, name]["fraction"] or 0.0 for name in grouping.names] for layer in layers])
     positions = np.arange(len(layers), dtype=float)
     if layers[-1] == LAYERS_AVG:
         positions[-1] += 0.6  # apart from the single layers
@@ -51,8 +55,8 @@ def plot_attention_fractions(
     styles = group_styles(grouping.names)
     bottom = np.zeros(len(layers))
     for i, name in enumerate(grouping.names):
-        if rows[f"{name}_keys"].sum() == 0 and rows[f"{name}_keys"].null_count() == 0:
-            continue  # a group without a key, like state digits where the prompt has none (null: nobody knows)
+        if name not in with_keys:
+            continue  # a group without a key, like state digits where the prompt has none
         style = styles[name]
         empty = not fractions[:, i].any()
         label = wrapped(name, 28, 1) + (" (0)" if empty else "")
@@ -79,8 +83,8 @@ def plot_attention_fractions(
     handles, labels = axes.get_legend_handles_labels()
     # In the order of the stack, top to bottom.
     axes.legend(handles[::-1], labels[::-1], loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    columns = [f"{name}_fraction{end}" for name in grouping.names for end in ("", "_low", "_high")]
-    data = rows.filter(pl.col("layer").is_in(layers)).select("layer", "block", "num_episodes", *columns)
+    drawn = rows.filter(pl.col("layer").is_in(layers)).select("layer", "block", "num_episodes")
+    data = drawn.join(level.groups.select("layer", "group", *FRACTION_COLUMNS), on="layer", maintain_order="left_right")
     return save_figure(figure, folder, stem, data)
 
 
@@ -90,6 +94,6 @@ def _ink(color: str) -> str:
     return "white" if 0.299 * red + 0.587 * green + 0.114 * blue < 0.55 else "black"
 
 
-def _patch(style: dict[str, str]) -> dict:
+def _patch(style: dict[str, str]) -> dict[str, Any]:
     """A plain background for a number on a hatched bar."""
     return {"facecolor": style["color"], "edgecolor": "none", "pad": 1.0}

@@ -9,7 +9,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG, layer_order, overall_layer
+from vla_attention.analyze.measures.aggregate import layer_order, overall_layer
+from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, ratio_axis, whole_numbers
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, NOTE_COLOR
@@ -36,7 +37,7 @@ def plot_ratio_distribution(
     about: str | None = None,
     note: str = "",
 ) -> list[Path]:
-    """Draw from the table of replans (`aggregate.add_layers_avg`); returns the paths of png, pdf and csv.
+    """Draw from the cells of `aggregate.replan_tables`; returns the paths of png, pdf and csv.
 
     `stem`: the files' name. `about`: what the title says the ratios are of, the grouping unless given. `note`: a further sentence.
     """

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG
+from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
 from vla_attention.analyze.show.numbers import format_number, plural
 from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, ratio_axis, whole_numbers
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, NOTE_COLOR, group_styles
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SLUG_LENGTH = 60
+#: By group, its rows over the replans; and how it is drawn.
+Groups = Mapping[str, pl.DataFrame]
+Styles = Mapping[str, Mapping[str, str]]
 
 
 def evolution_stem(task_id: int, instruction: str, episode_index: int, layer: str) -> str:
@@ -36,13 +39,14 @@ def evolution_stem(task_id: int, instruction: str, episode_index: int, layer: st
 
 @drawn_in_our_style
 def plot_ratio_evolution(
-    episode: pl.DataFrame, grouping: Grouping, folder: Path, formats: Sequence[str] = ("png", "pdf")
+    level: Tables, grouping: Grouping, folder: Path, formats: Sequence[str] = ("png", "pdf")
 ) -> list[Path]:
-    """Draw one episode in one layer: the rows of the table of replans that belong to them. Returns png, pdf and csv.
+    """Draw one episode in one layer: the part of `aggregate.replan_tables` that belongs to them. Returns png, pdf and csv.
 
     Groups without mass in this episode are left out of the legend.
     """
-    episode = episode.sort("replan")
+    episode = level.cells.sort("replan")
+    groups = {name: level.of_group(name).sort("replan") for name in grouping.names}
     first = episode.row(0, named=True)
     layer = first["layer"]
     figure = new_figure(10, 6.8)
@@ -54,11 +58,11 @@ def plot_ratio_evolution(
     ((ratio_axes, mass_axes), (fraction_axes, statistics_axes)) = figure.subplots(2, 2)
     steps = episode["env_step"].to_numpy()
     styles = group_styles(grouping.names)
-    drawn = [name for name in grouping.names if (episode[f"{name}_mass"].fill_null(0) > 0).any()]
+    drawn = level.groups_with_mass()
     _ratio_panel(ratio_axes, episode, steps, grouping)
-    _mass_panel(mass_axes, episode, steps, drawn, styles)
-    _fraction_panel(fraction_axes, episode, steps, drawn, styles)
-    _statistics_panel(statistics_axes, episode, grouping, drawn)
+    _mass_panel(mass_axes, groups, steps, drawn, styles)
+    _fraction_panel(fraction_axes, groups, steps, drawn, styles)
+    _statistics_panel(statistics_axes, episode, groups, grouping, drawn)
     # Room at either end, so that a marker on the first or last replan does not sit on the frame.
     room = 0.02 * (steps[-1] - steps[0]) or 2.5
     for axes in (ratio_axes, mass_axes, fraction_axes):
@@ -68,14 +72,18 @@ def plot_ratio_evolution(
             whole_numbers(axes.xaxis)
     _group_legend(figure, drawn, styles)
     columns = ["suite", "task_id", "episode_index", "layer", "replan", "env_step"]
-    columns += [f"{name}_{kind}" for name in grouping.names for kind in ("mass", "fraction", "lift")]
-    columns += ["ratio", "uniform_ratio", "ratio_lift"] if grouping.ratio else []
+    measures = ["group", "mass", "fraction", "lift"]
+    ratios = ["ratio", "uniform_ratio", "ratio_lift"] if grouping.ratio else []
+    data = {
+        "": episode.select(*columns, *ratios),
+        "_groups": level.groups.sort("replan", maintain_order=True).select(*columns, *measures),
+    }
     stem = evolution_stem(first["task_id"], first["instruction"], first["episode_index"], layer)
-    return save_figure(figure, folder, stem, episode.select(columns), formats)
+    return save_figure(figure, folder, stem, data, formats)
 
 
 def plot_all_evolutions(
-    replans: pl.DataFrame,
+    replans: Tables,
     grouping: Grouping,
     folder: Path,
     formats: Sequence[str] = ("png", "pdf"),
@@ -86,9 +94,12 @@ def plot_all_evolutions(
     About a second each, half of it for the pdf; `progress` is called with 1 after each.
     """
     paths = []
-    several = replans["suite"].n_unique() > 1
-    for part in replans.partition_by("suite", "task_id", "episode_index", "layer", maintain_order=True):
-        paths += plot_ratio_evolution(part, grouping, folder / part["suite"][0] if several else folder, formats)
+    several = replans.cells["suite"].n_unique() > 1
+    keys = (*EPISODE_ID, "layer")
+    groups = replans.groups.partition_by(keys, as_dict=True)
+    for key, cells in replans.cells.partition_by(keys, as_dict=True, maintain_order=True).items():
+        where = folder / str(key[0]) if several else folder
+        paths += plot_ratio_evolution(Tables(cells, groups[key]), grouping, where, formats)
         if progress is not None:
             progress(1)
     return paths
@@ -128,30 +139,28 @@ def _ratio_panel(axes: Axes, episode: pl.DataFrame, steps: NDArray[np.int64], gr
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.1)
 
 
-def _mass_panel(axes: Axes, episode: pl.DataFrame, steps: NDArray[np.int64], drawn: list[str], styles: dict) -> None:
+def _mass_panel(axes: Axes, groups: Groups, steps: NDArray[np.int64], drawn: Sequence[str], styles: Styles) -> None:
     axes.set_title("mass", loc="left")
     dashes = {"": "-", "///": "--", "...": ":", "xxx": "-."}
     for name in drawn:
         style = styles[name]
         axes.plot(
-            steps, episode[f"{name}_mass"].to_numpy(), dashes[style["hatch"]], marker="o", markersize=2.5, color=style["color"],
+            steps, groups[name]["mass"].to_numpy(), dashes[style["hatch"]], marker="o", markersize=2.5, color=style["color"],
         )  # fmt: skip
     axes.set_ylim(bottom=0)
     axes.set_ylabel("mass (mean over action queries)")
     axes.grid(axis="y")
 
 
-def _fraction_panel(
-    axes: Axes, episode: pl.DataFrame, steps: NDArray[np.int64], drawn: list[str], styles: dict
-) -> None:
+def _fraction_panel(axes: Axes, groups: Groups, steps: NDArray[np.int64], drawn: Sequence[str], styles: Styles) -> None:
     axes.set_title("fractions", loc="left")
     if not drawn:
         explain(axes, "No group has any mass in this episode.")
         return
-    shares = [episode[f"{name}_fraction"].fill_null(0).to_numpy() for name in drawn]
+    shares = [groups[name]["fraction"].fill_null(0).to_numpy() for name in drawn]
     bottom = np.zeros(len(steps))
     for name, share in zip(drawn, shares, strict=True):
-        style = {
+        style: dict[str, Any] = {
             "facecolor": styles[name]["color"],
             "hatch": styles[name]["hatch"],
             "edgecolor": "white",
@@ -167,7 +176,9 @@ def _fraction_panel(
     axes.set_ylabel("fraction of the groups' summed mass")
 
 
-def _statistics_panel(axes: Axes, episode: pl.DataFrame, grouping: Grouping, drawn: list[str]) -> None:
+def _statistics_panel(
+    axes: Axes, episode: pl.DataFrame, groups: Groups, grouping: Grouping, drawn: Sequence[str]
+) -> None:
     axes.set_title("statistics over the replans", loc="left")
     explain(axes, "")
     lines: list[tuple[str, str]] = []
@@ -187,10 +198,11 @@ def _statistics_panel(axes: Axes, episode: pl.DataFrame, grouping: Grouping, dra
             ("lift (ratio / uniform)", format_number(_finite_mean(episode["ratio_lift"]))),
         ]
     room = 14 - len(lines)
-    largest = sorted(drawn, key=lambda name: -(episode[f"{name}_fraction"].mean() or 0.0))  # type: ignore[operator]
+    means = {name: summarize(groups[name]["fraction"].fill_null(float("nan")).to_numpy()).mean for name in drawn}
+    largest = sorted(drawn, key=lambda name: -(means[name] or 0.0))
     shown = [name for name in drawn if name in largest[: room - (len(drawn) > room)]]
     for name in shown:
-        fraction = summarize(episode[f"{name}_fraction"].fill_null(float("nan")).to_numpy())
+        fraction = summarize(groups[name]["fraction"].fill_null(float("nan")).to_numpy())
         text = "-"
         if fraction.mean is not None:
             spread = f"{100 * (fraction.std or 0):.1f}"
@@ -213,7 +225,7 @@ def _finite_mean(series: pl.Series) -> float | None:
     return summarize(series.cast(pl.Float64).fill_null(float("nan")).to_numpy()).mean
 
 
-def _group_legend(figure: Figure, drawn: list[str], styles: dict) -> None:
+def _group_legend(figure: Figure, drawn: Sequence[str], styles: Styles) -> None:
     from matplotlib.patches import Patch
 
     if not drawn:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG, overall_layer
+from vla_attention.analyze.measures.aggregate import overall_layer
+from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, ratio_axis
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, NOTE_COLOR
@@ -45,7 +46,7 @@ def plot_ratio_per_task(
     about: str | None = None,
     note: str = "",
 ) -> list[Path]:
-    """Draw from `aggregate.episodes_table` and `aggregate.tasks_table`; returns the paths of png, pdf and csv.
+    """Draw from the cells of `aggregate.episode_tables` and `aggregate.task_tables`; returns the paths of png, pdf and csv.
 
     `layer`: which one, "layers_avg" unless given. `level` is that of the intervals in `tasks`. `stem`: the files' name.
     `about`: what the title says the ratios are of, the grouping unless given. `note`: a further sentence.
@@ -140,7 +141,7 @@ def _draw_rows(axes: Axes, shown: pl.DataFrame, dots: pl.DataFrame, few: bool) -
         axes.text(1.01, position, text, transform=axes.get_yaxis_transform(), va="center", size=7, color=NOTE_COLOR)
 
 
-def _label(row: dict, several: bool, few: bool) -> str:
+def _label(row: dict[str, Any], several: bool, few: bool) -> str:
     if row["scope"] == "combined":
         return "all suites"
     if row["scope"] == "all":

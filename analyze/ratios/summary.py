@@ -7,10 +7,13 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG, layer_order, overall_layer, overall_rows
+from vla_attention.analyze.measures.aggregate import layer_order, overall_layer, overall_rows
+from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables
+from vla_attention.analyze.ratios.verdict import LINGUISTIC_BELOW, VISUAL_ABOVE, verdict
 from vla_attention.analyze.show.numbers import format_interval, format_number
 from vla_attention.analyze.show.output_files import write_text
 from vla_attention.analyze.show.text_table import text_table
@@ -18,8 +21,6 @@ from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
 
 WIDTH = 100
-#: Thresholds of the published interpretation guide, on the mean ratio.
-VISUAL_ABOVE, LINGUISTIC_BELOW = 1.5, 0.67
 #: Below this, intervals of single tasks are so wide that a word on it is due.
 FEW_EPISODES = 5
 
@@ -47,22 +48,13 @@ class AnalysedRun:
     notes: Sequence[str] = field(default_factory=tuple)
 
 
-def verdict(ratio: float | None) -> str:
-    """The published guide's word for a mean ratio: above 1.5, below 0.67, or between."""
-    if ratio is None or math.isnan(ratio):
-        return "undefined"
-    if ratio > VISUAL_ABOVE:
-        return "visual-dominant"
-    return "linguistic-dominant" if ratio < LINGUISTIC_BELOW else "balanced"
-
-
-def summary_text(run: AnalysedRun, grouping: Grouping, episodes: pl.DataFrame, tasks: pl.DataFrame) -> str:
-    """The whole summary, at most 100 columns wide, from `aggregate.episodes_table` and `aggregate.tasks_table`."""
+def summary_text(run: AnalysedRun, grouping: Grouping, episodes: Tables, tasks: Tables) -> str:
+    """The whole summary, at most 100 columns wide, from `aggregate.episode_tables` and `aggregate.task_tables`."""
     parts = [_header(run, grouping, episodes)]
     if grouping.ratio:
-        parts += [_ratio_section(run, grouping, tasks), _nonfinite_section(tasks)]
+        parts += [_ratio_section(run, grouping, tasks), _nonfinite_section(overall_rows(tasks).cells)]
     parts += [_groups_section(grouping, tasks, "fraction"), _groups_section(grouping, tasks, "lift")]
-    suites = tasks["suite"].drop_nulls().unique().sort().to_list()
+    suites = tasks.cells["suite"].drop_nulls().unique().sort().to_list()
     if len(suites) > 1:
         parts.append(_across_section(run, grouping, tasks, "all"))
     for suite in suites:
@@ -76,12 +68,13 @@ def write_summary(path: Path, text: str) -> None:
     write_text(path, text)
 
 
-def _header(run: AnalysedRun, grouping: Grouping, episodes: pl.DataFrame) -> str:
-    overall = episodes.filter(pl.col("layer") == overall_layer(episodes))
+def _header(run: AnalysedRun, grouping: Grouping, episodes: Tables) -> str:
+    of_layer = episodes.filter(pl.col("layer") == overall_layer(episodes.cells))
+    overall = of_layer.cells
     num_tasks = overall.select("suite", "task_id").n_unique()
     successes = int(overall["success"].sum())
-    layers = [layer for layer in layer_order(episodes) if layer != LAYERS_AVG]
-    blocks = dict(episodes.select("layer", "block").unique().iter_rows())
+    layers = [layer for layer in layer_order(episodes.cells) if layer != LAYERS_AVG]
+    blocks = dict(episodes.cells.select("layer", "block").unique().iter_rows())
     translated = [f"{layer} = block {blocks[layer]}" for layer in layers if str(blocks[layer]) != layer]
     lines = ["ATTENTION SUMMARY", "=" * WIDTH]
     if run.untrained:
@@ -101,8 +94,9 @@ def _header(run: AnalysedRun, grouping: Grouping, episodes: pl.DataFrame) -> str
     lines += _labelled("layers", listing(layers, 40) + (f" ({', '.join(translated)})" if translated else ""))
     lines += _labelled("averaged over", f"denoise steps {listing(run.denoise_steps, 40)}; {run.heads}")
     lines += _labelled("grouping", f"{grouping.name}{': ' + grouping.description if grouping.description else ''}")
+    having = of_layer.groups_with_keys()
     for name, selectors in grouping.groups.items():
-        absent = "" if overall[f"{name}_keys"].sum() else "   (no keys here)"
+        absent = "" if name in having else "   (no keys here)"
         lines += textwrap.wrap(f"{name} = {' | '.join(selectors)}{absent}", WIDTH, **_indents(17, 21))
     if grouping.ratio:
         lines += _labelled("ratio", _ratio_definition(grouping))
@@ -111,8 +105,9 @@ def _header(run: AnalysedRun, grouping: Grouping, episodes: pl.DataFrame) -> str
     return "\n".join(lines)
 
 
-def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: pl.DataFrame) -> str:
-    rows = overall_rows(tasks)
+def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: Tables) -> str:
+    level = overall_rows(tasks)
+    rows = level.cells
     header = ["layer", "mean ± std", "median", "of means", "geom.", f"{run.level:.0%} interval"]
     header += ["uniform", "lift"] + ["verdict"] * grouping.compares_modalities
     body = [
@@ -139,7 +134,7 @@ def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: pl.DataFrame) ->
             text_table(header, body, left=(0, 8) if grouping.compares_modalities else (0,)),
             "",
             *textwrap.wrap(legend, WIDTH),
-            *textwrap.wrap(_baseline_sentence(grouping, overall), WIDTH),
+            *textwrap.wrap(_baseline_sentence(grouping, overall["uniform_ratio"], level), WIDTH),
         ]
     )
 
@@ -152,15 +147,15 @@ def _interval_note(run: AnalysedRun, overall: dict[str, object]) -> str:
     return f"interval: of the mean{about}; bootstrap over {units}, widened for their number."
 
 
-def _baseline_sentence(grouping: Grouping, overall: dict[str, float]) -> str:
+def _baseline_sentence(grouping: Grouping, uniform: float | None, level: Tables) -> str:
     assert grouping.ratio is not None
-    uniform = overall["uniform_ratio"]
     if uniform is None:
         return (
             "There is no uniform baseline, because a side of the ratio has no keys; the ratio means little without one."
         )
-    above = sum(overall[f"{name}_keys"] for name in grouping.ratio.numerator)
-    below = sum(overall[f"{name}_keys"] for name in grouping.ratio.denominator)
+    of_group, layer = level.by_group("layer"), overall_layer(level.cells)
+    above = sum(of_group[layer, name]["keys"] for name in grouping.ratio.numerator)
+    below = sum(of_group[layer, name]["keys"] for name in grouping.ratio.denominator)
     baseline = (
         f"Uniform attention alone gives ratio = {format_number(uniform)}, because there are on average {format_number(above)} keys "
         f"on one side and {format_number(below)} on the other"
@@ -173,9 +168,9 @@ def _baseline_sentence(grouping: Grouping, overall: dict[str, float]) -> str:
     )
 
 
-def _nonfinite_section(tasks: pl.DataFrame) -> str:
+def _nonfinite_section(rows: pl.DataFrame) -> str:
     lines = []
-    for row in _by_layer(overall_rows(tasks)):
+    for row in _by_layer(rows):
         of = f"layer {row['layer']}" if row["layer"] != LAYERS_AVG else LAYERS_AVG
         if row["num_nonfinite"]:
             without = row["episodes_without_ratio"]
@@ -197,18 +192,14 @@ def _nonfinite_section(tasks: pl.DataFrame) -> str:
     return "\n".join([_title("RATIOS THAT ARE NOT FINITE"), *textwrap.wrap(explanation, WIDTH), *lines])
 
 
-def _groups_section(grouping: Grouping, tasks: pl.DataFrame, kind: str) -> str:
+def _groups_section(grouping: Grouping, tasks: Tables, kind: str) -> str:
     """Layers by groups that have keys; in blocks of as many groups as the width allows."""
-    groups = [group for group in grouping.names if overall_rows(tasks)[f"{group}_keys"].sum()]
+    level = overall_rows(tasks)
+    groups = level.groups_with_keys()
     names = [name if len(name) <= 24 else name[:23] + "…" for name in groups]
-    cells = {
-        group: [
-            _percent(row[f"{group}_fraction"]) if kind == "fraction" else format_number(row[f"{group}_lift"])
-            for row in _by_layer(overall_rows(tasks))
-        ]
-        for group in groups
-    }
-    layers = [row["layer"] for row in _by_layer(overall_rows(tasks))]
+    layers, of_group = layer_order(level.cells), level.by_group("layer")
+    show = _percent if kind == "fraction" else format_number
+    cells = {group: [show(of_group[layer, group][kind]) for layer in layers] for group in groups}
     room = WIDTH - max(map(len, [*layers, "layer"]))
     blocks: list[list[int]] = [[]]
     used = 0
@@ -236,10 +227,11 @@ def _groups_section(grouping: Grouping, tasks: pl.DataFrame, kind: str) -> str:
     return "\n".join([_title(title), "\n\n".join(tables)]) + note
 
 
-def _across_section(run: AnalysedRun, grouping: Grouping, tasks: pl.DataFrame, scope: str, of: str = "") -> str:
-    """A row per task (scope "task") or per suite (scope "all"), for the layer that speaks for the whole."""
-    layer = overall_layer(tasks)
-    rows = tasks.filter((pl.col("scope") == scope) & (pl.col("layer") == layer))
+def _across_section(run: AnalysedRun, grouping: Grouping, tasks: Tables, scope: str, of: str = "") -> str:
+    """A row per task (scope "task") or per suite (scope "all"), of `overall_layer`."""
+    layer = overall_layer(tasks.cells)
+    level = tasks.filter((pl.col("scope") == scope) & (pl.col("layer") == layer))
+    rows, of_group = level.cells, level.by_group("suite", "task_id")
     name = "suite" if scope == "all" else "task"
     header = [name, "n", "success"]
     if grouping.ratio:
@@ -260,7 +252,9 @@ def _across_section(run: AnalysedRun, grouping: Grouping, tasks: pl.DataFrame, s
                 *(format_number(row[c]) for c in ("ratio_of_means", "geometric_mean", "uniform_ratio", "ratio_lift")),
             ]
         else:
-            cells += [_percent(row[f"{group}_fraction"]) for group in grouping.names[:5]]
+            cells += [
+                _percent(of_group[row["suite"], row["task_id"], group]["fraction"]) for group in grouping.names[:5]
+            ]
         body.append(cells)
     last = "" if scope == "all" else "instruction"
     texts = [row["instruction"] or "" for row in rows.iter_rows(named=True)]
@@ -277,11 +271,11 @@ def _across_section(run: AnalysedRun, grouping: Grouping, tasks: pl.DataFrame, s
     return "\n".join([_title(f"PER {name.upper()}{of}  {what}, {shown}"), table])
 
 
-def _by_layer(rows: pl.DataFrame) -> list[dict]:
+def _by_layer(rows: pl.DataFrame) -> list[dict[str, Any]]:
     return list(rows.sort("layer_number", nulls_last=True).iter_rows(named=True))
 
 
-def _mean_and_spread(row: dict) -> str:
+def _mean_and_spread(row: dict[str, Any]) -> str:
     # One episode has no spread; its std of 0 would read as certainty.
     if row["num_episodes"] - row["episodes_without_ratio"] < 2:
         return format_number(row["ratio_mean"])
@@ -310,5 +304,5 @@ def _labelled(label: str, text: str) -> list[str]:
     return textwrap.wrap(f"{label + ':':<15}{text}", WIDTH, subsequent_indent=" " * 15, break_on_hyphens=False)
 
 
-def _indents(first: int, rest: int) -> dict:
+def _indents(first: int, rest: int) -> dict[str, Any]:
     return {"initial_indent": " " * first, "subsequent_indent": " " * rest, "break_on_hyphens": False}

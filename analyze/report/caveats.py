@@ -11,7 +11,8 @@ import polars as pl
 from vla_attention.analyze.measures.aggregate import overall_layer, overall_rows
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.ratios.analysis import Analysis
-from vla_attention.analyze.ratios.summary import FEW_EPISODES, LINGUISTIC_BELOW, VISUAL_ABOVE, verdict
+from vla_attention.analyze.ratios.summary import FEW_EPISODES
+from vla_attention.analyze.ratios.verdict import LINGUISTIC_BELOW, VISUAL_ABOVE, verdict
 from vla_attention.analyze.show.numbers import format_number, plural
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
@@ -103,7 +104,9 @@ def _baseline(analysis: Analysis) -> list[Caveat]:
                 "No ratio", f"The grouping '{analysis.grouping.name}' defines no ratio here; read fractions and lifts."
             )
         ]
-    row = overall_rows(analysis.tasks).filter(layer=overall_layer(analysis.tasks)).row(0, named=True)
+    level = overall_rows(analysis.tasks)
+    layer = overall_layer(level.cells)
+    row, of_group = level.cells.filter(layer=layer).row(0, named=True), level.by_group("layer")
     if row["uniform_ratio"] is None:
         return [
             Caveat(
@@ -113,7 +116,7 @@ def _baseline(analysis: Analysis) -> list[Caveat]:
             )
         ]
     above, below = (
-        sum(row[f"{name}_keys"] for name in side)
+        sum(of_group[layer, name]["keys"] for name in side)
         for side in (analysis.grouping.ratio.numerator, analysis.grouping.ratio.denominator)
     )
     return [
@@ -130,7 +133,7 @@ def _baseline(analysis: Analysis) -> list[Caveat]:
 def _infinite(analysis: Analysis) -> list[Caveat]:
     if analysis.grouping.ratio is None:
         return []
-    rows = overall_rows(analysis.tasks)
+    rows = overall_rows(analysis.tasks).cells
     row = rows.filter(layer=overall_layer(rows)).row(0, named=True)
     left_out = row["num_nonfinite"] or 0
     layers = row["nonfinite_layers"] or 0
@@ -147,7 +150,7 @@ def _infinite(analysis: Analysis) -> list[Caveat]:
 
 
 def _episodes(analysis: Analysis) -> list[Caveat]:
-    rows = analysis.tasks.filter(layer=overall_layer(analysis.tasks))
+    rows = analysis.tasks.cells.filter(layer=overall_layer(analysis.tasks.cells))
     tasks = rows.filter(scope="task")
     counts = tasks["num_episodes"].to_list()
     if sum(counts) == 1:

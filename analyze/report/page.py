@@ -88,7 +88,7 @@ def _parts(
     return [
         *parts,
         lambda: contribution_section(analysis.contributions, question.settings.seed),
-        lambda: overlay_section(question, analysis.replans, episodes, replans),
+        lambda: overlay_section(question, analysis.replans.cells, episodes, replans),
         lambda: run_section(analysis),
         method_section,
     ]
@@ -99,7 +99,7 @@ def assemble(analysis: Analysis, sections: Sequence[Section]) -> str:
     stores = analysis.question.stores
     policy = stores[0].attributes.policy
     suites = ", ".join(dict.fromkeys(store.suite for store in stores))
-    row = overall_rows(analysis.tasks).filter(layer=overall_layer(analysis.tasks)).row(0, named=True)
+    row = overall_rows(analysis.tasks).cells.filter(layer=overall_layer(analysis.tasks.cells)).row(0, named=True)
     untrained = " (untrained weights)" if policy.untrained else ""
     subtitle = (
         f"{plural(row['num_episodes'], 'episode')} of {plural(row['num_tasks'], 'task')}, "

@@ -72,7 +72,7 @@ def layer_figures(analysis: Analysis, folder: Path) -> list[str]:
 
 def time_section(analysis: Analysis, folder: Path) -> Section | None:
     """How the ratio runs over an episode, and around the first closing of the gripper."""
-    if analysis.replans["replan"].max() == 0:
+    if analysis.replans.cells["replan"].max() == 0:
         return None
     courses = time_courses(analysis.question, replans=analysis.replans)
     files = plot_time_courses(courses, analysis.grouping, folder)

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG, layer_order, overall_layer, overall_rows
+from vla_attention.analyze.measures.aggregate import layer_order, overall_layer, overall_rows
 from vla_attention.analyze.measures.contributions import contribution_rows
+from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.ratios.analysis import Analysis, describe_heads
 from vla_attention.analyze.ratios.plot_attention_fractions import plot_attention_fractions
 from vla_attention.analyze.ratios.plot_ratio_distribution import plot_ratio_distribution
@@ -47,7 +48,9 @@ class Section:
 
 def headline(analysis: Analysis, notes: Sequence[Caveat]) -> Section:
     """The number, its interval, what uniform attention gives, and what to know before quoting it."""
-    row = overall_rows(analysis.tasks).filter(layer=overall_layer(analysis.tasks)).row(0, named=True)
+    level = overall_rows(analysis.tasks)
+    layer = overall_layer(level.cells)
+    row, of_group = level.cells.filter(layer=layer).row(0, named=True), level.by_group("layer")
     solved = f"{row['success_rate']:.0%} solved"
     episodes = (
         f"{row['num_episodes']}",
@@ -59,7 +62,6 @@ def headline(analysis: Analysis, notes: Sequence[Caveat]) -> Section:
     if analysis.grouping.ratio is not None:
         sides = (" + ".join(side) for side in (analysis.grouping.ratio.numerator, analysis.grouping.ratio.denominator))
         name = " / ".join(side if len(side) < 60 else side[:59] + "…" for side in sides)
-        layer = overall_layer(analysis.tasks)
         over = "mean over layers" if layer == LAYERS_AVG else f"layer {layer}"
         if row["ratio_mean"] is None:
             boxes.append(("none", f"ratio {name}", f"no replan has a finite ratio; {over}"))
@@ -74,9 +76,10 @@ def headline(analysis: Analysis, notes: Sequence[Caveat]) -> Section:
         sentence = verdict_sentence(analysis.grouping, row["ratio_mean"], row["uniform_ratio"])
     else:
         for group in _present(analysis)[:3]:
-            value = row[f"{group}_fraction"]
+            own = of_group[layer, group]
+            value = own["fraction"]
             shown = "-" if value is None else f"{100 * value:.1f} %"
-            low, high = row[f"{group}_fraction_low"], row[f"{group}_fraction_high"]
+            low, high = own["fraction_low"], own["fraction_high"]
             bounds = "no interval" if low is None else f"95 % interval {100 * low:.1f} to {100 * high:.1f} %"
             boxes.append((shown, f"fraction of {group}", bounds))
     boxes.append(episodes)
@@ -124,8 +127,9 @@ def caveat_section(notes: Sequence[Caveat]) -> Section:
 def task_section(analysis: Analysis, folder: Path) -> Section:
     """A row per task, sortable, and the picture of ratios per task."""
     grouping = analysis.grouping
-    layer = overall_layer(analysis.tasks)
-    rows = analysis.tasks.filter((pl.col("scope") == "task") & (pl.col("layer") == layer))
+    layer = overall_layer(analysis.tasks.cells)
+    level = analysis.tasks.filter((pl.col("scope") == "task") & (pl.col("layer") == layer))
+    rows, of_group = level.cells, level.by_group("suite", "task_id")
     several = rows["suite"].n_unique() > 1
     header = ["task", *(["suite"] if several else []), "instruction", "episodes", "solved %"]
     groups = _present(analysis)[: 2 if grouping.ratio is not None else 6]
@@ -147,7 +151,7 @@ def task_section(analysis: Analysis, folder: Path) -> Section:
                 number_cell(row[name]) for name in ("ratio_of_means", "geometric_mean", "uniform_ratio", "ratio_lift")
             ]
             cells.append(Cell(str(row["num_nonfinite"]), row["num_nonfinite"]))
-        cells += [percent_cell(row[f"{group}_fraction"]) for group in groups]
+        cells += [percent_cell(of_group[row["suite"], row["task_id"], group]["fraction"]) for group in groups]
         body.append(cells)
     shown = "mean over layers" if layer == LAYERS_AVG else f"layer {layer}"
     content = table(
@@ -167,7 +171,7 @@ def task_section(analysis: Analysis, folder: Path) -> Section:
             )
         content = (
             drawn(
-                lambda where: plot_ratio_per_task(analysis.episodes, analysis.tasks, grouping, where),
+                lambda where: plot_ratio_per_task(analysis.episodes.cells, analysis.tasks.cells, grouping, where),
                 folder,
                 f"Mean ratio of every task with its interval, single episodes, and the uniform baseline.{spread}",
                 "Ratio per task: mean over episodes with its bootstrap interval, single episodes as dots, uniform "
@@ -181,13 +185,13 @@ def task_section(analysis: Analysis, folder: Path) -> Section:
 def layer_section(analysis: Analysis, folder: Path, more: Sequence[str] = ()) -> Section:
     """A row per layer, and how ratios and fractions differ between layers. `more`: further figures."""
     grouping = analysis.grouping
-    rows = overall_rows(analysis.tasks)
+    rows = overall_rows(analysis.tasks).cells
     groups = _present(analysis)
     parts = []
     if grouping.ratio is not None:
         parts.append(
             drawn(
-                lambda where: plot_ratio_distribution(analysis.replans, grouping, where),
+                lambda where: plot_ratio_distribution(analysis.replans.cells, grouping, where),
                 folder,
                 f"Histogram of the ratio over replans, and a box for each of {rows.height} layers or averages "
                 f"over episodes.",
@@ -209,7 +213,8 @@ def layer_section(analysis: Analysis, folder: Path, more: Sequence[str] = ()) ->
 
 def _layer_tables(analysis: Analysis, groups: Sequence[str]) -> list[str]:
     """Ratios of the layers, then fractions and lifts of the groups: two tables, because one would be too wide."""
-    rows = overall_rows(analysis.tasks)
+    level = overall_rows(analysis.tasks)
+    rows, of_group = level.cells, level.by_group("layer")
     by_layer = {row["layer"]: row for row in rows.iter_rows(named=True)}
     ratios, shares = [], []
     for layer in layer_order(rows):
@@ -230,8 +235,8 @@ def _layer_tables(analysis: Analysis, groups: Sequence[str]) -> list[str]:
                     Cell(str(row["num_nonfinite"]), row["num_nonfinite"]),
                 ]
             )
-        fractions = [percent_cell(row[f"{group}_fraction"]) for group in groups]
-        shares.append([*name, *fractions, *(number_cell(row[f"{group}_lift"]) for group in groups)])
+        fractions = [percent_cell(of_group[layer, group]["fraction"]) for group in groups]
+        shares.append([*name, *fractions, *(number_cell(of_group[layer, group]["lift"]) for group in groups)])
     tables = []
     if ratios:
         header = [
@@ -252,17 +257,20 @@ def _layer_tables(analysis: Analysis, groups: Sequence[str]) -> list[str]:
 
 
 def _fractions_in_words(analysis: Analysis) -> str:
-    row = overall_rows(analysis.tasks).filter(layer=overall_layer(analysis.tasks)).row(0, named=True)
+    level = overall_rows(analysis.tasks)
+    layer = overall_layer(level.cells)
+    of_group = level.by_group("layer")
     return (
-        ", ".join(f"{group} {100 * (row[f'{group}_fraction'] or 0):.0f} %" for group in _present(analysis)[:8])
+        ", ".join(
+            f"{group} {100 * (of_group[layer, group]['fraction'] or 0):.0f} %" for group in _present(analysis)[:8]
+        )
         + " over all layers."
     )
 
 
 def _present(analysis: Analysis) -> list[str]:
     """Groups that have keys here."""
-    rows = overall_rows(analysis.tasks)
-    return [name for name in analysis.grouping.names if rows[f"{name}_keys"].sum()]
+    return list(overall_rows(analysis.tasks).groups_with_keys())
 
 
 def contribution_section(contributions: pl.DataFrame | None, seed: int) -> Section | None:

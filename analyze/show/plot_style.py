@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
@@ -73,9 +73,16 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def save_figure(
-    figure: Figure, folder: Path, stem: str, data: pl.DataFrame, formats: Sequence[str] = ("png", "pdf")
+    figure: Figure,
+    folder: Path,
+    stem: str,
+    data: pl.DataFrame | Mapping[str, pl.DataFrame],
+    formats: Sequence[str] = ("png", "pdf"),
 ) -> list[Path]:
-    """Save `stem`.png, .pdf and .csv (the plotted data) into a folder, each atomically, and return their paths."""
+    """Save `stem`.png, .pdf and .csv (the plotted data) into a folder, each atomically, and return their paths.
+
+    `data`: one table, or several by what their files' names have after `stem`.
+    """
     paths = []
     for kind in formats:
         path = folder / f"{stem}.{kind}"
@@ -85,7 +92,10 @@ def save_figure(
             figure.savefig(temporary, format=kind, dpi=DPI, metadata=metadata)
         figure.set_layout_engine("none")  # the places are found: they are the same in every format
         paths.append(path)
-    path = folder / f"{stem}.csv"
-    with replacing(path) as temporary:
-        data.write_csv(temporary)
-    return [*paths, path]
+    tables = data if isinstance(data, Mapping) else {"": data}
+    for end, table in tables.items():
+        path = folder / f"{stem}{end}.csv"
+        with replacing(path) as temporary:
+            table.write_csv(temporary)
+        paths.append(path)
+    return paths

@@ -18,7 +18,6 @@ import numpy as np
 import polars as pl
 from numpy.typing import ArrayLike, NDArray
 
-#: Shorter series have no second pair of lags.
 FEWEST = 4
 
 

@@ -170,7 +170,7 @@ def geometric_mean_over_episodes(log_means: ArrayLike) -> EpisodeStatistic:
 def resample_episodes(tasks: ArrayLike, num_resamples: int = DEFAULT_RESAMPLES, seed: int = DEFAULT_SEED) -> Resamples:
     """Draw episodes for the two-level bootstrap: how often each episode is in each resample.
 
-    Level one draws as many tasks as there are, with replacement. Level two draws, for each drawn task, as many of its
+    Tables one draws as many tasks as there are, with replacement. Tables two draws, for each drawn task, as many of its
     episodes as it has, with replacement. With one task only the second level is left: the usual bootstrap over
     episodes. For statistics that are quotients of sums, all resamples are then two matrix products.
 

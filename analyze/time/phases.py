@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.schemas.stores.store_format import StoreError
 
 #: Every suite of the capture side drives robosuite's one-number Panda gripper: of the command, the last number of an action,
@@ -89,9 +90,4 @@ def around_event(values: NDArray[np.float64], event: int, window: int) -> NDArra
 
 def change_at_event(around: NDArray[np.float64], window: int) -> NDArray[np.float64]:
     """Mean from offset 0 on minus mean before (quantity,), of finite values (offset, quantity); NaN when a side has none."""
-    sides = []
-    for part in (around[:window], around[window:]):
-        finite = np.isfinite(part)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            sides.append(np.where(finite, part, 0.0).sum(axis=0) / finite.sum(axis=0))
-    return sides[1] - sides[0]
+    return finite_mean(around[window:]) - finite_mean(around[:window])

@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG
+from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, ratio_axis, whole_numbers
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, NOTE_COLOR, group_styles

@@ -8,7 +8,7 @@ from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG
+from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.show.numbers import format_interval, format_number
 from vla_attention.analyze.show.text_table import text_table

@@ -14,12 +14,10 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.aggregate import EPISODE_KEYS, add_layers_avg, overall_layer, per_replan
+from vla_attention.analyze.measures.aggregate import overall_layer, replans_of
+from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, Tables
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.measures.steps import steps_table
-from vla_attention.analyze.show.progress import progress_bar
-from vla_attention.analyze.statistics.autocorrelation import autocorrelation_table
 from vla_attention.analyze.statistics.bootstrap import (
     SHARE,
     EpisodeStatistic,
@@ -31,6 +29,7 @@ from vla_attention.analyze.statistics.bootstrap import (
     resample_episodes,
 )
 from vla_attention.analyze.statistics.effect_sizes import contrast, contrast_row
+from vla_attention.analyze.time.effective_replans import effective_replans_table
 from vla_attention.analyze.time.phases import (
     around_event,
     change_at_event,
@@ -75,8 +74,7 @@ class TimeCourses:
         change: one row per quantity: mean change from before to after the closing (a factor for the ratio, a difference for
             fractions) with `low` and `high`, and how many episodes show both sides.
         outcomes: success against failure, one row per quantity, columns of `effect_sizes.contrast_row`; the ratio as log2.
-        autocorrelation: one row per episode, see `autocorrelation.autocorrelation_table`: of log2_ratio, or of the first
-            group's fraction when the grouping has no ratio.
+        autocorrelation: one row per episode, see `effective_replans.effective_replans_table`.
         num_nonfinite: (episode, replan) pairs without a finite log ratio, which take no part in the ratio's course.
     """
 
@@ -104,43 +102,31 @@ class _Episode:
     closing: int | None
 
 
-def replans_of(question: Question) -> pl.DataFrame:
-    """The replans of a question, with "layers_avg" (see `aggregate`)."""
-    with progress_bar(len(question.selected), "episodes") as advance:
-        steps = steps_table(question.selected, question.grouping, question.selection, question.site, advance)
-    return add_layers_avg(per_replan(steps, question.grouping), question.grouping)
-
-
-def time_course_table(question: Question, settings: TimeSettings | None = None) -> pl.DataFrame:
-    """The table `TimeCourses.course` of a question."""
-    return time_courses(question, settings).course
-
-
 def time_courses(
-    question: Question, settings: TimeSettings | None = None, replans: pl.DataFrame | None = None
+    question: Question, settings: TimeSettings | None = None, replans: Tables | None = None
 ) -> TimeCourses:
     """Everything about the course of episodes.
 
     Args:
         question: stores, selection and grouping.
         settings: bins and window.
-        replans: the question's replans when they are known already (`replans_of`).
+        replans: the question's replans when they are known already (`aggregate.replans_of`).
     """
     settings = settings or TimeSettings()
     replans = replans_of(question) if replans is None else replans
     grouping = question.grouping
-    layer = overall_layer(replans)
-    rows = replans.filter(pl.col("layer") == layer)
-    groups = [name for name in grouping.names if (rows[f"{name}_mass"] > 0).any()]
-    quantities = ((RATIO,) if grouping.ratio else ()) + tuple(groups)
+    layer = overall_layer(replans.cells)
+    of_layer = replans.filter(pl.col("layer") == layer).kept()
+    rows, groups = of_layer.cells, of_layer.groups_with_mass()
+    quantities = ((RATIO,) if grouping.ratio else ()) + groups
     has_actions = all("actions" in item.episode.attributes.arrays for item in question.selected)
     by_name = {
         (i.store.suite, i.episode.attributes.task_id, i.episode.attributes.episode_index): i for i in question.selected
     }
     episodes = []
-    for part in rows.partition_by("suite", "task_id", "episode_index", maintain_order=True):
-        item = by_name[part["suite"][0], part["task_id"][0], part["episode_index"][0]]
-        episodes.append(_episode(item, part.sort("replan"), quantities, has_actions))
+    fractions = of_layer.groups.partition_by(EPISODE_ID, as_dict=True)
+    for key, part in rows.partition_by(EPISODE_ID, as_dict=True, maintain_order=True).items():
+        episodes.append(_episode(by_name[key], Tables(part, fractions[key]), quantities, has_actions))
     seed = question.settings.seed
     classes = {ALL: episodes}
     solved = [episode for episode in episodes if episode.success]
@@ -159,21 +145,18 @@ def time_courses(
         closing=_closing_table(episodes if has_actions else [], rows),
         change=_change_table(episodes, quantities, settings.window, seed),
         outcomes=_outcomes_table(episodes, quantities, seed),
-        autocorrelation=autocorrelation_table(
-            rows,
-            [*EPISODE_KEYS, "layer", "layer_number"],
-            "log2_ratio" if grouping.ratio else f"{grouping.names[0]}_fraction",
-        ),
+        autocorrelation=effective_replans_table(of_layer, grouping),
         num_nonfinite=int(sum((~np.isfinite(values)).sum() for values in ratios)),
     )
 
 
-def _episode(item: SelectedEpisode, part: pl.DataFrame, quantities: Sequence[str], has_actions: bool) -> _Episode:
+def _episode(item: SelectedEpisode, level: Tables, quantities: Sequence[str], has_actions: bool) -> _Episode:
+    part = level.cells
     attributes = item.episode.attributes
     wait_steps = item.store.attributes.protocol.wait_steps
     starts = replan_starts(part["env_step"].to_numpy(), wait_steps, attributes.num_steps, item.episode.name)
     columns = [
-        part["log2_ratio"] * np.log(2.0) if quantity == RATIO else part[f"{quantity}_fraction"]
+        part["log2_ratio"] * np.log(2.0) if quantity == RATIO else level.of_group(quantity)["fraction"]
         for quantity in quantities
     ]
     uniform = part["uniform_ratio"].cast(pl.Float64).mean() if RATIO in quantities else None

@@ -4,14 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from vla_attention.analyze.arguments import (
-    add_output,
-    add_selection,
-    add_stores,
-    output_folder,
-    settings_of,
-    stores_of,
-)
+from vla_attention.analyze.arguments import add_output, add_selection, add_stores, output_folder, settings_of, stores_of
 from vla_attention.analyze.show.output_files import report_files, write_parquet
 from vla_attention.schemas.command_line import command_parser
 

@@ -1,12 +1,18 @@
-"""A made-up table of steps as `vla_attention.analyze.measures.steps` makes it, with metrics computed in numpy."""
+"""Made-up steps, as a wide table whose measures are computed here, and as the masses that an analysis begins with."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import polars as pl
 
+from vla_attention.analyze.measures.aggregate import replan_tables
+from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, Tables
+from vla_attention.analyze.measures.steps import MeasuredEpisode
+from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 
 #: Keys per group of the default grouping in something like pi0.5 with two cameras.
@@ -142,3 +148,65 @@ def make_steps(
         columns |= {"uniform_ratio": np.full(len(task), uniform), "ratio_lift": ratio / uniform}
         columns["log2_ratio"] = np.log2(ratio)
     return pl.DataFrame(columns)
+
+
+def measured_of(steps: pl.DataFrame, grouping: Grouping) -> list[MeasuredEpisode]:
+    """The episodes of `make_steps` (in any order of its rows) as measured masses."""
+    return [_measured(part, grouping) for part in steps.partition_by(EPISODE_ID, maintain_order=True)]
+
+
+def replans_of(steps: pl.DataFrame, grouping: Grouping) -> Tables:
+    return replan_tables(measured_of(steps, grouping), grouping)
+
+
+def flat(tables: Tables) -> pl.DataFrame:
+    """Cells with a column `{group}_{measure}` for each group and measure."""
+    shared = [name for name in tables.groups.columns if name in tables.cells.columns]
+    parts = [tables.cells]
+    for name in tables.groups["group"].unique(maintain_order=True):
+        own = tables.of_group(name)
+        assert own.select(shared).equals(tables.cells.select(shared))
+        parts.append(own.drop(*shared, "group").rename(lambda column, name=name: f"{name}_{column}"))
+    return pl.concat(parts, how="horizontal")
+
+
+def _measured(part: pl.DataFrame, grouping: Grouping) -> MeasuredEpisode:
+    part = part.sort("replan", "layer", "denoise_step", "head")
+    layers, steps, heads = (
+        part[name].unique(maintain_order=True).to_list() for name in ("layer", "denoise_step", "head")
+    )
+    blocks = dict(part.select("layer", "block").unique().iter_rows())
+    replans = part.unique("replan", maintain_order=True)
+    shape = (replans.height, len(layers), len(steps), len(heads))
+    selection = Selection(
+        layers=tuple(range(len(layers))),
+        layer_labels=tuple(layers),
+        blocks=tuple(blocks[layer] for layer in layers),
+        denoise=tuple(range(len(steps))),
+        denoise_steps=tuple(steps),
+        heads=tuple(range(len(heads))),
+        head_numbers=tuple(head or 0 for head in heads),
+        per_head=heads != [None],
+    )
+    arrays = {
+        "env_step": replans["env_step"].to_numpy(),
+        "denoise_time": part["denoise_time"].unique(maintain_order=True).to_numpy(),
+    }
+    first = part.row(0, named=True)
+    episode = SimpleNamespace(
+        attributes=SimpleNamespace(**{name: first[name] for name in EPISODE_KEYS}), read=lambda name: arrays[name]
+    )
+    item: Any = SimpleNamespace(store=SimpleNamespace(suite=first["suite"]), episode=episode)
+
+    def of(names: Sequence[str], table: pl.DataFrame = part) -> Any:
+        return table.select(pl.col(names).cast(pl.Float64)).to_numpy()
+
+    return MeasuredEpisode(
+        item=item,
+        selection=selection,
+        mass=of([f"{name}_mass" for name in grouping.names]).reshape(*shape, -1),
+        valid_mass=of(["valid_mass"]).reshape(shape),
+        row_sum=of(["row_sum"]).reshape(shape),
+        num_keys=of([f"{name}_keys" for name in grouping.names], replans),
+        num_valid=replans["num_valid"].to_numpy(),
+    )

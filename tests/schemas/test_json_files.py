@@ -6,8 +6,7 @@ import tomllib
 import jsonschema
 import pytest
 
-from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps
-from vla_attention.analyze.measures.aggregate import add_layers_avg, per_replan
+from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, replans_of
 from vla_attention.analyze.published.results_file import write_results_of_suites
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.json_files import FOLDER, schema_documents, schema_text, write_schema_files
@@ -135,7 +134,7 @@ def test_grouping_files_validate_after_toml_was_read():
 def test_results_files_validate(grouping, tmp_path):
     keys = None if grouping.name == "default" else CUSTOM_KEYS
     steps = make_steps(grouping, keys, no_denominator=0.5)
-    replans = add_layers_avg(per_replan(steps, grouping), grouping)
+    replans = replans_of(steps, grouping)
     (path,) = write_results_of_suites(tmp_path, replans, grouping)
     document = json.loads(path.read_text(encoding="utf-8"))
     check("results.schema.json", document)

@@ -101,8 +101,8 @@ def test_paired_differences_are_those_of_the_planted_pairs(stores):
         factor = stats.t.ppf(0.975, 3) / stats.norm.ppf(0.975) * np.sqrt(4 / 3)
         ends = [own.mean() + factor * (end - own.mean()) for end in theirs.confidence_interval]
         assert (row["low"], row["high"]) == pytest.approx(ends, abs=0.012)
-    pair = one(found.pairs, task_id=5, episode_first=3, layer="layers_avg")
-    assert pair["log2_ratio_difference"] == pytest.approx(expected[5, 3], rel=1e-3)
+    pair = one(found.pairs, task_id=5, episode_first=3, layer="layers_avg", quantity="log2_ratio")
+    assert pair["difference"] == pytest.approx(expected[5, 3], rel=1e-3)
     assert found.unpaired.is_empty()
 
 
@@ -120,7 +120,7 @@ def test_with_another_seed_allowed_the_initial_state_alone_makes_a_pair(stores):
     found = compare(opened(stores, "base", "reseeded", allowed=("seed",)), ("seed",))
     row = one(found.differences, scope="all", layer="layers_avg", quantity="log2_ratio")
     assert (row["paired"], row["num_pairs"]) == (True, 4)
-    assert found.pairs.height == 4 * 3
+    assert found.pairs.height == 4 * 3 * len(found.quantities)
     assert [note for note in found.notes if "seed" in note]
 
 
@@ -143,9 +143,9 @@ def test_three_runs_are_each_compared_with_the_first(stores):
     lower = one(found.differences, run="lower", scope="all", layer="layers_avg", quantity="log2_ratio")
     assert lower["high"] < 0 < -lower["low"]
     # Each run's own estimate is the plain geometric mean over its episodes.
-    row = one(found.estimates, run="lower", layer="layers_avg")
+    row = one(found.estimates, run="lower", layer="layers_avg", quantity="ratio")
     logs = [log_ratio(2, task, episode) for task in (1, 2, 5) for episode in range(5)]
-    assert row["ratio"] == pytest.approx(np.exp(np.mean(logs)), rel=1e-4)
+    assert row["value"] == pytest.approx(np.exp(np.mean(logs)), rel=1e-4)
     assert row["num_episodes"] == 15
 
 
@@ -313,7 +313,8 @@ def test_the_command_writes_tables_and_pictures(stores, tmp_path, capsys):
     )
     assert "new AGAINST base" in capsys.readouterr().out
     assert pl.read_parquet(out / "comparison.parquet")["run"].unique().sort().to_list() == ["lower", "new"]
-    assert pl.read_parquet(out / "pairs.parquet").height == (16 + 12) * 3
+    pairs = pl.read_parquet(out / "pairs.parquet")
+    assert pairs.filter(quantity="log2_ratio").height == (16 + 12) * 3
     for stem in ("forest", "paired_differences_new", "paired_differences_lower"):
         for kind in ("png", "pdf", "csv"):
             assert (out / f"{stem}.{kind}").stat().st_size > 300

@@ -60,22 +60,28 @@ def exported(*words: object) -> int:
 
 def test_tables_are_those_of_the_analysis(store, tmp_path, capsys):
     assert exported(store, "--csv", "--parquet", "--output", tmp_path) == 0
-    names = ("episodes", "tasks", "steps")
-    assert sorted(file.name for file in tmp_path.iterdir()) == sorted(
-        f"{n}.{e}" for n in names for e in ("csv", "parquet")
-    )
     analysis = analyse(question_about(store))
-    for name in names:
-        table = getattr(analysis, name)
+    tables = {}
+    for name in ("episodes", "tasks", "steps"):
+        level = getattr(analysis, name)
+        tables |= {name: level.cells, f"{name}_groups": level.groups}
+    assert sorted(file.name for file in tmp_path.iterdir()) == sorted(
+        f"{n}.{e}" for n in tables for e in ("csv", "parquet")
+    )
+    for name, table in tables.items():
         assert_frame_equal(pl.read_parquet(tmp_path / f"{name}.parquet"), table)
         text = pl.read_csv(tmp_path / f"{name}.csv", schema=table.schema)
         assert_frame_equal(text, table)
-    assert "6 files in" in capsys.readouterr().out
+    assert "12 files in" in capsys.readouterr().out
 
 
 def test_a_table_of_ones_own_choice(store, tmp_path):
     exported(store, "--parquet", "--table", "replans", "--table", "contributions", "--layers", 2, "--output", tmp_path)
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["contributions.parquet", "replans.parquet"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == [
+        "contributions.parquet",
+        "replans.parquet",
+        "replans_groups.parquet",
+    ]
     assert pl.read_parquet(tmp_path / "replans.parquet")["block"].drop_nulls().unique().to_list() == [2]
     exported(store, "--parquet", "--table", "steps", "--per-head", "--output", tmp_path)
     assert pl.read_parquet(tmp_path / "steps.parquet")["head"].unique().sort().to_list() == [0, 1]
@@ -176,8 +182,8 @@ def test_arrays_in_memory_are_those_of_the_file(store, tmp_path):
 def test_the_means_over_heads_are_those_of_the_steps_table(store):
     question = question_about(store)
     mean = masses_array(question)["mass"].mean("head")
-    steps = analyse(question).steps
-    np.testing.assert_allclose(mean.sel(group="visual").values.ravel(), steps["visual_mass"].to_numpy(), rtol=1e-5)
+    mass = analyse(question).steps.of_group("visual")["mass"].to_numpy()
+    np.testing.assert_allclose(mean.sel(group="visual").values.ravel(), mass, rtol=1e-5)
 
 
 def test_rows_that_are_too_large_for_memory_are_refused_with_their_size(store):

@@ -1,9 +1,11 @@
-"""Depth, layers over time and denoise steps: planted centres, centres of contributions, exact parts of an episode's time."""
+"""Depth, layers over time, denoise steps: planted centres, centres of contributions, parts of an episode's time."""
 
 from __future__ import annotations
 
 import tempfile
 import warnings
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +14,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps
+from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, measured_of, replans_of
 from tests.kit.questions import question_about
 from tests.kit.raw_rows import FEW, raw_episodes, weights_of
-from vla_attention.analyze.heads.denoise import denoise_table
+from vla_attention.analyze.heads.denoise import denoise_tables
 from vla_attention.analyze.heads.depth import depth_table
 from vla_attention.analyze.heads.head_study import study_heads
 from vla_attention.analyze.heads.layer_time import MOST_BINS, layer_time_table
-from vla_attention.analyze.measures.aggregate import add_layers_avg, per_replan
-from vla_attention.schemas.groupings.grouping import Grouping
+from vla_attention.analyze.measures.frames import Tables
+from vla_attention.analyze.measures.steps import MeasuredEpisode
 from vla_attention.schemas.segments import segments_of
 from vla_attention.testing.stores import StoreSpec, contribution_vectors, write_store
 from vla_attention.testing.strategies import episode_tokens, groupings
@@ -116,23 +118,16 @@ def test_all_mass_in_the_last_layer_has_its_centre_there(tmp_path):
 
 
 def test_no_mass_at_all_gives_an_empty_table():
-    grouping = Grouping("g", {"a": ("*",)})
-    episodes = pl.DataFrame(
-        {
-            "suite": ["s"] * 2,
-            "task_id": [0] * 2,
-            "episode_index": [0] * 2,
-            "layer": ["0", "1"],
-            "block": [0, 1],
-            "a_mass": [0.0, 0.0],
-        }
+    cells = pl.DataFrame(
+        {"suite": ["s"] * 2, "task_id": [0] * 2, "episode_index": [0] * 2, "layer": ["0", "1"], "block": [0, 1]}
     )
-    assert depth_table(episodes, grouping).is_empty()
+    groups = cells.with_columns(pl.lit("a").alias("group"), pl.lit(0.0).alias("mass"))
+    assert depth_table(Tables(cells, groups)).is_empty()
 
 
 @pytest.mark.parametrize("num_bins", [1, 4, None])
 def test_a_part_of_the_time_holds_what_lies_in_it_by_share(num_bins):
-    """Replans of uneven length in episodes of odd lengths, cut so fine that each crumb lies in one replan and one part."""
+    """Replans and episodes of unequal lengths, cut into pieces so small that each lies in one replan and one part."""
     grouping = default_grouping()
     steps = make_steps(
         layers=(3, 4), num_replans=5, num_tasks=2, num_episodes=2, no_denominator=0.3, denoise_steps=(0,)
@@ -140,7 +135,7 @@ def test_a_part_of_the_time_holds_what_lies_in_it_by_share(num_bins):
     steps = steps.with_columns(
         env_step=10 + pl.col("replan") * (pl.col("replan") + 3), num_steps=31 + pl.col("episode_index")
     )
-    replans = add_layers_avg(per_replan(steps, grouping), grouping)
+    replans = replans_of(steps, grouping)
     table = layer_time_table(replans, grouping, num_bins)
     bins = num_bins or 5
     assert table.height == 2 * bins
@@ -148,11 +143,11 @@ def test_a_part_of_the_time_holds_what_lies_in_it_by_share(num_bins):
     for row in table.iter_rows(named=True):
         means = []
         for task, episode in np.ndindex(2, 2):
-            part = replans.filter(task_id=task, episode_index=episode, layer=row["layer"]).sort("replan")
+            part = replans.cells.filter(task_id=task, episode_index=episode, layer=row["layer"]).sort("replan")
             values = np.log2(part["ratio"].to_numpy() / part["uniform_ratio"].to_numpy())
             num_steps = 31 + episode
-            crumbs = np.arange(num_steps * bins)
-            inside = crumbs[crumbs // num_steps == row["bin"]]
+            pieces = np.arange(num_steps * bins)
+            inside = pieces[pieces // num_steps == row["bin"]]
             values = values[np.searchsorted(starts, inside // bins, side="right") - 1]
             means += [values[np.isfinite(values)].mean()] if np.isfinite(values).any() else []
         assert row["quantity"] == "log2_lift"
@@ -164,7 +159,7 @@ def test_a_part_of_the_time_holds_what_lies_in_it_by_share(num_bins):
 def test_time_has_no_more_parts_than_replans_and_groups_stand_in_where_there_is_no_ratio():
     grouping = custom_grouping(with_ratio=False)
     steps = make_steps(grouping, CUSTOM_KEYS, num_replans=3)
-    short = layer_time_table(per_replan(steps, grouping), grouping)
+    short = layer_time_table(replans_of(steps, grouping), grouping)
     assert short["bin"].n_unique() == 3
     assert short["quantity"].unique(maintain_order=True).to_list() == [
         "base_fraction",
@@ -172,20 +167,37 @@ def test_time_has_no_more_parts_than_replans_and_groups_stand_in_where_there_is_
         "nouns_fraction",
     ]
     long = make_steps(grouping, CUSTOM_KEYS, num_replans=40)
-    assert layer_time_table(per_replan(long, grouping), grouping)["bin"].n_unique() == MOST_BINS
+    assert layer_time_table(replans_of(long, grouping), grouping)["bin"].n_unique() == MOST_BINS
 
 
 def test_all_ratios_infinite_leave_every_part_of_the_time_empty():
     grouping = default_grouping()
-    table = layer_time_table(per_replan(make_steps(no_denominator=1.0), grouping), grouping)
+    table = layer_time_table(replans_of(make_steps(no_denominator=1.0), grouping), grouping)
     assert table["mean"].is_null().all()
     assert (table["num_episodes"] == 0).all()
+
+
+def with_denoise_order(measured: MeasuredEpisode, order: Sequence[int]) -> MeasuredEpisode:
+    """The same masses with the denoise steps in another order, as a user may name them."""
+    selection, positions = measured.selection, list(order)
+    named = replace(
+        selection,
+        denoise=tuple(selection.denoise[i] for i in positions),
+        denoise_steps=tuple(selection.denoise_steps[i] for i in positions),
+    )
+    mass, valid_mass, row_sum = (
+        values[:, :, positions] for values in (measured.mass, measured.valid_mass, measured.row_sum)
+    )
+    return replace(measured, selection=named, mass=mass, valid_mass=valid_mass, row_sum=row_sum)
 
 
 def test_a_denoise_step_is_the_mean_over_layers_of_its_own_ratios():
     grouping = default_grouping()
     steps = make_steps(denoise_steps=(4, 0, 9), layers=(1, 2))
-    table = denoise_table(steps, grouping)
+    measured = [with_denoise_order(episode, (1, 0, 2)) for episode in measured_of(steps, grouping)]
+    assert measured[0].selection.denoise_steps == (4, 0, 9)
+    tables = denoise_tables(measured, grouping)
+    table = tables.cells
     assert table["denoise_step"].to_list() == [0, 4, 9]
     for row in table.iter_rows(named=True):
         part = steps.filter(denoise_step=row["denoise_step"])
@@ -194,3 +206,8 @@ def test_a_denoise_step_is_the_mean_over_layers_of_its_own_ratios():
         assert row["ratio_mean"] == pytest.approx(of_episodes["ratio"].mean())
         assert row["denoise_time"] == pytest.approx(1 - row["denoise_step"] / 10)
         assert row["ratio_mean_low"] < row["ratio_mean"] < row["ratio_mean_high"]
+        for name in ("visual", "state"):
+            own = tables.of_group(name).filter(denoise_step=row["denoise_step"])
+            # Masses of a row add up to 1, so that fractions may be averaged in any order.
+            assert own["fraction"].to_list() == [pytest.approx(part[f"{name}_fraction"].mean())]
+            assert own["denoise_time"].to_list() == [row["denoise_time"]]

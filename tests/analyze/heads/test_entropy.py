@@ -1,4 +1,4 @@
-"""Entropy, effective keys and top-k mass of random stores and groupings against scipy and sorting, and of rows that are known."""
+"""Entropy, effective keys and top-k mass: random stores and groupings against scipy and sorting, and known rows."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,7 +14,7 @@ from scipy.stats import entropy as entropy_of_scipy
 from tests.kit.questions import question_about
 from tests.kit.raw_rows import FEW, leaky, raw_episodes, weights_of
 from vla_attention.analyze.heads.entropy import effective_keys, entropies, top_mass
-from vla_attention.analyze.heads.row_metrics import RowOptions, groups_with_valid_keys, row_metrics_table
+from vla_attention.analyze.heads.row_metrics import RowOptions, groups_with_valid_keys, row_metrics
 from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.testing.stores import StoreSpec, write_store
@@ -27,7 +26,7 @@ def by_hand(row: np.ndarray, weights: np.ndarray) -> float:
     inside = row * weights
     if inside.sum() <= 0:
         return float("nan")
-    # scipy takes 0 x ln(0 / 0) for 0, and wants no weight of 0 below a probability above 0: there is none. It renormalises both.
+    # scipy takes 0 x ln(0 / 0) for 0, and renormalises both. No weight is 0 where a probability is above 0.
     return float(np.log(weights.sum()) - entropy_of_scipy(inside, weights))
 
 
@@ -81,15 +80,19 @@ def test_the_table_of_rows_holds_what_scipy_and_sorting_say_of_the_raw_rows(data
         path = write_store(Path(folder) / "a.zarr", spec=spec)
         question = question_about(path, grouping)
         shown = groups_with_valid_keys(question.selected, resolve_all(grouping, question.selected))
-        table = row_metrics_table(question, options)
+        found = row_metrics(question, options)
         (raw,) = raw_episodes(path, spec)
+    table, inside = found.cells, {name: found.of_group(name) for name in shown}
     rows, valid = raw.held()
     weights = weights_of(grouping, tokens) * valid[:, :, None]
     assert table.height == rows[..., 0].size
     assert table["layer"].unique().sort().to_list() == [0, 2, 4]
-    assert set(table.filter(pl.col("layer") == 4)["block"]) == {0}
+    assert set(table.filter(layer=4)["block"]) == {0}
     having = {name for i, name in enumerate(grouping.names) if weights[:, :, i].any()}
     assert set(shown) == having
+    assert found.groups["group"].to_list() == list(shown) * table.height
+    for own in inside.values():
+        assert own["row"].to_list() == table["row"].to_list() == list(range(table.height))
     for row, (replan, layer, denoise, head) in zip(
         table.iter_rows(named=True), np.ndindex(rows.shape[:4]), strict=True
     ):
@@ -104,12 +107,13 @@ def test_the_table_of_rows_holds_what_scipy_and_sorting_say_of_the_raw_rows(data
             assert row[f"top{k}_mass"] == pytest.approx(largest[:k].sum(), rel=1e-5)
         for name in shown:
             expected = by_hand(seen, weights[replan, :, grouping.names.index(name)])
+            own = inside[name].row(row["row"], named=True)
             if np.isnan(expected):
-                assert row[f"{name}_entropy"] is None
-                assert row[f"{name}_effective_keys"] is None
+                assert own["entropy"] is None
+                assert own["effective_keys"] is None
             else:
-                assert row[f"{name}_entropy"] == pytest.approx(expected, abs=5e-5)
-                assert row[f"{name}_effective_keys"] == pytest.approx(np.exp(expected), rel=2e-4)
+                assert own["entropy"] == pytest.approx(expected, abs=5e-5)
+                assert own["effective_keys"] == pytest.approx(np.exp(expected), rel=2e-4)
 
 
 def test_keys_that_are_padding_at_some_replans_are_in_no_entropy_of_a_group_there(tmp_path):
@@ -117,12 +121,13 @@ def test_keys_that_are_padding_at_some_replans_are_in_no_entropy_of_a_group_ther
     spec = StoreSpec(tasks=(0,), episodes=2, replans=4, plant_rows=leaky, mantissa_bits=23)
     path = write_store(tmp_path / "a.zarr", spec=spec)
     grouping = Grouping("g", {"text": ("span:prompt",), "rest": ("*",)})
-    table = row_metrics_table(question_about(path, grouping))
+    tables = row_metrics(question_about(path, grouping))
+    inside = tables.cells.select("row", "episode_index").join(tables.of_group("text"), on="row", maintain_order="left")
     text = np.zeros(spec.layout.num_keys)
     text[spec.layout.span("prompt").start : spec.layout.span("prompt").stop] = 1.0
     for raw in raw_episodes(path, spec):
         assert (raw.valid != raw.valid[0]).any()
-        found = table.filter(episode_index=raw.order[1])["text_entropy"].to_numpy()
+        found = inside.filter(episode_index=raw.order[1])["entropy"].to_numpy()
         cells = np.ndindex(raw.rows.shape[:4])
         expected = [by_hand(raw.rows[cell], text * raw.valid[cell[0]]) for cell in cells]
         np.testing.assert_allclose(found, expected, atol=5e-5)

@@ -1,4 +1,4 @@
-"""Heads of random stores and random groupings against the raw rows, and what is ranked, left out and named at the edges."""
+"""Heads of random stores and groupings against the raw rows; which heads are ranked, and which are left out."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
+from tests.kit.made_up_steps import flat
 from tests.kit.questions import question_about
 from tests.kit.raw_rows import FEW, leaky, raw_episodes, weights_of
 from vla_attention.analyze.heads.head_measures import ranked_heads
@@ -69,11 +70,11 @@ def test_every_number_of_a_head_is_that_of_loops_over_raw_rows(data):
         raws = raw_episodes(path, spec)
     weights = weights_of(grouping, tokens)
     keys = weights.sum(axis=1)
-    assert study.heads.select("layer", "block", "head").rows() == [
+    assert study.heads.cells.select("layer", "block", "head").rows() == [
         (label, label % 4, head) for label in (0, 2, 4) for head in (3, 0)
     ]
     shares: dict[tuple[int, int], list[list[float]]] = {}
-    for row in study.heads.iter_rows(named=True):
+    for row in flat(study.heads).iter_rows(named=True):
         layer, head = (0, 2, 4).index(row["layer"]), spec.heads.index(row["head"])
         per_episode: dict[str, list[float | None]] = {}
         above, below, left_out = [], [], 0
@@ -142,12 +143,14 @@ def test_a_study_says_of_layers_what_the_whole_analysis_says(data):
         whole = analyse(question)
         for options in (None, RowOptions()):
             study = study_heads(question, options)
-            assert_frame_equal(study.replans, whole.replans.select(study.replans.columns), rel_tol=1e-5, abs_tol=1e-7)
-            assert_frame_equal(study.tasks, whole.tasks, rel_tol=1e-4, abs_tol=1e-6)
+            for part in ("cells", "groups"):
+                replans, tasks = getattr(study.replans, part), getattr(study.tasks, part)
+                assert_frame_equal(replans, getattr(whole.replans, part), rel_tol=1e-5, abs_tol=1e-7)
+                assert_frame_equal(tasks, getattr(whole.tasks, part), rel_tol=1e-4, abs_tol=1e-6)
 
 
 def planted(where: dict[tuple[int, int], tuple[slice, float]]):
-    """Rows even over the valid keys, but for some (layer position, head) that hold keys of a slice so many times as much."""
+    """Rows even over the valid keys; some (layer position, head) give the keys of a slice so many times as much."""
 
     def plant(task, episode, tokens, rows):
         even = np.broadcast_to(tokens.valid[:, None, None, None, None], rows.shape).astype(float)
@@ -177,7 +180,7 @@ def test_planted_specialists_are_at_the_two_ends(tmp_path):
 def test_a_block_that_is_named_twice_is_ranked_once(tmp_path):
     study = study_of(tmp_path, layer_labels=(0, 2, 4))
     ranked = ranked_heads(study.heads, study.question.grouping)
-    assert study.heads.height == 6
+    assert study.heads.cells.height == 6
     assert ranked.height == 4
     assert set(ranked["layer"]) == {0, 2}
 
@@ -193,7 +196,9 @@ def test_heads_without_a_finite_ratio_stand_at_the_ends_and_those_without_mass_n
     study = study_of(tmp_path, SIDES, plant_rows=plant)
     ranked = ranked_heads(study.heads, SIDES)
     assert ranked.select("block", "head").rows() == [(0, 0), (2, 1), (0, 1)]
-    sees, reads, nothing = (study.heads.filter(block=b, head=h).row(0, named=True) for b, h in ((0, 0), (0, 1), (2, 0)))
+    sees, reads, nothing = (
+        study.heads.cells.filter(block=b, head=h).row(0, named=True) for b, h in ((0, 0), (0, 1), (2, 0))
+    )
     assert sees["log2_ratio"] is None
     assert sees["ratio_of_means"] == np.inf
     assert reads["ratio_of_means"] == 0.0
@@ -208,25 +213,25 @@ def test_all_ratios_infinite_is_said_and_nothing_breaks(tmp_path):
         Ratio(("seen",), ("masked",)),
     )
     study = study_of(tmp_path, grouping)
-    assert study.heads["log2_ratio"].is_null().all()
-    assert study.heads["ratio_of_means"].is_infinite().all()
-    assert study.heads["num_nonfinite"].to_list() == [2 * 2 * 3] * 4
+    assert study.heads.cells["log2_ratio"].is_null().all()
+    assert study.heads.cells["ratio_of_means"].is_infinite().all()
+    assert study.heads.cells["num_nonfinite"].to_list() == [2 * 2 * 3] * 4
     assert ranked_heads(study.heads, grouping).height == 4
     assert study.dispersion["log2_ratio_std"].is_null().all()
     assert study.dispersion["fraction_std"].is_not_null().all()
-    assert study.denoise["ratio_mean"].is_null().all()
-    assert study.denoise["num_nonfinite"].to_list() == [2 * 2 * 3] * 2
+    assert study.denoise.cells["ratio_mean"].is_null().all()
+    assert study.denoise.cells["num_nonfinite"].to_list() == [2 * 2 * 3] * 2
 
 
 def test_one_of_everything_has_numbers_but_no_intervals_and_no_spread(tmp_path):
     study = study_of(tmp_path, tasks=(0,), episodes=1, replans=1, layers=(2,), heads=(1,), denoise_steps=(9,))
-    (row,) = study.heads.iter_rows(named=True)
+    (row,) = study.heads.cells.iter_rows(named=True)
     assert row["log2_ratio"] is not None
     assert row["log2_ratio_low"] is None
     (spread,) = study.dispersion.iter_rows(named=True)
     assert spread["fraction_std"] is None
     assert set(study.depth["centre"]) == {2.0}
-    assert study.denoise.height == 1
+    assert study.denoise.cells.height == 1
 
 
 def test_without_a_ratio_heads_are_ranked_by_the_first_group_that_has_mass(tmp_path):
@@ -235,17 +240,20 @@ def test_without_a_ratio_heads_are_ranked_by_the_first_group_that_has_mass(tmp_p
     study = study_of(tmp_path, grouping, plant_rows=plant)
     ranked = ranked_heads(study.heads, grouping)
     assert ranked.select("block", "head").row(0) == (2, 0)
-    assert ranked["words_fraction"].is_sorted(descending=True)
-    assert "log2_ratio" not in study.heads.columns
+    assert ranked.height == 4
+    of_group = study.heads.by_group("block", "head")
+    shares = [of_group[block, head, "words"]["fraction"] for block, head in ranked.select("block", "head").rows()]
+    assert shares == sorted(shares, reverse=True)
+    assert "log2_ratio" not in study.heads.cells.columns
     assert "log2_ratio_std" not in study.dispersion.columns
 
 
 def test_intervals_of_heads_hold_what_was_planted_and_not_the_uniform_value(tmp_path):
     plant = planted({(0, 0): (slice(0, 16), 8.0)})
     study = study_of(tmp_path, tasks=(0, 1, 2), episodes=3, plant_rows=plant, replans=2)
-    row = study.heads.filter(block=0, head=0).row(0, named=True)
+    row = study.heads.cells.filter(block=0, head=0).row(0, named=True)
     assert row["log2_lift_low"] < 3.0 < row["log2_lift_high"]
     assert row["log2_lift_low"] > 2.5
     assert row["num_tasks"] == 3
     assert row["num_episodes"] == 9
-    assert study.heads.filter(pl.col("log2_lift_episodes") != 9).is_empty()
+    assert study.heads.cells.filter(pl.col("log2_lift_episodes") != 9).is_empty()

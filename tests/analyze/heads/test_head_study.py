@@ -1,4 +1,4 @@
-"""Heads, layers, denoise steps, rows and sinks of random stores against independent arithmetic on the raw Zarr arrays."""
+"""Heads, layers, denoise steps, rows and sinks of random stores against independent arithmetic on raw Zarr arrays."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from polars.testing import assert_frame_equal
 from scipy import stats
 
 from tests.kit.examples import examples
+from tests.kit.made_up_steps import flat
 from tests.kit.questions import question_about
 from vla_attention.analyze.heads import command as heads_command
 from vla_attention.analyze.heads.head_measures import ranked_heads
 from vla_attention.analyze.heads.head_study import study_heads
-from vla_attention.analyze.heads.row_metrics import RowOptions, row_metrics_table
+from vla_attention.analyze.heads.row_metrics import RowOptions, row_metrics
 from vla_attention.analyze.heads.text import heads_text
 from vla_attention.analyze.measures.sinks import SinkRule, sinks_table, without_sinks
 from vla_attention.analyze.ratios.analysis import analyse
@@ -54,8 +55,10 @@ def test_row_metrics_equal_scipy_on_raw_rows(data):
     with tempfile.TemporaryDirectory() as folder:
         path = write_store(Path(folder) / "a.zarr", tokens=tokens, tasks=(0,), episodes=1, queries=queries)
         question = question_about(path, grouping=grouping)
-        table = row_metrics_table(question, RowOptions(top=(1, 3)))
+        tables = row_metrics(question, RowOptions(top=(1, 3)))
         rows = raw_rows(path, "task000_episode000")
+    table = tables.cells
+    inside = {(row["row"], row["group"]): row["entropy"] for row in tables.groups.iter_rows(named=True)}
     resolved = resolve(question.grouping, tokens)
     valid = np.broadcast_to(valid_keys(tokens.key_role), (len(rows), rows.shape[-1]))
     weights = np.broadcast_to(resolved.weights, (len(rows), rows.shape[-1], len(resolved.names)))
@@ -74,10 +77,10 @@ def test_row_metrics_equal_scipy_on_raw_rows(data):
         for i, name in enumerate(resolved.names):
             part = weights[replan, :, i] * valid[replan]
             if (seen * part).sum() == 0:
-                assert row.get(f"{name}_entropy") is None
+                assert inside.get((row["row"], name)) is None
             else:
                 expected = np.log(part.sum()) - stats.entropy(seen * part, part)
-                assert row[f"{name}_entropy"] == pytest.approx(expected, abs=2e-3)
+                assert inside[row["row"], name] == pytest.approx(expected, abs=2e-3)
 
 
 @QUICK
@@ -100,7 +103,7 @@ def test_heads_equal_sums_over_raw_rows(data):
     masses = [
         np.einsum("rldhk,rkg->rldhg", part, weights).mean(axis=2) for part in rows
     ]  # (replan, layer, head, group)
-    for row in study.heads.iter_rows(named=True):
+    for row in flat(study.heads).iter_rows(named=True):
         layer, head = question.selection.blocks.index(row["block"]), row["head"]
         own = [mass[:, layer, head] for mass in masses]
         for i, name in enumerate(names):
@@ -128,16 +131,15 @@ def test_a_head_of_the_grid_is_what_the_whole_analysis_says_of_that_head_alone(t
     path = write_store(tmp_path / "a.zarr", tasks=(0, 1), episodes=3)
     study = study_heads(question_about(path))
     alone = analyse(question_about(path, heads=(1,), layers=(2,)))
-    expected = alone.tasks.filter(scope="all", layer="2").row(0, named=True)
-    row = study.heads.filter(block=2, head=1).row(0, named=True)
+    expected = flat(alone.tasks).filter(scope="all", layer="2").row(0, named=True)
+    row = flat(study.heads).filter(block=2, head=1).row(0, named=True)
     assert 2 ** row["log2_ratio"] == pytest.approx(expected["geometric_mean"])
     assert 2 ** row["log2_ratio_low"] == pytest.approx(expected["geometric_mean_low"])
     assert row["visual_fraction_high"] == pytest.approx(expected["visual_fraction_high"])
     assert row["ratio_of_means"] == pytest.approx(expected["ratio_of_means"])
-    step = (
-        analyse(question_about(path, denoise=("9",))).tasks.filter(scope="all", layer="layers_avg").row(0, named=True)
-    )
-    found = study.denoise.filter(denoise_step=9).row(0, named=True)
+    of_step = flat(analyse(question_about(path, denoise=("9",))).tasks)
+    step = of_step.filter(scope="all", layer="layers_avg").row(0, named=True)
+    found = flat(study.denoise).filter(denoise_step=9).row(0, named=True)
     assert found["denoise_time"] == pytest.approx(0.1)
     for name in ("ratio_mean", "ratio_mean_low", "visual_fraction", "uniform_ratio"):
         assert found[name] == pytest.approx(step[name])
@@ -189,12 +191,12 @@ def plant_sinks(task, episode, tokens, rows):
         planted *= 0.5 / (planted.sum(axis=-1, keepdims=True) - planted[..., 5:6])
         planted[..., 5] = 0.5
     bos = tokens.layout.span("prompt").start
-    flat = planted.reshape(-1, planted.shape[-1])
-    for i, row in enumerate(flat):
+    listed = planted.reshape(-1, planted.shape[-1])
+    for i, row in enumerate(listed):
         if i % 4:
             row *= (2 / 3) / (row.sum() - row[bos])
             row[bos] = 1 / 3
-    return flat.reshape(planted.shape) / flat.reshape(planted.shape).sum(axis=-1, keepdims=True)
+    return listed.reshape(planted.shape) / listed.reshape(planted.shape).sum(axis=-1, keepdims=True)
 
 
 @pytest.fixture(scope="module")
@@ -239,7 +241,7 @@ def test_masses_without_sinks_are_those_of_the_remaining_keys(sunken):
     corrected = without_sinks(question, sinks, RULE)
     assert corrected.grouping.name == "default-without-sinks"
     analysis = analyse(corrected)
-    steps = analysis.steps
+    steps, replans = flat(analysis.steps), flat(analysis.replans)
     bos = question.selected[0].tokens.layout.span("prompt").start
     for index, item in enumerate(question.selected):
         task, episode = divmod(index, 2)
@@ -271,7 +273,7 @@ def test_masses_without_sinks_are_those_of_the_remaining_keys(sunken):
         uniform = weights[:, :, visual].sum(axis=1) / weights[:, :, linguistic].sum(axis=1)
         np.testing.assert_allclose(part["uniform_ratio"].to_numpy().reshape(lift.shape)[:, 0, 0], uniform, rtol=1e-6)
         # And so it stays when denoise steps are averaged over: the baseline is that of the remaining keys, too.
-        whole = analysis.replans.filter(task_id=task, episode_index=episode, layer="2").sort("replan")
+        whole = replans.filter(task_id=task, episode_index=episode, layer="2").sort("replan")
         averaged = mass[:, 1, :, visual].mean(axis=1) / weights[:, :, visual].sum(axis=1)
         baseline = held[:, 1].mean(axis=1) / valid.sum(axis=1)
         np.testing.assert_allclose(whole["visual_lift"].to_numpy(), averaged / baseline, rtol=3 * BOUND)
@@ -305,13 +307,20 @@ def test_the_command_writes_tables_and_pictures_and_names_the_nearest_key(tmp_pa
     assert main(["heads", str(path), "--output", str(tmp_path / "out"), "--sink-factor", "1000", "--top", "2"]) == 0
     said = capsys.readouterr().out
     assert "None. The key that comes nearest, key " in said
-    tables = ("heads", "dispersion", "depth", "denoise", "row_metrics", "sinks")
-    pictures = ("head_grid", "layer_profile", "layer_time", "denoise_profile")
+    pairs, single = ("heads", "denoise", "row_metrics"), ("dispersion", "depth", "sinks")
+    pictures_of_groups = ("head_grid", "layer_profile", "denoise_profile")
+    pictures = (*pictures_of_groups, "layer_time")
     written = {file.name for file in (tmp_path / "out").iterdir()}
-    assert written == {f"{name}.parquet" for name in tables} | {
-        f"{name}.{kind}" for name in pictures for kind in ("png", "pdf", "csv")
-    }
-    assert pl.read_parquet(tmp_path / "out" / "row_metrics.parquet").height == 4 * 3 * 2 * 2 * 2
+    assert written == (
+        {f"{name}.parquet" for name in (*pairs, *single)}
+        | {f"{name}_groups.parquet" for name in pairs}
+        | {f"{name}.{kind}" for name in pictures for kind in ("png", "pdf", "csv")}
+        | {f"{name}_groups.csv" for name in pictures_of_groups}
+    )
+    rows, groups = (pl.read_parquet(tmp_path / "out" / f"row_metrics{end}.parquet") for end in ("", "_groups"))
+    assert rows.height == 4 * 3 * 2 * 2 * 2
+    assert groups.height == rows.height * groups["group"].n_unique()
+    assert groups["row"].unique().sort().to_list() == rows["row"].to_list()
 
 
 @pytest.mark.parametrize(
@@ -356,7 +365,10 @@ def test_bad_arguments_end_in_one_sentence(arguments, said, tmp_path, capsys):
 
 
 def test_the_help_has_examples_and_needs_no_library():
-    code = "import sys; from vla_attention.analyze.heads import command; command.build_parser().format_help(); print('numpy' in sys.modules)"
+    code = (
+        "import sys; from vla_attention.analyze.heads import command; command.build_parser().format_help(); "
+        "print('numpy' in sys.modules)"
+    )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "False"
     assert "vla-analyze heads runs/" in heads_command.build_parser().format_help()

@@ -1,4 +1,4 @@
-"""Marks of profiles and of layers over time: whole inside their axes, no line over what is unknown, no note on what is not there."""
+"""Marks of profiles and of layers over time: whole inside their axes, no line without a value, no needless note."""
 
 from __future__ import annotations
 
@@ -8,31 +8,25 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps
+from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, replans_of
 from vla_attention.analyze.heads import plot_layer_time as layer_time
-from vla_attention.analyze.measures.aggregate import (
-    LAYERS_AVG,
-    add_layers_avg,
-    episodes_table,
-    overall_rows,
-    per_replan,
-    tasks_table,
-)
+from vla_attention.analyze.measures.aggregate import episode_tables, overall_rows, task_tables
+from vla_attention.analyze.measures.frames import LAYERS_AVG
+from vla_attention.analyze.ratios.profile_panels import draw_profile
 from vla_attention.analyze.show.plot_heat_map import draw_log2_map, map_height
-from vla_attention.analyze.show.plot_profile import draw_profile
 from vla_attention.analyze.show.plot_style import new_figure
 from vla_attention.schemas.groupings.grouping import Grouping
 
 
 def drawn(steps: pl.DataFrame, grouping: Grouping):
     """The axes of a profile over layers, laid out."""
-    replans = add_layers_avg(per_replan(steps, grouping), grouping)
-    rows = overall_rows(tasks_table(episodes_table(replans, grouping), grouping, num_resamples=50))
-    rows = rows.filter(pl.col("layer") != LAYERS_AVG).sort("layer_number")
+    replans = replans_of(steps, grouping)
+    tasks = overall_rows(task_tables(episode_tables(replans, grouping), grouping, num_resamples=50))
+    level = tasks.filter(pl.col("layer") != LAYERS_AVG)
     figure = new_figure(7, 5)
-    draw_profile(figure, rows, grouping, rows["layer"].to_list(), "layer", 0.95)
+    draw_profile(figure, level, grouping, level.cells["layer"].to_list(), "layer", 0.95)
     figure.canvas.draw()
-    return figure.axes, rows
+    return figure.axes, level.cells.sort("layer_number")
 
 
 @pytest.mark.parametrize("layers", [(7,), (0, 1), tuple(range(18))])
@@ -62,8 +56,7 @@ def test_markers_of_one_position_stand_near_their_label():
 def test_the_line_of_ratios_breaks_where_a_layer_has_none():
     steps = make_steps(layers=(1, 2, 3, 4))
     hit = pl.col("layer") == 3
-    names = ("linguistic_mass", "denominator_mass")
-    steps = steps.with_columns(pl.when(hit).then(0.0).otherwise(pl.col(name)).alias(name) for name in names)
+    steps = steps.with_columns(pl.when(hit).then(0.0).otherwise(pl.col("linguistic_mass")).alias("linguistic_mass"))
     axes, rows = drawn(steps, default_grouping())
     heights = np.asarray(axes[0].lines[0].get_ydata(), dtype=float)
     assert np.isnan(heights).tolist() == [False, False, True, False]
@@ -81,9 +74,9 @@ def test_a_note_on_grey_cells_only_where_there_are_some(tmp_path, monkeypatch):
     grouping = default_grouping()
     some = make_steps(num_tasks=1, num_episodes=1)
     early = pl.col("replan") == 0
-    some = some.with_columns(pl.when(early).then(0.0).otherwise(pl.col("denominator_mass")).alias("denominator_mass"))
+    some = some.with_columns(pl.when(early).then(0.0).otherwise(pl.col("linguistic_mass")).alias("linguistic_mass"))
     for steps in (make_steps(), make_steps(no_denominator=1.0), some):
-        layer_time.plot_layer_time(add_layers_avg(per_replan(steps, grouping), grouping), grouping, tmp_path)
+        layer_time.plot_layer_time(replans_of(steps, grouping), grouping, tmp_path)
     assert ["Grey" in title for title in titles] == [False, False, True]
 
 

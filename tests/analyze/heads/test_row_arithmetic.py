@@ -11,15 +11,16 @@ from scipy import stats
 from tests.kit.examples import examples
 from vla_attention.analyze.heads.depth import depth_centre
 from vla_attention.analyze.heads.entropy import effective_keys, entropies, top_mass
-from vla_attention.analyze.heads.head_measures import dispersion, finite_mean
+from vla_attention.analyze.heads.head_measures import dispersion
 from vla_attention.analyze.heads.row_metrics import RowOptions
+from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.sinks import SinkRule, key_sums
 from vla_attention.schemas.errors import BadArgument
 
 
 @st.composite
 def rows_and_weights(draw: st.DrawFn):
-    """Rows (replan, head, key) with exact zeros and any sum; weights (replan or 1, key, group) of 0, 1 and fractions."""
+    """Rows (replan, head, key) with exact zeros, of any sum; weights (replan or 1, key, group): 0, 1 and fractions."""
     generator = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     replans, heads, keys = draw(st.integers(1, 3)), draw(st.integers(1, 3)), draw(st.integers(1, 40))
     rows = np.exp(generator.normal(0, draw(st.sampled_from([0.1, 3.0])), (replans, heads, keys)))
@@ -53,7 +54,7 @@ def test_entropy_is_scipys_and_of_fractions_of_keys_its_divergence_from_the_weig
 
 @given(seed=st.integers(0, 2**16), parts=st.integers(2, 5))
 def test_a_key_cut_into_parts_counts_as_the_sum_of_its_parts(seed, parts):
-    """What the entropy of fractions means: attention that is the same all over a patch does not depend on how it is cut up."""
+    """Attention that is the same all over a patch has an entropy that does not depend on how the patch is cut up."""
     row = np.random.default_rng(seed).dirichlet(np.ones(6)).astype(np.float32)
     whole = entropies(row[None], np.ones((1, 6, 1), np.float32))
     cut = np.repeat(row, parts)[None]  # the same density of attention per whole key

@@ -4,24 +4,23 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps
+from tests.kit import made_up_steps
+from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, flat, make_steps
 from vla_attention.analyze.measures.aggregate import (
-    LAYERS_AVG,
-    add_layers_avg,
-    episodes_table,
+    episode_tables,
     layer_order,
     overall_layer,
     overall_rows,
-    per_replan,
-    tasks_table,
+    task_tables,
 )
+from vla_attention.analyze.measures.frames import LAYERS_AVG
 
 GROUPING = default_grouping()
 STEPS = make_steps(num_tasks=3, num_episodes=4, heads=(0, 3), no_denominator=0.1)
 
 
 def replans_of(steps, grouping=GROUPING):
-    return add_layers_avg(per_replan(steps, grouping), grouping)
+    return made_up_steps.replans_of(steps, grouping)
 
 
 def one(table, **values):
@@ -33,7 +32,7 @@ def one(table, **values):
 def test_replans_average_masses_first_and_divide_afterwards():
     part = STEPS.filter(task_id=1, episode_index=2, replan=3, layer=25)
     assert part.height == 4  # two denoise steps, two heads
-    row = one(per_replan(STEPS, GROUPING), task_id=1, episode_index=2, replan=3, layer="25")
+    row = one(flat(replans_of(STEPS)), task_id=1, episode_index=2, replan=3, layer="25")
     assert (row["layer_number"], row["block"], row["env_step"]) == (25, 7, 25)
     visual, linguistic = part["visual_mass"].to_numpy().mean(), part["linguistic_mass"].to_numpy().mean()
     assert row["visual_mass"] == pytest.approx(visual)
@@ -49,9 +48,8 @@ def test_replans_average_masses_first_and_divide_afterwards():
 
 
 def test_fractions_of_every_row_sum_to_one():
-    for table in (replans_of(STEPS), episodes_table(replans_of(STEPS), GROUPING)):
-        total = table.select(pl.sum_horizontal(f"{name}_fraction" for name in GROUPING.names)).to_series()
-        assert total.to_numpy() == pytest.approx(np.ones(table.height))
+    for tables in (replans_of(STEPS), episode_tables(replans_of(STEPS), GROUPING)):
+        assert tables.values("fraction").sum(axis=1) == pytest.approx(np.ones(tables.cells.height))
 
 
 def test_infinite_and_undefined_ratios_are_told_apart_and_counted():
@@ -62,10 +60,11 @@ def test_infinite_and_undefined_ratios_are_told_apart_and_counted():
         visual_mass=pl.when(pl.col("replan") == 0).then(0.0).otherwise(0.5),
         numerator_mass=pl.when(pl.col("replan") == 0).then(0.0).otherwise(0.5),
     )
-    replans = per_replan(steps, GROUPING)
-    assert replans["ratio"].to_list() == [None, np.inf]
-    assert replans["nonfinite_layers"].to_list() == [1, 1]
-    episode = one(episodes_table(replans, GROUPING), layer="1")
+    replans = replans_of(steps)
+    of_layer = replans.cells.filter(layer="1")
+    assert of_layer["ratio"].to_list() == [None, np.inf]
+    assert of_layer["nonfinite_layers"].to_list() == [1, 1]
+    episode = one(episode_tables(replans, GROUPING).cells, layer="1")
     assert episode["num_nonfinite"] == episode["geometric_left_out"] == 2
     assert episode["ratio_mean"] is None
     assert episode["ratio_of_means"] == np.inf
@@ -78,8 +77,8 @@ def test_layers_avg_is_the_published_definition():
     steps = steps.with_columns(
         pl.when(hit).then(0.0).otherwise(pl.col(name)).alias(name) for name in ("linguistic_mass", "denominator_mass")
     )
-    replans = per_replan(steps, GROUPING)
-    average = add_layers_avg(replans, GROUPING).filter(layer=LAYERS_AVG)
+    table = flat(replans_of(steps))
+    average, replans = table.filter(layer=LAYERS_AVG), table.filter(pl.col("layer") != LAYERS_AVG)
     assert average["layer_number"].null_count() == average["block"].null_count() == 3
     for replan in range(3):
         layers = replans.filter(replan=replan)
@@ -93,14 +92,14 @@ def test_layers_avg_is_the_published_definition():
 
 
 def test_layers_avg_without_a_finite_ratio_is_null_not_zero():
-    average = replans_of(make_steps(no_denominator=1.0)).filter(layer=LAYERS_AVG)
+    average = replans_of(make_steps(no_denominator=1.0)).cells.filter(layer=LAYERS_AVG)
     assert average["ratio"].null_count() == average.height
     assert average["nonfinite_layers"].unique().to_list() == [3]
 
 
 def test_episode_statistics_are_those_of_numpy():
-    replans = replans_of(STEPS)
-    episodes = episodes_table(replans, GROUPING)
+    replans = flat(replans_of(STEPS))
+    episodes = flat(episode_tables(replans_of(STEPS), GROUPING))
     assert episodes.height == 3 * 4 * 4
     for layer in ("18", LAYERS_AVG):
         part = replans.filter(task_id=2, episode_index=1, layer=layer)
@@ -120,8 +119,9 @@ def test_episode_statistics_are_those_of_numpy():
 
 
 def test_tasks_are_means_over_episodes_with_intervals_around_them():
-    episodes = episodes_table(replans_of(STEPS), GROUPING)
-    tasks = tasks_table(episodes, GROUPING)
+    tables = episode_tables(replans_of(STEPS), GROUPING)
+    of_tasks = task_tables(tables, GROUPING)
+    episodes, tasks = flat(tables), flat(of_tasks)
     assert tasks.height == (3 + 1) * 4
     for layer in ("18", LAYERS_AVG):
         part = episodes.filter(task_id=1, layer=layer)
@@ -136,13 +136,13 @@ def test_tasks_are_means_over_episodes_with_intervals_around_them():
         assert row["num_nonfinite"] == part["num_nonfinite"].sum()
         for name in ("ratio_mean", "ratio_of_means", "geometric_mean", "ratio_lift", "visual_fraction"):
             assert row[f"{name}_low"] <= row[name] <= row[f"{name}_high"]
-    overall = one(overall_rows(tasks), layer=LAYERS_AVG)
+    overall = one(overall_rows(of_tasks).cells, layer=LAYERS_AVG)
     assert (overall["task_id"], overall["num_tasks"], overall["num_episodes"]) == (None, 3, 12)
     assert overall["ratio_mean"] == pytest.approx(episodes.filter(layer=LAYERS_AVG)["ratio_mean"].mean())
 
 
 def test_one_episode_has_no_interval():
-    tasks = tasks_table(episodes_table(replans_of(make_steps(num_tasks=1, num_episodes=1)), GROUPING), GROUPING)
+    tasks = flat(task_tables(episode_tables(replans_of(make_steps(num_tasks=1, num_episodes=1)), GROUPING), GROUPING))
     bounds = [name for name in tasks.columns if name.endswith(("_low", "_high"))]
     assert bounds
     assert all(tasks[name].null_count() == tasks.height for name in bounds)
@@ -150,7 +150,9 @@ def test_one_episode_has_no_interval():
 
 def test_nothing_depends_on_the_order_of_the_rows():
     shuffled = STEPS.sample(fraction=1.0, shuffle=True, seed=1)
-    first, second = (tasks_table(episodes_table(replans_of(steps), GROUPING), GROUPING) for steps in (STEPS, shuffled))
+    first, second = (
+        flat(task_tables(episode_tables(replans_of(steps), GROUPING), GROUPING)) for steps in (STEPS, shuffled)
+    )
     for name, kind in first.schema.items():
         if kind == pl.Float64:
             plain, other = (table[name].fill_null(-1.0).to_numpy() for table in (first, second))
@@ -162,26 +164,26 @@ def test_nothing_depends_on_the_order_of_the_rows():
 def test_groupings_without_a_ratio_give_masses_fractions_and_lifts_only():
     grouping = custom_grouping(with_ratio=False)
     replans = replans_of(make_steps(grouping, CUSTOM_KEYS), grouping)
-    episodes = episodes_table(replans, grouping)
-    tasks = tasks_table(episodes, grouping)
-    for table in (replans, episodes, tasks):
-        assert {"base_mass", "base_fraction", "base_lift"} <= set(table.columns)
-        assert not [name for name in table.columns if "ratio" in name or "geometric" in name]
-    assert tasks["base_fraction_low"].null_count() == 0
+    episodes = episode_tables(replans, grouping)
+    tasks = task_tables(episodes, grouping)
+    for tables in (replans, episodes, tasks):
+        assert {"group", "mass", "fraction", "lift"} <= set(tables.groups.columns)
+        assert not [name for name in tables.cells.columns if "ratio" in name or "geometric" in name]
+    assert tasks.groups.filter(group="base")["fraction_low"].null_count() == 0
 
 
 def test_same_task_ids_of_two_suites_stay_two_tasks():
     steps = pl.concat([make_steps(), make_steps(suite="libero_goal", seed=5)])
-    tasks = tasks_table(episodes_table(replans_of(steps), GROUPING), GROUPING)
-    average = tasks.filter(layer=LAYERS_AVG)
+    tasks = task_tables(episode_tables(replans_of(steps), GROUPING), GROUPING)
+    average = tasks.cells.filter(layer=LAYERS_AVG)
     assert average["scope"].to_list() == ["task", "task", "all", "task", "task", "all", "combined"]
     assert one(average, scope="combined")["num_tasks"] == 4
-    assert overall_rows(tasks)["num_episodes"].unique().to_list() == [12]
+    assert overall_rows(tasks).cells["num_episodes"].unique().to_list() == [12]
     assert one(average, scope="combined")["suite"] is None
 
 
 def test_layers_are_in_the_order_of_their_numbers():
-    replans = replans_of(make_steps(layers=(9, 10, 2)))
+    replans = replans_of(make_steps(layers=(9, 10, 2))).cells
     assert layer_order(replans) == ["2", "9", "10", LAYERS_AVG]
     assert overall_layer(replans) == LAYERS_AVG
-    assert overall_layer(per_replan(make_steps(layers=(9, 10, 2)), GROUPING)) == "2"
+    assert overall_layer(replans.filter(pl.col("layer") != LAYERS_AVG)) == "2"

@@ -7,15 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.kit.questions import question_about
-from vla_attention.analyze.measures.contributions import (
-    LINGUISTIC_ROLES,
-    VISUAL_ROLES,
-    contribution_table,
-    joint_norm,
-    summarise_contributions,
-)
-from vla_attention.analyze.ratios.analysis import analyse
+from vla_attention.analyze.measures.contributions import LINGUISTIC_ROLES, VISUAL_ROLES, contribution_table, joint_norm
+from vla_attention.analyze.measures.selected import load_tokens
 from vla_attention.analyze.stores.selection import select
 from vla_attention.schemas.segments import segments_of
 from vla_attention.schemas.stores.reader import open_store
@@ -38,7 +31,8 @@ def test_the_norm_of_a_union_is_that_of_the_summed_vectors(seed, parts, chosen):
 def test_both_sides_and_their_ratio_equal_a_direct_computation(tmp_path):
     store = open_store(write_store(tmp_path / "a.zarr", spec=SPEC))
     assert verify_store(store) == []
-    table = contribution_table([(store, episode) for episode in store.episodes], select(store.attributes, layers=[2]))
+    selected = load_tokens([(store, episode) for episode in store.episodes], "joint")
+    table = contribution_table(selected, select(store.attributes, layers=[2]))
     assert table is not None
     assert table.height == 4 * SPEC.replans * len(SPEC.denoise_steps)
     for row in table.iter_rows(named=True):
@@ -55,18 +49,7 @@ def test_both_sides_and_their_ratio_equal_a_direct_computation(tmp_path):
         assert row["contribution_ratio"] == pytest.approx(row["visual_norm"] / row["linguistic_norm"])
 
 
-def test_the_summary_has_a_line_per_layer_and_an_interval(tmp_path):
-    analysis = analyse(question_about(write_store(tmp_path / "a.zarr", spec=SPEC)))
-    assert analysis.contributions is not None
-    section = summarise_contributions(analysis.contributions, seed=0)
-    assert section in analysis.summary
-    lines = [line.split() for line in section.splitlines()]
-    assert [line[0] for line in lines if line and line[0] in ("0", "2", "layers_avg")] == ["0", "2", "layers_avg"]
-    assert all("[" in " ".join(line) for line in lines if line and line[0] in ("0", "2", "layers_avg"))
-    assert max(map(len, section.splitlines())) <= 100
-
-
-def test_a_store_without_contributions_has_no_section(tmp_path):
-    analysis = analyse(question_about(write_store(tmp_path / "a.zarr")))
-    assert analysis.contributions is None
-    assert "CONTRIBUTIONS" not in analysis.summary
+def test_a_store_without_contributions_has_no_norms(tmp_path):
+    store = open_store(write_store(tmp_path / "a.zarr"))
+    selected = load_tokens([(store, episode) for episode in store.episodes], "joint")
+    assert contribution_table(selected, select(store.attributes)) is None

@@ -1,4 +1,4 @@
-"""Norms of groups' contributions against the vectors that the Gram matrices were made of: whole segments, cut ones, unions."""
+"""Norms of groups' contributions against the vectors of the Gram matrices: segments whole or cut, unions."""
 
 from __future__ import annotations
 
@@ -9,12 +9,9 @@ import numpy as np
 import polars as pl
 import pytest
 
+from tests.kit.made_up_steps import flat
 from tests.kit.questions import question_about
-from vla_attention.analyze.measures.group_contributions import (
-    group_contribution_table,
-    summarise_group_contributions,
-    whole_segments,
-)
+from vla_attention.analyze.measures.group_contributions import group_contribution_tables, whole_segments
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
@@ -50,7 +47,8 @@ def grouping_of(ratio: Ratio | None = None, **groups) -> Grouping:
 
 
 def table_of(question: Question) -> pl.DataFrame | None:
-    return group_contribution_table(question, resolve_all(question.grouping, question.selected))
+    tables = group_contribution_tables(question, resolve_all(question.grouping, question.selected))
+    return None if tables is None else flat(tables)
 
 
 def norm_by_hand(spec: StoreSpec, row: dict, chosen, layer: int, denoise: int) -> float:
@@ -116,7 +114,7 @@ def test_a_ratio_with_a_side_that_is_cut_or_empty_is_no_number(store):
 
 
 def test_a_group_that_takes_a_segment_at_some_replans_only_is_cut(store):
-    """The third of a prompt's digits exists at some replans; where it is padding, the group has none of the padding's segment."""
+    """A prompt's third digit exists at some replans; where it is padding, the group has no key of the padding."""
     question = question_about(store)
     bos = question.selected[0].tokens.layout.span("prompt").start
     grouping = grouping_of(late=(f"keys:{bos + 10} & role:state",), all=("role:state",))
@@ -143,7 +141,8 @@ def test_a_segment_is_taken_whole_always_or_not_at_all(store, weight, replans, k
 
 def test_only_groups_that_are_whole_in_every_episode_are_measured(tmp_path):
     path = write_store(tmp_path / "a.zarr", spec=replace(SPEC, episodes=1, replans=1))
-    # Task 1 says "open the top drawer": there, the phrase takes its segment whole; in task 0 no key is taken, which is whole too.
+    # Task 1 says "open the top drawer": there, the phrase takes its segment whole.
+    # In task 0 no key is taken, which counts as whole, too.
     whole = grouping_of(phrase=('word:"open the top drawer"',), rest=("*",))
     table = table_of(question_about(path, whole))
     assert table is not None
@@ -158,29 +157,3 @@ def test_only_groups_that_are_whole_in_every_episode_are_measured(tmp_path):
 
 def test_a_store_without_contributions_has_no_norms_of_groups(tmp_path):
     assert table_of(question_about(write_store(tmp_path / "a.zarr"), grouping_of())) is None
-
-
-def test_a_block_that_is_named_twice_counts_once_in_the_average_over_layers(tmp_path):
-    spec = replace(SPEC, layers=(0, 2), layer_labels=(0, 2, 4), episodes=1)
-    ratio = Ratio(("images",), ("instruction",))
-    question = question_about(
-        write_store(tmp_path / "a.zarr", spec=spec),
-        grouping_of(ratio, images=("role:image",), instruction=("role:instruction",), bowl=("word:the",)),
-    )
-    table = table_of(question)
-    assert table is not None
-    assert table["layer"].unique().sort().to_list() == [0, 2, 4]
-    text = summarise_group_contributions(table, question.grouping, "joint", seed=0)
-    lines = {line.split()[0]: line.split() for line in text.splitlines() if line[:1].strip()}
-    means = {layer: table.filter(layer=layer)["images_norm"].mean() for layer in (0, 2)}
-    # Episodes have as many replans each, so that the mean over episodes is that over rows.
-    assert float(lines["layers_avg"][1]) == pytest.approx((means[0] + means[2]) / 2, rel=1e-3)
-    assert lines["4"][1] == lines["0"][1]
-    assert "Not of bowl" in text
-    assert max(map(len, text.splitlines())) <= 100
-
-
-def test_when_every_group_is_cut_the_summary_says_why(store):
-    question = question_about(store, grouping_of(word=("word:the",)))
-    text = summarise_group_contributions(table_of(question), question.grouping, "joint", seed=0)
-    assert "Not of word: contributions are stored for whole segments" in text

@@ -1,4 +1,4 @@
-"""Which keys are sinks, whose they are and what is left without them, on the raw rows of random stores and of planted ones."""
+"""Which keys are sinks, of which task and role, and the measures without them, on raw rows, random and planted."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import entropy as entropy_of_scipy
 
+from tests.kit.made_up_steps import flat
 from tests.kit.questions import question_about
 from tests.kit.raw_rows import FEW, RawEpisode, leaky, raw_episodes, weights_of
 from vla_attention.analyze.heads.head_study import study_heads
-from vla_attention.analyze.heads.row_metrics import RowOptions, row_metrics_table
+from vla_attention.analyze.heads.row_metrics import RowOptions, row_metrics
 from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.analyze.measures.sinks import SinkRule, describe_sinks, key_sums, sinks_table, without_sinks
-from vla_attention.analyze.measures.steps import steps_table
+from vla_attention.analyze.measures.steps import measure_episodes, step_tables
 from vla_attention.schemas.layout import Role
 from vla_attention.testing.stores import StoreSpec, write_store
 from vla_attention.testing.strategies import episode_tokens, groupings
@@ -28,7 +29,7 @@ BOS = small_layout().span("prompt").start
 
 
 def shares_of(raw: RawEpisode, factor: float) -> tuple[np.ndarray, np.ndarray]:
-    """Of each key the share of rows in which it takes more than factor x its uniform share, and its mean share, in a loop."""
+    """Of each key the share of rows in which it takes more than factor x its uniform share, and its mean share."""
     rows, valid = raw.held()
     above, held, count = np.zeros(valid.shape[1]), np.zeros(valid.shape[1]), 0
     for replan, layer, denoise, head in np.ndindex(rows.shape[:4]):
@@ -138,7 +139,7 @@ def test_without_sinks_every_measure_is_that_of_the_other_keys(data):
         sinks = sinks_table(question, rule)
         corrected = without_sinks(question, sinks, rule)
         resolved = resolve_all(corrected.grouping, corrected.selected)
-        steps = steps_table(corrected.selected, corrected.grouping, corrected.selection, "joint", resolved=resolved)
+        steps = flat(step_tables(measure_episodes(corrected, resolved), corrected.grouping))
         study = study_heads(corrected, RowOptions(rule=rule))
         raws = raw_episodes(path, spec)
     weights = weights_of(grouping, tokens)
@@ -166,7 +167,7 @@ def test_without_sinks_every_measure_is_that_of_the_other_keys(data):
                 part[f"{name}_keys"].to_numpy()[:: rows[0, ..., 0, 0].size], keys[:, i], rtol=1e-5
             )
         entropies = entropy_of_scipy(rows, axis=-1)
-        found = study.rows.filter(task_id=raw.order[0])["entropy"].to_numpy().reshape(rows.shape[:4])
+        found = study.rows.cells.filter(task_id=raw.order[0])["entropy"].to_numpy().reshape(rows.shape[:4])
         np.testing.assert_allclose(found, entropies, atol=1e-4)
     per_task = sinks.group_by("task_id").len().height
     said = describe_sinks(sinks, 2, rule)
@@ -184,4 +185,4 @@ def test_taking_out_the_sinks_again_takes_out_nothing_twice(tmp_path):
     assert all(list(item.without) == sorted(set(item.without)) for item in again.selected)
     gone = pl.Series(once.selected[0].without)
     assert not sinks_table(once, rule).filter(task_id=0)["key"].is_in(gone.implode()).any()
-    assert row_metrics_table(once)["top1_mass"].max() <= 1.0
+    assert row_metrics(once).cells["top1_mass"].max() <= 1.0

@@ -1,4 +1,4 @@
-"""The steps table against independent arithmetic, straight from the raw Zarr arrays of random stores."""
+"""The tables of steps against independent arithmetic, straight from the raw Zarr arrays of random stores."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
 from tests.kit.examples import examples
+from tests.kit.made_up_steps import flat
 from tests.kit.questions import question_about
-from vla_attention.analyze.measures.selected import load_tokens, vocabulary_of
-from vla_attention.analyze.measures.steps import steps_table
+from vla_attention.analyze.measures.selected import load_tokens, resolve_all, vocabulary_of
+from vla_attention.analyze.measures.steps import measure_episode, step_tables
 from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.analyze.stores.selection import parse_denoise_steps, select
 from vla_attention.schemas.errors import BadArgument
@@ -41,7 +42,9 @@ QUICK = settings(
 def table_of(path: Path, grouping: Grouping, **selected) -> pl.DataFrame:
     store = open_store(path)
     chosen = load_tokens([(store, episode) for episode in store.episodes], "joint")
-    return steps_table(chosen, grouping, select(store.attributes, **selected), "joint")
+    selection, resolved = select(store.attributes, **selected), resolve_all(grouping, chosen)
+    measured = [measure_episode(*pair, selection, "joint") for pair in zip(chosen, resolved, strict=True)]
+    return flat(step_tables(measured, grouping))
 
 
 @QUICK
@@ -154,7 +157,7 @@ def test_several_stores_are_analysed_as_one_when_they_fit(tmp_path):
     first = open_store(write_store(tmp_path / "a.zarr", suite="one"))
     second = open_store(write_store(tmp_path / "b.zarr", suite="two"))
     together = analyse(question_about([first, second]))
-    assert together.steps["suite"].unique().sort().to_list() == ["one", "two"]
+    assert together.steps.cells["suite"].unique().sort().to_list() == ["one", "two"]
     assert "two" in together.summary
     other = open_store(write_store(tmp_path / "c.zarr", suite="three", layers=(1,)))
     with pytest.raises(StoreError, match="differ in their recording"):

@@ -157,7 +157,7 @@ def test_ratios_that_are_all_infinite_are_reported_and_pictures_are_drawn(tmp_pa
     mine, _ = ours(tmp_path / "mine", no_denominator=1.0)
     code, out, _ = run(capsys, "--results", mine, path, "--plot-comparison", "--output-dir", tmp_path / "compared")
     assert code == 0
-    assert len(list((tmp_path / "compared").iterdir())) == 3
+    assert len(list((tmp_path / "compared").iterdir())) == 4
 
 
 def test_episodes_without_steps_count_and_are_named(tmp_path, capsys):
@@ -201,7 +201,7 @@ def test_mistakes_end_with_one_sentence(tmp_path, capsys, monkeypatch, words, me
 def test_a_file_written_from_a_table_and_its_table_say_the_same(tmp_path, capsys):
     path, replans = ours(tmp_path)
     _, out, _ = run(capsys, "--results", path)
-    ratios = replans.filter(layer="layers_avg")["ratio"].to_numpy()
+    ratios = replans.cells.filter(layer="layers_avg")["ratio"].to_numpy()
     assert f"  Mean:   {ratios.mean():.3f} ± {ratios.std():.3f}" in out
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps
-from vla_attention.analyze.measures.aggregate import add_layers_avg, per_replan
+from tests.kit import made_up_steps
+from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, flat, make_steps
 from vla_attention.analyze.published.results_file import (
     episode_documents,
     episode_results,
@@ -27,7 +27,7 @@ GROUPING = default_grouping()
 
 
 def replans_of(steps, grouping=GROUPING):
-    return add_layers_avg(per_replan(steps, grouping), grouping)
+    return made_up_steps.replans_of(steps, grouping)
 
 
 def test_file_has_the_published_structure(tmp_path):
@@ -55,7 +55,7 @@ def test_file_has_the_published_structure(tmp_path):
 def test_numbers_are_those_of_the_table():
     replans = replans_of(make_steps(no_denominator=0.2))
     results = episode_results(replans, GROUPING)
-    part = replans.filter(task_id=1, episode_index=2, layer="25")
+    part = flat(replans).filter(task_id=1, episode_index=2, layer="25")
     result = next(item for item in results if (item.task_id, item.episode_idx) == (1, 2))
     steps = result.per_step_ratios["layer_25"]
     ratio = part["ratio"].to_numpy()
@@ -100,7 +100,7 @@ def test_sides_of_another_grouping_are_the_sums_of_the_ratios_groups():
     grouping = custom_grouping()
     replans = replans_of(make_steps(grouping, CUSTOM_KEYS), grouping)
     step = episode_results(replans, grouping)[0].per_step_ratios["layer_18"][0]
-    row = replans.filter(task_id=0, episode_index=0, replan=0, layer="18").row(0, named=True)
+    row = flat(replans).filter(task_id=0, episode_index=0, replan=0, layer="18").row(0, named=True)
     assert step.visual_mass == pytest.approx(row["base_mass"] + row["wrist_mass"])
     assert step.linguistic_mass == pytest.approx(row["nouns_mass"])
     assert step.visual_fraction == pytest.approx(row["base_fraction"] + row["wrist_fraction"])
@@ -114,7 +114,7 @@ def test_a_ratio_of_latent_frames_has_the_published_fields_and_sums_over_queries
     replans = replans_of(make_steps())
     (path,) = write_results_of_suites(tmp_path, replans, GROUPING, proxy)
     episode = json.loads(path.read_text(encoding="utf-8"))[1]
-    rows = replans.filter(task_id=0, episode_index=1, layer="25").sort("replan")
+    rows = flat(replans).filter(task_id=0, episode_index=1, layer="25").sort("replan")
     for step, row in zip(episode["per_step_ratios"]["layer_25"], rows.iter_rows(named=True), strict=True):
         assert step["visual_mass"] == pytest.approx(196 * row["visual_mass"])
         assert step["linguistic_mass"] == pytest.approx(196 * row["linguistic_mass"])

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.kit.examples import examples
-from tests.kit.made_up_steps import default_grouping, make_steps
+from tests.kit.made_up_steps import default_grouping, flat, make_steps, replans_of
 from tests.kit.published_results import (
     cosmos_episodes,
     pi_episodes,
@@ -23,7 +23,6 @@ from tests.kit.published_results import (
     published_episode,
     write_published,
 )
-from vla_attention.analyze.measures.aggregate import add_layers_avg, per_replan
 from vla_attention.analyze.published.results_file import write_results_of_suites
 from vla_attention.analyze.published.results_reader import find_results, read_results_file
 from vla_attention.analyze.published.results_tables import (
@@ -40,7 +39,7 @@ GROUPING = default_grouping()
 
 
 def ours(folder, **changes):
-    replans = add_layers_avg(per_replan(make_steps(**changes), GROUPING), GROUPING)
+    replans = replans_of(make_steps(**changes), GROUPING)
     (path,) = write_results_of_suites(folder, replans, GROUPING)
     return path, replans
 
@@ -56,7 +55,7 @@ def test_our_own_files_read_back_as_the_table_they_were_written_from(tmp_path):
     back = file.steps.join(file.episodes.select("episode", "task_id", "episode_index"), on="episode").sort(
         "task_id", "episode_index", "replan", "layer_number", nulls_last=True
     )
-    expected = replans.sort("task_id", "episode_index", "replan", "layer_number", nulls_last=True)
+    expected = flat(replans).sort("task_id", "episode_index", "replan", "layer_number", nulls_last=True)
     for column in ("layer", "env_step", "visual_mass", "linguistic_mass", "action_mass", "visual_fraction"):
         assert back[column].to_list() == expected[column].to_list(), column
     # Infinities come back, although the file has only null for them.
@@ -122,10 +121,9 @@ def test_what_no_named_fraction_holds_is_the_rest(tmp_path):
     tables = results_tables([read_results_file(path)], ["x"])
     assert tables.grouping.names == ("visual", "linguistic", "action", "rest")
     others = [name for name in GROUPING.names if name not in ("visual", "linguistic", "action")]
-    expected = replans.select(pl.sum_horizontal(f"{name}_fraction" for name in others)).to_series()
-    np.testing.assert_allclose(tables.replans["rest_fraction"].to_numpy(), expected.to_numpy(), atol=1e-9)
-    mass = replans.select(pl.sum_horizontal(f"{name}_mass" for name in others)).to_series()
-    np.testing.assert_allclose(tables.replans["rest_mass"].to_numpy(), mass.to_numpy(), atol=1e-9)
+    for measure in ("fraction", "mass"):
+        expected = sum(replans.of_group(name)[measure].to_numpy() for name in others)
+        np.testing.assert_allclose(tables.replans.of_group("rest")[measure].to_numpy(), expected, atol=1e-9)
 
 
 def test_tables_are_those_of_numpy(tmp_path):
@@ -140,9 +138,9 @@ def test_tables_are_those_of_numpy(tmp_path):
                 finite = finite[finite > 0]
             key = (episode["task_id"], episode["episode_idx"], name.removeprefix("layer_"))
             means[key] = finite.mean() if finite.size else None
-    for row in tables.episodes.iter_rows(named=True):
+    for row in tables.episodes.cells.iter_rows(named=True):
         assert row["ratio_mean"] == pytest.approx(means[row["task_id"], row["episode_index"], row["layer"]])
-    for row in tables.tasks.filter(scope="task").iter_rows(named=True):
+    for row in tables.tasks.cells.filter(scope="task").iter_rows(named=True):
         own = [v for (task, _, layer), v in means.items() if (task, layer) == (row["task_id"], row["layer"]) and v]
         assert row["ratio_mean"] == pytest.approx(np.mean(own))
         assert row["num_episodes"] == 4

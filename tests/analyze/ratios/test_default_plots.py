@@ -8,8 +8,9 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups
-from vla_attention.analyze.measures.aggregate import LAYERS_AVG, add_layers_avg, episodes_table, per_replan, tasks_table
+from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups, replans_of
+from vla_attention.analyze.measures.aggregate import episode_tables, task_tables
+from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.ratios.plot_attention_fractions import plot_attention_fractions
 from vla_attention.analyze.ratios.plot_ratio_distribution import plot_ratio_distribution
 from vla_attention.analyze.ratios.plot_ratio_evolution import evolution_stem, plot_all_evolutions, plot_ratio_evolution
@@ -55,21 +56,22 @@ AS_PDF = ("some infinite", "many groups")
 @pytest.mark.parametrize("case", [pytest.param(case, marks=[pytest.mark.pdf] * (case in AS_PDF)) for case in CASES])
 def test_every_picture_of_every_case_is_drawn_without_a_warning(case, tmp_path):
     steps, grouping = CASES[case]()
-    replans = add_layers_avg(per_replan(steps, grouping), grouping)
-    episodes = episodes_table(replans, grouping)
-    tasks = tasks_table(episodes, grouping, num_resamples=50)
+    replans = replans_of(steps, grouping)
+    episodes = episode_tables(replans, grouping)
+    tasks = task_tables(episodes, grouping, num_resamples=50)
     with warnings.catch_warnings():
         # Layout that does not fit, missing glyphs and empty limits are warnings of matplotlib.
         warnings.simplefilter("error")
-        paths = plot_ratio_distribution(replans, grouping, tmp_path)
-        paths += plot_ratio_per_task(episodes, tasks, grouping, tmp_path)
+        paths = plot_ratio_distribution(replans.cells, grouping, tmp_path)
+        paths += plot_ratio_per_task(episodes.cells, tasks.cells, grouping, tmp_path)
         paths += plot_attention_fractions(tasks, grouping, tmp_path)
-        first = replans.row(0, named=True)
+        first = replans.cells.row(0, named=True)
         one = replans.filter(*(pl.col(name) == first[name] for name in ("suite", "task_id", "episode_index", "layer")))
         paths += plot_ratio_evolution(one, grouping, tmp_path)
     stems = ["ratio_distribution", "ratio_per_task", "attention_fractions"]
     stems.append(evolution_stem(0, first["instruction"], 0, first["layer"]))
-    assert [path.name for path in paths] == [f"{stem}.{kind}" for stem in stems for kind in ("png", "pdf", "csv")]
+    names = [f"{stem}.{kind}" for stem in stems for kind in ("png", "pdf", "csv")]
+    assert [path.name for path in paths] == [*names, f"{stems[-1]}_groups.csv"]
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in paths)
     for path in paths:
         start = path.read_bytes()[:5]
@@ -80,7 +82,7 @@ def test_every_picture_of_every_case_is_drawn_without_a_warning(case, tmp_path):
 
 def test_data_beside_the_picture_are_those_of_the_picture(tmp_path):
     grouping = default_grouping()
-    replans = add_layers_avg(per_replan(make_steps(), grouping), grouping)
+    replans = replans_of(make_steps(), grouping).cells
     plot_ratio_distribution(replans, grouping, tmp_path)
     data = pl.read_csv(tmp_path / "ratio_distribution.csv")
     assert data.height == replans.height
@@ -90,9 +92,7 @@ def test_data_beside_the_picture_are_those_of_the_picture(tmp_path):
 @pytest.mark.pdf
 def test_same_data_give_the_same_file(tmp_path):
     grouping = default_grouping()
-    tasks = tasks_table(
-        episodes_table(add_layers_avg(per_replan(make_steps(), grouping), grouping), grouping), grouping
-    )
+    tasks = task_tables(episode_tables(replans_of(make_steps(), grouping), grouping), grouping)
     for folder in ("a", "b"):
         plot_attention_fractions(tasks, grouping, tmp_path / folder)
     for kind in ("png", "pdf", "csv"):
@@ -104,11 +104,11 @@ def test_all_evolutions_keep_suites_apart(tmp_path):
     grouping = default_grouping()
     small = {"num_tasks": 1, "num_episodes": 1, "layers": (3, 4), "num_replans": 2}
     steps = pl.concat([make_steps(**small), make_steps(**small, suite="libero_goal")])
-    replans = add_layers_avg(per_replan(steps, grouping), grouping)
+    replans = replans_of(steps, grouping)
     done = []
     paths = plot_all_evolutions(replans, grouping, tmp_path, formats=("png",), progress=done.append)
     assert len(done) == 2 * 3
-    assert len(set(paths)) == len(paths) == 2 * 3 * 2
+    assert len(set(paths)) == len(paths) == 2 * 3 * 3
     assert {path.parent.name for path in paths} == {"libero_10", "libero_goal"}
 
 
@@ -139,8 +139,6 @@ def test_drawing_leaves_the_settings_of_the_caller_alone(tmp_path):
 
     before = mpl.rcParams.copy()
     grouping = default_grouping()
-    tasks = tasks_table(
-        episodes_table(add_layers_avg(per_replan(make_steps(), grouping), grouping), grouping), grouping
-    )
+    tasks = task_tables(episode_tables(replans_of(make_steps(), grouping), grouping), grouping)
     plot_attention_fractions(tasks, grouping, tmp_path)
     assert mpl.rcParams.copy() == before

@@ -3,9 +3,10 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups
-from vla_attention.analyze.measures.aggregate import add_layers_avg, episodes_table, per_replan, tasks_table
-from vla_attention.analyze.ratios.summary import AnalysedRun, summary_text, verdict, write_summary
+from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups, replans_of
+from vla_attention.analyze.measures.aggregate import episode_tables, task_tables
+from vla_attention.analyze.ratios.summary import AnalysedRun, summary_text, write_summary
+from vla_attention.analyze.ratios.verdict import verdict
 
 RUN = AnalysedRun(
     stores=["runs/pi05_libero_10.zarr"],
@@ -17,8 +18,8 @@ RUN = AnalysedRun(
 
 
 def summarise(steps, grouping, run=RUN):
-    episodes = episodes_table(add_layers_avg(per_replan(steps, grouping), grouping), grouping)
-    return summary_text(run, grouping, episodes, tasks_table(episodes, grouping, num_resamples=200))
+    episodes = episode_tables(replans_of(steps, grouping), grouping)
+    return summary_text(run, grouping, episodes, task_tables(episodes, grouping, num_resamples=200))
 
 
 def two_suites():

@@ -118,12 +118,12 @@ def test_the_page_is_small_and_the_same_twice(analysis: Analysis, html: str) -> 
 
 def test_the_headline_and_the_tables_have_the_analysis_s_numbers(analysis: Analysis, html: str) -> None:
     page = Page(html)
-    row = analysis.tasks.filter(layer="layers_avg", scope="all").row(0, named=True)
+    row = analysis.tasks.cells.filter(layer="layers_avg", scope="all").row(0, named=True)
     for column in ("ratio_mean", "ratio_mean_low", "ratio_mean_high", "uniform_ratio", "ratio_lift", "geometric_mean"):
         assert format_number(row[column]) in page.text
     keys = [float(cell["data-key"]) for tag, cell in page.tags if tag == "td" and cell.get("data-key", "x") not in ("", "x")
             and re.fullmatch(r"[\d.e+-]+", str(cell["data-key"]))]  # fmt: skip
-    for value in analysis.tasks.filter(layer="layers_avg", scope="task")["ratio_mean"]:
+    for value in analysis.tasks.cells.filter(layer="layers_avg", scope="task")["ratio_mean"]:
         assert value in keys
     store = analysis.question.stores[0].attributes
     assert store.policy.digest in page.text

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
 
-from tests.kit.made_up_steps import default_grouping, make_steps
+from tests.kit.made_up_steps import default_grouping, make_steps, replans_of
 from vla_attention.analyze.statistics.autocorrelation import autocorrelation_table, autocovariances, effective_count
 from vla_attention.analyze.statistics.bootstrap import resample_episodes
 from vla_attention.analyze.statistics.effect_sizes import cliffs_delta, contrast, contrast_row, hedges_g
@@ -194,13 +194,11 @@ def test_what_cannot_be_estimated_is_none(series):
 
 
 def test_the_table_of_counts_is_per_episode_and_layer():
-    from vla_attention.analyze.measures.aggregate import per_replan
-
-    replans = per_replan(make_steps(num_replans=20), default_grouping())
+    replans = replans_of(make_steps(num_replans=20), default_grouping()).cells
     by = ["suite", "task_id", "episode_index", "layer"]
     table = autocorrelation_table(replans, by, "log2_ratio")
     assert table.columns == [*by, "series", "num_replans", "autocorrelation_time", "effective_replans"]
-    assert table.height == 2 * 3 * 3
+    assert table.height == 2 * 3 * 4  # three layers and their mean
     row = table.filter(task_id=1, episode_index=2, layer="25").row(0, named=True)
     series = replans.filter(task_id=1, episode_index=2, layer="25").sort("replan")["log2_ratio"].to_numpy()
     assert row["effective_replans"] == pytest.approx(effective_count(series).effective)

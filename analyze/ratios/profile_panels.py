@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
+from vla_attention.analyze.measures.frames import Tables
 from vla_attention.analyze.show.numbers import interval_name
 from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, label_positions, legend_beside, ratio_axis
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, group_styles
@@ -18,35 +19,38 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+#: A fraction with its interval.
+FRACTION_COLUMNS = ("fraction", "fraction_low", "fraction_high")
 #: Lines that one panel carries.
 _MOST_GROUPS = 6
 _MOST_LABELS = 20
 
 
 def draw_profile(
-    figure: Figure, rows: pl.DataFrame, grouping: Grouping, labels: Sequence[str], along: str, level: float
+    figure: Figure, tables: Tables, grouping: Grouping, labels: Sequence[str], along: str, level: float
 ) -> None:
-    """Draw rows of `aggregate.tasks_table`, one per position: ratio (if there is one) above, fractions below.
+    """Draw cells of `aggregate.task_tables`, one per position: ratio (if there is one) above, fractions below.
 
-    `along` names the positions; `level` is that of the intervals in `rows`.
+    `along` names the positions; `level` is that of the intervals in `tables`.
     """
     panels = 1 if grouping.ratio is None else 2
     every = figure.subplots(panels, 1, squeeze=False, sharex=False)[:, 0]
     if grouping.ratio is not None:
-        _ratio_panel(every[0], rows, grouping, level)
+        _ratio_panel(every[0], tables.cells, grouping, level)
         if every[0].axison and every[0].get_xticks().size:
             _positions(every[0], labels)
-    _fraction_panel(every[-1], rows, grouping)
+    _fraction_panel(every[-1], tables, grouping)
     _positions(every[-1], labels)
     every[-1].set_xlabel(along)
 
 
-def shown_groups(rows: pl.DataFrame, grouping: Grouping) -> list[str]:
+def shown_groups(tables: Tables, grouping: Grouping) -> list[str]:
     """The groups in a panel of fractions: those of the ratio, then those with most mass; none without mass."""
-    means = {name: rows[f"{name}_fraction"].mean() for name in grouping.names}
-    having = [name for name in grouping.names if isinstance(means[name], float) and means[name] > 0]  # type: ignore[operator]
+    table = tables.groups.group_by("group", maintain_order=True).agg(pl.col("fraction").mean())
+    means = {name: mean for name, mean in table.iter_rows() if mean is not None}
+    having = [name for name in grouping.names if means.get(name, 0.0) > 0]
     first = (*grouping.ratio.numerator, *grouping.ratio.denominator) if grouping.ratio else ()
-    ranked = sorted(having, key=lambda name: (name not in first, -means[name]))[:_MOST_GROUPS]  # type: ignore[operator]
+    ranked = sorted(having, key=lambda name: (name not in first, -means[name]))[:_MOST_GROUPS]
     return [name for name in grouping.names if name in ranked]
 
 
@@ -79,17 +83,17 @@ def _ratio_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping, level: floa
     legend_beside(axes)
 
 
-def _fraction_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping) -> None:
+def _fraction_panel(axes: Axes, tables: Tables, grouping: Grouping) -> None:
     styles = group_styles(grouping.names)
-    groups = shown_groups(rows, grouping)
-    at = np.arange(rows.height, dtype=float)
+    groups = shown_groups(tables, grouping)
+    at = np.arange(tables.cells.height, dtype=float)
     highest = 0.0
     # Side by side, so that the intervals of groups do not cover each other; near their label where positions are few.
-    apart = min(0.08, 0.012 * (rows.height + 0.2))
+    apart = min(0.08, 0.012 * (len(at) + 0.2))
     for i, name in enumerate(groups):
+        rows = tables.of_group(name)
         mean, low, high = (
-            rows[f"{name}_fraction{end}"].cast(pl.Float64).fill_null(float("nan")).to_numpy()
-            for end in ("", "_low", "_high")
+            rows[column].cast(pl.Float64).fill_null(float("nan")).to_numpy() for column in FRACTION_COLUMNS
         )
         where = at + (i - (len(groups) - 1) / 2) * apart
         color = styles[name]["color"]
@@ -104,7 +108,7 @@ def _fraction_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping) -> None:
     axes.set_ylim(-0.03 * highest, 1.06 * highest)
     axes.set_ylabel("fraction of the groups'\nsummed mass")
     axes.grid(axis="y")
-    having = sum((rows[f"{name}_fraction"].fill_null(0.0) > 0).any() for name in grouping.names)
+    having = tables.groups.filter(pl.col("fraction") > 0)["group"].n_unique()
     heading = f"{len(groups)} of {having} groups" if having > len(groups) else None
     legend_beside(axes, title=heading, title_fontsize=8, alignment="left")
 

@@ -1,0 +1,70 @@
+"""The summary's sections on contribution norms."""
+
+from __future__ import annotations
+
+import textwrap
+
+import polars as pl
+
+from vla_attention.analyze.measures.contributions import contribution_rows
+from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables
+from vla_attention.analyze.measures.group_contributions import norms_by_layer, ratios_by_layer
+from vla_attention.analyze.ratios.summary import WIDTH
+from vla_attention.analyze.show.numbers import format_interval, format_number
+from vla_attention.analyze.show.text_table import text_table
+from vla_attention.schemas.errors import listing
+from vla_attention.schemas.groupings.grouping import Grouping
+
+
+def contributions_section(table: pl.DataFrame, seed: int) -> str:
+    """The summary's section: `contribution_rows` as text."""
+    rows = [
+        [
+            row["layer"],
+            *(format_number(row[column]) for column in ("visual_norm", "linguistic_norm", "ratio")),
+            format_interval(row["ratio_low"], row["ratio_high"]),
+        ]
+        for row in contribution_rows(table, seed).iter_rows(named=True)
+    ]
+    title = "CONTRIBUTIONS  |visual| / |linguistic|, norms of what the keys add to the residual stream"
+    note = (
+        "Value-weighted, through output projection and gate; root mean square over action queries, mean over replans and denoise "
+        "steps. ratio: mean over episodes of the mean ratio of norms. Norms of different sites may be divided; masses may not."
+    )
+    header = ["layer", "|visual|", "|linguistic|", "ratio", "95% interval"]
+    return "\n".join([title, "-" * WIDTH, text_table(header, rows, left=(0,)), "", textwrap.fill(note, WIDTH), ""])
+
+
+def group_contributions_section(tables: Tables | None, grouping: Grouping, site: str, seed: int) -> str:
+    """The summary's section: per layer the mean norms of the groups and the ratio of norms with a two-level interval."""
+    title = f"CONTRIBUTIONS OF GROUPS  norms of what they add to the residual stream at site '{site}'"
+    measured = [] if tables is None else tables.groups["group"].unique(maintain_order=True).to_list()
+    cut = [name for name in grouping.names if name not in measured]
+    note = (
+        f"Not of {listing(cut)}: contributions are stored for whole segments (a span's keys of one role), and "
+        f"{'this group takes' if len(cut) == 1 else 'these groups take'} parts of segments."
+        if cut
+        else ""
+    )
+    if tables is None:
+        return "\n".join([title, "-" * WIDTH, *textwrap.wrap(note, WIDTH), ""])
+    adding = tables.groups_with("norm")
+    shown = [name for name in measured if name in adding]
+    nothing = [name for name in measured if name not in shown]
+    if nothing:
+        note = f"The keys of {listing(nothing)} add exactly nothing. {note}".strip()
+    norms = norms_by_layer(tables.groups)
+    ratios = ratios_by_layer(tables.cells, seed)
+    rows = []
+    for layer in tables.cells.select("layer").to_series().unique(maintain_order=True).cast(pl.String).to_list() + [
+        LAYERS_AVG
+    ]:
+        cells = [layer, *(format_number(norms[layer, name]) for name in shown)]
+        if layer in ratios:
+            row = ratios[layer]
+            bounds = format_interval(row["contribution_ratio_low"], row["contribution_ratio_high"])
+            cells += [format_number(row["contribution_ratio"]), bounds]
+        rows.append(cells)
+    header = ["layer", *(f"|{name}|" for name in shown), *(["ratio", "95% interval"] if ratios else [])]
+    lines = [title, "-" * WIDTH, text_table(header, rows, left=(0,))]
+    return "\n".join([*lines, *(["", *textwrap.wrap(note, WIDTH)] if note else []), ""])
