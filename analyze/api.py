@@ -224,26 +224,18 @@ class OpenStores(Opened):
     ) -> Path:
         """Write the self-contained HTML page of `vla-analyze report`; returns its path.
 
-        `episodes` with overlays and `replans` of each are those of `vla_attention.analyze.report.page.report_html`.
+        `episodes` with overlays and `replans` of each are those of `vla_attention.analyze.report.settings.ReportSettings`.
 
         >>> page = va.open(store).report(folder / "report.html", episodes=1, replans=2)
         >>> page.read_text(encoding="utf-8")[:15].lower()
         '<!doctype html>'
         """
-        from vla_attention.analyze.report.page import DEFAULT_EPISODES, DEFAULT_REPLANS, report_html
-        from vla_attention.analyze.show.output_files import write_text
+        from vla_attention.analyze.report.page import write_report
+        from vla_attention.analyze.report.settings import ReportSettings
 
-        page = report_html(
-            self.analysis(**settings),
-            episodes=DEFAULT_EPISODES if episodes is None else episodes,
-            replans=DEFAULT_REPLANS if replans is None else replans,
-        )
-        try:
-            write_text(Path(path), page)
-        except OSError as error:
-            raise BadArgument(
-                f"Cannot write the report to {path}: {error.strerror or error}; give another path."
-            ) from None
+        usual = ReportSettings()
+        shown = usual.episodes if episodes is None else episodes, usual.replans if replans is None else replans
+        write_report(self.ask(**settings), Path(path), ReportSettings(*shown))
         return Path(path)
 
     def __repr__(self) -> str:

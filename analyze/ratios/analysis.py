@@ -6,10 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import measured_episode_tables, replan_tables, task_tables
+from vla_attention.analyze.measures.aggregate import (
+    measured_episode_tables,
+    overall_layer,
+    overall_rows,
+    replan_tables,
+    task_tables,
+)
 from vla_attention.analyze.measures.contributions import contribution_table
 from vla_attention.analyze.measures.frames import Tables, named_tables
 from vla_attention.analyze.measures.group_contributions import group_contribution_tables
@@ -47,6 +54,26 @@ class Analysis:
     def grouping(self) -> Grouping:
         """The groups of keys that everything is about."""
         return self.question.grouping
+
+    @cached_property
+    def overall(self) -> dict[str, Any]:
+        """The cell of `tasks` over all tasks and layers (over the one layer, if one was selected)."""
+        cells = overall_rows(self.tasks).cells
+        return cells.row(by_predicate=pl.col("layer") == overall_layer(cells), named=True)
+
+    @cached_property
+    def overall_groups(self) -> dict[str, dict[str, Any]]:
+        """The groups of the cell `overall`, by name."""
+        return {
+            group: row
+            for (layer, group), row in overall_rows(self.tasks).by_group("layer").items()
+            if layer == self.overall["layer"]
+        }
+
+    @property
+    def present_groups(self) -> tuple[str, ...]:
+        """The groups that have keys."""
+        return overall_rows(self.tasks).groups_with_keys()
 
     @property
     def steps(self) -> Tables:

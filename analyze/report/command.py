@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from vla_attention.analyze.arguments import add_grouping, add_selection, add_stores, settings_of
+from vla_attention.analyze.report.settings import ReportSettings
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
@@ -23,20 +24,29 @@ def build_parser() -> argparse.ArgumentParser:
 
     parser = command_parser(
         "vla-analyze report",
-        "One self-contained HTML file: what was run, the ratio with its interval and with what has to be "
-        "known about it, tasks, layers, "
+        "One self-contained HTML file: what was run, the ratio with its interval and its caveats, tasks, layers, "
         "contributions, overlays of some episodes, methods.",
         _EXAMPLES,
     )
     add_stores(parser)
     add_grouping(parser)
     add_selection(parser)
-    shown = parser.add_argument_group("content")
-    shown.add_argument(
-        "--episodes", type=int, default=4, metavar="N", help="episodes with overlays (default: 4; 0: none)"
+    content, defaults = parser.add_argument_group("content"), ReportSettings()
+    content.add_argument(
+        "--episodes",
+        type=int,
+        default=defaults.episodes,
+        metavar="N",
+        help="episodes with overlays (default: %(default)s; 0: none)",
     )
-    shown.add_argument("--replans", type=int, default=24, metavar="N", help="replans of each, at most (default: 24)")
-    shown.add_argument("--quick", action="store_true", help="leave out what reads every row: sinks, words, objects")
+    content.add_argument(
+        "--replans",
+        type=int,
+        default=defaults.replans,
+        metavar="N",
+        help="replans of each, at most (default: %(default)s)",
+    )
+    content.add_argument("--quick", action="store_true", help="leave out what reads every row: sinks, words, objects")
     output = parser.add_argument_group("output")
     output.add_argument("--output", type=Path, metavar="FILE", help="HTML file (default: results/STORE/report.html)")
     output.add_argument("--seed", type=int, default=0, help="seed of the bootstrap (default: 0)")
@@ -48,32 +58,19 @@ def run(arguments: argparse.Namespace) -> int:
     from pathlib import Path
 
     from vla_attention.analyze.measures.question import ask
-    from vla_attention.analyze.ratios.analysis import analyse
-    from vla_attention.analyze.report.page import report_html
+    from vla_attention.analyze.report.page import write_report
     from vla_attention.analyze.show.numbers import plural
-    from vla_attention.analyze.show.output_files import write_text
     from vla_attention.schemas.errors import BadArgument
     from vla_attention.schemas.stores.reader import open_store
 
-    if arguments.episodes < 0 or arguments.replans < 1:
-        raise BadArgument(
-            f"Cannot show {arguments.episodes} episodes with {arguments.replans} replans each; expected --episodes "
-            f"from 0 and --replans from 1."
-        )
+    settings = ReportSettings(arguments.episodes, arguments.replans, rows=not arguments.quick)
     path = arguments.output or Path("results") / arguments.stores[0].stem / "report.html"
     if path.is_dir() or path.suffix.lower() not in (".html", ".htm"):
         raise BadArgument(f"Cannot write the report to {path}; expected --output FILE.html.")
-    stores = [open_store(store) for store in arguments.stores]
-    analysis = analyse(ask(stores, settings_of(arguments)))
-    page = report_html(analysis, arguments.episodes, arguments.replans, rows=not arguments.quick)
-    try:
-        write_text(path, page)
-    except OSError as error:
-        raise BadArgument(
-            f"Cannot write the report to {path}: {error.strerror or error}; give another --output."
-        ) from None
-    for line in analysis.question.skipped:
+    question = ask([open_store(store) for store in arguments.stores], settings_of(arguments))
+    write_report(question, path, settings)
+    for line in question.skipped:
         print(line)
-    size = len(page.encode()) / 1e6
-    print(f"{path}: {size:.1f} MB on {plural(len(analysis.question.selected), 'episode')}. Open it in a browser.")
+    megabytes = path.stat().st_size / 1e6
+    print(f"{path}: {megabytes:.1f} MB on {plural(len(question.selected), 'episode')}. Open it in a browser.")
     return 0

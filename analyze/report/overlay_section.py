@@ -1,11 +1,14 @@
-"""Overlays of a few episodes with a slider over their replans. Without the script, and on paper, the slider is a strip."""
+"""Overlays of a few episodes with a slider over their replans; without the script, and on paper, a strip of them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.patch_maps import seen_cameras
 from vla_attention.analyze.measures.question import Question
@@ -19,32 +22,117 @@ from vla_attention.analyze.overlay.overlay_data import (
     episode_overlay,
     orientation_note,
 )
-from vla_attention.analyze.report.markup import paragraph, text
-from vla_attention.analyze.report.pictures import photograph, png_uri
-from vla_attention.analyze.report.sections import Section
-from vla_attention.analyze.show.numbers import format_number
+from vla_attention.analyze.report.pictures import photograph, png_address
+from vla_attention.analyze.report.ratio_curve import RatioCurve, ratio_curve
+from vla_attention.analyze.report.section_parts import Paragraph, Section
+from vla_attention.analyze.report.settings import ReportSettings
+from vla_attention.analyze.show.numbers import format_number, format_percent
 from vla_attention.analyze.show.patch_pictures import upright
 from vla_attention.analyze.show.progress import progress_bar
 
 #: Pixels of the longer side of a camera picture in the page.
 LARGEST_SIDE = 224
-_WIDTH, _HEIGHT, _LEFT, _TOP, _BOTTOM = 560.0, 130.0, 46.0, 16.0, 24.0
+
+
+@dataclass(frozen=True)
+class ScaleBar:
+    """The colours' meaning: `address` of a bar of them from 0 to `high`, and where on it `uniform` attention is."""
+
+    address: str
+    high: str
+    label: str
+    uniform: str | None
+    uniform_percent: str
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """One camera at one replan: the overlay and the picture alone (empty when it was not stored), as data addresses."""
+
+    camera: str
+    overlay: str
+    alternative: str
+    frame: str
+    note: str
+
+
+@dataclass(frozen=True)
+class ShownReplan:
+    """One position of the slider; `x` and `y` are its place on the ratio's curve, `y` empty where there is none."""
+
+    label: str
+    x: float | str
+    y: float | str
+    views: Sequence[CameraView]
+
+
+@dataclass(frozen=True)
+class ShownEpisode:
+    """One slider with its curve, or why there is no curve; `left_out` says which replans are not shown."""
+
+    heading: str
+    curve: RatioCurve | None
+    without_curve: str
+    left_out: str
+    has_frames: bool
+    replans: Sequence[ShownReplan]
+
+
+@dataclass(frozen=True)
+class Overlays:
+    """Episodes with one scale of colours."""
+
+    template: ClassVar[str] = "overlays.html"
+    scale: ScaleBar
+    episodes: Sequence[ShownEpisode]
+
+
+def overlay_section(question: Question, replans: pl.DataFrame, settings: ReportSettings) -> Section | None:
+    """The overlays; None when the site has no cameras or no episode is wanted.
+
+    Args:
+        question: stores, selection, site and grouping.
+        replans: a row per replan and layer of all selected episodes, with the ratio.
+        settings: number of episodes, and of replans of each.
+    """
+    if not settings.episodes or not seen_cameras(question.selected[0]):
+        return None
+    cameras = camera_names(question, None)
+    chosen = choose_episodes(question.selected, settings.episodes)
+    overlays = []
+    with progress_bar(len(chosen), "overlays") as advance:
+        for item in chosen:
+            overlays.append(episode_overlay(question, item, cameras, replans))
+            advance(1)
+    shown = [chosen_replans(overlay, None, settings.replans) for overlay in overlays]
+    values = [
+        lift[list(which)].ravel()
+        for overlay, which in zip(overlays, shown, strict=True)
+        for lift in overlay.values("lift").values()
+    ]
+    scale = scale_for(np.concatenate(values), "lift", max(overlay.num_image_keys for overlay in overlays))
+    intro = (
+        "Attention of the action queries on the pictures that the policy saw, mean over the layers, denoise steps and "
+        "heads of this report. All episodes here have one scale. The picture below the patches keeps a third of its "
+        "colour."
+    )
+    notes = [note for note in dict.fromkeys(map(orientation_note, overlays)) if note]
+    part = Overlays(_scale_bar(scale), [_episode(*pair, scale) for pair in zip(overlays, shown, strict=True)])
+    return Section("overlays", "Where it looks", [*map(Paragraph, [intro, *notes]), part])
 
 
 def choose_episodes(selected: Sequence[SelectedEpisode], count: int) -> list[SelectedEpisode]:
-    """So many episodes, of tasks spread evenly over all tasks; solved and unsolved ones in turn, where a task has both."""
+    """`count` episodes of tasks spread evenly over all tasks; solved and failed ones in turn, where a task has both."""
     by_task: dict[tuple[str, int], list[SelectedEpisode]] = {}
     for item in selected:
         by_task.setdefault((item.store.suite, item.episode.attributes.task_id), []).append(item)
     tasks = list(by_task.values())
     picked: list[SelectedEpisode] = []
     spread = np.linspace(0, len(tasks) - 1, min(count, len(tasks))).round()
-    places = sorted({int(place) for place in spread})
-    for turn, place in enumerate(places):
-        wanted = turn % 2 == 0
-        fitting = [item for item in tasks[place] if item.episode.attributes.success == wanted]
+    for turn, place in enumerate(sorted({int(place) for place in spread})):
+        fitting = [item for item in tasks[place] if item.episode.attributes.success == (turn % 2 == 0)]
         picked.append((fitting or tasks[place])[0])
-    # Fewer tasks than wanted episodes: further episodes of the same tasks, in turn.
+    # With fewer tasks than wanted episodes: further episodes of the same tasks, in turn.
     rest = [item for depth in range(max(map(len, tasks))) for group in tasks for item in group[depth : depth + 1]]
     for item in rest:
         if len(picked) >= count:
@@ -54,201 +142,79 @@ def choose_episodes(selected: Sequence[SelectedEpisode], count: int) -> list[Sel
     return picked
 
 
-def overlay_section(question: Question, replans: pl.DataFrame, episodes: int, most_replans: int) -> Section | None:
-    """The overlays, or None when the site has no cameras or no episode is wanted."""
-    if not episodes or not seen_cameras(question.selected[0]):
-        return None
-    cameras = camera_names(question, None)
-    chosen = choose_episodes(question.selected, episodes)
-    overlays = []
-    with progress_bar(len(chosen), "overlays") as advance:
-        for item in chosen:
-            overlays.append(episode_overlay(question, item, cameras, replans))
-            advance(1)
-    shown = [chosen_replans(overlay, None, most_replans) for overlay in overlays]
-    values = [
-        lift[list(which)].ravel()
-        for overlay, which in zip(overlays, shown, strict=True)
-        for lift in overlay.values("lift").values()
-    ]
-    scale = scale_for(np.concatenate(values), "lift", max(overlay.num_image_keys for overlay in overlays))
-    notes = [note for note in dict.fromkeys(map(orientation_note, overlays)) if note]
-    intro = (
-        "Attention of the action queries on what the policy saw, mean over the layers, denoise steps and heads of "
-        "this report, with one scale for all "
-        "episodes here. The picture lies under the patches with a third of its colour."
-    )
-    parts = [f"<p>{text(intro)}</p>", *(f"<p>{text(note)}</p>" for note in notes), _scale(scale)]
-    for number, (overlay, which) in enumerate(zip(overlays, shown, strict=True)):
-        parts.append(_episode(number, overlay, which, scale))
-    return Section("overlays", "Where it looks", "".join(parts))
-
-
-def _scale(scale: Scale) -> str:
-    mark = ""
-    if scale.uniform is not None:
-        place = f"left:{100 * scale.uniform / scale.high:.2f}%"
-        mark = f'<span class="mark" style="{place}"><span>uniform: {scale.uniform:g}</span></span>'
-    return (
-        f'<div class="scale"><div class="bar"><img src="{png_uri(color_bar(scale, 256, 8))}" alt="Colours from none '
-        f"at 0 over purple and orange to pale yellow "
-        f'at {scale.high:g}">{mark}</div><div class="ends"><span>0</span><span>{scale.high:g} and '
-        f"more</span></div>{text(scale.label)}</div>"
+def _scale_bar(scale: Scale) -> ScaleBar:
+    return ScaleBar(
+        address=png_address(color_bar(scale, 256, 8)),
+        high=f"{scale.high:g}",
+        label=scale.label,
+        uniform=None if scale.uniform is None else f"{scale.uniform:g}",
+        uniform_percent="" if scale.uniform is None else f"{100 * scale.uniform / scale.high:.2f}",
     )
 
 
-def _episode(number: int, overlay: EpisodeOverlay, replans: Sequence[int], scale: Scale) -> str:
+def _episode(overlay: EpisodeOverlay, replans: Sequence[int], scale: Scale) -> ShownEpisode:
     attributes = overlay.item.episode.attributes
     outcome = "solved" if attributes.success else "not solved"
     name = f"{overlay.item.store.suite} task {attributes.task_id}, episode {attributes.episode_index}"
-    heading = f"{name}, {outcome}: {attributes.instruction}"
-    has_frames = any(overlay.has_frames(camera) for camera in overlay.maps)
-    bare = '<label><input type="checkbox"> pictures alone</label>' if has_frames else ""
-    some = ""
-    if len(replans) < overlay.num_replans:
-        some = paragraph(f"{len(replans)} of {overlay.num_replans} replans, from the first to the last.", "quiet")
-    points = _points(overlay)
-    figures = "".join(_replan(overlay, replan, scale, points[replan]) for replan in replans)
-    return (
-        f'<section class="episode" aria-labelledby="episode{number}"><h3 '
-        f'id="episode{number}">{text(heading)}</h3>{_curve(overlay, points)}'
-        f'<div class="player"><label for="slider{number}">replan</label><input type="range" id="slider{number}" '
-        f'min="0" max="{len(replans) - 1}" value="0" '
-        f'step="1"><output for="slider{number}"></output>{bare}</div>{some}<div class="strip">{figures}</div></section>'
+    curve = None if overlay.ratio is None else ratio_curve(overlay.ratio, overlay.uniform_ratio, overlay.env_step)
+    missing = overlay.ratio is not None and curve is None
+    some = f"{len(replans)} of {overlay.num_replans} replans, from the first to the last."
+    lifts = overlay.values("lift")
+    return ShownEpisode(
+        heading=f"{name}, {outcome}: {attributes.instruction}",
+        curve=curve,
+        without_curve="No replan of this episode has a finite ratio." if missing else "",
+        left_out=some if len(replans) < overlay.num_replans else "",
+        has_frames=any(map(overlay.has_frames, overlay.maps)),
+        replans=[_replan(overlay, replan, scale, lifts, curve) for replan in replans],
     )
 
 
-def _label(overlay: EpisodeOverlay, replan: int) -> str:
+def _replan(
+    overlay: EpisodeOverlay,
+    replan: int,
+    scale: Scale,
+    lifts: Mapping[str, NDArray[np.float64]],
+    curve: RatioCurve | None,
+) -> ShownReplan:
     label = f"replan {replan}, step {overlay.env_step[replan]}"
-    return label if overlay.ratio is None else f"{label}, ratio {format_number(float(overlay.ratio[replan]))}"
+    if overlay.ratio is not None:
+        label += f", ratio {format_number(float(overlay.ratio[replan]))}"
+    views = [_view(overlay, camera, replan, label, scale, lifts) for camera in overlay.maps]
+    if curve is None:
+        return ShownReplan(label, "", "", views)
+    point = curve.points[replan]
+    return ShownReplan(label, point.x, "" if point.y is None else point.y, views)
 
 
-def _replan(overlay: EpisodeOverlay, replan: int, scale: Scale, point: tuple[float, float | None]) -> str:
-    values = overlay.values("lift")
-    views = []
-    for camera in overlay.maps:
-        mass = overlay.maps[camera][replan].sum()
-        share = 100 * mass / overlay.image_mass[replan] if overlay.image_mass[replan] else float("nan")
-        lift = upright(values[camera][replan], overlay.views[camera])
-        row, column = divmod(int(np.nan_to_num(lift).argmax()), lift.shape[1])
-        place = _place(row, column, *lift.shape)
-        peak = format_number(float(lift[row, column]))
-        alternative = (
-            f"{camera} at {_label(overlay, replan)}: {share:.0f} % of image attention; highest lift {peak}, {place}"
-        )
-        heat = photograph(draw(overlay, camera, replan, scale, values), LARGEST_SIDE)
-        images = f'<img class="heat" src="{heat}" alt="{text(alternative)}">'
-        if overlay.has_frames(camera):
-            frame = upright(overlay.item.episode.read(f"frames/{camera}", replan), overlay.views[camera])
-            bare = f"{camera} at {_label(overlay, replan)}, without attention"
-            images += f'<img class="plain" src="{photograph(frame, LARGEST_SIDE)}" alt="{text(bare)}">'
-        note = f"{camera}: {share:.0f} % of image attention, highest lift {peak}"
-        views.append(f"<span>{images}<small>{text(note)}</small></span>")
-    x, y = point
-    return (
-        f'<figure class="replan" data-label="{text(_label(overlay, replan))}" data-x="{x:.1f}" '
-        f'data-y="{"" if y is None else f"{y:.1f}"}">'
-        f'<div class="views">{"".join(views)}</div><figcaption>{text(_label(overlay, replan))}</figcaption></figure>'
+def _view(
+    overlay: EpisodeOverlay,
+    camera: str,
+    replan: int,
+    label: str,
+    scale: Scale,
+    lifts: Mapping[str, NDArray[np.float64]],
+) -> CameraView:
+    mass, of_image = overlay.maps[camera][replan].sum(), overlay.image_mass[replan]
+    share = f"{format_percent(mass / of_image if of_image else None, 0)} of image attention"
+    lift = upright(lifts[camera][replan], overlay.views[camera])
+    row, column = divmod(int(np.nan_to_num(lift).argmax()), lift.shape[1])
+    peak = format_number(float(lift[row, column]))
+    frame = ""
+    if overlay.has_frames(camera):
+        picture = upright(overlay.item.episode.read(f"frames/{camera}", replan), overlay.views[camera])
+        frame = photograph(picture, LARGEST_SIDE)
+    place = _place_in_words(row, column, *lift.shape)
+    return CameraView(
+        camera=camera,
+        overlay=photograph(draw(overlay, camera, replan, scale, lifts), LARGEST_SIDE),
+        alternative=f"{camera} at {label}: {share}; highest lift {peak}, {place}",
+        frame=frame,
+        note=f"{camera}: {share}, highest lift {peak}",
     )
 
 
-def _place(row: int, column: int, rows: int, columns: int) -> str:
-    """Where a patch lies in a picture, in words."""
+def _place_in_words(row: int, column: int, rows: int, columns: int) -> str:
     vertical = ("at the top", "in the middle", "at the bottom")[min(2, 3 * row // rows)]
     horizontal = ("left", "centre", "right")[min(2, 3 * column // columns)]
     return f"{vertical} {horizontal}"
-
-
-def _drawable(overlay: EpisodeOverlay) -> np.ndarray | None:
-    """Base-2 logarithms of the ratios, NaN where they have none; None when nothing can be drawn."""
-    if overlay.ratio is None:
-        return None
-    usable = np.isfinite(overlay.ratio) & (overlay.ratio > 0)
-    if not usable.any():
-        return None
-    return np.log2(np.where(usable, overlay.ratio, np.nan))
-
-
-def _limits(overlay: EpisodeOverlay, logs: np.ndarray) -> tuple[float, float]:
-    """Limits of the curve's axis, at least a factor of two apart, with uniform attention inside."""
-    known = [logs[np.isfinite(logs)]]
-    if overlay.uniform_ratio is not None:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            uniform = np.log2(overlay.uniform_ratio)
-        known.append(uniform[np.isfinite(uniform)])
-    every = np.concatenate(known)
-    low, high = float(every.min()), float(every.max())
-    room = max(0.08 * (high - low), 0.5 * (1.0 - (high - low)), 0.05)
-    return low - room, high + room
-
-
-def _points(overlay: EpisodeOverlay) -> list[tuple[float, float | None]]:
-    """Where each replan stands in the curve's picture."""
-    steps = overlay.env_step.astype(float)
-    length = steps[-1] - steps[0]
-    x = _LEFT + (steps - steps[0]) / length * (_WIDTH - _LEFT - 10) if length else np.full(len(steps), _WIDTH / 2)
-    logs = _drawable(overlay)
-    if logs is None:
-        return [(float(place), None) for place in x]
-    low, high = _limits(overlay, logs)
-    y = _TOP + (high - logs) / (high - low) * (_HEIGHT - _TOP - _BOTTOM)
-    return [(float(a), None if np.isnan(b) else float(b)) for a, b in zip(x, y, strict=True)]
-
-
-def _curve(overlay: EpisodeOverlay, points: Sequence[tuple[float, float | None]]) -> str:
-    """The ratio over the whole episode as a small inline SVG; infinite ratios are gaps."""
-    logs = _drawable(overlay)
-    if logs is None or overlay.ratio is None:
-        return "" if overlay.ratio is None else '<p class="quiet">No replan of this episode has a finite ratio.</p>'
-    low, high = _limits(overlay, logs)
-
-    def height(value: float) -> float:
-        return _TOP + (high - value) / (high - low) * (_HEIGHT - _TOP - _BOTTOM)
-
-    runs: list[list[str]] = [[]]
-    for x, y in points:
-        if y is None:
-            runs.append([])
-        else:
-            runs[-1].append(f"{x:.1f},{y:.1f}")
-    lines = "".join(
-        f'<polyline points="{" ".join(run if len(run) > 1 else run * 2)}" stroke-linecap="round"></polyline>'
-        for run in runs
-        if run
-    )
-    finite = overlay.ratio[np.isfinite(logs)]
-    ticks = {float(finite.min()), float(finite.max())}
-    uniform = ""
-    if (
-        overlay.uniform_ratio is not None
-        and np.isfinite(overlay.uniform_ratio).any()
-        and (overlay.uniform_ratio > 0).all()
-    ):
-        value = float(np.nanmean(overlay.uniform_ratio))
-        y = height(float(np.log2(value)))
-        above = y > _TOP + 14
-        uniform = (
-            f'<line class="uniform" x1="{_LEFT:g}" x2="{_WIDTH - 10:g}" y1="{y:.1f}" y2="{y:.1f}"></line>'
-            f'<text x="{_WIDTH - 10:g}" y="{y - 4 if above else y + 13:.1f}" text-anchor="end">uniform attention: '
-            f"{format_number(value)}</text>"
-        )
-    marks = sorted((height(float(np.log2(tick))), tick) for tick in ticks)
-    if len(marks) == 2 and marks[1][0] - marks[0][0] < 12:
-        marks = marks[:1]
-    labels = "".join(
-        f'<text x="{_LEFT - 6:g}" y="{y + 4:.1f}" text-anchor="end">{format_number(tick)}</text>' for y, tick in marks
-    )
-    bottom = _HEIGHT - _BOTTOM
-    first, last = overlay.env_step[0], overlay.env_step[-1]
-    lowest, highest = format_number(float(finite.min())), format_number(float(finite.max()))
-    description = f"Ratio from step {first} to {last}: lowest {lowest}, highest {highest}"
-    return (
-        f'<svg class="curve" viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" role="img" aria-label="{text(description)}">'
-        f'<line class="axis" x1="{_LEFT:g}" x2="{_WIDTH - 10:g}" y1="{bottom:g}" y2="{bottom:g}"></line>{uniform}'
-        f'<line class="now" x1="{_LEFT:g}" x2="{_LEFT:g}" y1="{_TOP:g}" y2="{bottom:g}"></line>{lines}<circle r="5" '
-        f'cx="{points[0][0]:.1f}" '
-        f'cy="{points[0][1] if points[0][1] is not None else -99:.1f}"></circle>{labels}<text x="{_LEFT:g}" '
-        f'y="{_HEIGHT - 7:g}">step {first}</text>'
-        f'<text x="{_WIDTH - 10:g}" y="{_HEIGHT - 7:g}" text-anchor="end">step {last}</text><text x="{_LEFT:g}" '
-        f'y="11">ratio (log axis)</text></svg>'
-    )

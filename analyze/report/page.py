@@ -1,130 +1,123 @@
-"""The whole page: sections in order, style and script inside it."""
+"""The whole page: its sections in order, put into the templates of `templates/`."""
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Sequence
-from importlib import metadata, resources
+from importlib import metadata
 from pathlib import Path
-from string import Template
 
+import jinja2
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import overall_layer, overall_rows
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.role_masses import role_masses
 from vla_attention.analyze.measures.sinks import merged_sinks, sinks_table
-from vla_attention.analyze.ratios.analysis import Analysis
-from vla_attention.analyze.report.caveats import Caveat, caveats, role_shares
-from vla_attention.analyze.report.markup import text
+from vla_attention.analyze.ratios.analysis import Analysis, analyse
+from vla_attention.analyze.report.caveats import Caveat, caveat_section, caveats
+from vla_attention.analyze.report.headline import headline_section
+from vla_attention.analyze.report.methods import method_section
 from vla_attention.analyze.report.overlay_section import overlay_section
-from vla_attention.analyze.report.question_sections import (
-    layer_figures,
-    object_section,
-    sink_section,
-    time_section,
-    word_section,
-)
-from vla_attention.analyze.report.sections import (
-    Section,
-    caveat_section,
-    contribution_section,
-    headline,
-    layer_section,
-    method_section,
-    run_section,
-    task_section,
-)
-from vla_attention.analyze.show.numbers import plural
+from vla_attention.analyze.report.question_sections import object_section, sink_section, time_section, word_section
+from vla_attention.analyze.report.ratio_sections import contribution_section, layer_section, task_section
+from vla_attention.analyze.report.run_section import run_section
+from vla_attention.analyze.report.section_parts import Section
+from vla_attention.analyze.report.settings import ReportSettings
+from vla_attention.analyze.show.numbers import of_tasks
+from vla_attention.analyze.show.output_files import write_text
 from vla_attention.analyze.show.progress import progress_bar
+from vla_attention.schemas.errors import BadArgument
 
-DEFAULT_EPISODES, DEFAULT_REPLANS = 4, 24
 
+def write_report(question: Question, path: Path, settings: ReportSettings) -> None:
+    """Analyse and write the page of `report_html`, atomically.
 
-def report_html(
-    analysis: Analysis, episodes: int = DEFAULT_EPISODES, replans: int = DEFAULT_REPLANS, rows: bool = True
-) -> str:
-    """One self-contained HTML page on an analysis. The same analysis gives the same page, to the byte.
-
-    `episodes`: how many episodes have overlays; `replans`: how many replans of each, at most; `rows`: also what
-    needs every row to be read once or more: sinks, words and objects.
+    Raises:
+        BadArgument: the file cannot be written.
     """
+    page = report_html(analyse(question), settings)
+    try:
+        write_text(path, page)
+    except OSError as error:
+        raise BadArgument(f"Cannot write the report to {path}: {error.strerror or error}; give another path.") from None
+
+
+def report_html(analysis: Analysis, settings: ReportSettings) -> str:
+    """One self-contained HTML page on an analysis. The same analysis gives the same page, to the byte."""
     question = analysis.question
-    sinks = merged_sinks(sinks_table(question)) if rows else None
-    notes = caveats(analysis, role_shares(question), sinks)
+    sinks = merged_sinks(sinks_table(question)) if settings.rows else None
+    notes = caveats(analysis, role_masses(question), sinks)
     found = []
     with tempfile.TemporaryDirectory() as folder:
-        parts = _parts(analysis, notes, sinks, Path(folder), episodes, replans)
-        with progress_bar(len(parts), "sections") as advance:
-            for make in parts:
+        makers = _section_makers(analysis, notes, sinks, Path(folder), settings)
+        with progress_bar(len(makers), "sections") as advance:
+            for make in makers:
                 section = make()
                 advance(1)
                 if section is not None:
                     found.append(section)
-    return assemble(analysis, found)
+    return render(analysis, found)
 
 
-def _parts(
+def _section_makers(
     analysis: Analysis,
     notes: Sequence[Caveat],
     sinks: pl.DataFrame | None,
     folder: Path,
-    episodes: int,
-    replans: int,
+    settings: ReportSettings,
 ) -> list[Callable[[], Section | None]]:
-    """What makes each section, in the page's order; a section that does not apply is None."""
+    """A function per section, in the page's order. It returns None for a section that does not apply."""
     question = analysis.question
-    parts: list[Callable[[], Section | None]] = [
-        lambda: headline(analysis, notes),
+    makers: list[Callable[[], Section | None]] = [
+        lambda: headline_section(analysis, notes),
         lambda: caveat_section(notes),
         lambda: task_section(analysis, folder),
-        lambda: layer_section(analysis, folder, layer_figures(analysis, folder)),
+        lambda: layer_section(analysis, folder),
         lambda: time_section(analysis, folder),
     ]
     if sinks is not None:
-        parts += [
+        makers += [
             lambda: sink_section(sinks),
             lambda: word_section(question, folder),
             lambda: object_section(question, folder),
         ]
     return [
-        *parts,
-        lambda: contribution_section(analysis.contributions, question.settings.seed),
-        lambda: overlay_section(question, analysis.replans.cells, episodes, replans),
+        *makers,
+        lambda: contribution_section(analysis),
+        lambda: overlay_section(question, analysis.replans.cells, settings),
         lambda: run_section(analysis),
         method_section,
     ]
 
 
-def assemble(analysis: Analysis, sections: Sequence[Section]) -> str:
-    """Put sections into the page's frame."""
+def render(analysis: Analysis, sections: Sequence[Section]) -> str:
+    """The sections in the page's frame."""
     stores = analysis.question.stores
-    policy = stores[0].attributes.policy
+    policy, row = stores[0].attributes.policy, analysis.overall
     suites = ", ".join(dict.fromkeys(store.suite for store in stores))
-    row = overall_rows(analysis.tasks).cells.filter(layer=overall_layer(analysis.tasks.cells)).row(0, named=True)
     untrained = " (untrained weights)" if policy.untrained else ""
-    subtitle = (
-        f"{plural(row['num_episodes'], 'episode')} of {plural(row['num_tasks'], 'task')}, "
-        f"site {analysis.question.site}, grouping {analysis.grouping.name}{untrained}"
-    )
-    shown = "\n".join(
-        f'<section id="{section.anchor}" aria-labelledby="{section.anchor}-heading"><h2 '
-        f'id="{section.anchor}-heading">{text(section.heading)}</h2>'
-        f"{section.content}</section>"
-        for section in sections
-    )
-    navigation = "".join(f'<li><a href="#{section.anchor}">{text(section.heading)}</a></li>' for section in sections)
-    return Template(_resource("page.html")).substitute(
-        title=text(f"Attention of {policy.name} on {suites}"),
-        subtitle=text(subtitle),
-        version=text(_version()),
-        navigation=navigation,
-        sections=shown,
-        style=_resource("style.css"),
-        script=_resource("script.js"),
+    return (
+        templates()
+        .get_template("page.html")
+        .render(
+            title=f"Attention of {policy.name} on {suites}",
+            subtitle=f"{of_tasks(row['num_episodes'], row['num_tasks'])}, site {analysis.question.site}, grouping "
+            f"{analysis.grouping.name}{untrained}",
+            version=_version(),
+            sections=sections,
+        )
     )
 
 
-def _resource(name: str) -> str:
-    return resources.files("vla_attention.analyze.report").joinpath(name).read_text(encoding="utf-8")
+def templates() -> jinja2.Environment:
+    """The folder `templates/`. Every text is escaped; an unknown name in a template is an error."""
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader("vla_attention.analyze.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
 
 
 def _version() -> str:

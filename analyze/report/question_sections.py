@@ -1,4 +1,4 @@
-"""Sections that come from measurements beside the ratio: sinks, the course of episodes, words, objects."""
+"""Sections with the answers of other commands: sinks (`heads`), the course of episodes (`time`), `words`, `objects`."""
 
 from __future__ import annotations
 
@@ -7,76 +7,45 @@ from pathlib import Path
 
 import polars as pl
 
-from vla_attention.analyze.heads.layer_time import layer_time_table
-from vla_attention.analyze.heads.plot_layer_time import plot_layer_time
-from vla_attention.analyze.measures.aggregate import overall_layer
-from vla_attention.analyze.measures.question import Question, ask
+from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.sinks import SinkRule
 from vla_attention.analyze.objects.object_attention import object_tables
 from vla_attention.analyze.objects.object_settings import ObjectSettings
-from vla_attention.analyze.objects.object_study import objects_summary
+from vla_attention.analyze.objects.object_study import ObjectStudy
 from vla_attention.analyze.objects.object_views import ALL_CAMERAS
 from vla_attention.analyze.objects.plot_object_shares import plot_object_shares
 from vla_attention.analyze.ratios.analysis import Analysis
-from vla_attention.analyze.ratios.plot_layer_profile import plot_layer_profile
-from vla_attention.analyze.report.markup import (
-    Cell,
+from vla_attention.analyze.report.pictures import diagram_of, drawn
+from vla_attention.analyze.report.section_parts import (
+    Paragraph,
+    Section,
+    Table,
+    count_cell,
     interval_cell,
     number_cell,
-    paragraph,
     percent_cell,
-    table,
     text_cell,
 )
-from vla_attention.analyze.report.pictures import drawn, figure, take
-from vla_attention.analyze.report.sections import Section
-from vla_attention.analyze.show.numbers import format_number
+from vla_attention.analyze.show.numbers import format_number, format_percent, interval_name
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 from vla_attention.analyze.time.plot_time_course import plot_time_courses
 from vla_attention.analyze.time.time_courses import time_courses
 from vla_attention.analyze.words.plot_word_bars import plot_word_bars
-from vla_attention.analyze.words.word_reading import words_table
-from vla_attention.analyze.words.word_study import site_of_words, words_summary
+from vla_attention.analyze.words.word_study import study_words
 from vla_attention.schemas.errors import UserError
 
-#: Rows of the tables of sinks and objects: what follows is weak, and the commands have it.
+#: Rows of the tables of sinks and objects; the rows after these are small, and the commands print them.
 _MOST_ROWS = 30
-
-
-def layer_figures(analysis: Analysis, folder: Path) -> list[str]:
-    """Layer profile and layers over time, where there are several layers."""
-    if len(set(analysis.question.selection.blocks)) < 2:
-        return []
-    grouping, seed = analysis.grouping, analysis.question.settings.seed
-    what = "ratio" if grouping.ratio is not None else "fractions"
-    time = layer_time_table(analysis.replans, grouping, seed=seed)
-    cells = time.filter(pl.col("mean").is_not_null()).sort("mean")
-    extremes = ""
-    if cells.height and grouping.ratio is not None:
-        low, high = cells.row(0, named=True), cells.row(-1, named=True)
-        extremes = f" Lowest in layer {low['layer']}, highest in layer {high['layer']}."
-    return [
-        drawn(
-            lambda where: plot_layer_profile(analysis.tasks, grouping, where),
-            folder,
-            f"Lines of the {what} over the layers with bootstrap intervals.",
-            "Every layer with its interval over tasks and episodes.",
-        ),
-        drawn(
-            lambda where: plot_layer_time(analysis.replans, grouping, where, seed),
-            folder,
-            f"A map of the {what} with layers from bottom to top and the episodes' time from left to right.{extremes}",
-            "Layers over the course of the episodes, from the first replan (0) to the end (1).",
-        ),
-    ]
+_INTERVAL = interval_name(DEFAULT_LEVEL)
 
 
 def time_section(analysis: Analysis, folder: Path) -> Section | None:
-    """How the ratio runs over an episode, and around the first closing of the gripper."""
+    """The ratio over an episode, and around the first closing of the gripper; None when episodes have one replan."""
     if analysis.replans.cells["replan"].max() == 0:
         return None
     courses = time_courses(analysis.question, replans=analysis.replans)
     files = plot_time_courses(courses, analysis.grouping, folder)
-    pictures = []
+    diagrams = []
     for stem, what in (
         ("time_course", "Over the course of an episode, from its first replan (0) to its end (1)."),
         ("time_course_gripper", "Before and after the gripper first closes."),
@@ -84,120 +53,114 @@ def time_section(analysis: Analysis, folder: Path) -> Section | None:
         own = [path for path in files if path.stem == stem]
         if own:
             alternative = f"Lines with bands for their intervals: {what[0].lower()}{what[1:]}"
-            pictures.append(
-                figure(take(own, alternative, f"{what} Bands are pointwise 95 % intervals over tasks and episodes."))
-            )
-    return Section("time", "Over time", "".join(pictures))
+            caption = f"{what} Bands are pointwise {_INTERVAL}s over tasks and episodes."
+            diagrams.append(diagram_of(own, alternative, caption))
+    return Section("time", "Over time", diagrams)
 
 
 def sink_section(sinks: pl.DataFrame) -> Section:
-    """Keys that take far more than their share in most rows, from `sinks.merged_sinks` by the default rule."""
-    rule = SinkRule()
-    explanation = (
-        f"A sink is a key that takes {rule} of a task. Trained transformers put what they do not need on a few such "
-        f"keys, whose values may be close to "
-        "nothing; a mass counts them like any other."
+    """Keys that take far more than their share in most rows, from `sinks.merged_sinks` with the default rule."""
+    explanation = Paragraph(
+        f"A sink is a key that takes {SinkRule()} of a task. Trained transformers put attention that nothing needs on "
+        "a few such keys, and their values may be near zero; a mass includes them like any other key."
     )
     if sinks.is_empty():
-        return Section("sinks", "Sinks", paragraph(explanation) + paragraph("No key does so here."))
+        return Section("sinks", "Sinks", [explanation, Paragraph("There are none here.")])
+    shown, heaviest = sinks.head(_MOST_ROWS), sinks.row(0, named=True)
     rows = [
         [
             text_cell(row["description"]),
             text_cell(row["role"]),
-            Cell(str(row["num_tasks"]), row["num_tasks"]),
+            count_cell(row["num_tasks"]),
             percent_cell(row["share_of_rows"]),
             percent_cell(row["mean_mass"]),
             number_cell(row["times_uniform"]),
         ]
-        for row in sinks.head(_MOST_ROWS).iter_rows(named=True)
+        for row in shown.iter_rows(named=True)
     ]
-    left = sinks.height - len(rows)
-    heaviest = sinks.row(0, named=True)
     found = (
-        f"{sinks.height} key{'s do' if sinks.height > 1 else ' does'} so here; the first, {heaviest['description']}, "
-        f"takes "
-        f"{100 * heaviest['mean_mass']:.1f} % of the attention to valid keys. vla-analyze ratios --without-sinks "
-        f"computes everything without them."
+        f"{'One key is a sink' if sinks.height == 1 else f'{sinks.height} keys are sinks'} here; the first, "
+        f"{heaviest['description']}, takes {format_percent(heaviest['mean_mass'])} of the attention to valid keys. "
+        "vla-analyze ratios --without-sinks computes everything without sinks."
     )
-    caption = "Sinks" + (f", the first {len(rows)}; vla-analyze heads lists {left} more" if left else "")
+    left = sinks.height - len(rows)
+    caption = f"Sinks, the first {len(rows)}; vla-analyze heads lists {left} more" if left else "Sinks"
     header = ["key", "role", "tasks", "rows %", "mass %", "times uniform"]
-    return Section("sinks", "Sinks", paragraph(explanation) + paragraph(found) + table(caption, header, rows))
+    return Section("sinks", "Sinks", [explanation, Paragraph(found), Table(caption, header, rows)])
 
 
-def word_section(question: Question, folder: Path) -> Section | None:
-    """Which words are read: at the question's site, or where the policy reads when its site was not chosen."""
+def word_section(question: Question, folder: Path) -> Section:
+    """Which words are read: at the site that was chosen, or without a choice at the site that reads the instruction."""
+    # Words need no groups, and another site may not have the keys of the question's groups.
+    settings = replace(question.settings, grouping=None, groups=(), ratio=None)
     try:
-        site = site_of_words(question.stores[0].attributes, question.settings.site)
-        if site != question.site:
-            # Another site has other keys, so groups and ratio of the question need not exist there.
-            settings = replace(question.settings, site=site, grouping=None, groups=(), ratio=None)
-            question = ask(question.stores, settings)
-        measured = words_table(question)
+        study = study_words(question.stores, settings)
     except UserError as error:
-        return Section("words", "Words", paragraph(str(error)))
-    summary = words_summary(measured, by_place=False, seed=question.settings.seed)
-    words = summary.filter((pl.col("kind") == "word") & pl.col("lift").is_not_null())
-    first = ", ".join(f"{row['item']} {format_number(row['lift'])}" for row in words.head(5).iter_rows(named=True))
-    picture = drawn(
-        lambda where: plot_word_bars(summary, where, overall_layer(measured)),
+        return Section("words", "Words", [Paragraph(str(error))])
+    of_words = study.summary.filter(pl.col("kind") == "word")
+    diagram = drawn(
+        lambda where: plot_word_bars(study.summary, where, study.layer),
         folder,
-        f"Bars of the words' lifts, highest first: {first or 'none'}.",
-        f"Words by lift, site {site}: mass per piece against the mean over valid keys; 1 is uniform attention.",
+        f"Bars of the words' lifts, highest first: {_lifts(of_words.head(5)) or 'none'}.",
+        f"Words by lift, site {study.question.site}: mass per piece against the mean over valid keys; 1 is uniform "
+        "attention.",
     )
     rows = [
         [
             text_cell(row["item"]),
             text_cell(row["word_class"] or "-"),
-            Cell(str(row["num_episodes"]), row["num_episodes"]),
+            count_cell(row["num_episodes"]),
             number_cell(row["lift"]),
             interval_cell(row["lift_low"], row["lift_high"]),
             percent_cell(row["mass"]),
             percent_cell(row["share"]),
         ]
-        for row in summary.filter(pl.col("kind") == "word").iter_rows(named=True)
+        for row in of_words.iter_rows(named=True)
     ]
-    header = ["word", "class", "episodes", "lift", "95 % interval", "mass %", "of the text %"]
-    return Section("words", "Words", picture + table("Words of the instructions", header, rows))
+    header = ["word", "class", "episodes", "lift", _INTERVAL, "mass %", "of the text %"]
+    return Section("words", "Words", [diagram, Table("Words of the instructions", header, rows)])
 
 
 def object_section(question: Question, folder: Path) -> Section | None:
     """Which objects get the image attention; None where no object masks were stored for the site's cameras."""
     if not any(item.tokens.coverage for item in question.selected):
         return None
+    settings = ObjectSettings(spatial=False)
     try:
-        tables = object_tables(question, ObjectSettings(spatial=False))
+        study = ObjectStudy(question, settings, question.selected[0], object_tables(question, settings))
     except UserError as error:
-        return Section("objects", "Objects", paragraph(str(error)))
-    seed = question.settings.seed
-    summary = objects_summary(tables.objects, seed)
-    whole = summary.filter(
-        pl.col("camera") == (ALL_CAMERAS if ALL_CAMERAS in summary["camera"] else summary["camera"][0])
-    )
-    classes = [row for row in whole.filter(pl.col("kind") == "class").iter_rows(named=True) if row["lift"] is not None]
-    told = ", ".join(f"{row['item']} {format_number(row['lift'])}" for row in classes)
-    picture = drawn(
-        lambda where: plot_object_shares(tables.times, question.selected[0], where, seed),
+        return Section("objects", "Objects", [Paragraph(str(error))])
+    cameras = study.summary["camera"]
+    together = ALL_CAMERAS if ALL_CAMERAS in cameras else cameras[0]
+    whole = study.summary.filter(pl.col("camera") == together)
+    diagram = drawn(
+        lambda where: plot_object_shares(study.tables.times, study.example, where, question.settings.seed),
         folder,
-        f"Shares of image attention over time, by object and by class. Lifts of the classes: {told or 'none'}.",
-        "Where image attention goes, by object in one episode and by class over all. Dashed: the area that is "
-        "covered, which is what uniform "
-        "attention would give.",
+        "Shares of image attention over time, by object and by class. "
+        f"Lifts of the classes: {_lifts(whole.filter(pl.col('kind') == 'class')) or 'none'}.",
+        "Where image attention goes, by object in one episode and by class over all. Dashed: the area that is covered, "
+        "which is what uniform attention would give.",
     )
     rows = [
         [
             text_cell(row["item"]),
             text_cell(row["kind"]),
-            Cell(str(row["num_episodes"]), row["num_episodes"]),
+            count_cell(row["num_episodes"]),
             percent_cell(row["share"]),
-            interval_cell(*(None if bound is None else 100 * bound for bound in (row["share_low"], row["share_high"]))),
+            interval_cell(row["share_low"], row["share_high"], times=100),
             percent_cell(row["area_share"]),
             number_cell(row["lift"]),
             interval_cell(row["lift_low"], row["lift_high"]),
         ]
         for row in whole.head(_MOST_ROWS).iter_rows(named=True)
     ]
-    header = ["object", "kind", "episodes", "share %", "95 % interval", "area %", "lift", "95 % interval"]
-    caption = "Objects, all cameras together" + (
-        f" (the first {_MOST_ROWS}; vla-analyze objects has all)" if whole.height > _MOST_ROWS else ""
-    )
-    return Section("objects", "Objects", picture + table(caption, header, rows))
+    header = ["object", "kind", "episodes", "share %", _INTERVAL, "area %", "lift", _INTERVAL]
+    more = f" (the first {_MOST_ROWS}; vla-analyze objects has all)" if whole.height > _MOST_ROWS else ""
+    table = Table(f"Objects, all cameras together{more}", header, rows)
+    return Section("objects", "Objects", [diagram, table])
+
+
+def _lifts(summary: pl.DataFrame) -> str:
+    """Names with their lifts, for people who do not see the diagram."""
+    rows = summary.filter(pl.col("lift").is_not_null()).iter_rows(named=True)
+    return ", ".join(f"{row['item']} {format_number(row['lift'])}" for row in rows)

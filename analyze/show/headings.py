@@ -36,12 +36,17 @@ def heading(text: str) -> str:
     return "\n".join([*wrap(text), "-" * WIDTH])
 
 
+def untrained_sentence(whose: str) -> str:
+    """What untrained weights mean for the numbers; `whose` begins the sentence: `The policy has`."""
+    return (
+        f"{whose} untrained (random) weights. These numbers show that the pipeline works; they say nothing about any "
+        "policy."
+    )
+
+
 def untrained_warning(whose: str = "the policy has") -> str:
     """The warning that stands above all numbers of a policy with untrained weights."""
-    return (
-        f"WARNING: {whose} untrained (random) weights. These numbers show that the pipeline works; they say nothing "
-        "about any policy."
-    )
+    return f"WARNING: {untrained_sentence(whose)}"
 
 
 def run_header(

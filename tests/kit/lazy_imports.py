@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 #: Each takes a tenth of a second or more to import.
-HEAVY = ("numpy", "polars", "zarr", "matplotlib", "tqdm", "xarray", "pandas", "torch")
+HEAVY = ("numpy", "polars", "zarr", "matplotlib", "tqdm", "xarray", "pandas", "torch", "jinja2")
 _CHECK = """
 import runpy, sys
 sys.argv = {argv!r}

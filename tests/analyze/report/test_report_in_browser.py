@@ -35,13 +35,15 @@ addEventListener("load", function () {
     found.visible = (found.visible || []).concat([shown.length]);
     return Array.from(shown[0].querySelectorAll("img.heat")).map((image) => image.src).join();
   };
-  found.requests = performance.getEntriesByType("resource").map((entry) => entry.name).filter((name) => !name.startsWith("data:"));
+  const requests = performance.getEntriesByType("resource").map((entry) => entry.name);
+  found.requests = requests.filter((name) => !name.startsWith("data:"));
   found.broken = Array.from(document.images).filter((image) => !image.complete || !image.naturalWidth).length;
   found.images = document.images.length;
   const episode = document.querySelector(".episode");
   const slider = episode.querySelector("input[type=range]");
   const dot = episode.querySelector(".curve circle");
-  const before = shownImage(episode), placeBefore = dot.getAttribute("cx"), labelBefore = episode.querySelector("output").textContent;
+  const before = shownImage(episode), placeBefore = dot.getAttribute("cx");
+  const labelBefore = episode.querySelector("output").textContent;
   slider.value = "2";
   slider.dispatchEvent(new Event("input", {bubbles: true}));
   found.pictureChanged = shownImage(episode) !== before;
@@ -95,10 +97,10 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def browse(page: Path, *options: str) -> dict[str, Any]:
     """What the page says of itself after it was used."""
     assert BROWSER is not None
-    command = [
-        BROWSER, "--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run", f"--user-data-dir={page.parent / 'profile'}",
-        "--virtual-time-budget=8000", "--host-resolver-rules=MAP * ~NOTFOUND", *options, "--dump-dom", page.as_uri(),
-    ]  # fmt: skip
+    profile = f"--user-data-dir={page.parent / 'profile'}"
+    setup = ["--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run", profile]
+    offline = ["--virtual-time-budget=8000", "--host-resolver-rules=MAP * ~NOTFOUND"]
+    command = [BROWSER, *setup, *offline, *options, "--dump-dom", page.as_uri()]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     match = re.search(r'<pre id="probe">(.*?)</pre>', done.stdout, re.DOTALL)
     assert match is not None, done.stderr[-2000:]

@@ -1,0 +1,22 @@
+"""The last section: formulas and what they mean. Its text is `templates/methods.html`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from vla_attention.analyze.report.section_parts import Section
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+
+
+@dataclass(frozen=True)
+class Methods:
+    """`level`: of all intervals on the page."""
+
+    template: ClassVar[str] = "methods.html"
+    level: str
+
+
+def method_section() -> Section:
+    """How everything on the page is computed."""
+    return Section("methods", "How it is computed", [Methods(f"{100 * DEFAULT_LEVEL:g}%")])

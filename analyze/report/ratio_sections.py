@@ -1,0 +1,196 @@
+"""Sections on masses, ratios and contributions: tasks, layers and groups, contributions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from vla_attention.analyze.heads.layer_time import layer_time_table
+from vla_attention.analyze.heads.plot_layer_time import plot_layer_time
+from vla_attention.analyze.measures.aggregate import layer_order, overall_rows
+from vla_attention.analyze.measures.contributions import contribution_rows
+from vla_attention.analyze.measures.frames import layer_name
+from vla_attention.analyze.ratios.analysis import Analysis
+from vla_attention.analyze.ratios.plot_attention_fractions import plot_attention_fractions
+from vla_attention.analyze.ratios.plot_layer_profile import plot_layer_profile
+from vla_attention.analyze.ratios.plot_ratio_distribution import plot_ratio_distribution
+from vla_attention.analyze.ratios.plot_ratio_per_task import plot_ratio_per_task
+from vla_attention.analyze.report.pictures import Diagram, drawn
+from vla_attention.analyze.report.section_parts import (
+    Cell,
+    Paragraph,
+    Part,
+    Section,
+    Table,
+    count_cell,
+    interval_cell,
+    number_cell,
+    percent_cell,
+    text_cell,
+)
+from vla_attention.analyze.show.numbers import format_number, format_percent, interval_name
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+
+_INTERVAL = interval_name(DEFAULT_LEVEL)
+#: Groups with a column of their own in the table of tasks: beside a ratio, and alone.
+_GROUPS_BESIDE_RATIO, _GROUPS_ALONE = 2, 6
+
+
+def task_section(analysis: Analysis, folder: Path) -> Section:
+    """A row per task, and the picture of ratios per task."""
+    ratio, layer = analysis.grouping.ratio, analysis.overall["layer"]
+    chosen = analysis.tasks.filter((pl.col("scope") == "task") & (pl.col("layer") == layer))
+    of_group = chosen.by_group("suite", "task_id")
+    several = chosen.cells["suite"].n_unique() > 1
+    groups = analysis.present_groups[: _GROUPS_ALONE if ratio is None else _GROUPS_BESIDE_RATIO]
+    header = ["task", *(["suite"] if several else []), "instruction", "episodes", "solved %"]
+    if ratio is not None:
+        header += ["mean ratio", _INTERVAL, "of means", "geom.", "uniform", "lift", "not finite"]
+    header += [f"{group} %" for group in groups]
+    body = []
+    for row in chosen.cells.iter_rows(named=True):
+        cells = [count_cell(row["task_id"]), *([text_cell(row["suite"])] if several else [])]
+        cells += [text_cell(row["instruction"]), count_cell(row["num_episodes"]), percent_cell(row["success_rate"])]
+        if ratio is not None:
+            cells += _ratio_cells(row, "ratio_of_means", "geometric_mean", "uniform_ratio", "ratio_lift")
+        cells += [percent_cell(of_group[row["suite"], row["task_id"], group]["fraction"]) for group in groups]
+        body.append(cells)
+    caption = (
+        f"Tasks ({layer_name(layer)}). Per cent of a group: its fraction of all attention. The interval's column sorts "
+        "by width."
+    )
+    parts: list[Part] = [Table(caption, header, body)]
+    if ratio is not None:
+        parts.insert(0, _tasks_diagram(analysis, chosen.cells, folder))
+    return Section("tasks", "Tasks", parts)
+
+
+def _ratio_cells(row: dict[str, Any], *columns: str) -> list[Cell]:
+    """The mean ratio with its interval, further columns, and how many replans have no finite ratio."""
+    interval = interval_cell(row["ratio_mean_low"], row["ratio_mean_high"])
+    numbers = [number_cell(row[column]) for column in columns]
+    return [number_cell(row["ratio_mean"]), interval, *numbers, count_cell(row["num_nonfinite"])]
+
+
+def _tasks_diagram(analysis: Analysis, tasks: pl.DataFrame, folder: Path) -> Diagram:
+    known = tasks.filter(pl.col("ratio_mean").is_not_null()).sort("ratio_mean").rows(named=True)
+    extremes = "".join(
+        f" {which}: task {row['task_id']} with {format_number(row['ratio_mean'])}."
+        for which, row in zip(("Lowest", "Highest"), (*known[:1], *known[-1:]), strict=False)
+    )
+    return drawn(
+        lambda where: plot_ratio_per_task(analysis.episodes.cells, analysis.tasks.cells, analysis.grouping, where),
+        folder,
+        f"Mean ratio of every task with its interval, single episodes, and the uniform baseline.{extremes}",
+        "Ratio per task: mean over episodes with its bootstrap interval, single episodes as dots, uniform attention "
+        "dashed.",
+    )
+
+
+def layer_section(analysis: Analysis, folder: Path) -> Section:
+    """A row per layer, and how ratios and fractions differ between layers."""
+    grouping, rows = analysis.grouping, overall_rows(analysis.tasks).cells
+    parts: list[Part] = []
+    if grouping.ratio is not None:
+        parts.append(
+            drawn(
+                lambda where: plot_ratio_distribution(analysis.replans.cells, grouping, where),
+                folder,
+                f"Histogram of the ratio over replans, and a box for each of {rows.height} layers or averages over "
+                "episodes.",
+                "How the ratio is spread over replans, and over episodes in every layer.",
+            )
+        )
+    if len(set(analysis.question.selection.blocks)) > 1:
+        parts += _layer_diagrams(analysis, folder)
+    shares = [
+        f"{group} {format_percent(analysis.overall_groups[group]['fraction'] or 0, 0)}"
+        for group in analysis.present_groups[:8]
+    ]
+    parts.append(
+        drawn(
+            lambda where: plot_attention_fractions(analysis.tasks, grouping, where),
+            folder,
+            f"Stacked bars of every group's fraction in each layer: {', '.join(shares)} over all layers.",
+            "Fractions of all groups per layer, means over episodes.",
+        )
+    )
+    return Section("layers", "Layers and groups", [*parts, *_layer_tables(analysis)])
+
+
+def _layer_diagrams(analysis: Analysis, folder: Path) -> list[Diagram]:
+    """Layer profile, and layers over time."""
+    grouping, seed = analysis.grouping, analysis.question.settings.seed
+    what = "fractions" if grouping.ratio is None else "ratio"
+    extremes = ""
+    if grouping.ratio is not None:
+        time = layer_time_table(analysis.replans, grouping, seed=seed)
+        known = time.filter(pl.col("mean").is_not_null()).sort("mean")["layer"].to_list()
+        extremes = f" Lowest in layer {known[0]}, highest in layer {known[-1]}." if known else ""
+    return [
+        drawn(
+            lambda where: plot_layer_profile(analysis.tasks, grouping, where),
+            folder,
+            f"Lines of the {what} over the layers with bootstrap intervals.",
+            "Every layer with its interval over tasks and episodes.",
+        ),
+        drawn(
+            lambda where: plot_layer_time(analysis.replans, grouping, where, seed),
+            folder,
+            f"A map of the {what} with layers from bottom to top and the episodes' time from left to right.{extremes}",
+            "Layers over the course of the episodes, from the first replan (0) to the end (1).",
+        ),
+    ]
+
+
+def _layer_tables(analysis: Analysis) -> list[Table]:
+    """Ratios of the layers, then fractions and lifts of the groups: two tables, because one would be too wide."""
+    over_all, groups = overall_rows(analysis.tasks), analysis.present_groups
+    of_group = over_all.by_group("layer")
+    rows = {row["layer"]: row for row in over_all.cells.iter_rows(named=True)}
+    ratios, shares = [], []
+    for layer in layer_order(over_all.cells):
+        row = rows[layer]
+        block = "" if row["block"] is None or str(row["block"]) == layer else f" (block {row['block']})"
+        name = Cell(f"{layer}{block}", row["layer_number"])
+        if analysis.grouping.ratio is not None:
+            columns = ("ratio_median", "ratio_of_means", "geometric_mean", "uniform_ratio", "ratio_lift")
+            ratios.append([name, *_ratio_cells(row, *columns)])
+        fractions = [percent_cell(of_group[layer, group]["fraction"]) for group in groups]
+        shares.append([name, *fractions, *(number_cell(of_group[layer, group]["lift"]) for group in groups)])
+    caption = (
+        "Groups per layer. Per cent: fraction of the groups' summed mass; lift: mass per key against the mean over "
+        "valid keys"
+    )
+    tables = [Table(caption, ["layer", *(f"{g} %" for g in groups), *(f"{g} lift" for g in groups)], shares)]
+    if ratios:
+        header = ["layer", "mean ratio", _INTERVAL, "median", "of means", "geom.", "uniform", "lift", "not finite"]
+        tables.insert(0, Table("Ratio per layer", header, ratios))
+    return tables
+
+
+def contribution_section(analysis: Analysis) -> Section | None:
+    """What the image keys and the text keys add to the residual stream; None when it was not recorded."""
+    if analysis.contributions is None:
+        return None
+    note = (
+        "A mass is how much attention keys get; a norm is the length of the vector that they add to the residual "
+        "stream (value-weighted, through output projection and gate; root mean square over action queries, mean over "
+        "replans and denoise steps). A sink has a large mass and may have a small norm. Unlike masses, norms of "
+        "different sites may be divided by each other."
+    )
+    rows = [
+        [
+            Cell(row["layer"], row["layer_number"]),
+            number_cell(row["visual_norm"]),
+            number_cell(row["linguistic_norm"]),
+            number_cell(row["ratio"]),
+            interval_cell(row["ratio_low"], row["ratio_high"]),
+        ]
+        for row in contribution_rows(analysis.contributions, analysis.question.settings.seed).iter_rows(named=True)
+    ]
+    caption = "Norms of contributions; ratio: mean over episodes of the mean ratio of norms"
+    table = Table(caption, ["layer", "visual norm", "linguistic norm", "ratio", _INTERVAL], rows)
+    return Section("contributions", "Contributions", [Paragraph(note), table])
