@@ -12,8 +12,8 @@ import polars as pl
 from vla_attention.analyze.compare.comparison import LOG2_RATIO, Comparison
 from vla_attention.analyze.compare.text import overall_layer_of
 from vla_attention.analyze.measures.frames import LAYERS_AVG
-from vla_attention.analyze.show.numbers import plural
-from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, ratio_axis
+from vla_attention.analyze.show.numbers import interval_name, plural
+from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, legend_above, note_at_row, ratio_axis
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, NOTE_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, ratio_name, title, wrapped
@@ -51,7 +51,7 @@ def plot_forest(comparison: Comparison, folder: Path, layer: str | None = None, 
     rows = _rows(comparison, layer, quantity, shown)
     figure = new_figure(10, 1.9 + 0.34 * (rows.height + rows["suite"].n_unique()))
     which = "mean over layers" if layer == LAYERS_AVG else f"block {layer}"
-    note = f"n counts episodes (pairs where runs are paired). Bars: {level:.0%} bootstrap intervals over tasks and episodes."
+    note = f"n counts episodes (pairs where runs are paired). Bars: {interval_name(level, 'bootstrap')}s over tasks and episodes."
     if not comparison.differences["paired"].all():
         note += " Not every run is paired with the first one: those differences hold differences between scenes."
     if rows["low"].null_count():
@@ -149,19 +149,11 @@ def _estimates_panel(
                 linewidth=1.2,
                 zorder=1,
             )
-        axes.text(
-            1.01,
-            place,
-            f"n = {row['num_episodes']}",
-            transform=axes.get_yaxis_transform(),
-            va="center",
-            size=7,
-            color=NOTE_COLOR,
-        )
+        note_at_row(axes, place, f"n = {row['num_episodes']}")
     axes.grid(axis="x")
     if is_ratio:
         axes.plot([], [], "--", color=BASELINE_COLOR, linewidth=1.2, label=BASELINE_LABEL)
-        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
+        legend_above(axes)
 
 
 def _differences_panel(
@@ -191,7 +183,7 @@ def _differences_panel(
         value, low, high = (scale(row[name]) for name in names)
         _estimate(axes, place, value, low, high, style)
         text = f"n = {plural(row['num_pairs'], 'pair')}" if row["paired"] else "not paired"
-        axes.text(1.01, place, text, transform=axes.get_yaxis_transform(), va="center", size=7, color=NOTE_COLOR)
+        note_at_row(axes, place, text)
     axes.grid(axis="x")
 
 
@@ -199,9 +191,7 @@ def _estimate(
     axes: Axes, place: float, value: float | None, low: float | None, high: float | None, style: Mapping[str, Any]
 ) -> None:
     if value is None or not np.isfinite(value):
-        axes.text(
-            0.01, place, "no finite ratio", transform=axes.get_yaxis_transform(), va="center", size=7, color=NOTE_COLOR
-        )
+        note_at_row(axes, place, "no finite ratio", x=0.01)
         return
     if low is not None and high is not None:
         axes.plot([low, high], [place, place], color=style["color"], linewidth=2.0, zorder=3)

@@ -13,8 +13,9 @@ from vla_attention.analyze.compare.comparison import LOG2_RATIO, Comparison
 from vla_attention.analyze.compare.plot_forest import factor_axis
 from vla_attention.analyze.compare.text import overall_layer_of
 from vla_attention.analyze.measures.frames import LAYERS_AVG
-from vla_attention.analyze.show.numbers import plural
-from vla_attention.analyze.show.plot_colours import DATA_COLOR, NOTE_COLOR
+from vla_attention.analyze.show.numbers import interval_name, plural
+from vla_attention.analyze.show.plot_axes import legend_above, note_at_row
+from vla_attention.analyze.show.plot_colours import DATA_COLOR, DOT_COLOR, NOTE_COLOR, STRIPE_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, title, wrapped
 
@@ -80,10 +81,10 @@ def plot_paired_differences(
     axes.grid(axis="x")
     axes.plot([], [], "o", color=DATA_COLOR, markersize=6, label="mean")
     if rows["low"].is_not_null().any():
-        axes.plot([], [], color=DATA_COLOR, linewidth=2, label=f"{level:.0%} bootstrap interval")
+        axes.plot([], [], color=DATA_COLOR, linewidth=2, label=interval_name(level, "bootstrap"))
     if paired:
-        axes.scatter([], [], s=14, color="#56B4E9", linewidths=0, label="single pair")
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.1, handlelength=1.5)
+        axes.scatter([], [], s=14, color=DOT_COLOR, linewidths=0, label="single pair")
+    legend_above(axes, 3, handlelength=1.5)
     return save_figure(figure, folder, stem_of(name), rows)
 
 
@@ -101,14 +102,14 @@ def _draw_row(
 
     total = row["scope"] != "task"
     if total:
-        axes.axhspan(place - 0.5, place + 0.5, color="#F0F0F0", linewidth=0, zorder=0)
+        axes.axhspan(place - 0.5, place + 0.5, color=STRIPE_COLOR, linewidth=0, zorder=0)
     else:
         own = pairs.filter((pl.col("suite") == row["suite"]) & (pl.col("task_id") == row["task_id"]))
         values = own["difference"].drop_nulls().to_numpy()
         values = values[np.isfinite(values)]
         jitter = generator.uniform(-0.22, 0.22, len(values)) if len(values) > 1 else np.zeros(len(values))
         axes.scatter(
-            scaled(values), place + jitter, s=14 if few else 8, color="#56B4E9", alpha=0.8, linewidths=0, zorder=2
+            scaled(values), place + jitter, s=14 if few else 8, color=DOT_COLOR, alpha=0.8, linewidths=0, zorder=2
         )
     if row["low"] is not None:
         ends = [scaled(row["low"]), scaled(row["high"])]
@@ -119,17 +120,9 @@ def _draw_row(
             markeredgecolor="white", zorder=4,
         )  # fmt: skip
     else:
-        axes.text(
-            0.01,
-            place,
-            "no difference to show",
-            transform=axes.get_yaxis_transform(),
-            va="center",
-            size=7,
-            color=NOTE_COLOR,
-        )
+        note_at_row(axes, place, "no difference to show", x=0.01)
     n = f"n = {row['num_pairs']}" if row["paired"] else f"n = {row['num_first']}, {row['num_other']}"
-    axes.text(1.01, place, n, transform=axes.get_yaxis_transform(), va="center", size=7, color=NOTE_COLOR)
+    note_at_row(axes, place, n)
 
 
 def _label(row: dict[str, Any], several: bool, few: bool) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
 
 import polars as pl
@@ -10,12 +9,20 @@ import polars as pl
 from vla_attention.analyze.compare.comparison import LOG2_RATIO, SUCCESS, Comparison
 from vla_attention.analyze.compare.runs import Run
 from vla_attention.analyze.measures.frames import LAYERS_AVG
-from vla_attention.analyze.show.numbers import format_interval, format_number
+from vla_attention.analyze.show.headings import (
+    WIDTH,
+    heading,
+    interval_note,
+    note_lines,
+    title,
+    untrained_warning,
+    wrap,
+)
+from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent
 from vla_attention.analyze.show.text_table import text_table
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.stores.store_format import episode_name
-
-WIDTH = 100
 
 
 def overall_layer_of(table: pl.DataFrame) -> str:
@@ -37,23 +44,19 @@ def comparison_text(comparison: Comparison, runs: Sequence[Run]) -> str:
 
 
 def _header(comparison: Comparison, runs: Sequence[Run], layer: str) -> str:
-    lines = ["COMPARISON OF RUNS", "=" * WIDTH]
+    lines = title("COMPARISON OF RUNS")
     if any(store.attributes.policy.untrained for run in runs for store in run.stores):
-        lines += _wrapped(
-            "WARNING: a policy has untrained (random) weights; differences to it say nothing about any policy.", ""
-        )
+        lines += wrap(untrained_warning("a policy has"))
     for run in runs:
         policy = run.stores[0].attributes.policy
         stores = ", ".join(str(store.path) for store in run.stores)
-        lines += _wrapped(f"{run.name}: {policy.name} ({policy.checkpoint}), {listing(run.suites)}; {stores}", "  ")
+        lines += wrap(f"{run.name}: {policy.name} ({policy.checkpoint}), {listing(run.suites)}; {stores}", rest="  ")
     which = layer if layer == LAYERS_AVG else f"block {layer}"
-    lines += _wrapped(
+    lines += wrap(
         f"Grouping '{comparison.grouping.name}', site {runs[0].question.site}, {which}; differences are run "
-        f"minus {comparison.names[0]}. Intervals: 95%, bootstrap over tasks and episodes.",
-        "",
+        f"minus {comparison.names[0]}. {interval_note(DEFAULT_LEVEL)}",
     )
-    for note in comparison.notes:
-        lines += _wrapped(f"note: {note}", "  ")
+    lines += note_lines(comparison.notes)
     return "\n".join(lines)
 
 
@@ -72,19 +75,18 @@ def _estimates_section(comparison: Comparison, layer: str) -> str:
             row = of["ratio"]
             cells += [format_number(row["value"]), format_interval(row["low"], row["high"])]
             cells += [format_number(row["uniform_ratio"]), format_number(of["ratio_lift"]["value"])]
-        body.append(cells + [_percent(of[name]["value"]) for name in fractions])
+        body.append(cells + [format_percent(of[name]["value"]) for name in fractions])
     note = (
         "ratio: geometric mean over episodes; uniform: what uniform attention gives; lift: ratio / uniform."
         if ratio
         else ""
     )
-    lines = [_title("EACH RUN"), text_table(header, body, left=(0, 1)), *_wrapped(note, "")]
+    lines = [heading("EACH RUN"), text_table(header, body, left=(0, 1)), *wrap(note)]
     for row in (of["ratio"] for of in estimates) if ratio else ():
         if row["num_nonfinite"] or row["episodes_without_ratio"]:
-            lines += _wrapped(
+            lines += wrap(
                 f"{row['run']}, {row['suite']}: {row['num_nonfinite']} replans have no finite ratio and are in no ratio; "
                 f"{row['episodes_without_ratio']} of {row['num_episodes']} episodes have none at all.",
-                "",
             )
     return "\n".join(lines)
 
@@ -92,7 +94,7 @@ def _estimates_section(comparison: Comparison, layer: str) -> str:
 def _difference_section(comparison: Comparison, name: str, layer: str) -> str:
     first = comparison.names[0]
     rows = comparison.differences.filter(pl.col("run") == name, pl.col("scope") == "all", pl.col("layer") == layer)
-    lines = [_title(f"{name} AGAINST {first}")]
+    lines = [heading(f"{name} AGAINST {first}")]
     lines += _pairing(comparison, name, rows)
     header = ["quantity", "n", first[:14], name[:14], "difference", "interval", "factor", "effect"]
     body = []
@@ -115,7 +117,7 @@ def _difference_section(comparison: Comparison, name: str, layer: str) -> str:
     lines.append(text_table(header, body, left=(0,)))
     paired = bool(rows["paired"].any())
     effect = "mean / standard deviation of the paired differences" if paired else "Hedges' g, in standard deviations"
-    lines += _wrapped(f"effect: {effect}. A difference of 1 in log2_ratio is a factor of 2 in the ratio.", "")
+    lines += wrap(f"effect: {effect}. A difference of 1 in log2_ratio is a factor of 2 in the ratio.")
     return "\n".join(lines)
 
 
@@ -126,10 +128,9 @@ def _pairing(comparison: Comparison, name: str, rows: pl.DataFrame) -> list[str]
         for run, other in ((first, name), (name, first))
     }
     if not rows["paired"].any():
-        return _wrapped(
+        return wrap(
             f"NOT PAIRED: no episode of {name} has the suite, task, initial state and seed of one of {first}, so this compares means "
             "of independent episodes; differences between scenes are in it, and intervals are wider for that.",
-            "",
         )
     pairs = comparison.pairs.filter(pl.col("run") == name).select("suite", "task_id", "episode_first").unique().height
     text = f"{pairs} pair{'' if pairs == 1 else 's'} of episodes with the same task, initial state and seed."
@@ -137,7 +138,7 @@ def _pairing(comparison: Comparison, name: str, rows: pl.DataFrame) -> list[str]
         if table.height:
             names = [episode_name(row["task_id"], row["episode_index"]) for row in table.iter_rows(named=True)]
             text += f" Of {run}, {table.height} have no partner and are left out: {listing(names, 6)}."
-    return _wrapped(text, "")
+    return wrap(text)
 
 
 def _tasks_section(comparison: Comparison, name: str, layer: str) -> str:
@@ -158,7 +159,7 @@ def _tasks_section(comparison: Comparison, name: str, layer: str) -> str:
     ]
     texts = [row["instruction"] or "" for row in rows.iter_rows(named=True)]
     table = text_table(header, body, left=(0,), last="instruction", texts=texts, width=WIDTH)
-    return "\n".join([_title(f"PER TASK  {quantity}, {name} minus {comparison.names[0]}"), table])
+    return "\n".join([heading(f"PER TASK  {quantity}, {name} minus {comparison.names[0]}"), table])
 
 
 def _layers_section(comparison: Comparison) -> str:
@@ -184,20 +185,8 @@ def _layers_section(comparison: Comparison) -> str:
         else ""
     )
     title = f"PER LAYER  {comparison.quantities[0]}, run minus {comparison.names[0]}{more}"
-    return "\n".join([_title(title), text_table(header, body, left=(0,))])
+    return "\n".join([heading(title), text_table(header, body, left=(0,))])
 
 
 def _signed(value: float | None) -> str:
     return format_number(value) if value is None or value <= 0 else f"+{format_number(value)}"
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.1f}%"
-
-
-def _title(text: str) -> str:
-    return "\n".join([*textwrap.wrap(text, WIDTH), "-" * WIDTH])
-
-
-def _wrapped(text: str, indent: str) -> list[str]:
-    return textwrap.wrap(text, WIDTH, subsequent_indent=indent, break_on_hyphens=False)

@@ -8,7 +8,7 @@ import polars as pl
 
 from vla_attention.analyze.measures.frames import Tables
 from vla_attention.analyze.ratios.profile_panels import FRACTION_COLUMNS, draw_profile, shown_groups
-from vla_attention.analyze.show.numbers import plural
+from vla_attention.analyze.show.numbers import of_tasks
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import named, title
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
@@ -22,7 +22,7 @@ def plot_denoise_profile(denoise: Tables, grouping: Grouping, folder: Path) -> l
     """Draw from `denoise.denoise_tables`; returns the paths of png, pdf and csv."""
     table = denoise.cells
     figure = new_figure(max(6.6, 3.6 + 0.45 * table.height), 3.2 if grouping.ratio is None else 5.1)
-    note = f"Means over {plural(table['num_episodes'][0], 'episode')} of {plural(table['num_tasks'][0], 'task')} and over all layers."
+    note = f"Means over {of_tasks(table['num_episodes'][0], table['num_tasks'][0])} and over all layers."
     if table.height == 1:
         note += " One denoise step was recorded or selected: there is no course to see."
     if grouping.ratio is not None and table["nonfinite_layers"].sum():

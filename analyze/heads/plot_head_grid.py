@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.heads.head_measures import main_group
 from vla_attention.analyze.measures.frames import Tables
-from vla_attention.analyze.show.numbers import plural
+from vla_attention.analyze.show.numbers import interval_name, of_tasks, plural
 from vla_attention.analyze.show.plot_heat_map import draw_log2_map, label_axis, map_height
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, ratio_name, title
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 from vla_attention.schemas.groupings.grouping import Grouping
 
 STEM = "head_grid"
@@ -82,9 +83,9 @@ def _with_limits(heads: pl.DataFrame, log2: NDArray[np.float64]) -> NDArray[np.f
 
 def _note(heads: pl.DataFrame, log2: NDArray[np.float64], dots: bool) -> str:
     episodes, tasks = int(heads["num_episodes"][0]), int(heads["num_tasks"][0])
-    text = f"Means over {plural(episodes, 'episode')} of {plural(tasks, 'task')}."
+    text = f"Means over {of_tasks(episodes, tasks)}."
     if dots:
-        text += " Dot: the head's 95 % bootstrap interval holds the uniform value. By chance alone one head in twenty lacks its dot."
+        text += f" Dot: the head's {interval_name(DEFAULT_LEVEL, 'bootstrap')} holds the uniform value. By chance alone one head in twenty lacks its dot."
     infinite = int(np.isinf(log2).sum())
     if infinite:
         text += f" ∞ or 0: {plural(infinite, 'head')} with no mass on one side at any replan."

@@ -10,11 +10,11 @@ import polars as pl
 
 from vla_attention.analyze.heads.layer_time import layer_time_table
 from vla_attention.analyze.measures.frames import Tables
-from vla_attention.analyze.show.numbers import plural
+from vla_attention.analyze.show.numbers import interval_name, of_tasks
 from vla_attention.analyze.show.plot_heat_map import draw_log2_map, label_axis, map_height
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, ratio_name, title, wrapped
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_SEED
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL, DEFAULT_SEED
 from vla_attention.schemas.groupings.grouping import Grouping
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def plot_layer_time(replans: Tables, grouping: Grouping, folder: Path, seed: int
     layers, bins = table["layer"].unique(maintain_order=True).to_list(), table["bin"].n_unique()
     figure = new_figure(max(6.4, 3.6 * len(quantities) + 1.0), max(2.7, 1.6 + map_height(len(layers), bins)))
     episodes = replans.cells.select("suite", "task_id", "episode_index").unique()
-    note = f"Means over {plural(episodes.height, 'episode')} of {plural(episodes.select('suite', 'task_id').n_unique(), 'task')}."
+    note = f"Means over {of_tasks(episodes.height, episodes.select('suite', 'task_id').n_unique())}."
     shared = figure.subplots(1, len(quantities), squeeze=False, sharey=True)[0]
     undefined, dots = False, False
     for axes, quantity in zip(shared, quantities, strict=True):
@@ -64,7 +64,7 @@ def plot_layer_time(replans: Tables, grouping: Grouping, folder: Path, seed: int
         if axes is shared[0]:
             axes.set_ylabel("layer")
     if dots:
-        note += " Dot: the cell's 95 % bootstrap interval holds the uniform value."
+        note += f" Dot: the cell's {interval_name(DEFAULT_LEVEL, 'bootstrap')} holds the uniform value."
     if undefined and grouping.ratio is not None:
         note += " Grey: no finite logarithm (infinite, undefined or zero ratios take no part)."
     about = ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,10 +13,10 @@ from vla_attention.analyze.heads.row_metrics import episode_layer_means
 from vla_attention.analyze.measures.aggregate import overall_rows
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
 from vla_attention.analyze.measures.sinks import SinkRule, merged_sinks
-from vla_attention.analyze.show.headings import WIDTH
-from vla_attention.analyze.show.numbers import format_interval, format_number
+from vla_attention.analyze.show.headings import WIDTH, heading, interval_note, wrap
+from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent, format_percent_interval
 from vla_attention.analyze.show.text_table import text_table
-from vla_attention.analyze.statistics.bootstrap import NO_LIMITS, POSITIVE
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL, NO_LIMITS, POSITIVE
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
@@ -63,9 +62,9 @@ def _header(study: HeadStudy) -> str:
         f"Grouping '{question.grouping.name}'; {_measure_name(study.heads, question.grouping)}",
         *([chosen.note] if chosen.note else []),
         *question.notes,
-        "Intervals: 95 %, two-level bootstrap over tasks and episodes; - with fewer than two episodes",
+        interval_note(DEFAULT_LEVEL),
     ]
-    return "\n".join([*lines, *(part for line in told for part in textwrap.wrap(line, WIDTH))])
+    return "\n".join([*lines, *(part for line in told for part in wrap(line))])
 
 
 def _measure_name(heads: Tables, grouping: Grouping) -> str:
@@ -78,7 +77,7 @@ def _ranking(study: HeadStudy, top: int) -> str:
     grouping = study.question.grouping
     ranked = ranked_heads(study.heads, grouping)
     if ranked.is_empty():
-        return _title("HEADS") + "\nNo head has any mass on either side of the ratio."
+        return heading("HEADS") + "\nNo head has any mass on either side of the ratio."
     if grouping.ratio is None:
         most, least = f"MOST ON '{main_group(study.heads, grouping)}'", "LEAST"
     elif grouping.compares_modalities:
@@ -87,9 +86,9 @@ def _ranking(study: HeadStudy, top: int) -> str:
         most, least = "HEADS WITH THE HIGHEST RATIO", "HEADS WITH THE LOWEST RATIO"
     shown = min(top, ranked.height)
     first, last = ranked.head(shown), ranked.tail(min(shown, ranked.height - shown)).reverse()
-    lines = [_title(most), _head_rows(first, study)]
+    lines = [heading(most), _head_rows(first, study)]
     if last.height:
-        lines += ["", _title(least), _head_rows(last, study)]
+        lines += ["", heading(least), _head_rows(last, study)]
     note = (
         f"{ranked.height} heads. The ends of so many are extreme partly by chance: their intervals are those of heads chosen "
         "beforehand."
@@ -102,7 +101,7 @@ def _ranking(study: HeadStudy, top: int) -> str:
         left_out = int(study.heads.cells.unique(["block", "head"])["num_nonfinite"].sum())
         if left_out:
             note += f" {left_out} (head, replan) ratios are infinite, undefined or 0 and in no geometric mean."
-    return "\n".join([*lines, *textwrap.wrap(note, WIDTH)])
+    return "\n".join([*lines, *wrap(note)])
 
 
 def _head_rows(rows: pl.DataFrame, study: HeadStudy) -> str:
@@ -118,13 +117,13 @@ def _head_rows(rows: pl.DataFrame, study: HeadStudy) -> str:
                 _interval(row, "log2_ratio", power=True),
                 format_number(_power(row["log2_lift"])),
                 _interval(row, "log2_lift", power=True),
-                _percent(row["numerator_fraction"]),
-                _percent(row["denominator_fraction"]),
+                format_percent(row["numerator_fraction"]),
+                format_percent(row["denominator_fraction"]),
             ]
         else:
             own = of_group[row["layer"], row["head"], group]
             cells += [
-                _percent(own["fraction"]),
+                format_percent(own["fraction"]),
                 _percent_interval(own, "fraction"),
                 format_number(own["lift"]),
                 _interval(own, "lift"),
@@ -155,7 +154,7 @@ def _dispersion(study: HeadStudy) -> str:
             cells += [format_number(row[name]), _interval(row, name)]
         rows.append(cells)
     return "\n".join(
-        [_title(f"HOW MUCH HEADS DIFFER  spread of {what} over the heads of a layer"), text_table(header, rows)]
+        [heading(f"HOW MUCH HEADS DIFFER  spread of {what} over the heads of a layer"), text_table(header, rows)]
     )
 
 
@@ -163,7 +162,7 @@ def _layers(study: HeadStudy) -> str:
     grouping = study.question.grouping
     level = overall_rows(study.tasks).filter(pl.col("layer") != LAYERS_AVG)
     labels = [str(layer) for layer in level.cells["layer"]]
-    return "\n".join([_title("LAYERS  mean over heads"), _profile(level, "layer", "layer", labels, grouping)])
+    return "\n".join([heading("LAYERS  mean over heads"), _profile(level, "layer", "layer", labels, grouping)])
 
 
 def _profile(level: Tables, along: str, label: str, labels: Sequence[str], grouping: Grouping) -> str:
@@ -182,7 +181,7 @@ def _profile(level: Tables, along: str, label: str, labels: Sequence[str], group
             cells = [
                 cell
                 for own in (of_group[row[along], group] for group in groups)
-                for cell in (_percent(own["fraction"]), _percent_interval(own, "fraction"))
+                for cell in (format_percent(own["fraction"]), _percent_interval(own, "fraction"))
             ]
         table.append([name, *cells])
     if grouping.ratio is not None:
@@ -197,7 +196,8 @@ def _depth(study: HeadStudy) -> str:
     first, last, count = (table[name][0] for name in ("first_block", "last_block", "num_layers"))
     if count < 2:
         return (
-            _title("DEPTH") + f"\nA centre of gravity over layers needs two of them; this is about block {first} alone."
+            heading("DEPTH")
+            + f"\nA centre of gravity over layers needs two of them; this is about block {first} alone."
         )
     rows = [
         [
@@ -217,9 +217,9 @@ def _depth(study: HeadStudy) -> str:
     )
     return "\n".join(
         [
-            _title("DEPTH  centre of gravity over blocks"),
+            heading("DEPTH  centre of gravity over blocks"),
             text_table(["group", "of", "centre", "interval"], rows, left=(0, 1)),
-            *textwrap.wrap(note, WIDTH),
+            *wrap(note),
         ]
     )
 
@@ -231,7 +231,7 @@ def _denoise(study: HeadStudy) -> str:
     labels = [f"{step} ({time:.3g})" for step, time in rows.select("denoise_step", "denoise_time").iter_rows()]
     return "\n".join(
         [
-            _title("DENOISE STEPS  (and their times), mean over layers and heads"),
+            heading("DENOISE STEPS  (and their times), mean over layers and heads"),
             _profile(study.denoise, "denoise_step", "step", labels, study.question.grouping),
         ]
     )
@@ -252,7 +252,7 @@ def _rows_by_layer(study: HeadStudy) -> str:
             format_number(row["effective_keys"]),
             _interval(row, "effective_keys"),
         ]
-        cells += [_percent(row[f"top{k}_mass"]) for k in study.options.top]
+        cells += [format_percent(row[f"top{k}_mass"]) for k in study.options.top]
         cells += [format_number(of_group[row["layer"], name]["effective_keys"]) for name in groups]
         rows.append(cells)
     keys = [item.valid.sum(axis=1).mean() for item in study.question.selected]
@@ -261,9 +261,7 @@ def _rows_by_layer(study: HeadStudy) -> str:
         f"exp(entropy), the number of keys that sharing evenly would have it, of {format_number(sum(keys) / len(keys))}. top k: "
         "share of the k largest keys. in GROUP: effective keys of the row cut down to the group."
     )
-    return "\n".join(
-        [_title("ROWS  how spread out attention is"), text_table(header, rows), *textwrap.wrap(note, WIDTH)]
-    )
+    return "\n".join([heading("ROWS  how spread out attention is"), text_table(header, rows), *wrap(note)])
 
 
 def _sinks(study: HeadStudy) -> str:
@@ -271,7 +269,7 @@ def _sinks(study: HeadStudy) -> str:
     assert study.sinks is not None
     assert study.key_shares is not None
     rule = study.options.rule
-    return "\n".join([_title(f"SINKS  keys that take {rule}"), sinks_text(study.sinks, study.key_shares, rule)])
+    return "\n".join([heading(f"SINKS  keys that take {rule}"), sinks_text(study.sinks, study.key_shares, rule)])
 
 
 def sinks_text(sinks: pl.DataFrame, key_shares: pl.DataFrame, rule: SinkRule) -> str:
@@ -284,7 +282,7 @@ def sinks_text(sinks: pl.DataFrame, key_shares: pl.DataFrame, rule: SinkRule) ->
             f"{nearest['share_of_rows']:.0%} of the rows of task {nearest['task_id']}, and on average "
             f"{format_number(nearest['times_uniform'])} x its uniform share. Other rules: --sink-factor, --sink-share."
         )
-        return "\n".join(textwrap.wrap(text, WIDTH))
+        return "\n".join(wrap(text))
     merged = merged_sinks(sinks)
     header = ["key", "role", "tasks", "rows", "mass", "x uniform"]
     rows = [
@@ -292,8 +290,8 @@ def sinks_text(sinks: pl.DataFrame, key_shares: pl.DataFrame, rule: SinkRule) ->
             str(row["key"]),
             row["role"],
             f"{row['num_tasks']} of {num_tasks}",
-            _percent(row["share_of_rows"]),
-            _percent(row["mean_mass"]),
+            format_percent(row["share_of_rows"]),
+            format_percent(row["mean_mass"]),
             format_number(row["times_uniform"]),
         ]
         for row in merged.head(_MOST_SINKS).iter_rows(named=True)
@@ -307,7 +305,7 @@ def sinks_text(sinks: pl.DataFrame, key_shares: pl.DataFrame, rule: SinkRule) ->
         "mean share of the valid keys' mass. Numbers without these keys: vla-analyze ratios --without-sinks, with the same "
         "--sink-factor and --sink-share."
     )
-    return "\n".join([*lines, *textwrap.wrap(note, WIDTH)])
+    return "\n".join([*lines, *wrap(note)])
 
 
 def _power(value: float | None) -> float | None:
@@ -319,14 +317,5 @@ def _interval(row: dict[str, Any], name: str, power: bool = False) -> str:
     return format_interval(_power(low), _power(high)) if power else format_interval(low, high)
 
 
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.1f}%"
-
-
 def _percent_interval(row: dict[str, Any], name: str) -> str:
-    low, high = row[f"{name}_low"], row[f"{name}_high"]
-    return "-" if low is None or high is None else f"[{100 * low:.1f}, {100 * high:.1f}]%"
-
-
-def _title(text: str) -> str:
-    return "\n".join([*textwrap.wrap(text, WIDTH), "-" * WIDTH])
+    return format_percent_interval(row[f"{name}_low"], row[f"{name}_high"])

@@ -133,15 +133,10 @@ def _wrapped(text: str) -> str:
 
 
 def _write_summary(path: Path, text: str) -> list[Path]:
-    from vla_attention.analyze.show.output_files import write_text
-    from vla_attention.schemas.errors import BadArgument
+    from vla_attention.analyze.show.output_files import write_text, writing
 
-    try:
+    with writing("the summary", path):
         write_text(path, text)
-    except OSError as error:
-        raise BadArgument(
-            f"Cannot write the summary to {path}: {error.strerror or error}; give another --output."
-        ) from None
     return [path]
 
 
@@ -149,7 +144,7 @@ def _draw(
     arguments: argparse.Namespace, files: Sequence[ResultsFile], labels: Sequence[str], tables: Sequence[ResultsTables]
 ) -> list[Path]:
     """The pictures that were asked for; with several files, each file's label stands behind the picture's name."""
-    from vla_attention.schemas.errors import BadArgument
+    from vla_attention.analyze.show.output_files import writing
 
     wanted = [
         name
@@ -161,7 +156,7 @@ def _draw(
         return []
     folder: Path = arguments.output_dir
     written: list[Path] = []
-    try:
+    with writing("pictures", folder, "another --output-dir"):
         folder.mkdir(parents=True, exist_ok=True)
         for label, table in zip(labels, tables, strict=True):
             written += _draw_file(wanted, folder, label, table, several=len(files) > 1)
@@ -169,10 +164,6 @@ def _draw(
             from vla_attention.analyze.published.plot_results_comparison import plot_results_comparison
 
             written += plot_results_comparison(tables, labels, folder)
-    except OSError as error:
-        raise BadArgument(
-            f"Cannot write pictures to {folder}: {error.strerror or error}; give another --output-dir."
-        ) from None
     return written
 
 

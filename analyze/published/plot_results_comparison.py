@@ -13,8 +13,8 @@ from vla_attention.analyze.measures.aggregate import overall_layer, overall_rows
 from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.published.results_tables import ResultsTables
 from vla_attention.analyze.ratios.profile_panels import FRACTION_COLUMNS
-from vla_attention.analyze.show.numbers import plural
-from vla_attention.analyze.show.plot_axes import ratio_axis
+from vla_attention.analyze.show.numbers import interval_name, plural
+from vla_attention.analyze.show.plot_axes import note_at_row, ratio_axis, share_ticks
 from vla_attention.analyze.show.plot_colours import FIXED_COLORS, NOTE_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import title, wrapped
@@ -64,7 +64,7 @@ def plot_results_comparison(tables: Sequence[ResultsTables], labels: Sequence[st
     kinds = data["kind"].unique(maintain_order=True).to_list()
     figure = new_figure(10, 1.9 + (0.42 if few else 0.22) * (data.height + 0.5) + 0.16 * len(kinds))
     note = (
-        f"n counts episodes. Means over episodes with {DEFAULT_LEVEL:.0%} intervals (two-level bootstrap over tasks and episodes). "
+        f"n counts episodes. Means over episodes with {interval_name(DEFAULT_LEVEL)}s (two-level bootstrap over tasks and episodes). "
         "No uniform baseline: results files do not hold the numbers of keys."
     )
     if len(kinds) > 1:
@@ -138,7 +138,7 @@ def _ratios(axes: Axes, data: pl.DataFrame, tables: Sequence[ResultsTables], kin
         axes.scatter(values, position + jitter, s=10 if few else 6, color=color, alpha=0.35, linewidths=0, zorder=2)
         if row["ratio_mean"] is None or row["ratio_mean"] <= 0:
             text = "no finite ratio" if row["ratio_mean"] is None else "mean ratio 0"
-            axes.text(0.01, position, text, transform=axes.get_yaxis_transform(), va="center", size=7, color=NOTE_COLOR)
+            note_at_row(axes, position, text, x=0.01)
         else:
             if row["ratio_mean_low"] is not None:
                 ends = [max(row["ratio_mean_low"], low), row["ratio_mean_high"]]
@@ -149,7 +149,7 @@ def _ratios(axes: Axes, data: pl.DataFrame, tables: Sequence[ResultsTables], kin
         text = f"n = {row['num_episodes']}"
         if row["episodes_without_ratio"]:
             text += f" ({row['episodes_without_ratio']} without)"
-        axes.text(1.01, position, text, transform=axes.get_yaxis_transform(), va="center", size=7, color=NOTE_COLOR)
+        note_at_row(axes, position, text)
     for i, kind in enumerate(kinds):
         color, marker = _KINDS[i % len(_KINDS)]
         axes.plot([], [], marker, color=color, markersize=6, label=wrapped(kind, 60, 2))
@@ -174,7 +174,7 @@ def _stacked_fractions(axes: Axes, files: Sequence[str], fractions: pl.DataFrame
                 )
         start += values
     axes.set_xlim(0, 1)
-    axes.set_xticks(np.linspace(0, 1, 5), [f"{value:.0%}" for value in np.linspace(0, 1, 5)])
+    share_ticks(axes.xaxis, 5)
     axes.set_xlabel("mean fraction")
     axes.legend(
         loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, borderaxespad=0.2, handlelength=1.0, columnspacing=1.0

@@ -19,9 +19,9 @@ from vla_attention.analyze.published.results_tables import (
     layers_of,
     spread_of,
 )
-from vla_attention.analyze.ratios.summary import WIDTH
 from vla_attention.analyze.ratios.verdict import LINGUISTIC_BELOW, VISUAL_ABOVE, verdict
-from vla_attention.analyze.show.numbers import format_interval, format_number
+from vla_attention.analyze.show.headings import WIDTH
+from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent, interval_name, plural
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 from vla_attention.schemas.errors import listing
@@ -52,7 +52,7 @@ def summary_of_files(title: str, files: Sequence[ResultsFile], tables: ResultsTa
     lines += _dataset(episodes)
     lines += [
         "",
-        f"Visual/Linguistic Ratio ({_named(layer)}, {_count(spread.num_replans, 'replan')}):",
+        f"Visual/Linguistic Ratio ({_named(layer)}, {plural(spread.num_replans, 'replan')}):",
         *_ratio(spread, layer),
     ]
     lines += _over_episodes(tables, layer)
@@ -98,7 +98,7 @@ def _dataset(episodes: pl.DataFrame) -> list[str]:
         "Dataset:",
         f"  Episodes: {episodes.height}",
         f"  Tasks: {episodes.select('file', 'task_id').n_unique()}",
-        f"  Success Rate: {_percent(solved / episodes.height)} ({solved} of {episodes.height})",
+        f"  Success Rate: {format_percent(solved / episodes.height)} ({solved} of {episodes.height})",
     ]
     if without.height:
         named = [f"task {row['task_id']} episode {row['episode_index']}" for row in without.iter_rows(named=True)]
@@ -111,7 +111,7 @@ def _ratio(spread: Spread, layer: str) -> list[str]:
     parts = {"infinite (no linguistic mass)": spread.num_infinite, f"undefined ({why})": spread.num_undefined}
     left_out = ", ".join(f"{count} {what}" for what, count in parts.items() if count)
     if not spread.num_finite:
-        return [f"  None of the {_count(spread.num_replans, 'ratio')} is finite: {left_out}."]
+        return [f"  None of the {plural(spread.num_replans, 'ratio')} is finite: {left_out}."]
     lines = [
         f"  Mean:   {spread.mean:.3f} ± {spread.std:.3f}",
         f"  Median: {spread.median:.3f}",
@@ -134,7 +134,7 @@ def _over_episodes(tables: ResultsTables, layer: str) -> list[str]:
     if row["ratio_mean_low"] is None:
         return [f"{text}; no interval from a single episode"]
     interval = format_interval(row["ratio_mean_low"], row["ratio_mean_high"])
-    return [f"{text}, {DEFAULT_LEVEL:.0%} interval {interval} (two-level bootstrap: tasks, episodes)"]
+    return [f"{text}, {interval_name(DEFAULT_LEVEL)} {interval} (two-level bootstrap: tasks, episodes)"]
 
 
 def _fractions(rows: pl.DataFrame) -> list[str]:
@@ -143,7 +143,7 @@ def _fractions(rows: pl.DataFrame) -> list[str]:
         if f"{name}_fraction" in rows.columns:
             known = rows[f"{name}_fraction"].cast(pl.Float64).drop_nulls()
             text = (
-                f"{_percent(_float(known.mean()))} ± {_percent(_float(known.std(ddof=0)))}"
+                f"{format_percent(_float(known.mean()))} ± {format_percent(_float(known.std(ddof=0)))}"
                 if len(known)
                 else "undefined"
             )
@@ -165,7 +165,7 @@ def _per_layer(files: Sequence[ResultsFile]) -> list[str]:
                 str(spread.num_infinite),
                 str(spread.num_undefined),
                 *(
-                    _percent(_float(rows[f"{name}_fraction"].cast(pl.Float64).mean()))
+                    format_percent(_float(rows[f"{name}_fraction"].cast(pl.Float64).mean()))
                     for name in ("visual", "linguistic")
                 ),
             ]
@@ -181,7 +181,7 @@ def _per_task(episodes: pl.DataFrame, files: Sequence[ResultsFile], layer: str) 
         own = rows.filter((pl.col("file") == number) & pl.col("episode").is_in(part["episode"].implode()))
         spread = spread_of(own["ratio"])
         name = str(task) if len(files) == 1 else f"{files[int(str(number))].suite} {task}"
-        success = _percent(_float(part["success"].cast(pl.Float64).mean()))
+        success = format_percent(_float(part["success"].cast(pl.Float64).mean()))
         body.append([name, str(part.height), str(spread.num_replans), success, _mean_std(spread)])
         texts.append(str(part["instruction"][0]))
     header = ["task", "n", "replans", "success", "mean ± std"]
@@ -199,7 +199,7 @@ def _notes(file: ResultsFile, layer: str, named: bool) -> list[str]:
         - file.steps.filter(layer=chosen_layer(file))["episode"].n_unique()
     )
     if lacking:
-        notes.append(f"{of}{_count(lacking, 'episode')} with steps, but without any in {_named(chosen_layer(file))}.")
+        notes.append(f"{of}{plural(lacking, 'episode')} with steps, but without any in {_named(chosen_layer(file))}.")
     if file.zeros:
         notes.append(
             f"{of}{file.zeros} ratios of 0 stand for 'no ratio' (nothing on either side, or no layer with a finite ratio) and are "
@@ -208,13 +208,13 @@ def _notes(file: ResultsFile, layer: str, named: bool) -> list[str]:
     found = disagreements(file)
     for reason in sorted({item.reason for item in found if item.reason}):
         count = sum(item.reason == reason for item in found)
-        notes.append(f"{of}Differs from the file's own summary in {_count(count, 'number')}: {reason}.")
+        notes.append(f"{of}Differs from the file's own summary in {plural(count, 'number')}: {reason}.")
     unexplained = [item for item in found if not item.reason]
     if unexplained:
         first = unexplained[0]
         episode = file.episodes.row(first.claim.episode, named=True)
         notes.append(
-            f"{of}The file's own summary disagrees with its steps in {_count(len(unexplained), 'number')}; the first: task "
+            f"{of}The file's own summary disagrees with its steps in {plural(len(unexplained), 'number')}; the first: task "
             f"{episode['task_id']} episode {episode['episode_index']}, {_named(first.claim.layer)}, {first.claim.measure} "
             f"{first.claim.statistic}: summary {format_number(first.claim.value)}, from the steps {format_number(first.computed)}. "
             "Everything here is computed from the steps."
@@ -230,14 +230,6 @@ def _mean_std(spread: Spread) -> str:
 
 def _named(layer: str) -> str:
     return layer if layer == LAYERS_AVG else f"layer {layer}"
-
-
-def _count(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.1f}%"
 
 
 def _float(value: object) -> float | None:

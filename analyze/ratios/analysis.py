@@ -27,9 +27,9 @@ from vla_attention.analyze.published.frame_proxy import frame_proxy
 from vla_attention.analyze.published.results_file import write_results_of_suites
 from vla_attention.analyze.ratios.contribution_text import contributions_section, group_contributions_section
 from vla_attention.analyze.ratios.summary import AnalysedRun, summary_text, write_summary
-from vla_attention.analyze.show.output_files import write_parquet
+from vla_attention.analyze.show.output_files import write_parquet, writing
 from vla_attention.analyze.stores.selection import Selection, heads_text
-from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 from vla_attention.schemas.stores.store_format import RootAttributes
@@ -148,16 +148,12 @@ def write_tables(analysis: Analysis, folder: Path) -> WrittenFiles:
         if "contribution_ratio" in analysis.group_contributions.cells.columns:
             further["group_contribution_ratios"] = analysis.group_contributions.cells
     written.files += write_parquet(folder, **further)
-    try:
+    with writing("results", folder):
         if analysis.grouping.ratio is not None:
             question = analysis.question
             proxy = frame_proxy(question.stores[0].attributes, question.selected[0].tokens.layout, analysis.grouping)
             written.files += write_results_of_suites(folder, analysis.replans, analysis.grouping, proxy)
         write_summary(folder / "summary.txt", analysis.summary)
-    except OSError as error:
-        raise BadArgument(
-            f"Cannot write results to {folder}: {error.strerror or error}; give another --output."
-        ) from None
     written.files.append(folder / "summary.txt")
     return written
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import textwrap
-
 import polars as pl
 
 from vla_attention.analyze.measures.contributions import contribution_rows
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables
 from vla_attention.analyze.measures.group_contributions import norms_by_layer, ratios_by_layer
-from vla_attention.analyze.ratios.summary import WIDTH
-from vla_attention.analyze.show.numbers import format_interval, format_number
+from vla_attention.analyze.show.headings import heading, wrap
+from vla_attention.analyze.show.numbers import format_interval, format_number, interval_name
 from vla_attention.analyze.show.text_table import text_table
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
 
@@ -31,8 +30,8 @@ def contributions_section(table: pl.DataFrame, seed: int) -> str:
         "Value-weighted, through output projection and gate; root mean square over action queries, mean over replans and denoise "
         "steps. ratio: mean over episodes of the mean ratio of norms. Norms of different sites may be divided; masses may not."
     )
-    header = ["layer", "|visual|", "|linguistic|", "ratio", "95% interval"]
-    return "\n".join([title, "-" * WIDTH, text_table(header, rows, left=(0,)), "", textwrap.fill(note, WIDTH), ""])
+    header = ["layer", "|visual|", "|linguistic|", "ratio", interval_name(DEFAULT_LEVEL)]
+    return "\n".join([heading(title), text_table(header, rows, left=(0,)), "", *wrap(note), ""])
 
 
 def group_contributions_section(tables: Tables | None, grouping: Grouping, site: str, seed: int) -> str:
@@ -47,7 +46,7 @@ def group_contributions_section(tables: Tables | None, grouping: Grouping, site:
         else ""
     )
     if tables is None:
-        return "\n".join([title, "-" * WIDTH, *textwrap.wrap(note, WIDTH), ""])
+        return "\n".join([heading(title), *wrap(note), ""])
     adding = tables.groups_with("norm")
     shown = [name for name in measured if name in adding]
     nothing = [name for name in measured if name not in shown]
@@ -65,6 +64,6 @@ def group_contributions_section(tables: Tables | None, grouping: Grouping, site:
             bounds = format_interval(row["contribution_ratio_low"], row["contribution_ratio_high"])
             cells += [format_number(row["contribution_ratio"]), bounds]
         rows.append(cells)
-    header = ["layer", *(f"|{name}|" for name in shown), *(["ratio", "95% interval"] if ratios else [])]
-    lines = [title, "-" * WIDTH, text_table(header, rows, left=(0,))]
-    return "\n".join([*lines, *(["", *textwrap.wrap(note, WIDTH)] if note else []), ""])
+    header = ["layer", *(f"|{name}|" for name in shown), *(["ratio", interval_name(DEFAULT_LEVEL)] if ratios else [])]
+    lines = [heading(title), text_table(header, rows, left=(0,))]
+    return "\n".join([*lines, *(["", *wrap(note)] if note else []), ""])

@@ -11,7 +11,8 @@ import polars as pl
 from vla_attention.analyze.measures.aggregate import layer_order, overall_layer, overall_rows
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables
 from vla_attention.analyze.ratios.profile_panels import FRACTION_COLUMNS
-from vla_attention.analyze.show.numbers import plural
+from vla_attention.analyze.show.numbers import of_tasks
+from vla_attention.analyze.show.plot_axes import legend_beside, share_ticks
 from vla_attention.analyze.show.plot_colours import group_styles
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import named, title, wrapped
@@ -47,7 +48,7 @@ def plot_attention_fractions(
         positions[-1] += 0.6  # apart from the single layers
     figure = new_figure(max(6.2, 3.4 + 0.42 * len(layers)), 4.6)
     overall = by_layer[overall_layer(rows)]
-    counts = f"n = {plural(overall['num_episodes'], 'episode')} of {plural(overall['num_tasks'], 'task')}, means over episodes."
+    counts = f"n = {of_tasks(overall['num_episodes'], overall['num_tasks'])}, means over episodes."
     if grouping.overlap:
         counts += " Groups overlap: a fraction is the share in the sum of all groups' masses."
     title(figure, f"Attention fractions, {about or named(grouping)}", f"{counts} {note}")
@@ -77,12 +78,12 @@ def plot_attention_fractions(
     axes.set_xticks(positions, layers)
     axes.set_xlim(positions[0] - (0.6 if len(layers) > 1 else 1.2), positions[-1] + (0.6 if len(layers) > 1 else 1.2))
     axes.set_ylim(0, 1)
-    axes.set_yticks(np.linspace(0, 1, 6), [f"{value:.0%}" for value in np.linspace(0, 1, 6)])
+    share_ticks(axes.yaxis, 6)
     axes.set_xlabel("layer")
     axes.set_ylabel("fraction of the groups' summed mass")
     handles, labels = axes.get_legend_handles_labels()
     # In the order of the stack, top to bottom.
-    axes.legend(handles[::-1], labels[::-1], loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    legend_beside(axes, handles=handles[::-1], labels=labels[::-1])
     drawn = rows.filter(pl.col("layer").is_in(layers)).select("layer", "block", "num_episodes")
     data = drawn.join(level.groups.select("layer", "group", *FRACTION_COLUMNS), on="layer", maintain_order="left_right")
     return save_figure(figure, folder, stem, data)

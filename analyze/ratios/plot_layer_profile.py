@@ -9,7 +9,7 @@ import polars as pl
 from vla_attention.analyze.measures.aggregate import layer_order, overall_rows
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables
 from vla_attention.analyze.ratios.profile_panels import FRACTION_COLUMNS, draw_profile, shown_groups
-from vla_attention.analyze.show.numbers import plural
+from vla_attention.analyze.show.numbers import of_tasks
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import named, title
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
@@ -24,7 +24,7 @@ def plot_layer_profile(tasks: Tables, grouping: Grouping, folder: Path) -> list[
     level = overall_rows(tasks).filter(pl.col("layer") != LAYERS_AVG)
     rows, layers = level.cells, layer_order(level.cells)
     figure = new_figure(max(6.6, 3.2 + 0.3 * min(len(layers), 28)), 3.1 if grouping.ratio is None else 5.0)
-    note = f"Means over {plural(rows['num_episodes'][0], 'episode')} of {plural(rows['num_tasks'][0], 'task')}."
+    note = f"Means over {of_tasks(rows['num_episodes'][0], rows['num_tasks'][0])}."
     if grouping.ratio is not None and rows["num_nonfinite"].sum():
         note += f" {rows['num_nonfinite'].sum()} of {rows['num_replans'].sum()} ratios are not finite and in no mean."
     title(figure, f"Layers, {named(grouping)}", note)

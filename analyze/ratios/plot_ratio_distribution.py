@@ -11,8 +11,15 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.aggregate import layer_order, overall_layer
 from vla_attention.analyze.measures.frames import LAYERS_AVG
-from vla_attention.analyze.show.numbers import plural
-from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, ratio_axis, whole_numbers
+from vla_attention.analyze.show.numbers import of_tasks, plural
+from vla_attention.analyze.show.plot_axes import (
+    BASELINE_LABEL,
+    legend_beside,
+    note_at_row,
+    ratio_axis,
+    uniform_line,
+    whole_numbers,
+)
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, NOTE_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, ratio_name, title
@@ -73,7 +80,7 @@ def plot_ratio_distribution(
     for axes in (top, bottom):
         _baseline(axes, uniform)
         axes.grid(axis="x")
-    top.legend(handles=_legend(uniform), loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    legend_beside(top, handles=_legend(uniform))
     bottom.set_xlabel(f"ratio of masses, {ratio_name(grouping.ratio)} (logarithmic)")
     return save_figure(figure, folder, stem, data)
 
@@ -104,15 +111,7 @@ def _boxes(axes: Axes, shown: pl.DataFrame, layers: list[str]) -> None:
     for position, layer in zip(positions, layers, strict=True):
         rows = shown.filter(pl.col("layer") == layer)
         if rows.is_empty():
-            axes.text(
-                0.01,
-                position,
-                "no finite ratio",
-                transform=axes.get_yaxis_transform(),
-                va="center",
-                size=7,
-                color=NOTE_COLOR,
-            )
+            note_at_row(axes, position, "no finite ratio", x=0.01)
             continue
         # Percentiles throughout, not multiples of the interquartile range: they mean the same on a logarithmic axis.
         least, low, middle, high, most = np.quantile(rows["ratio"].to_numpy(), [0.05, 0.25, 0.5, 0.75, 0.95])
@@ -134,7 +133,7 @@ def _baseline(axes: Axes, uniform: NDArray[np.float64]) -> None:
         return
     if _differs(uniform):
         axes.axvspan(float(uniform.min()), float(uniform.max()), color=_BASELINE_RANGE_COLOR, linewidth=0, zorder=0)
-    axes.axvline(float(np.median(uniform)), color=BASELINE_COLOR, linestyle="--", linewidth=1.2)
+    uniform_line(axes, float(np.median(uniform)), along="x", linewidth=1.2)
 
 
 def _differs(uniform: NDArray[np.float64]) -> bool:
@@ -168,7 +167,7 @@ def _counts(overall: pl.DataFrame, rows: pl.DataFrame, chosen: str) -> str:
     left_out = overall.height - int(overall["ratio"].is_finite().fill_null(False).sum())
     zeros = int((overall["ratio"] == 0).fill_null(False).sum())
     name = chosen if chosen == LAYERS_AVG else f"layer {chosen}"
-    text = f"n = {plural(episodes, 'episode')} of {plural(tasks, 'task')}, {plural(overall.height, 'replan')}."
+    text = f"n = {of_tasks(episodes, tasks)}, {plural(overall.height, 'replan')}."
     if left_out:
         text += f" {left_out} of {overall.height} ratios of {name} are not finite and not drawn."
     if zeros:

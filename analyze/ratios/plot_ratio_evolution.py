@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
 from vla_attention.analyze.show.numbers import format_number, plural
-from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, ratio_axis, whole_numbers
+from vla_attention.analyze.show.plot_axes import (
+    BASELINE_LABEL,
+    legend_above,
+    ratio_axis,
+    share_ticks,
+    uniform_line,
+    whole_numbers,
+)
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, NOTE_COLOR, group_styles
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, ratio_name, title, wrapped
@@ -125,7 +132,7 @@ def _ratio_panel(axes: Axes, episode: pl.DataFrame, steps: NDArray[np.int64], gr
     if np.isfinite(uniform).any():
         # One point is no line: it is drawn across the panel.
         if len(steps) == 1:
-            axes.axhline(uniform[0], linestyle="--", color=BASELINE_COLOR, linewidth=1.2, label=BASELINE_LABEL)
+            uniform_line(axes, uniform[0], linewidth=1.2, label=BASELINE_LABEL)
         else:
             axes.plot(steps, uniform, "--", color=BASELINE_COLOR, linewidth=1.2, label=BASELINE_LABEL)
     if not drawable.all():
@@ -136,7 +143,7 @@ def _ratio_panel(axes: Axes, episode: pl.DataFrame, steps: NDArray[np.int64], gr
         )  # fmt: skip
     axes.grid(axis="y")
     axes.set_ylabel(f"{ratio_name(grouping.ratio)} (log axis)")
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.1)
+    legend_above(axes, 3)
 
 
 def _mass_panel(axes: Axes, groups: Groups, steps: NDArray[np.int64], drawn: Sequence[str], styles: Styles) -> None:
@@ -172,7 +179,7 @@ def _fraction_panel(axes: Axes, groups: Groups, steps: NDArray[np.int64], drawn:
             axes.fill_between(steps, bottom, bottom + share, **style)
         bottom = bottom + share
     axes.set_ylim(0, 1)
-    axes.set_yticks(np.linspace(0, 1, 6), [f"{value:.0%}" for value in np.linspace(0, 1, 6)])
+    share_ticks(axes.yaxis, 6)
     axes.set_ylabel("fraction of the groups' summed mass")
 
 

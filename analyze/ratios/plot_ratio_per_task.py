@@ -10,9 +10,9 @@ import polars as pl
 
 from vla_attention.analyze.measures.aggregate import overall_layer
 from vla_attention.analyze.measures.frames import LAYERS_AVG
-from vla_attention.analyze.show.numbers import plural
-from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, ratio_axis
-from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, NOTE_COLOR
+from vla_attention.analyze.show.numbers import interval_name, of_tasks
+from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, legend_above, note_at_row, ratio_axis
+from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, DOT_COLOR, NOTE_COLOR, STRIPE_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, ratio_name, title, wrapped
 from vla_attention.schemas.groupings.grouping import Grouping
@@ -100,14 +100,14 @@ def _draw_rows(axes: Axes, shown: pl.DataFrame, dots: pl.DataFrame, few: bool) -
     for position, row in enumerate(shown.iter_rows(named=True)):
         total = row["scope"] != "task"
         if total:
-            axes.axhspan(position - 0.5, position + 0.5, color="#F0F0F0", linewidth=0, zorder=0)
+            axes.axhspan(position - 0.5, position + 0.5, color=STRIPE_COLOR, linewidth=0, zorder=0)
         else:
             own = dots.filter((pl.col("suite") == row["suite"]) & (pl.col("task_id") == row["task_id"]))
             values = own["ratio_mean"].drop_nulls().to_numpy()
             values = values[values > 0]
             jitter = generator.uniform(-0.22, 0.22, len(values)) if len(values) > 1 else np.zeros(len(values))
             axes.scatter(
-                values, position + jitter, s=14 if few else 8, color="#56B4E9", alpha=0.8, linewidths=0, zorder=2
+                values, position + jitter, s=14 if few else 8, color=DOT_COLOR, alpha=0.8, linewidths=0, zorder=2
             )
         mean, low, high = row["ratio_mean"], row["ratio_mean_low"], row["ratio_mean_high"]
         if mean is not None and mean > 0:
@@ -138,7 +138,7 @@ def _draw_rows(axes: Axes, shown: pl.DataFrame, dots: pl.DataFrame, few: bool) -
             )
         left_out = f" ({row['episodes_without_ratio']} without)" if row["episodes_without_ratio"] else ""
         text = f"n = {row['num_episodes']}{left_out}"
-        axes.text(1.01, position, text, transform=axes.get_yaxis_transform(), va="center", size=7, color=NOTE_COLOR)
+        note_at_row(axes, position, text)
 
 
 def _label(row: dict[str, Any], several: bool, few: bool) -> str:
@@ -153,15 +153,15 @@ def _label(row: dict[str, Any], several: bool, few: bool) -> str:
 def _legend(axes: Axes, level: float, with_interval: bool, with_baseline: bool) -> None:
     axes.plot([], [], "o", color=DATA_COLOR, markersize=6, label="mean over episodes")
     if with_interval:
-        axes.plot([], [], color=DATA_COLOR, linewidth=2, label=f"{level:.0%} bootstrap interval")
-    axes.scatter([], [], s=14, color="#56B4E9", linewidths=0, label="single episode")
+        axes.plot([], [], color=DATA_COLOR, linewidth=2, label=interval_name(level, "bootstrap"))
+    axes.scatter([], [], s=14, color=DOT_COLOR, linewidths=0, label="single episode")
     if with_baseline:
         axes.plot([], [], "--", color=BASELINE_COLOR, linewidth=1.2, label=BASELINE_LABEL)
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderaxespad=0.1, handlelength=1.5)
+    legend_above(axes, 4, handlelength=1.5)
 
 
 def _counts(rows: pl.DataFrame, dots: pl.DataFrame) -> str:
-    text = f"{plural(dots.height, 'episode')} of {plural(rows.height, 'task')}; n counts episodes."
+    text = f"{of_tasks(dots.height, rows.height)}; n counts episodes."
     left_out = int(dots["num_nonfinite"].sum())
     if left_out:
         text += f" {left_out} of {int(dots['num_replans'].sum())} ratios are not finite and not in any mean."

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,13 +12,13 @@ import polars as pl
 from vla_attention.analyze.measures.aggregate import layer_order, overall_layer, overall_rows
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables
 from vla_attention.analyze.ratios.verdict import LINGUISTIC_BELOW, VISUAL_ABOVE, verdict
-from vla_attention.analyze.show.numbers import format_interval, format_number
+from vla_attention.analyze.show.headings import WIDTH, heading, title, untrained_warning, wrap
+from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent, interval_name
 from vla_attention.analyze.show.output_files import write_text
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
 
-WIDTH = 100
 #: Below this, intervals of single tasks are so wide that a word on it is due.
 FEW_EPISODES = 5
 
@@ -76,20 +74,16 @@ def _header(run: AnalysedRun, grouping: Grouping, episodes: Tables) -> str:
     layers = [layer for layer in layer_order(episodes.cells) if layer != LAYERS_AVG]
     blocks = dict(episodes.cells.select("layer", "block").unique().iter_rows())
     translated = [f"{layer} = block {blocks[layer]}" for layer in layers if str(blocks[layer]) != layer]
-    lines = ["ATTENTION SUMMARY", "=" * WIDTH]
+    lines = title("ATTENTION SUMMARY")
     if run.untrained:
-        warning = (
-            "WARNING: the policy has untrained (random) weights. These numbers show that the pipeline works; they say "
-            "nothing about any policy."
-        )
-        lines += ["!" * WIDTH, *textwrap.wrap(warning, WIDTH), "!" * WIDTH]
+        lines += ["!" * WIDTH, *wrap(untrained_warning()), "!" * WIDTH]
     lines += _labelled("store", ", ".join(run.stores))
     lines += _labelled("policy", run.policy + (" (UNTRAINED WEIGHTS)" if run.untrained else ""))
     lines += _labelled("suite", ", ".join(sorted(overall["suite"].unique())))
     lines += _labelled(
         "episodes",
         f"{overall.height} of {num_tasks} task{'' if num_tasks == 1 else 's'}, {successes} successful "
-        f"({_percent(successes / overall.height)}); {int(overall['num_replans'].sum())} replans",
+        f"({format_percent(successes / overall.height)}); {int(overall['num_replans'].sum())} replans",
     )
     lines += _labelled("layers", listing(layers, 40) + (f" ({', '.join(translated)})" if translated else ""))
     lines += _labelled("averaged over", f"denoise steps {listing(run.denoise_steps, 40)}; {run.heads}")
@@ -97,7 +91,7 @@ def _header(run: AnalysedRun, grouping: Grouping, episodes: Tables) -> str:
     having = of_layer.groups_with_keys()
     for name, selectors in grouping.groups.items():
         absent = "" if name in having else "   (no keys here)"
-        lines += textwrap.wrap(f"{name} = {' | '.join(selectors)}{absent}", WIDTH, **_indents(17, 21))
+        lines += wrap(f"{name} = {' | '.join(selectors)}{absent}", first=" " * 17, rest=" " * 21)
     if grouping.ratio:
         lines += _labelled("ratio", _ratio_definition(grouping))
     for note in run.notes:
@@ -108,7 +102,7 @@ def _header(run: AnalysedRun, grouping: Grouping, episodes: Tables) -> str:
 def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: Tables) -> str:
     level = overall_rows(tasks)
     rows = level.cells
-    header = ["layer", "mean ± std", "median", "of means", "geom.", f"{run.level:.0%} interval"]
+    header = ["layer", "mean ± std", "median", "of means", "geom.", interval_name(run.level)]
     header += ["uniform", "lift"] + ["verdict"] * grouping.compares_modalities
     body = [
         [
@@ -130,11 +124,11 @@ def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: Tables) -> str:
     )
     return "\n".join(
         [
-            _title(f"RATIO  {_ratio_definition(grouping)}"),
+            heading(f"RATIO  {_ratio_definition(grouping)}"),
             text_table(header, body, left=(0, 8) if grouping.compares_modalities else (0,)),
             "",
-            *textwrap.wrap(legend, WIDTH),
-            *textwrap.wrap(_baseline_sentence(grouping, overall["uniform_ratio"], level), WIDTH),
+            *wrap(legend),
+            *wrap(_baseline_sentence(grouping, overall["uniform_ratio"], level)),
         ]
     )
 
@@ -189,7 +183,7 @@ def _nonfinite_section(rows: pl.DataFrame) -> str:
         "Infinite (no denominator mass) or undefined (no mass on either side). Left out of mean, median and geometric "
         "mean; the ratio of means and the fractions include these replans."
     )
-    return "\n".join([_title("RATIOS THAT ARE NOT FINITE"), *textwrap.wrap(explanation, WIDTH), *lines])
+    return "\n".join([heading("RATIOS THAT ARE NOT FINITE"), *wrap(explanation), *lines])
 
 
 def _groups_section(grouping: Grouping, tasks: Tables, kind: str) -> str:
@@ -198,7 +192,7 @@ def _groups_section(grouping: Grouping, tasks: Tables, kind: str) -> str:
     groups = level.groups_with_keys()
     names = [name if len(name) <= 24 else name[:23] + "…" for name in groups]
     layers, of_group = layer_order(level.cells), level.by_group("layer")
-    show = _percent if kind == "fraction" else format_number
+    show = format_percent if kind == "fraction" else format_number
     cells = {group: [show(of_group[layer, group][kind]) for layer in layers] for group in groups}
     room = WIDTH - max(map(len, [*layers, "layer"]))
     blocks: list[list[int]] = [[]]
@@ -224,7 +218,7 @@ def _groups_section(grouping: Grouping, tasks: Tables, kind: str) -> str:
     else:
         title = "LIFT  mass per key, against the mean over valid keys"
         note = "\n1 = what uniform attention gives."
-    return "\n".join([_title(title), "\n\n".join(tables)]) + note
+    return "\n".join([heading(title), "\n\n".join(tables)]) + note
 
 
 def _across_section(run: AnalysedRun, grouping: Grouping, tasks: Tables, scope: str, of: str = "") -> str:
@@ -235,7 +229,7 @@ def _across_section(run: AnalysedRun, grouping: Grouping, tasks: Tables, scope: 
     name = "suite" if scope == "all" else "task"
     header = [name, "n", "success"]
     if grouping.ratio:
-        header += ["mean", f"{run.level:.0%} interval", "of means", "geom.", "uniform", "lift"]
+        header += ["mean", interval_name(run.level), "of means", "geom.", "uniform", "lift"]
     else:
         header += [group if len(group) <= 12 else group[:11] + "…" for group in grouping.names[:5]]
     body = []
@@ -243,7 +237,7 @@ def _across_section(run: AnalysedRun, grouping: Grouping, tasks: Tables, scope: 
         cells = [
             row["suite"] if scope == "all" else str(row["task_id"]),
             str(row["num_episodes"]),
-            _percent(row["success_rate"]),
+            format_percent(row["success_rate"]),
         ]
         if grouping.ratio:
             cells += [
@@ -253,7 +247,8 @@ def _across_section(run: AnalysedRun, grouping: Grouping, tasks: Tables, scope: 
             ]
         else:
             cells += [
-                _percent(of_group[row["suite"], row["task_id"], group]["fraction"]) for group in grouping.names[:5]
+                format_percent(of_group[row["suite"], row["task_id"], group]["fraction"])
+                for group in grouping.names[:5]
             ]
         body.append(cells)
     last = "" if scope == "all" else "instruction"
@@ -267,8 +262,8 @@ def _across_section(run: AnalysedRun, grouping: Grouping, tasks: Tables, scope: 
             f"Intervals over fewer than {FEW_EPISODES} episodes of a task are wide, because so few show little of how much episodes "
             "differ; more episodes narrow them quickly."
         )
-        table = "\n".join([table, *textwrap.wrap(warning, WIDTH)])
-    return "\n".join([_title(f"PER {name.upper()}{of}  {what}, {shown}"), table])
+        table = "\n".join([table, *wrap(warning)])
+    return "\n".join([heading(f"PER {name.upper()}{of}  {what}, {shown}"), table])
 
 
 def _by_layer(rows: pl.DataFrame) -> list[dict[str, Any]]:
@@ -292,17 +287,5 @@ def _ratio_definition(grouping: Grouping) -> str:
     return " / ".join(sides)
 
 
-def _percent(value: float | None) -> str:
-    return "-" if value is None or math.isnan(value) else f"{100 * value:.1f}%"
-
-
-def _title(text: str) -> str:
-    return "\n".join([*textwrap.wrap(text, WIDTH), "-" * WIDTH])
-
-
 def _labelled(label: str, text: str) -> list[str]:
-    return textwrap.wrap(f"{label + ':':<15}{text}", WIDTH, subsequent_indent=" " * 15, break_on_hyphens=False)
-
-
-def _indents(first: int, rest: int) -> dict[str, Any]:
-    return {"initial_indent": " " * first, "subsequent_indent": " " * rest, "break_on_hyphens": False}
+    return wrap(f"{label + ':':<15}{text}", rest=" " * 15)

@@ -14,8 +14,8 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.frames import LAYERS_AVG
-from vla_attention.analyze.show.numbers import plural
-from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, ratio_axis, whole_numbers
+from vla_attention.analyze.show.numbers import interval_name, of_tasks
+from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, legend_above, ratio_axis, whole_numbers
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, NOTE_COLOR, group_styles
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, ratio_name, title
@@ -116,7 +116,7 @@ def _contrast_panel(axes: Axes, data: pl.DataFrame, outcomes: list[str], groupin
             label=BASELINE_LABEL,
         )
     axes.grid(axis="y")
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.1)
+    legend_above(axes, 3)
 
 
 def _fraction_panel(axes: Axes, data: pl.DataFrame, grouping: Grouping, level: float) -> None:
@@ -168,8 +168,8 @@ def _counts_strip(axes: Axes, data: pl.DataFrame, outcomes: list[str]) -> None:
 def _note(courses: TimeCourses, alignment: str, level: float) -> str:
     episodes = courses.autocorrelation.height
     tasks = courses.autocorrelation.select("suite", "task_id").n_unique()
-    text = f"{plural(episodes, 'episode')} of {plural(tasks, 'task')}. "
-    text += f"Bands: pointwise {level:.0%} bootstrap intervals over tasks and episodes."
+    text = f"{of_tasks(episodes, tasks)}. "
+    text += f"Bands: pointwise {interval_name(level, 'bootstrap')}s over tasks and episodes."
     if alignment == GRIPPER_CLOSING:
         closers = courses.closing["closing_replan"].is_not_null().sum()
         others = "; the others are not shown" if closers < courses.closing.height else ""

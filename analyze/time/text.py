@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,8 +9,10 @@ import polars as pl
 
 from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.show.numbers import format_interval, format_number
+from vla_attention.analyze.show.headings import heading, interval_note, title, untrained_warning, wrap
+from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent, of_tasks
 from vla_attention.analyze.show.text_table import text_table
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 from vla_attention.analyze.time.time_courses import (
     ALL,
     EPISODE_TIME,
@@ -22,7 +23,6 @@ from vla_attention.analyze.time.time_courses import (
     TimeSettings,
 )
 
-WIDTH = 100
 #: Rows of the printed course; the table and the pictures have every bin.
 _SHOWN = 10
 #: Groups of the printed course.
@@ -39,18 +39,16 @@ def time_text(question: Question, courses: TimeCourses, settings: TimeSettings) 
 def _header(question: Question, courses: TimeCourses) -> str:
     of = courses.autocorrelation
     layer = courses.layer if courses.layer == LAYERS_AVG else f"layer {courses.layer}"
-    lines = ["TIME COURSES", "=" * WIDTH]
-    if any(store.attributes.policy.untrained for store in question.stores):
-        lines += _wrapped(
-            "WARNING: the policy has untrained (random) weights; these numbers say nothing about any policy."
-        )
-    lines += _wrapped(f"stores: {', '.join(str(store.path) for store in question.stores)}")
-    lines += _wrapped(
-        f"{of.height} episodes of {of.select('suite', 'task_id').n_unique()} tasks, {int(of['success'].sum())} successful; "
-        f"{layer}; grouping '{question.grouping.name}'. Intervals: 95%, pointwise, bootstrap over tasks and episodes."
+    lines = title("TIME COURSES")
+    if question.untrained:
+        lines += wrap(untrained_warning())
+    lines += wrap(f"stores: {', '.join(str(store.path) for store in question.stores)}")
+    lines += wrap(
+        f"{of_tasks(of.height, of.select('suite', 'task_id').n_unique())}, {int(of['success'].sum())} successful; "
+        f"{layer}; grouping '{question.grouping.name}'. {interval_note(DEFAULT_LEVEL, 'pointwise')}"
     )
     for line in question.skipped:
-        lines += _wrapped(line)
+        lines += wrap(line)
     return "\n".join(lines)
 
 
@@ -67,27 +65,27 @@ def _course_section(courses: TimeCourses, settings: TimeSettings) -> str:
         cells = [f"{first['position_low']:.2f}-{first['position_high']:.2f}"]
         if RATIO in of:
             cells += [format_number(of[RATIO]["value"]), _interval(of[RATIO]), format_number(of[RATIO]["uniform"])]
-        body.append(cells + [_percent(of[name]["value"]) for name in groups])
+        body.append(cells + [format_percent(of[name]["value"]) for name in groups])
     every = f" (one bin in {stride}; all are in the table)" if stride > 1 else ""
     note = "The ratio is a geometric mean over episodes, fractions are means; a replan stands until the next one."
     if courses.num_nonfinite:
         note += f" {courses.num_nonfinite} replans without a finite ratio take no part in its course."
     return "\n".join(
-        [_title(f"OVER THE EPISODE'S TIME, 0 to 1{every}"), text_table(header, body, left=(0,)), *_wrapped(note)]
+        [heading(f"OVER THE EPISODE'S TIME, 0 to 1{every}"), text_table(header, body, left=(0,)), *wrap(note)]
     )
 
 
 def _gripper_section(courses: TimeCourses, settings: TimeSettings) -> str:
-    heading = _title("AT THE FIRST GRIPPER CLOSING")
+    above = heading("AT THE FIRST GRIPPER CLOSING")
     if courses.closing.is_empty():
-        return f"{heading}\nThe stores hold no actions, so there is nothing to align at."
+        return f"{above}\nThe stores hold no actions, so there is nothing to align at."
     closed = courses.closing.drop_nulls("closing_replan")
     rule = (
         f"The gripper closes in {closed.height} of {courses.closing.height} episodes (the first replan one of whose executed actions "
         "has a last number above 0)"
     )
     if closed.is_empty():
-        return "\n".join([heading, *_wrapped(f"{rule}.")])
+        return "\n".join([above, *wrap(f"{rule}.")])
     rule += (
         f", at replan {format_number(closed['closing_replan'].cast(pl.Float64).median())} and episode time "  # type: ignore[arg-type]
         f"{format_number(closed['closing_time'].median())} in the median."  # type: ignore[arg-type]
@@ -109,20 +107,20 @@ def _gripper_section(courses: TimeCourses, settings: TimeSettings) -> str:
         "each episode; a factor for the ratio, a difference of fractions for groups. No causal claim: much else changes then."
     )
     if not courses.change["num_episodes"].max():
-        return "\n".join([heading, *_wrapped(f"{rule} No episode shows both sides of a closing.")])
+        return "\n".join([above, *wrap(f"{rule} No episode shows both sides of a closing.")])
     table = text_table(["quantity", "change", "interval", "episodes"], body, left=(0,))
-    return "\n".join([heading, *_wrapped(rule), table, *_wrapped(note)])
+    return "\n".join([above, *wrap(rule), table, *wrap(note)])
 
 
 def outcomes_section(outcomes: pl.DataFrame) -> str:
     """Success against failure as text, from `TimeCourses.outcomes`."""
-    heading = _title("SUCCESS AGAINST FAILURE  means of the episodes' means over replans")
+    above = heading("SUCCESS AGAINST FAILURE  means of the episodes' means over replans")
     notes = [f"{row['quantity']}: {row['note']}." for row in outcomes.iter_rows(named=True) if row["note"]]
     if outcomes["difference"].null_count() == outcomes.height:
         counts = outcomes.row(0, named=True)
         numbers = f"{counts[f'num_{SUCCESS}']} solved and {counts[f'num_{FAILURE}']} failed"
         said = f"Not compared: of the episodes, {numbers}; at least 2 of either are needed."
-        return "\n".join([heading, *_wrapped(said)])
+        return "\n".join([above, *wrap(said)])
     header = ["quantity", "n", "difference", "interval", "in tasks", "interval", "g", "delta"]
     body = [
         [
@@ -143,18 +141,16 @@ def outcomes_section(outcomes: pl.DataFrame) -> str:
         f"tasks ({both} hold both outcomes), free of differences between tasks. g: Hedges' g, in standard deviations. delta: Cliff's "
         "delta, P(solved > failed) - P(solved < failed). Their intervals are in the table."
     )
-    return "\n".join(
-        [heading, text_table(header, body, left=(0,)), *_wrapped(note), *(w for n in notes for w in _wrapped(n))]
-    )
+    return "\n".join([above, text_table(header, body, left=(0,)), *wrap(note), *(w for n in notes for w in wrap(n))])
 
 
 def _counts_section(courses: TimeCourses) -> str:
     table = courses.autocorrelation
     known = table.drop_nulls("effective_replans")
-    heading = _title("INDEPENDENT REPLANS  how many an episode is worth")
+    above = heading("INDEPENDENT REPLANS  how many an episode is worth")
     if known.is_empty():
         why = f"Cannot be estimated in any of the {table.height} episodes: too few replans, no change, or ratios that are not finite."
-        return "\n".join([heading, *_wrapped(why)])
+        return "\n".join([above, *wrap(why)])
     series = known["series"][0]
     text = (
         f"{int(known['num_replans'].sum())} replans of {known.height} episodes are worth "
@@ -164,7 +160,7 @@ def _counts_section(courses: TimeCourses) -> str:
     )
     if known.height < table.height:
         text += f" {table.height - known.height} of {table.height} episodes are left out: too few replans, no change, or gaps."
-    return "\n".join([heading, *_wrapped(text)])
+    return "\n".join([above, *wrap(text)])
 
 
 def _median(column: pl.Series) -> float | None:
@@ -183,15 +179,3 @@ def _short(name: str, width: int) -> str:
 
 def _signed(value: float | None) -> str:
     return format_number(value) if value is None or value <= 0 else f"+{format_number(value)}"
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.1f}%"
-
-
-def _title(text: str) -> str:
-    return "\n".join([*textwrap.wrap(text, WIDTH), "-" * WIDTH])
-
-
-def _wrapped(text: str) -> list[str]:
-    return textwrap.wrap(text, WIDTH, break_on_hyphens=False)
