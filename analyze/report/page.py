@@ -24,9 +24,8 @@ from vla_attention.analyze.report.run_section import run_section
 from vla_attention.analyze.report.section_parts import Section
 from vla_attention.analyze.report.settings import ReportSettings
 from vla_attention.analyze.show.numbers import of_tasks
-from vla_attention.analyze.show.output_files import write_text
+from vla_attention.analyze.show.output_files import write_text, writing
 from vla_attention.analyze.show.progress import progress_bar
-from vla_attention.schemas.errors import BadArgument
 
 
 def write_report(question: Question, path: Path, settings: ReportSettings) -> None:
@@ -36,10 +35,8 @@ def write_report(question: Question, path: Path, settings: ReportSettings) -> No
         BadArgument: the file cannot be written.
     """
     page = report_html(analyse(question), settings)
-    try:
+    with writing("the report", path, "another path"):
         write_text(path, page)
-    except OSError as error:
-        raise BadArgument(f"Cannot write the report to {path}: {error.strerror or error}; give another path.") from None
 
 
 def report_html(analysis: Analysis, settings: ReportSettings) -> str:
