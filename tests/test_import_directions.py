@@ -24,7 +24,8 @@ LEVELS = {
     "analyze.measures": 2,
     "analyze.arguments": 3,
     **{f"analyze.{command}": 4 for command in COMMANDS},
-    "analyze.published": 4,
+    "analyze.published": 3,
+    "analyze.parse": 5,
     "analyze.report": 5,
     "analyze.opened": 5,
     "analyze.api": 6,
@@ -38,13 +39,6 @@ LEVELS = {
     "capture": 5,
     "capture.published": 6,
     "testing": 2,
-}
-#: (module, imported) that run upwards or close a circle. To be empty.
-KNOWN = {
-    ("analyze.measures.contributions", "analyze.ratios.summary"),
-    ("analyze.measures.group_contributions", "analyze.ratios.summary"),
-    ("analyze.ratios.analysis", "analyze.published.frame_proxy"),
-    ("analyze.ratios.analysis", "analyze.published.results_file"),
 }
 
 
@@ -74,7 +68,7 @@ def imports(module: str) -> Iterator[str]:
             continue
         for name in found:
             imported = name.removeprefix(f"{PACKAGE}.")
-            if imported != name and (module, imported) not in KNOWN:
+            if imported != name:
                 yield imported
 
 

@@ -1,1 +1,1 @@
-"""The results files of the published scripts and ours: written, read, parsed, compared."""
+"""The results files of the published scripts and ours: written, read, and as tables."""

@@ -14,7 +14,7 @@ from vla_attention.analyze.commands import COMMANDS
 @pytest.mark.parametrize(
     ("module", "words"),
     [
-        ("vla_attention.analyze.published.command", ["--help"]),
+        ("vla_attention.analyze.parse.command", ["--help"]),
         ("vla_attention.analyze", ["--help"]),
         *(("vla_attention.analyze", [command, "--help"]) for command in COMMANDS),
     ],

@@ -68,9 +68,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def run(arguments: argparse.Namespace) -> int:
     """Read, summarise, and draw what was asked for."""
     # Imported after the arguments were read: `--help` must not wait for polars.
+    from vla_attention.analyze.parse.text import summary_of_files
     from vla_attention.analyze.published.results_reader import find_results, read_results_file
     from vla_attention.analyze.published.results_tables import labels_of, results_tables
-    from vla_attention.analyze.published.results_text import summary_of_files
     from vla_attention.analyze.show.progress import progress_bar
     from vla_attention.schemas.errors import BadArgument
 
@@ -161,7 +161,7 @@ def _draw(
         for label, table in zip(labels, tables, strict=True):
             written += _draw_file(wanted, folder, label, table, several=len(files) > 1)
         if compare:
-            from vla_attention.analyze.published.plot_results_comparison import plot_results_comparison
+            from vla_attention.analyze.parse.plot_results_comparison import plot_results_comparison
 
             written += plot_results_comparison(tables, labels, folder)
     return written

@@ -14,8 +14,8 @@ import pytest
 
 from tests.analyze.published.test_results_reader import ours
 from tests.kit.published_results import cosmos_episodes, pi_episodes, write_published
-from vla_attention.analyze.published.command import main
-from vla_attention.analyze.published.plot_results_comparison import row_names
+from vla_attention.analyze.parse.command import main
+from vla_attention.analyze.parse.plot_results_comparison import row_names
 
 
 def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
