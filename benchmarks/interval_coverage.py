@@ -11,7 +11,7 @@ truths is measured:
     the population's ratio    by the two-level interval over all tasks: the ratio of tasks like these
     these tasks' ratio        by the same interval: the mean over exactly these tasks, with endless episodes
 
-The intervals are those of `aggregate.tasks_table`, column `geometric_mean`, as they are and as plain percentile
+The intervals are those of `aggregate.task_tables`, column `geometric_mean`, as they are and as plain percentile
 intervals.
 """
 
@@ -30,7 +30,9 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from tests.kit import made_up_steps
 from vla_attention.analyze.measures import aggregate
+from vla_attention.analyze.measures.frames import Tables
 from vla_attention.analyze.statistics import bootstrap
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 
@@ -77,8 +79,8 @@ def log_ratios(case: Case, generator: np.random.Generator) -> tuple[NDArray[np.f
     return tasks, episodes[:, :, None] + walk - walk.mean(axis=2, keepdims=True)
 
 
-def replans_of(logs: NDArray[np.float64]) -> pl.DataFrame:
-    """A table as `aggregate.per_replan` gives it, of one layer, from log ratios (task, episode, replan)."""
+def replans_of(logs: NDArray[np.float64]) -> Tables:
+    """Tables as `aggregate.replan_tables` gives them, of one layer, from log ratios (task, episode, replan)."""
     task, episode, replan = (part.ravel() for part in np.indices(logs.shape))
     visual = 1 / (1 + np.exp(-logs.ravel()))
     keys = {"visual": 512.0, "linguistic": 12.0}
@@ -93,29 +95,31 @@ def replans_of(logs: NDArray[np.float64]) -> pl.DataFrame:
         "env_step": 10 + 5 * replan,
         "layer": np.zeros(logs.size, dtype=np.int64),
         "block": np.zeros(logs.size, dtype=np.int64),
+        "denoise_step": np.full(logs.size, 9),
+        "denoise_time": np.full(logs.size, 0.1),
+        "head": pl.Series([None] * logs.size, dtype=pl.Int64),
         "row_sum": np.ones(logs.size),
         "valid_mass": np.ones(logs.size),
         "num_valid": np.full(logs.size, 524),
         "visual_mass": visual,
         "linguistic_mass": 1 - visual,
-        "numerator_mass": visual,
-        "denominator_mass": 1 - visual,
-        "uniform_ratio": np.full(logs.size, 512 / 12),
     }
     columns |= {f"{name}_keys": np.full(logs.size, count) for name, count in keys.items()}
-    return aggregate.per_replan(pl.DataFrame(columns), GROUPING)
+    return made_up_steps.replans_of(pl.DataFrame(columns), GROUPING)
 
 
-def tables(replans: pl.DataFrame, seed: int) -> dict[str, pl.DataFrame]:
-    """`aggregate.tasks_table` with the intervals of this program, and with plain percentile intervals."""
-    episodes = aggregate.episodes_table(replans, GROUPING)
+def tables(replans: Tables, seed: int) -> dict[str, pl.DataFrame]:
+    """`aggregate.task_tables` with the intervals of this program, and with plain percentile intervals."""
+    episodes = aggregate.episode_tables(replans, GROUPING)
     with mock.patch.object(bootstrap, "widening", return_value=1.0):
-        percentile = aggregate.tasks_table(episodes, GROUPING, NUM_RESAMPLES, seed=seed)
-    return {"widened": aggregate.tasks_table(episodes, GROUPING, NUM_RESAMPLES, seed=seed), "percentile": percentile}
+        percentile = aggregate.task_tables(episodes, GROUPING, NUM_RESAMPLES, seed=seed)
+    widened = aggregate.task_tables(episodes, GROUPING, NUM_RESAMPLES, seed=seed)
+    return {"widened": widened.cells, "percentile": percentile.cells}
 
 
 def hits(table: pl.DataFrame, tasks: NDArray[np.float64]) -> dict[str, float]:
     """Share of the intervals that hold each truth."""
+    table = table.filter(pl.col("layer") == "0")
     of_tasks = table.filter(pl.col("scope") == "task").sort("task_id")
     low, high = (of_tasks[f"geometric_mean_{end}"].to_numpy() for end in ("low", "high"))
     inside = (low <= np.exp(tasks)) & (np.exp(tasks) <= high)
@@ -173,8 +177,7 @@ def through_files(case: Case, num_stores: int, seed: int) -> dict[tuple[str, str
         with tempfile.TemporaryDirectory() as folder:
             store = open_store(write_store(Path(folder) / "simulated.zarr", spec=spec))
             analysis = analyse(ask([store], AnalysisSettings(seed=number)))
-        table = analysis.tasks.filter(pl.col("layer") == "0")
-        for truth, share in hits(table, tasks).items():
+        for truth, share in hits(analysis.tasks.cells, tasks).items():
             found.setdefault(("widened", truth), []).append(share)
     return {key: float(np.mean(values)) for key, values in found.items()}
 

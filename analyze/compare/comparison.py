@@ -1,9 +1,8 @@
 """Differences between runs: paired where they share initial states and seeds, otherwise between independent episodes.
 
-Two episodes are a pair when suite, task, initial state (by its digest) and seed are equal: the same scene, the same
-noise, other weights. Differences inside pairs are free of what makes scenes differ, and their intervals are two-level
-bootstraps over tasks and pairs. The first run is what the others are compared with; every difference is other run minus
-first run.
+Two episodes are a pair when suite, task, initial state (by its digest) and seed are equal: the same scene, the same noise,
+other weights. Differences inside pairs are free of what makes scenes differ, and their intervals are two-level bootstraps over
+tasks and pairs. The first run is what the others are compared with; every difference is other run minus first run.
 
 Quantities, one value per episode: `log2_ratio` (mean over replans of log2 of the ratio: 1 more is twice the ratio),
 `{group}_fraction` (mean over replans), and `success` (0 or 1).
@@ -49,16 +48,13 @@ class Comparison:
         names: the runs, the first one being what the others are compared with.
         grouping: groups of the comparison.
         quantities: what is compared, in order.
-        estimates: one row per (run, suite, layer, quantity): `num_tasks`, `num_episodes`, `value`, `low`, `high`.
-            Quantities are `ratio` (geometric mean), `ratio_lift`, every fraction and `success`. On rows of the ratio
-            also `uniform_ratio`, `episodes_without_ratio` (no finite positive ratio in any replan) and `num_nonfinite`
-            (replans without a finite ratio).
+        estimates: one row per (run, suite, layer, quantity): `num_tasks`, `num_episodes`, `value`, `low`, `high`. Quantities are
+            `ratio` (geometric mean), `ratio_lift`, every fraction and `success`. On rows of the ratio also `uniform_ratio`,
+            `episodes_without_ratio` (no finite positive ratio in any replan) and `num_nonfinite` (replans without a finite ratio).
         differences: one row per (run, scope, layer, quantity) for every run but the first: scope "task", "suite" (only
-            when there are several) or "all"; `paired`; `num_pairs`, `num_first`, `num_other`, `num_tasks`;
-            `mean_first`, `mean_other`, `difference`, `low`, `high`; `effect` (mean / standard deviation of the paired
-            differences, or Hedges' g).
-        pairs: one row per (run, pair, layer, quantity): `episode_first`, `episode_other`, `first`, `other`,
-            `difference`.
+            when there are several) or "all"; `paired`; `num_pairs`, `num_first`, `num_other`, `num_tasks`; `mean_first`, `mean_other`,
+            `difference`, `low`, `high`; `effect` (mean / standard deviation of the paired differences, or Hedges' g).
+        pairs: one row per (run, pair, layer, quantity): `episode_first`, `episode_other`, `first`, `other`, `difference`.
         unpaired: one row per episode that has no partner: `run`, `compared_with`, its suite, task and episode index.
         notes: lines on what differs between the runs and was allowed or does not matter.
     """
@@ -241,10 +237,7 @@ def _paired(joined: pl.DataFrame, quantities: Sequence[str], seed: int) -> pl.Da
 
 
 def _unpaired(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str], seed: int) -> pl.DataFrame:
-    """Differences of means of independent episodes.
-
-    Tasks that both runs have are drawn together, others in each run alone.
-    """
+    """Differences of means of independent episodes. Tasks that both runs have are drawn together, others in each run alone."""
     both = pl.concat(
         [
             table.select(*PAIR_KEYS, "instruction", "layer", "block", *quantities, pl.lit(number).alias("_run"))

@@ -1,6 +1,4 @@
-"""`forest`: every run in every suite with its interval and uniform baseline, and beside it its difference to the first
-run.
-"""
+"""`forest`: every run in every suite with its interval and uniform baseline, and beside it its difference to the first run."""
 
 from __future__ import annotations
 
@@ -35,9 +33,7 @@ def run_style(number: int) -> dict[str, str]:
 
 
 def factor_axis(axis: Any, factors: Any) -> None:
-    """Make an axis logarithmic around factors near 1, with more labels than a ratio's axis would have in so small a
-    range.
-    """
+    """Make an axis logarithmic around factors near 1, with more labels than a ratio's axis would have in so small a range."""
     from matplotlib.ticker import LogLocator
 
     ratio_axis(axis, factors)

@@ -85,8 +85,8 @@ def _estimates_section(comparison: Comparison, layer: str) -> str:
     for row in (of["ratio"] for of in estimates) if ratio else ():
         if row["num_nonfinite"] or row["episodes_without_ratio"]:
             lines += wrap(
-                f"{row['run']}, {row['suite']}: {row['num_nonfinite']} replans have no finite ratio and are in no "
-                f"ratio; {row['episodes_without_ratio']} of {row['num_episodes']} episodes have none at all.",
+                f"{row['run']}, {row['suite']}: {row['num_nonfinite']} replans have no finite ratio and are in no ratio; "
+                f"{row['episodes_without_ratio']} of {row['num_episodes']} episodes have none at all.",
             )
     return "\n".join(lines)
 
@@ -129,9 +129,8 @@ def _pairing(comparison: Comparison, name: str, rows: pl.DataFrame) -> list[str]
     }
     if not rows["paired"].any():
         return wrap(
-            f"NOT PAIRED: no episode of {name} has the suite, task, initial state and seed of one of {first}, so this "
-            "compares means of independent episodes; differences between scenes are in it, and intervals are wider for "
-            "that.",
+            f"NOT PAIRED: no episode of {name} has the suite, task, initial state and seed of one of {first}, so this compares means "
+            "of independent episodes; differences between scenes are in it, and intervals are wider for that.",
         )
     pairs = comparison.pairs.filter(pl.col("run") == name).select("suite", "task_id", "episode_first").unique().height
     text = f"{pairs} pair{'' if pairs == 1 else 's'} of episodes with the same task, initial state and seed."

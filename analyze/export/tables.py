@@ -24,8 +24,7 @@ DEFAULT_TABLES = ("episodes", "tasks", "steps")
 
 
 def chosen_tables(analysis: Analysis, names: Sequence[str]) -> dict[str, pl.DataFrame]:
-    """Tables of an analysis by the names of their files; steps, replans, episodes and tasks are two each, NAME and
-    NAME_groups.
+    """Tables of an analysis by the names of their files; steps, replans, episodes and tasks are two each, NAME and NAME_groups.
 
     Raises:
         BadArgument: contributions are wanted and were not recorded.

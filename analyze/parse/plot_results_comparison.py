@@ -1,6 +1,4 @@
-"""`results_comparison`: several results files side by side: mean ratio with its interval, episodes as dots, and
-fractions.
-"""
+"""`results_comparison`: several results files side by side: mean ratio with its interval, episodes as dots, and fractions."""
 
 from __future__ import annotations
 
@@ -34,8 +32,8 @@ _FRACTIONS = ("visual", "linguistic", "action", "rest")
 def comparison_table(tables: Sequence[ResultsTables], labels: Sequence[str]) -> pl.DataFrame:
     """One row per results file, over all its episodes, in the layer that speaks for it ("layers_avg", else the first).
 
-    Columns: file, kind, layer, num_tasks, num_episodes, episodes_without_ratio, num_replans, num_nonfinite,
-    success_rate, ratio_mean with ratio_mean_low and ratio_mean_high (two-level bootstrap), ratio_std (over episodes).
+    Columns: file, kind, layer, num_tasks, num_episodes, episodes_without_ratio, num_replans, num_nonfinite, success_rate,
+    ratio_mean with ratio_mean_low and ratio_mean_high (two-level bootstrap), ratio_std (over episodes).
     """
     columns = ["num_tasks", "num_episodes", "episodes_without_ratio", "num_replans", "num_nonfinite", "success_rate"]
     columns += ["ratio_mean", "ratio_mean_low", "ratio_mean_high", "ratio_std"]
@@ -50,9 +48,7 @@ def comparison_table(tables: Sequence[ResultsTables], labels: Sequence[str]) -> 
 
 
 def fractions_table(tables: Sequence[ResultsTables], labels: Sequence[str]) -> pl.DataFrame:
-    """Mean fractions of the files' groups in the layer of `comparison_table`: file, group, fraction, fraction_low,
-    fraction_high.
-    """
+    """Mean fractions of the files' groups in the layer of `comparison_table`: file, group, fraction, fraction_low, fraction_high."""
     parts = []
     for table, label in zip(tables, labels, strict=True):
         rows = overall_rows(table.tasks).filter(pl.col("layer") == overall_layer(table.tasks.cells)).groups
@@ -68,8 +64,8 @@ def plot_results_comparison(tables: Sequence[ResultsTables], labels: Sequence[st
     kinds = data["kind"].unique(maintain_order=True).to_list()
     figure = new_figure(10, 1.9 + (0.42 if few else 0.22) * (data.height + 0.5) + 0.16 * len(kinds))
     note = (
-        f"n counts episodes. Means over episodes with {interval_name(DEFAULT_LEVEL)}s (two-level bootstrap over tasks "
-        "and episodes). No uniform baseline: results files do not hold the numbers of keys."
+        f"n counts episodes. Means over episodes with {interval_name(DEFAULT_LEVEL)}s (two-level bootstrap over tasks and episodes). "
+        "No uniform baseline: results files do not hold the numbers of keys."
     )
     if len(kinds) > 1:
         note += " Files of different kinds measure different things: compare within a kind."

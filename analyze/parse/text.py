@@ -32,15 +32,13 @@ _VERDICTS = {
     "balanced": "Model shows BALANCED attention between visual and linguistic",
 }
 _CAVEAT = (
-    "Results files do not say how many keys are on each side, so there is no uniform baseline here. With hundreds of "
-    "image keys and a dozen words, uniform attention alone gives ratios of 35 to 50: the verdict (above "
-    f"{VISUAL_ABOVE} visual, below {LINGUISTIC_BELOW} linguistic) means little without it. vla-analyze prints it "
-    "beside every ratio."
+    "Results files do not say how many keys are on each side, so there is no uniform baseline here. With hundreds of image keys and "
+    "a dozen words, uniform attention alone gives ratios of 35 to 50: the verdict (above "
+    f"{VISUAL_ABOVE} visual, below {LINGUISTIC_BELOW} linguistic) means little without it. vla-analyze prints it beside every ratio."
 )
 _FRAMES_CAVEAT = (
-    "Latent frames have equally many keys: uniform attention gives a ratio of 1. The usual text frame, frame0, is a "
-    "blank placeholder without language: an instruction enters through cross-attention, which these masses are not of. "
-    "Masses may be sums over queries."
+    "Latent frames have equally many keys: uniform attention gives a ratio of 1. The usual text frame, frame0, is a blank placeholder "
+    "without language: an instruction enters through cross-attention, which these masses are not of. Masses may be sums over queries."
 )
 
 
@@ -204,8 +202,8 @@ def _notes(file: ResultsFile, layer: str, named: bool) -> list[str]:
         notes.append(f"{of}{plural(lacking, 'episode')} with steps, but without any in {_named(chosen_layer(file))}.")
     if file.zeros:
         notes.append(
-            f"{of}{file.zeros} ratios of 0 stand for 'no ratio' (nothing on either side, or no layer with a finite "
-            "ratio) and are read as undefined; the published parser counts them as 0."
+            f"{of}{file.zeros} ratios of 0 stand for 'no ratio' (nothing on either side, or no layer with a finite ratio) and are "
+            "read as undefined; the published parser counts them as 0."
         )
     found = disagreements(file)
     for reason in sorted({item.reason for item in found if item.reason}):
@@ -216,10 +214,10 @@ def _notes(file: ResultsFile, layer: str, named: bool) -> list[str]:
         first = unexplained[0]
         episode = file.episodes.row(first.claim.episode, named=True)
         notes.append(
-            f"{of}The file's own summary disagrees with its steps in {plural(len(unexplained), 'number')}; the first: "
-            f"task {episode['task_id']} episode {episode['episode_index']}, {_named(first.claim.layer)}, "
-            f"{first.claim.measure} {first.claim.statistic}: summary {format_number(first.claim.value)}, from the "
-            f"steps {format_number(first.computed)}. Everything here is computed from the steps."
+            f"{of}The file's own summary disagrees with its steps in {plural(len(unexplained), 'number')}; the first: task "
+            f"{episode['task_id']} episode {episode['episode_index']}, {_named(first.claim.layer)}, {first.claim.measure} "
+            f"{first.claim.statistic}: summary {format_number(first.claim.value)}, from the steps {format_number(first.computed)}. "
+            "Everything here is computed from the steps."
         )
     if file.unused:
         notes.append(f"{of}Fields that are not used: {listing(file.unused, 20)}.")

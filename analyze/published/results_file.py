@@ -24,17 +24,16 @@ _RATIO = "visual_linguistic_ratio"
 def episode_documents(replans: Tables, grouping: Grouping, proxy: FrameProxy | None = None) -> Iterator[dict[str, Any]]:
     """Episodes of one or more suites from `aggregate.replan_tables`, in their order, as JSON documents.
 
-    visual is the sum of the ratio's numerator groups, linguistic that of its denominator groups; the fraction of either
-    is its mass / sum of all groups' masses. With a `proxy` the numbers are those of the published Cosmos scripts
-    instead: masses are sums over the queries (ours are means), and fractions are of visual + linguistic only.
+    visual is the sum of the ratio's numerator groups, linguistic that of its denominator groups; the fraction of either is
+    its mass / sum of all groups' masses. With a `proxy` the numbers are those of the published Cosmos scripts instead: masses are
+    sums over the queries (ours are means), and fractions are of visual + linguistic only.
 
-    Plain values rather than `vla_attention.schemas.results.EpisodeResult` objects, which describe them: a suite has a
-    hundred thousand steps.
+    Plain values rather than `vla_attention.schemas.results.EpisodeResult` objects, which describe them: a suite has a hundred thousand steps.
     """
     if grouping.ratio is None:
         raise ResultsError(
-            f"Grouping '{grouping.name}' defines no ratio, so there is no visual/linguistic ratio to write into a "
-            "results file; expected a [ratio] with numerator and denominator groups (or --ratio A,B/C)."
+            f"Grouping '{grouping.name}' defines no ratio, so there is no visual/linguistic ratio to write into a results "
+            "file; expected a [ratio] with numerator and denominator groups (or --ratio A,B/C)."
         )
     sides = [*_SIDES, _ACTION] if _ACTION in grouping.names and proxy is None else list(_SIDES)
     kinds = [f"{side}_{kind}" for side in sides for kind in ("mass", "fraction")]
@@ -103,8 +102,7 @@ def read_results(path: Path) -> list[EpisodeResult]:
 
 def _refuse_constant(constant: str) -> NoReturn:
     raise ResultsError(
-        f"it holds {constant}, which JSON does not have; files of the published scripts do, files of this tool write "
-        "null."
+        f"it holds {constant}, which JSON does not have; files of the published scripts do, files of this tool write null."
     )
 
 

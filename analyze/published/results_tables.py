@@ -1,8 +1,7 @@
-"""Results files as the tables of `vla_attention.analyze.measures.aggregate`, so that pictures and intervals are the
-same as those from stores.
+"""Results files as the tables of `vla_attention.analyze.measures.aggregate`, so that pictures and intervals are the same as those from stores.
 
-A results file knows masses and fractions, but neither how many keys are on each side nor row sums: those columns are
-null, and with them the uniform baseline and every lift.
+A results file knows masses and fractions, but neither how many keys are on each side nor row sums: those columns are null, and
+with them the uniform baseline and every lift.
 """
 
 from __future__ import annotations
@@ -32,9 +31,7 @@ _UNKNOWN = pl.lit(None, dtype=pl.Float64)
 
 @dataclass(frozen=True)
 class ResultsTables:
-    """Tables of one or several results files; column `suite` holds the files' labels, so that equal task ids stay
-    apart.
-    """
+    """Tables of one or several results files; column `suite` holds the files' labels, so that equal task ids stay apart."""
 
     grouping: Grouping
     replans: Tables
@@ -172,9 +169,7 @@ def chosen_layer(file: ResultsFile) -> str:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """A claim of a file's summary that its own steps do not bear out; `reason` where the cause is a known other
-    definition.
-    """
+    """A claim of a file's summary that its own steps do not bear out; `reason` where the cause is a known other definition."""
 
     claim: Claim
     computed: float | None

@@ -39,8 +39,8 @@ from vla_attention.schemas.stores.store_format import RootAttributes
 class Analysis:
     """The tables of one grouping over one selection of episodes, as pairs of cells and groups (`frames.Tables`).
 
-    `step_tables` and the functions of `measures.aggregate` list their columns. Steps, contributions and the summary are
-    computed when they are first asked for.
+    `step_tables` and the functions of `measures.aggregate` list their columns. Steps, contributions and the summary are computed when they
+    are first asked for.
     """
 
     question: Question
@@ -163,8 +163,8 @@ def _notes(root: RootAttributes, selection: Selection, site: str) -> list[str]:
     others = [other.name for other in root.sites if other.name != site]
     if others:
         notes.append(
-            f"Masses of the site '{site}' only; the other sites ({listing(others)}) are softmaxes of their own, and a "
-            "mass of one must not be divided by a mass of another. Choose with --site."
+            f"Masses of the site '{site}' only; the other sites ({listing(others)}) are softmaxes of their own, and a mass of one "
+            "must not be divided by a mass of another. Choose with --site."
         )
     return notes
 

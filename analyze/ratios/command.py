@@ -1,6 +1,4 @@
-"""`vla-analyze ratios`, and `vla-analyze STORE` alone: masses, fractions and ratios, with intervals, tables and
-pictures.
-"""
+"""`vla-analyze ratios`, and `vla-analyze STORE` alone: masses, fractions and ratios, with intervals, tables and pictures."""
 
 from __future__ import annotations
 

@@ -27,9 +27,8 @@ def contributions_section(table: pl.DataFrame, seed: int) -> str:
     ]
     title = "CONTRIBUTIONS  |visual| / |linguistic|, norms of what the keys add to the residual stream"
     note = (
-        "Value-weighted, through output projection and gate; root mean square over action queries, mean over replans "
-        "and denoise steps. ratio: mean over episodes of the mean ratio of norms. Norms of different sites may be "
-        "divided; masses may not."
+        "Value-weighted, through output projection and gate; root mean square over action queries, mean over replans and denoise "
+        "steps. ratio: mean over episodes of the mean ratio of norms. Norms of different sites may be divided; masses may not."
     )
     header = ["layer", "|visual|", "|linguistic|", "ratio", interval_name(DEFAULT_LEVEL)]
     return "\n".join([heading(title), text_table(header, rows, left=(0,)), "", *wrap(note), ""])

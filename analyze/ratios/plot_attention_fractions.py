@@ -33,9 +33,8 @@ def plot_attention_fractions(
 ) -> list[Path]:
     """Draw from `aggregate.task_tables` (its rows over everything); returns the paths of png, pdf and csv.
 
-    `stem`: the files' name. `about`: what the title says the fractions are of, the grouping unless given. `note`: a
-    further sentence. Fractions are means over episodes; they sum to 1 also where groups overlap, because each is a
-    share of the summed masses.
+    `stem`: the files' name. `about`: what the title says the fractions are of, the grouping unless given. `note`: a further sentence.
+    Fractions are means over episodes; they sum to 1 also where groups overlap, because each is a share of the summed masses.
     """
     level = overall_rows(tasks)
     rows, of_group, with_keys = level.cells, level.by_group("layer"), level.groups_with_keys()

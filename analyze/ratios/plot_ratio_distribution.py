@@ -46,8 +46,7 @@ def plot_ratio_distribution(
 ) -> list[Path]:
     """Draw from the cells of `aggregate.replan_tables`; returns the paths of png, pdf and csv.
 
-    `stem`: the files' name. `about`: what the title says the ratios are of, the grouping unless given. `note`: a
-    further sentence.
+    `stem`: the files' name. `about`: what the title says the ratios are of, the grouping unless given. `note`: a further sentence.
     """
     layers = layer_order(replans)
     if len(layers) == 2 and LAYERS_AVG in layers:

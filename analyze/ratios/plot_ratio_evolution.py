@@ -48,8 +48,7 @@ def evolution_stem(task_id: int, instruction: str, episode_index: int, layer: st
 def plot_ratio_evolution(
     level: Tables, grouping: Grouping, folder: Path, formats: Sequence[str] = ("png", "pdf")
 ) -> list[Path]:
-    """Draw one episode in one layer: the part of `aggregate.replan_tables` that belongs to them. Returns png, pdf and
-    csv.
+    """Draw one episode in one layer: the part of `aggregate.replan_tables` that belongs to them. Returns png, pdf and csv.
 
     Groups without mass in this episode are left out of the legend.
     """
@@ -125,8 +124,7 @@ def _ratio_panel(axes: Axes, episode: pl.DataFrame, steps: NDArray[np.int64], gr
         infinite = int(np.isinf(ratio).sum())
         explain(
             axes,
-            f"No finite ratio: {infinite} of {len(ratio)} are infinite (no denominator mass), the others undefined or "
-            "0.",
+            f"No finite ratio: {infinite} of {len(ratio)} are infinite (no denominator mass), the others undefined or 0.",
         )
         return
     ratio_axis(axes.yaxis, np.concatenate([ratio, uniform]))

@@ -1,6 +1,4 @@
-"""`ratio_per_task`: every task's mean ratio with its interval, single episodes as dots, and each task's uniform
-baseline.
-"""
+"""`ratio_per_task`: every task's mean ratio with its interval, single episodes as dots, and each task's uniform baseline."""
 
 from __future__ import annotations
 
@@ -48,8 +46,7 @@ def plot_ratio_per_task(
     about: str | None = None,
     note: str = "",
 ) -> list[Path]:
-    """Draw from the cells of `aggregate.episode_tables` and `aggregate.task_tables`; returns the paths of png, pdf and
-    csv.
+    """Draw from the cells of `aggregate.episode_tables` and `aggregate.task_tables`; returns the paths of png, pdf and csv.
 
     `layer`: which one, "layers_avg" unless given. `level` is that of the intervals in `tasks`. `stem`: the files' name.
     `about`: what the title says the ratios are of, the grouping unless given. `note`: a further sentence.

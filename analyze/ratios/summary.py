@@ -1,6 +1,4 @@
-"""The text summary: what was analysed, ratios beside what uniform attention would give, fractions, tasks, and what was
-left out.
-"""
+"""The text summary: what was analysed, ratios beside what uniform attention would give, fractions, tasks, and what was left out."""
 
 from __future__ import annotations
 
@@ -120,9 +118,9 @@ def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: Tables) -> str:
     ]
     overall = rows.filter(pl.col("layer") == overall_layer(rows)).row(0, named=True)
     legend = (
-        f"mean, std, median: of the episodes' mean ratios (n = {overall['num_episodes']}). of means: mean numerator "
-        "mass / mean denominator mass. geom.: geometric mean of the ratios. lift: ratio / uniform ratio, 1 = what "
-        f"uniform attention gives. {_interval_note(run, overall)}"
+        f"mean, std, median: of the episodes' mean ratios (n = {overall['num_episodes']}). of means: mean numerator mass / "
+        "mean denominator mass. geom.: geometric mean of the ratios. lift: ratio / uniform ratio, 1 = what uniform "
+        f"attention gives. {_interval_note(run, overall)}"
     )
     return "\n".join(
         [
@@ -153,14 +151,14 @@ def _baseline_sentence(grouping: Grouping, uniform: float | None, level: Tables)
     above = sum(of_group[layer, name]["keys"] for name in grouping.ratio.numerator)
     below = sum(of_group[layer, name]["keys"] for name in grouping.ratio.denominator)
     baseline = (
-        f"Uniform attention alone gives ratio = {format_number(uniform)}, because there are on average "
-        f"{format_number(above)} keys on one side and {format_number(below)} on the other"
+        f"Uniform attention alone gives ratio = {format_number(uniform)}, because there are on average {format_number(above)} keys "
+        f"on one side and {format_number(below)} on the other"
     )
     if not grouping.compares_modalities:
         return f"{baseline}: read the ratio beside it, or read the lift."
     return (
-        f"{baseline}, and that alone would be called '{verdict(uniform)}': the verdict (above {VISUAL_ABOVE} visual, "
-        f"below {LINGUISTIC_BELOW} linguistic) means little without the lift."
+        f"{baseline}, and that alone would be called '{verdict(uniform)}': the verdict (above {VISUAL_ABOVE} visual, below "
+        f"{LINGUISTIC_BELOW} linguistic) means little without the lift."
     )
 
 
@@ -261,8 +259,8 @@ def _across_section(run: AnalysedRun, grouping: Grouping, tasks: Tables, scope: 
     fewest = rows["num_episodes"].min()
     if grouping.ratio and scope == "task" and isinstance(fewest, int) and 1 < fewest < FEW_EPISODES:
         warning = (
-            f"Intervals over fewer than {FEW_EPISODES} episodes of a task are wide, because so few show little of how "
-            "much episodes differ; more episodes narrow them quickly."
+            f"Intervals over fewer than {FEW_EPISODES} episodes of a task are wide, because so few show little of how much episodes "
+            "differ; more episodes narrow them quickly."
         )
         table = "\n".join([table, *wrap(warning)])
     return "\n".join([heading(f"PER {name.upper()}{of}  {what}, {shown}"), table])

@@ -1,8 +1,7 @@
 """`time_course` and `time_course_gripper`: ratio and fractions over an episode, and around the first gripper closing.
 
-Left the ratio (or the first group's fraction), success and failure apart when there are both; right every group's
-fraction over all episodes. Bands are pointwise intervals; the strips below say how many episodes each point is a mean
-of.
+Left the ratio (or the first group's fraction), success and failure apart when there are both; right every group's fraction over all
+episodes. Bands are pointwise intervals; the strips below say how many episodes each point is a mean of.
 """
 
 from __future__ import annotations

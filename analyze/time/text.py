@@ -81,8 +81,8 @@ def _gripper_section(courses: TimeCourses, settings: TimeSettings) -> str:
         return f"{above}\nThe stores hold no actions, so there is nothing to align at."
     closed = courses.closing.drop_nulls("closing_replan")
     rule = (
-        f"The gripper closes in {closed.height} of {courses.closing.height} episodes (the first replan one of whose "
-        "executed actions has a last number above 0)"
+        f"The gripper closes in {closed.height} of {courses.closing.height} episodes (the first replan one of whose executed actions "
+        "has a last number above 0)"
     )
     if closed.is_empty():
         return "\n".join([above, *wrap(f"{rule}.")])
@@ -103,9 +103,8 @@ def _gripper_section(courses: TimeCourses, settings: TimeSettings) -> str:
         for row in courses.change.iter_rows(named=True)
     ]
     note = (
-        f"change: mean over the {settings.window + 1} replans from the closing on, against the {settings.window} "
-        "before it, within each episode; a factor for the ratio, a difference of fractions for groups. No causal "
-        "claim: much else changes then."
+        f"change: mean over the {settings.window + 1} replans from the closing on, against the {settings.window} before it, within "
+        "each episode; a factor for the ratio, a difference of fractions for groups. No causal claim: much else changes then."
     )
     if not courses.change["num_episodes"].max():
         return "\n".join([above, *wrap(f"{rule} No episode shows both sides of a closing.")])
@@ -138,10 +137,9 @@ def outcomes_section(outcomes: pl.DataFrame) -> str:
     ]
     both = max(outcomes["num_tasks_with_both"])
     note = (
-        "n: solved / failed episodes. difference: solved minus failed (for log2_ratio, 1 is a factor of 2). in tasks: "
-        f"the same inside tasks ({both} hold both outcomes), free of differences between tasks. g: Hedges' g, in "
-        "standard deviations. delta: Cliff's delta, P(solved > failed) - P(solved < failed). Their intervals are in "
-        "the table."
+        "n: solved / failed episodes. difference: solved minus failed (for log2_ratio, 1 is a factor of 2). in tasks: the same inside "
+        f"tasks ({both} hold both outcomes), free of differences between tasks. g: Hedges' g, in standard deviations. delta: Cliff's "
+        "delta, P(solved > failed) - P(solved < failed). Their intervals are in the table."
     )
     return "\n".join([above, text_table(header, body, left=(0,)), *wrap(note), *(w for n in notes for w in wrap(n))])
 
@@ -156,10 +154,9 @@ def _counts_section(courses: TimeCourses) -> str:
     series = known["series"][0]
     text = (
         f"{int(known['num_replans'].sum())} replans of {known.height} episodes are worth "
-        f"{format_number(float(known['effective_replans'].sum()))} independent ones for {series} (integrated "
-        f"autocorrelation time {format_number(_median(known['autocorrelation_time']))} replans in the median; initial "
-        "positive sequence, Geyer 1992). In series this short that is an upper bound. No interval counts replans: the "
-        "episode is the unit."
+        f"{format_number(float(known['effective_replans'].sum()))} independent ones for {series} (integrated autocorrelation time "
+        f"{format_number(_median(known['autocorrelation_time']))} replans in the median; initial positive sequence, Geyer 1992). "
+        "In series this short that is an upper bound. No interval counts replans: the episode is the unit."
     )
     if known.height < table.height:
         text += f" {table.height - known.height} of {table.height} episodes are left out: too few replans, no change, or gaps."

@@ -1,9 +1,8 @@
-"""Time courses: means over episodes on the episode's own time and around the first gripper closing, with pointwise
-intervals.
+"""Time courses: means over episodes on the episode's own time and around the first gripper closing, with pointwise intervals.
 
 Quantities are the ratio (its geometric mean: the course of a mean of ratios is that of its largest episode) and the
-fractions of all groups that take any mass, for the layer that speaks for the whole ("layers_avg" unless one layer is
-chosen). Intervals are pointwise two-level bootstraps: each point's own, not a band for the whole curve.
+fractions of all groups that take any mass, for the layer that speaks for the whole ("layers_avg" unless one layer is chosen).
+Intervals are pointwise two-level bootstraps: each point's own, not a band for the whole curve.
 """
 
 from __future__ import annotations
@@ -68,15 +67,13 @@ class TimeCourses:
     Attributes:
         layer: which one.
         quantities: "ratio" (when the grouping has one) and the groups whose fractions are followed.
-        course: one row per (alignment, outcome, quantity, position): `position_low`, `position`, `position_high`
-            (episode time 0 to 1, or replans from the closing), `value`, `low`, `high`, `num_episodes`, `num_tasks`,
-            `uniform` (of the ratio).
-        closing: one row per episode: its identity, `closing_replan` (null when the gripper never closes) and
-            `closing_time` (0 to 1); empty when the stores hold no actions.
-        change: one row per quantity: mean change from before to after the closing (a factor for the ratio, a difference
-            for fractions) with `low` and `high`, and how many episodes show both sides.
-        outcomes: success against failure, one row per quantity, columns of `effect_sizes.contrast_row`; the ratio as
-            log2.
+        course: one row per (alignment, outcome, quantity, position): `position_low`, `position`, `position_high` (episode time 0 to
+            1, or replans from the closing), `value`, `low`, `high`, `num_episodes`, `num_tasks`, `uniform` (of the ratio).
+        closing: one row per episode: its identity, `closing_replan` (null when the gripper never closes) and `closing_time`
+            (0 to 1); empty when the stores hold no actions.
+        change: one row per quantity: mean change from before to after the closing (a factor for the ratio, a difference for
+            fractions) with `low` and `high`, and how many episodes show both sides.
+        outcomes: success against failure, one row per quantity, columns of `effect_sizes.contrast_row`; the ratio as log2.
         autocorrelation: one row per episode, see `effective_replans.effective_replans_table`.
         num_nonfinite: (episode, replan) pairs without a finite log ratio, which take no part in the ratio's course.
     """
