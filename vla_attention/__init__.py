@@ -6,7 +6,8 @@
     run.ratios()                            # a polars frame; docs/python.md lists the other methods
 
 Public names: `open` and `OpenStores` (stage two), `UserError` (the base of every error that a user can cause) and
-`__version__`. This import loads neither torch nor zarr, polars or numpy.
+`__version__`. `vla_attention.testing` makes small stores with known content. This import loads neither torch nor zarr,
+polars or numpy.
 """
 
 from __future__ import annotations
