@@ -1,21 +1,33 @@
-"""The Python API: an opened store whose methods mirror the commands of `vla-analyze` and return polars frames.
+"""The Python API: an opened store whose methods are the commands of `vla-analyze` and return polars frames.
 
 The examples run as tests, with `store` and `other` being paths of small stores and `folder` that of an empty folder.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import OrderedDict
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Literal, Unpack
+from typing import TYPE_CHECKING, Any, Literal, Unpack, get_args
 
 import polars as pl
 
-from vla_attention.analyze.measures.settings import Settings, analysis_settings
-from vla_attention.analyze.opened import Opened, check_name
+from vla_attention.analyze.measures.frames import Tables
+from vla_attention.analyze.measures.question import Question, ask
+from vla_attention.analyze.measures.settings import AnalysisSettings, SettingKeywords, settings_from_keywords
+from vla_attention.analyze.ratios.analysis import Analysis, analyse
+from vla_attention.analyze.stores.contents import describe_store, episodes_table, header_lines, one_line
 from vla_attention.analyze.stores.selection import check_combinable
-from vla_attention.schemas.errors import BadArgument, listing
-from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
+from vla_attention.schemas.stores.reader import Store, open_store
+from vla_attention.schemas.stores.store_format import RootAttributes
+
+if TYPE_CHECKING:
+    import xarray
+
+LevelName = Literal["tasks", "episodes", "replans", "steps"]
+#: So many analyses are kept, so that asking for tasks after episodes does not read everything again.
+_KEPT = 4
 
 
 def open_stores(stores: str | Path | Sequence[str | Path]) -> OpenStores:
@@ -28,15 +40,16 @@ def open_stores(stores: str | Path | Sequence[str | Path]) -> OpenStores:
     return OpenStores(opened)
 
 
-class OpenStores(Opened):
+class OpenStores:
     """One or several stores, opened for questions. Made by `va.open`; holds the episodes that were complete then.
 
-    Every method takes the keywords of `vla_attention.analyze.measures.settings.Settings`, reads what it needs and no more, and returns a polars frame
-    (which of several is chosen by `table`). Mistakes raise a `vla_attention.schemas.errors.UserError` that says what exists.
+    Every method takes the keywords of `vla_attention.analyze.measures.settings.SettingKeywords`, reads only what it
+    needs and returns a polars frame; where there are several, `table` or `level` chooses one. Mistakes raise a
+    `va.UserError` that says what exists.
 
     Attributes:
         stores: the stores, as `vla_attention.schemas.stores.reader` opens them.
-        attributes: the run's own description (policy, protocol, recording, sites) of the first store.
+        attributes: policy, protocol, recording and sites of the run, from the first store.
 
     >>> run = va.open(store)
     >>> run.attributes.recording.layers
@@ -45,10 +58,126 @@ class OpenStores(Opened):
     OpenStores of 1 store: 4 episodes of 2 tasks (2 solved), 12 replans, suite made_up
     """
 
+    def __init__(self, stores: Sequence[Store]) -> None:
+        self.stores = tuple(stores)
+        self._analyses: OrderedDict[AnalysisSettings, Analysis] = OrderedDict()
+
+    @property
+    def attributes(self) -> RootAttributes:
+        """What the store says of its run; only the suite may differ between the stores."""
+        return self.stores[0].attributes
+
+    @property
+    def episodes(self) -> pl.DataFrame:
+        """One row per episode, from its attributes; reads no rows.
+
+        >>> va.open(store).episodes.select("task_id", "episode_index", "success", "num_replans").rows()
+        [(0, 0, False, 3), (0, 1, True, 3), (1, 0, False, 3), (1, 1, True, 3)]
+        """
+        return episodes_table(self.stores)
+
+    def ask(self, **settings: Unpack[SettingKeywords]) -> Question:
+        """The checked question that the tables answer; the modules of the package take it.
+
+        >>> va.open(store).ask(grouping="cameras", layers=2).selection.blocks
+        (2,)
+        """
+        return ask(self.stores, settings_from_keywords(**settings))
+
+    def analysis(self, **settings: Unpack[SettingKeywords]) -> Analysis:
+        """All tables and the summary of one grouping, as `vla-analyze STORE` computes them; the last few are kept."""
+        wanted = settings_from_keywords(**settings)
+        if wanted not in self._analyses:
+            self._analyses[wanted] = analyse(ask(self.stores, wanted))
+        self._analyses.move_to_end(wanted)
+        while len(self._analyses) > _KEPT:
+            self._analyses.popitem(last=False)
+        return self._analyses[wanted]
+
+    def ratios(self, level: LevelName = "tasks", **settings: Unpack[SettingKeywords]) -> pl.DataFrame:
+        """Ratios as `vla-analyze ratios` gives them: one row per cell. Masses of the groups are in `masses`.
+
+        `level`: "tasks" (per task and over all, with intervals), "episodes", "replans" or "steps" (every replan, layer
+        and denoise step). docs/python.md lists the columns.
+
+        >>> run = va.open(store)
+        >>> run.ratios("steps", groups={"bowl": "word:bowl", "rest": "*"}, layers=2, denoise="last").height
+        12
+        >>> run.ratios("episodes", grouping="cameras", tasks=0).select("task_id", "layer").unique().height
+        3
+        """
+        return self._level(level, settings).cells
+
+    def masses(self, level: LevelName = "steps", **settings: Unpack[SettingKeywords]) -> pl.DataFrame:
+        """Masses, fractions, densities and lifts of the groups: one row per cell of `ratios` and group.
+
+        `level`: as in `ratios`. `pivot` of polars makes a column per group of it; docs/python.md has an example.
+
+        >>> masses = va.open(store).masses(grouping="instruction", per_head=True)
+        >>> masses.group_by("group").agg(pl.col("keys").mean()).filter(group="linguistic")["keys"].to_list()
+        [5.0]
+        """
+        return self._level(level, settings).groups
+
+    def _level(self, level: LevelName, settings: SettingKeywords) -> Tables:
+        _check_name("level", level, get_args(LevelName))
+        tables: Tables = getattr(self.analysis(**settings), level)
+        return tables
+
+    def summary(self, **settings: Unpack[SettingKeywords]) -> str:
+        """The text that `vla-analyze STORE` prints.
+
+        >>> va.open(store).summary().splitlines()[0]
+        'ATTENTION SUMMARY'
+        """
+        return self.analysis(**settings).summary
+
+    def describe(self) -> str:
+        """What the stores hold: run, layout, words, objects, tasks; the text of `vla-analyze STORE --list`.
+
+        >>> "akita_black_bowl_1" in va.open(store).describe()
+        True
+        """
+        return "\n\n".join(describe_store(store) for store in self.stores)
+
+    def contributions(self, **settings: Unpack[SettingKeywords]) -> pl.DataFrame:
+        """Norms of what visual and linguistic keys add to the residual stream (`measures.contributions`).
+
+        >>> va.open(store).contributions(layers=0)["contribution_ratio"].is_finite().all()
+        True
+
+        Raises:
+            BadArgument: the stores hold no contributions.
+        """
+        from vla_attention.analyze.export.tables import chosen_tables
+
+        return chosen_tables(self.analysis(**settings), ["contributions"])["contributions"]
+
+    def to_xarray(
+        self, rows: bool = False, most_gigabytes: float = 4.0, **settings: Unpack[SettingKeywords]
+    ) -> xarray.Dataset:
+        """Masses of every head as labelled arrays, or with `rows` the rows themselves. Needs the extra `xarray`.
+
+        (episode, replan) is one axis `sample`; see `vla_attention.analyze.export.labelled_arrays`.
+
+        >>> va.open(store).to_xarray(grouping="cameras")["mass"].dims
+        ('sample', 'layer', 'denoise', 'head', 'group')
+        >>> va.open(store).to_xarray(rows=True, layers=2)["rows"].shape
+        (12, 1, 2, 2, 39)
+
+        Raises:
+            MissingDependency: xarray is not installed.
+            BadArgument: the rows would take more memory than `most_gigabytes`.
+        """
+        from vla_attention.analyze.export.labelled_arrays import masses_array, rows_array
+
+        question = self.ask(**settings)
+        return rows_array(question, int(most_gigabytes * 1e9)) if rows else masses_array(question)
+
     def groups(
-        self, table: Literal["groups", "words", "overlaps"] = "groups", **settings: Unpack[Settings]
+        self, table: Literal["groups", "words", "overlaps"] = "groups", **settings: Unpack[SettingKeywords]
     ) -> pl.DataFrame:
-        """What a grouping takes, before any number: keys by span and role, words with their pieces, shared keys.
+        """The keys of every group: their numbers by span and role, words with their pieces, keys that groups share.
 
         >>> found = va.open(store).groups(groups={"bowl": "word:bowl", "rest": "*"})
         >>> found.filter(pl.col("span").is_null(), group="bowl")["keys_max"].to_list()
@@ -56,15 +185,15 @@ class OpenStores(Opened):
         """
         from vla_attention.analyze.groups.group_preview import preview_groups
 
-        check_name("table", table, ("groups", "words", "overlaps"))
+        _check_name("table", table, ("groups", "words", "overlaps"))
         return _frame(preview_groups(self.ask(**settings)), table)
 
     def heads(
         self,
         table: Literal["heads", "heads_groups", "dispersion", "depth", "denoise", "denoise_groups"] = "heads",
-        **settings: Unpack[Settings],
+        **settings: Unpack[SettingKeywords],
     ) -> pl.DataFrame:
-        """Who looks and who reads: every head, how much heads differ, the profile over depth, over denoise steps.
+        """Every head, how much the heads of a layer differ, depth (centres over layers) and denoise steps.
 
         "heads" and "denoise" hold ratios, "heads_groups" and "denoise_groups" the groups' fractions and lifts.
 
@@ -74,25 +203,28 @@ class OpenStores(Opened):
         from vla_attention.analyze.heads.head_study import study_heads
 
         tables = study_heads(self.ask(**settings)).tables()
-        check_name("table", table, tables)
+        _check_name("table", table, tables)
         return tables[table]
 
-    def row_metrics(self, table: Literal["rows", "groups"] = "rows", **settings: Unpack[Settings]) -> pl.DataFrame:
-        """Entropy, effective number of keys and top-k mass of every row (`heads.row_metrics.row_tables`). Reads all rows.
+    def row_metrics(
+        self, table: Literal["rows", "groups"] = "rows", **settings: Unpack[SettingKeywords]
+    ) -> pl.DataFrame:
+        """Entropy, effective number of keys and top-k mass of every row. Reads all rows.
 
-        "groups": entropy and effective keys inside each group; its column `row` is that of "rows".
+        "groups": entropy and effective keys inside each group; its column `row` is that of "rows". Columns:
+        `row_tables` in `vla_attention.analyze.heads.row_metrics`.
 
         >>> va.open(store).row_metrics(layers=0, denoise="first", heads=1).height
         12
         """
         from vla_attention.analyze.heads.row_metrics import row_metrics
 
-        check_name("table", table, ("rows", "groups"))
+        _check_name("table", table, ("rows", "groups"))
         level = row_metrics(self.ask(**settings))
         return level.cells if table == "rows" else level.groups
 
-    def sinks(self, **settings: Unpack[Settings]) -> pl.DataFrame:
-        """Keys that take far more than their share in most rows (`vla_attention.analyze.measures.sinks`), per task. Reads all rows.
+    def sinks(self, **settings: Unpack[SettingKeywords]) -> pl.DataFrame:
+        """Keys of each task that take far more than their share in most rows (`measures.sinks`). Reads all rows.
 
         >>> va.open(store).sinks().columns[:3]
         ['suite', 'task_id', 'num_episodes']
@@ -101,8 +233,10 @@ class OpenStores(Opened):
 
         return sinks_table(self.ask(**settings))
 
-    def words(self, table: Literal["summary", "episodes"] = "summary", **settings: Unpack[Settings]) -> pl.DataFrame:
-        """Which words are read: over all episodes with intervals ("summary"), or per episode and layer.
+    def words(
+        self, table: Literal["summary", "episodes"] = "summary", **settings: Unpack[SettingKeywords]
+    ) -> pl.DataFrame:
+        """Attention on the words: over all episodes with intervals ("summary"), or per episode and layer ("episodes").
 
         >>> words = va.open(store).words(tasks=0)
         >>> sorted(words.filter(kind="word")["item"].to_list())
@@ -110,13 +244,13 @@ class OpenStores(Opened):
         """
         from vla_attention.analyze.words.word_study import study_words
 
-        check_name("table", table, ("summary", "episodes"))
-        return _frame(study_words(self.stores, analysis_settings(**settings)), table)
+        _check_name("table", table, ("summary", "episodes"))
+        return _frame(study_words(self.stores, settings_from_keywords(**settings)), table)
 
     def objects(
-        self, table: Literal["objects", "times", "pointing", "iou"] = "objects", **settings: Unpack[Settings]
+        self, table: Literal["objects", "times", "pointing", "iou"] = "objects", **settings: Unpack[SettingKeywords]
     ) -> pl.DataFrame:
-        """Which objects are looked at: shares and lifts, shares over time, or pointing game and IoU with their masks.
+        """Attention on the objects: shares and lifts, shares over time, pointing game, or IoU with the objects' masks.
 
         >>> objects = va.open(store).objects()
         >>> "akita_black_bowl_1" in objects["item"].to_list()
@@ -128,20 +262,20 @@ class OpenStores(Opened):
         from vla_attention.analyze.objects.object_settings import ObjectSettings
         from vla_attention.analyze.objects.object_study import study_objects
 
-        check_name("table", table, ("objects", "times", "pointing", "iou"))
+        _check_name("table", table, ("objects", "times", "pointing", "iou"))
         options = ObjectSettings(spatial=table in ("pointing", "iou"))
-        return _frame(study_objects(self.stores, analysis_settings(**settings), options).tables, table)
+        return _frame(study_objects(self.stores, settings_from_keywords(**settings), options).tables, table)
 
     def time(
         self,
         table: Literal["course", "closing", "change", "outcomes", "autocorrelation"] = "course",
         bins: int | None = None,
         window: int | None = None,
-        **settings: Unpack[Settings],
+        **settings: Unpack[SettingKeywords],
     ) -> pl.DataFrame:
-        """Over the course of an episode: phase-aligned means, the gripper's closing, success against failure.
+        """Over the course of an episode: means at equal phases, the gripper's closing, success against failure.
 
-        `bins` and `window` are those of `vla_attention.analyze.time.time_courses.TimeSettings`.
+        `bins` and `window`: as `TimeSettings` in `vla_attention.analyze.time.time_courses`.
 
         >>> course = va.open(store).time(bins=3)
         >>> course["quantity"].unique().sort().to_list()[-1]
@@ -149,7 +283,7 @@ class OpenStores(Opened):
         """
         from vla_attention.analyze.time.time_courses import TimeSettings, time_courses
 
-        check_name("table", table, ("course", "closing", "change", "outcomes", "autocorrelation"))
+        _check_name("table", table, ("course", "closing", "change", "outcomes", "autocorrelation"))
         given = {name: value for name, value in (("num_bins", bins), ("window", window)) if value is not None}
         return _frame(time_courses(self.ask(**settings), TimeSettings(**given)), table)
 
@@ -159,7 +293,7 @@ class OpenStores(Opened):
         table: Literal["differences", "estimates", "pairs", "unpaired"] = "differences",
         allow_mismatch: Sequence[str] = (),
         names: tuple[str, str] = ("first", "other"),
-        **settings: Unpack[Settings],
+        **settings: Unpack[SettingKeywords],
     ) -> pl.DataFrame:
         """This run against another: other minus this one, paired where initial states and seeds are shared.
 
@@ -168,18 +302,18 @@ class OpenStores(Opened):
         [0.0]
 
         Raises:
-            MixedPolicies, RunsDiffer: the runs differ in what is not compared, see `allow_mismatch` and `vla_attention.analyze.compare.runs`.
+            MixedPolicies, RunsDiffer: the runs differ in more than their weights and `allow_mismatch` does not name it;
+                see `vla_attention.analyze.compare.runs`.
         """
         from vla_attention.analyze.compare.comparison import compare
         from vla_attention.analyze.compare.runs import RunArgument, open_runs
 
-        check_name("table", table, ("differences", "estimates", "pairs", "unpaired"))
-        opened = other if isinstance(other, OpenStores) else open_stores(other)
+        _check_name("table", table, ("differences", "estimates", "pairs", "unpaired"))
+        both = self, other if isinstance(other, OpenStores) else open_stores(other)
         arguments = [
-            RunArgument(name, tuple(store.path for store in stores))
-            for name, stores in zip(names, (self.stores, opened.stores), strict=True)
+            RunArgument(name, tuple(one.path for one in run.stores)) for name, run in zip(names, both, strict=True)
         ]
-        runs = open_runs(arguments, analysis_settings(**settings), allow_mismatch)
+        runs = open_runs(arguments, settings_from_keywords(**settings), allow_mismatch)
         return _frame(compare(runs, allow_mismatch), table)
 
     def overlay(
@@ -191,12 +325,12 @@ class OpenStores(Opened):
         folder: str | Path | None = None,
         measure: Literal["lift", "share"] = "lift",
         smooth: bool = False,
-        **settings: Unpack[Settings],
+        **settings: Unpack[SettingKeywords],
     ) -> pl.DataFrame:
-        """Attention on the pictures of one episode: one row per (replan, camera, patch); with `folder`, also drawn there as a strip.
+        """Attention on the pictures of one episode: one row per (replan, camera, patch).
 
-        The first episode unless `task` and `episode` say which; every replan unless `replans` names some. `groups` are outlined, as in
-        `vla-analyze overlay`, which can also make videos.
+        With `folder`, a strip of pictures is drawn there, with outlines around `groups`. Without `task`, `episode` and
+        `replans`: the first episode, every replan. `vla-analyze overlay` can also make videos.
 
         >>> patches = va.open(store).overlay(task=1, replans=0, folder=folder)
         >>> patches.height, sorted(file.suffix for file in folder.iterdir())
@@ -204,10 +338,10 @@ class OpenStores(Opened):
         """
         from vla_attention.analyze.overlay.overlay_study import study_overlay
 
-        check_name("measure", measure, ("lift", "share"))
+        _check_name("measure", measure, ("lift", "share"))
         study = study_overlay(
             self.stores,
-            analysis_settings(**settings),
+            settings_from_keywords(**settings),
             task=task,
             episode=episode,
             cameras=[cameras] if isinstance(cameras, str) else cameras,
@@ -220,11 +354,15 @@ class OpenStores(Opened):
         return study.table
 
     def report(
-        self, path: str | Path, episodes: int | None = None, replans: int | None = None, **settings: Unpack[Settings]
+        self,
+        path: str | Path,
+        episodes: int | None = None,
+        replans: int | None = None,
+        **settings: Unpack[SettingKeywords],
     ) -> Path:
         """Write the self-contained HTML page of `vla-analyze report`; returns its path.
 
-        `episodes` with overlays and `replans` of each are those of `vla_attention.analyze.report.settings.ReportSettings`.
+        `episodes`: how many are shown with pictures; `replans`: how many of each.
 
         >>> page = va.open(store).report(folder / "report.html", episodes=1, replans=2)
         >>> page.read_text(encoding="utf-8")[:15].lower()
@@ -233,26 +371,28 @@ class OpenStores(Opened):
         from vla_attention.analyze.report.page import write_report
         from vla_attention.analyze.report.settings import ReportSettings
 
-        usual = ReportSettings()
-        shown = usual.episodes if episodes is None else episodes, usual.replans if replans is None else replans
-        write_report(self.ask(**settings), Path(path), ReportSettings(*shown))
+        shown: dict[str, Any] = {
+            name: count for name, count in (("episodes", episodes), ("replans", replans)) if count is not None
+        }
+        write_report(self.ask(**settings), Path(path), ReportSettings(**shown))
         return Path(path)
 
+    def __str__(self) -> str:
+        return f"OpenStores of {one_line(self.stores)}"
+
     def __repr__(self) -> str:
-        root = self.attributes
-        policy, recording = root.policy, root.recording
-        untrained = ", UNTRAINED random weights" if policy.untrained else ""
         lines = [
-            str(self),
-            f"  stores   {listing([store.path for store in self.stores])}",
-            f"  policy   {policy.name} ({policy.checkpoint_format}: {policy.checkpoint}){untrained}",
-            f"  layers   {listing(recording.layer_labels, 40)}; denoise steps {listing(recording.denoise_steps, 40)}; "
-            f"heads {listing(recording.heads, 40)}",
-            f"  sites    {listing(f'{site.name} ({site.num_keys} keys)' for site in root.sites)}",
-            "  ask with .ratios() .masses() .summary() .groups() .heads() .words() .objects() .time() .compare(other)",
-            "           .overlay() .report(path) .to_xarray()",
+            *header_lines(self.stores),
+            "ask with .ratios() .masses() .summary() .groups() .heads() .words() .objects() .time() .compare(other)",
+            "         .overlay() .report(path) .to_xarray()",
         ]
-        return "\n".join(lines)
+        return "\n  ".join([str(self), *lines])
+
+
+def _check_name(what: str, given: str, known: Collection[str]) -> None:
+    """Raise `BadArgument` unless the name exists."""
+    if given not in known:
+        raise BadArgument(f"Unknown {what} '{given}'.{did_you_mean(given, known)} Existing: {listing(known)}.")
 
 
 def _frame(tables: object, name: str) -> pl.DataFrame:

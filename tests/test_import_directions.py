@@ -27,7 +27,6 @@ LEVELS = {
     "analyze.published": 3,
     "analyze.parse": 5,
     "analyze.report": 5,
-    "analyze.opened": 5,
     "analyze.api": 6,
     "analyze.__main__": 7,
     "capture.environments": 1,

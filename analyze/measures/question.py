@@ -1,6 +1,6 @@
-"""What is asked of which rows: stores, a selection of episodes and axes, a site and a grouping, all checked against what exists.
+"""A question: stores, selected episodes and axes, a site and a grouping, all checked against what exists.
 
-Every command and every method of the Python API begins with `ask`; what comes out of it is what the measuring modules take.
+Every command and every method of the Python API begins with `ask`; the functions that measure take its `Question`.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 from vla_attention.analyze.measures.frames import layer_name
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
+from vla_attention.analyze.measures.settings import AnalysisSettings
 from vla_attention.analyze.show.headings import run_header
 from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.selection import Selection, check_combinable, choose_site, select, select_episodes
@@ -25,36 +26,19 @@ DEFAULT_GROUPING = "default"
 
 
 @dataclass(frozen=True)
-class AnalysisSettings:
-    """What a user asks for; None means the default (see `vla_attention.analyze.arguments`)."""
-
-    grouping: str | None = None
-    groups: tuple[str, ...] = ()
-    ratio: str | None = None
-    layers: tuple[int, ...] | None = None
-    denoise: tuple[str, ...] | None = None
-    heads: tuple[int, ...] | None = None
-    per_head: bool = False
-    tasks: tuple[int, ...] | None = None
-    site: str | None = None
-    seed: int = 0
-    skip_corrupt: bool = False
-
-
-@dataclass(frozen=True)
 class Question:
-    """Settings held against stores.
+    """Settings that were checked against stores.
 
     Attributes:
         stores: the stores, of one policy and one kind of recording.
         settings: what the user asked for.
         selection: positions along the stored axes.
-        site: the softmax family that is looked at.
+        site: the softmax family whose rows are used.
         selected: the episodes, each with its store and its tokens.
         grouping: the groups of keys.
         vocabulary: the names that selectors may use over the episodes.
         skipped: one line for every episode that was left out because it is damaged or empty (`skip_corrupt`).
-        notes: further lines that belong beside every number, for instance which keys were taken out.
+        notes: further lines for every result, for instance which keys were taken out.
     """
 
     stores: tuple[Store, ...]
@@ -97,10 +81,11 @@ class Question:
 
 
 def ask(stores: Sequence[Store], settings: AnalysisSettings) -> Question:
-    """Check what is wanted against what the stores hold. Reads the episodes' attributes and roles, no rows.
+    """Check the settings against what the stores hold. Reads the episodes' attributes and roles, no rows.
 
     Raises:
-        UserError: a subclass that says what does not fit; see the functions of `vla_attention.analyze.stores.selection` and `vla_attention.schemas.groupings.resolve`.
+        UserError: a subclass that says what does not fit; see `vla_attention.analyze.stores.selection` and
+            `vla_attention.schemas.groupings.resolve`.
     """
     check_combinable(stores)
     root = stores[0].attributes
@@ -132,7 +117,7 @@ def choose_grouping(settings: AnalysisSettings, vocabulary: Vocabulary) -> Group
 def _without_faulty(
     chosen: Sequence[tuple[Store, StoredEpisode]],
 ) -> tuple[list[tuple[Store, StoredEpisode]], list[str]]:
-    """The episodes that read back whole and hold a replan, and a line on each of the others. Reads everything once."""
+    """The episodes that are undamaged and hold a replan, and a line on each of the others. Reads everything once."""
     kept, skipped = [], []
     with progress_bar(len(chosen), "episodes checked") as advance:
         for store, episode in chosen:
@@ -155,6 +140,6 @@ def _refuse_empty(chosen: Sequence[tuple[Store, StoredEpisode]]) -> None:
     empty = [f"{episode.name} of {store.path}" for store, episode in chosen if not episode.attributes.num_replans]
     if empty:
         raise StoreError(
-            f"{listing(empty)} hold{'s' if len(empty) == 1 else ''} no replan, so there is no attention to measure; leave "
-            "such episodes out with --skip-corrupt."
+            f"{listing(empty)} hold{'s' if len(empty) == 1 else ''} no replan, so there is no attention to measure; "
+            "leave such episodes out with --skip-corrupt."
         )

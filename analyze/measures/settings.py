@@ -1,23 +1,47 @@
-"""Settings as plain Python values: what the methods of the Python API take as keywords."""
+"""The settings of a question: as the functions take them, and as keywords of the Python API."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypedDict
 
-from vla_attention.analyze.measures.question import AnalysisSettings
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
 
 
-class Settings(TypedDict, total=False):
-    """Keywords that every method takes; what they mean is what the options of the same names mean on the command line.
+@dataclass(frozen=True)
+class AnalysisSettings:
+    """What a user asks for; None means the default. `vla_attention.analyze.arguments` reads it from a command line."""
 
-    grouping: a built-in grouping or a TOML file. groups: further groups, name to selector or selectors (or a list of "NAME=SELECTOR").
-    ratio: "A,B/C", or a pair of names or lists of names. layers, heads, tasks: a number or several. denoise: "first", "last",
-    "all" or numbers. per_head: keep heads apart. site: the softmax family. seed: of the bootstrap. skip_corrupt: leave out damaged
-    and empty episodes.
+    grouping: str | None = None
+    groups: tuple[str, ...] = ()
+    ratio: str | None = None
+    layers: tuple[int, ...] | None = None
+    denoise: tuple[str, ...] | None = None
+    heads: tuple[int, ...] | None = None
+    per_head: bool = False
+    tasks: tuple[int, ...] | None = None
+    site: str | None = None
+    seed: int = 0
+    skip_corrupt: bool = False
+
+
+class SettingKeywords(TypedDict, total=False):
+    """The keywords that every method of the Python API takes: the names of `AnalysisSettings`, plain Python values.
+
+    Each means the same as the option of its name on the command line.
+
+    Keys:
+        grouping: a built-in grouping or the path of a TOML file.
+        groups: further groups, from name to selector or list of selectors; or a list of "NAME=SELECTOR".
+        ratio: "A,B/C", or a pair (numerator, denominator) of names or lists of names.
+        layers, heads, tasks: a number or several.
+        denoise: "first", "last", "all", a number or several.
+        per_head: whether heads are kept apart.
+        site: the softmax family.
+        seed: of the bootstrap.
+        skip_corrupt: whether damaged and empty episodes are left out.
     """
 
     grouping: str | Path | None
@@ -33,21 +57,21 @@ class Settings(TypedDict, total=False):
     skip_corrupt: bool
 
 
-def analysis_settings(**settings: Any) -> AnalysisSettings:
-    """Plain keywords as `AnalysisSettings`; see `Settings`.
+def settings_from_keywords(**keywords: Any) -> AnalysisSettings:
+    """Keywords of the Python API as `AnalysisSettings`; see `SettingKeywords`.
 
-    >>> analysis_settings(layers=25, groups={"bowl": "word:bowl"}, ratio=(["base", "wrist"], "bowl")).ratio
+    >>> settings_from_keywords(layers=25, groups={"bowl": "word:bowl"}, ratio=(["base", "wrist"], "bowl")).ratio
     'base,wrist/bowl'
 
     Raises:
-        BadArgument: a keyword does not exist, or its value has no meaning.
+        BadArgument: a keyword does not exist, or its value cannot be used.
     """
     known = [field.name for field in fields(AnalysisSettings)]
     values: dict[str, Any] = {}
-    for name, value in settings.items():
+    for name, value in keywords.items():
         if name not in known:
             raise BadArgument(f"Unknown setting '{name}'.{did_you_mean(name, known)} Existing: {listing(known, 20)}.")
-        values[name] = _READ[name](value) if name in _READ and value is not None else value
+        values[name] = _CONVERT[name](value) if name in _CONVERT and value is not None else value
     return AnalysisSettings(**values)
 
 
@@ -59,7 +83,7 @@ def _numbers(value: int | Sequence[int]) -> tuple[int, ...]:
         raise BadArgument(f"Cannot use {value!r} as numbers; expected a whole number or several.") from None
 
 
-def _words(value: int | str | Sequence[int | str]) -> tuple[str, ...]:
+def _steps(value: int | str | Sequence[int | str]) -> tuple[str, ...]:
     items: Sequence[int | str] = [value] if isinstance(value, (int, str)) else list(value)
     return tuple(str(item) for item in items)
 
@@ -84,6 +108,12 @@ def _ratio(value: str | tuple[str | Sequence[str], str | Sequence[str]]) -> str:
     return "/".join(side if isinstance(side, str) else ",".join(side) for side in value)
 
 
-_READ: dict[str, Any] = {
-    "grouping": str, "groups": _groups, "ratio": _ratio, "layers": _numbers, "heads": _numbers, "tasks": _numbers, "denoise": _words,
-}  # fmt: skip
+_CONVERT: dict[str, Any] = {
+    "grouping": str,
+    "groups": _groups,
+    "ratio": _ratio,
+    "layers": _numbers,
+    "heads": _numbers,
+    "tasks": _numbers,
+    "denoise": _steps,
+}

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import polars as pl
 
-from vla_attention.analyze.measures.question import AnalysisSettings, Question, ask
+from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.selected import find_episode
+from vla_attention.analyze.measures.settings import AnalysisSettings
 from vla_attention.analyze.overlay.overlay_data import (
     EpisodeOverlay,
     camera_names,

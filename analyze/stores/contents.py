@@ -1,9 +1,12 @@
-"""`--list`: what stores hold."""
+"""What stores hold: the text of `--list`, a few lines, a table of episodes."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+import polars as pl
+
+from vla_attention.analyze.show.numbers import of_tasks, plural
 from vla_attention.analyze.stores.selection import select_episodes
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS
@@ -12,6 +15,54 @@ from vla_attention.schemas.layers import block_of_labels
 from vla_attention.schemas.layout import Role, Span
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, mass_error_bound
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
+
+#: Attributes of an episode that are columns of `episodes_table`.
+_EPISODE_COLUMNS = (
+    "task_id",
+    "task_name",
+    "instruction",
+    "episode_index",
+    "initial_state_index",
+    "success",
+    "num_steps",
+    "num_replans",
+)
+
+
+def episodes_table(stores: Sequence[Store]) -> pl.DataFrame:
+    """One row per episode: store, suite and `_EPISODE_COLUMNS`, from the attributes."""
+    rows = [
+        {"store": str(store.path), "suite": store.suite}
+        | {name: getattr(episode.attributes, name) for name in _EPISODE_COLUMNS}
+        for store in stores
+        for episode in store.episodes
+    ]
+    return pl.DataFrame(rows, schema_overrides={"task_id": pl.Int64})
+
+
+def one_line(stores: Sequence[Store]) -> str:
+    """Numbers of stores, episodes, tasks, solved episodes and replans, and the suites."""
+    episodes = [episode.attributes for store in stores for episode in store.episodes]
+    tasks = {(store.suite, task) for store in stores for task in store.task_ids}
+    solved, replans = (sum(getattr(one, name) for one in episodes) for name in ("success", "num_replans"))
+    return (
+        f"{plural(len(stores), 'store')}: {of_tasks(len(episodes), len(tasks))} ({solved} solved), {replans} replans, "
+        f"suite {listing(dict.fromkeys(store.suite for store in stores))}"
+    )
+
+
+def header_lines(stores: Sequence[Store]) -> list[str]:
+    """Paths, policy, recorded axes and sites of stores of one run."""
+    root = stores[0].attributes
+    policy, recording = root.policy, root.recording
+    untrained = ", UNTRAINED random weights" if policy.untrained else ""
+    return [
+        f"stores   {listing([store.path for store in stores])}",
+        f"policy   {policy.name} ({policy.checkpoint_format}: {policy.checkpoint}){untrained}",
+        f"layers   {listing(recording.layer_labels, 40)}; denoise steps {listing(recording.denoise_steps, 40)}; "
+        f"heads {listing(recording.heads, 40)}",
+        f"sites    {listing(f'{site.name} ({site.num_keys} keys)' for site in root.sites)}",
+    ]
 
 
 def describe_store(store: Store, tasks: Sequence[int] | None = None) -> str:

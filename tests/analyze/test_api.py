@@ -16,18 +16,16 @@ from polars.testing import assert_frame_equal
 import vla_attention as va
 import vla_attention.analyze.api
 import vla_attention.analyze.measures.settings
-import vla_attention.analyze.opened
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.api import OpenStores
-from vla_attention.analyze.measures.question import AnalysisSettings
-from vla_attention.analyze.measures.settings import Settings, analysis_settings
+from vla_attention.analyze.measures.settings import AnalysisSettings, SettingKeywords, settings_from_keywords
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.precision import mass_error_bound
 from vla_attention.schemas.stores.store_format import StoreError, StoreNotFound
 from vla_attention.testing.stores import write_store
 from vla_attention.testing.tokens import small_layout
 
-MODULES = (va, vla_attention.analyze.api, vla_attention.analyze.opened, vla_attention.analyze.measures.settings)
+MODULES = (va, vla_attention.analyze.api, vla_attention.analyze.measures.settings)
 
 
 @pytest.fixture(scope="module")
@@ -87,12 +85,12 @@ def test_masses_in_long_form_are_sums_over_the_raw_rows(run, store):
     np.testing.assert_allclose(total["fraction"].to_numpy(), 1, rtol=1e-9)
 
 
-def test_answers_are_kept_and_the_oldest_go(store, monkeypatch):
+def test_the_last_four_analyses_are_kept(store, monkeypatch):
     run = va.open(store)
     asked = []
-    real = vla_attention.analyze.opened.analyse
+    real = vla_attention.analyze.api.analyse
     monkeypatch.setattr(
-        vla_attention.analyze.opened, "analyse", lambda question: (asked.append(question), real(question))[1]
+        vla_attention.analyze.api, "analyse", lambda question: (asked.append(question), real(question))[1]
     )
     run.ratios("tasks")
     run.ratios("episodes")
@@ -121,13 +119,13 @@ def test_answers_are_kept_and_the_oldest_go(store, monkeypatch):
         ({"grouping": Path("g.toml"), "layers": None}, AnalysisSettings(grouping="g.toml")),
     ],
 )
-def test_plain_values_are_settings(given, expected):
-    assert analysis_settings(**given) == expected
-    assert hash(analysis_settings(**given)) == hash(expected)
+def test_keywords_become_settings(given, expected):
+    assert settings_from_keywords(**given) == expected
+    assert hash(settings_from_keywords(**given)) == hash(expected)
 
 
-def test_keywords_are_the_settings_of_the_commands():
-    assert set(Settings.__annotations__) == {field.name for field in fields(AnalysisSettings)}
+def test_keywords_have_the_names_of_the_settings():
+    assert set(SettingKeywords.__annotations__) == {field.name for field in fields(AnalysisSettings)}
 
 
 @pytest.mark.parametrize(
@@ -160,7 +158,7 @@ def test_stores_are_opened_by_path_text_or_several(store, other, tmp_path):
         va.open([store, other])
 
 
-def test_what_it_is_can_be_seen(run, store):
+def test_repr_names_stores_policy_and_axes(run, store):
     text = repr(run)
     assert text.splitlines()[0] == "OpenStores of 1 store: 4 episodes of 2 tasks (2 solved), 12 replans, suite made_up"
     for part in (str(store), "UNTRAINED", "layers   0, 2", "joint (39 keys)", ".ratios()"):

@@ -7,7 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from vla_attention.analyze.measures.question import AnalysisSettings, Question, ask
+from vla_attention.analyze.measures.question import Question, ask
+from vla_attention.analyze.measures.settings import AnalysisSettings
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.stores.reader import Store, open_store
 
