@@ -19,9 +19,8 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.compare.runs import Run, check_comparable, noted_differences
-from vla_attention.analyze.measures.aggregate import measured_episode_tables
+from vla_attention.analyze.measures.aggregate import episode_tables, replans_of
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables
-from vla_attention.analyze.measures.steps import measure_episodes
 from vla_attention.analyze.statistics.bootstrap import (
     POSITIVE,
     SHARE,
@@ -90,7 +89,7 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = (), seed: int | None =
     notes += [line for run in runs for line in run.question.skipped]
     grouping = runs[0].question.grouping
     seed = runs[0].question.settings.seed if seed is None else seed
-    levels = [measured_episode_tables(measure_episodes(run.question), run.question.grouping) for run in runs]
+    levels = [episode_tables(replans_of(run.question), run.question.grouping) for run in runs]
     having = {name for level in levels for name in level.groups_with_mass()}
     filled = [name for name in grouping.names if name in having]
     tables = [_episode_values(run, level, filled, "seed" in allowed) for run, level in zip(runs, levels, strict=True)]

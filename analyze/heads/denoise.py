@@ -7,7 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import measured_episode_tables, overall_layer, overall_rows, task_tables
+from vla_attention.analyze.measures.aggregate import (
+    episode_tables,
+    overall_layer,
+    overall_rows,
+    replan_tables,
+    task_tables,
+)
 from vla_attention.analyze.measures.frames import Tables, concat_tables
 from vla_attention.analyze.measures.steps import MeasuredEpisode
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_SEED
@@ -23,7 +29,7 @@ def denoise_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping, seed
     selection = measured[0].selection
     parts = []
     for position in np.argsort(selection.denoise_steps, kind="stable").tolist():
-        episodes = measured_episode_tables([one.at_denoise(position) for one in measured], grouping)
+        episodes = episode_tables(replan_tables([one.at_denoise(position) for one in measured], grouping), grouping)
         layer = overall_layer(episodes.cells)
         whole = overall_rows(task_tables(episodes.filter(pl.col("layer") == layer), grouping, seed=seed))
         times = [one.item.episode.read("denoise_time")[selection.denoise[position]] for one in measured]

@@ -88,4 +88,7 @@ def contribution_norms(question: Question, resolved: Sequence[ResolvedGrouping])
     tables = group_contribution_tables(question, resolved)
     if tables is None:
         return None
-    return tables.groups.group_by(*EPISODE_ID, "block", "group", maintain_order=True).agg(pl.col("norm").mean())
+    by = (*EPISODE_ID, "block", "group")
+    return pl.concat(
+        [part.groups.group_by(by, maintain_order=True).agg(pl.col("norm").mean()) for part in tables.parts]
+    )

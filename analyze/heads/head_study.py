@@ -11,7 +11,7 @@ from vla_attention.analyze.heads.denoise import denoise_tables
 from vla_attention.analyze.heads.depth import contribution_norms, depth_table
 from vla_attention.analyze.heads.head_measures import dispersion_table, episode_heads, heads_tables
 from vla_attention.analyze.heads.row_metrics import RowOptions, groups_with_valid_keys, measure_all_rows, row_tables
-from vla_attention.analyze.measures.aggregate import measured_episode_tables, replan_tables, task_tables
+from vla_attention.analyze.measures.aggregate import episode_tables, replan_tables, task_tables
 from vla_attention.analyze.measures.frames import Tables, concat_tables, named_tables
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import resolve_all
@@ -97,7 +97,7 @@ def study_heads(question: Question, options: RowOptions | None = None) -> HeadSt
     heads = concat_tables([episode_heads(episode, grouping) for episode in measured])
     over_heads = [episode.over_heads() for episode in measured]
     replans = replan_tables(over_heads, grouping)
-    episodes = measured_episode_tables(over_heads, grouping)
+    episodes = episode_tables(replans, grouping)
     rows = key_shares = sinks = None
     if options is not None and measures is not None:
         rows = row_tables(question.selected, measures, shown, selection, options)

@@ -113,14 +113,6 @@ def _episode_replans(measured: MeasuredEpisode, grouping: Grouping) -> Tables:
     )
 
 
-def measured_episode_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Tables:
-    """`episode_tables` of measured episodes, one after the other: the groups of all replans at once would fill the memory."""
-    parts = [episode_tables(replan_tables([episode], grouping), grouping) for episode in measured]
-    return Tables(
-        _sorted(pl.concat([part.cells for part in parts])), _sorted(pl.concat([part.groups for part in parts]))
-    )
-
-
 def episode_tables(replans: Tables, grouping: Grouping) -> Tables:
     """Every (episode, layer), over the episode's replans; standard deviations with ddof 0.
 
@@ -160,7 +152,7 @@ def episode_tables(replans: Tables, grouping: Grouping) -> Tables:
     cells = replans.cells.group_by(*EPISODE_KEYS, *_LAYER_KEYS, maintain_order=True).agg(*columns)
     if grouping.ratio:
         cells = cells.with_columns(pl.col("log_ratio_mean").exp().alias("geometric_mean"))
-    groups = replans.groups.group_by(*EPISODE_ID, *_LAYER_KEYS, "group", maintain_order=True).agg(
+    measures = (
         pl.col("mass").mean(),
         pl.col("mass").std(ddof=0).alias("mass_std"),
         pl.col("fraction").mean(),
@@ -169,6 +161,8 @@ def episode_tables(replans: Tables, grouping: Grouping) -> Tables:
         pl.col("density").mean(),
         _finite("lift").mean(),
     )
+    by = (*EPISODE_ID, *_LAYER_KEYS, "group")
+    groups = pl.concat([part.groups.group_by(*by, maintain_order=True).agg(*measures) for part in replans.parts])
     return Tables(_sorted(cells), _sorted(groups))
 
 

@@ -162,9 +162,20 @@ class Tables:
             Of steps and replans it is made at every access, and not kept: it is several times as large as the masses.
     """
 
-    def __init__(self, cells: pl.DataFrame, groups: pl.DataFrame | Callable[[], pl.DataFrame]) -> None:
+    def __init__(
+        self,
+        cells: pl.DataFrame,
+        groups: pl.DataFrame | Callable[[], pl.DataFrame],
+        parts: Sequence[Tables] = (),
+    ) -> None:
         self.cells = cells
         self._groups = groups
+        self._parts = parts
+
+    @property
+    def parts(self) -> Sequence[Tables]:
+        """The same rows in parts of whole episodes, whose `groups` can be aggregated one after the other to save memory."""
+        return self._parts or (self,)
 
     @property
     def groups(self) -> pl.DataFrame:
@@ -177,7 +188,8 @@ class Tables:
 
     def filter(self, *conditions: pl.Expr) -> Tables:
         """The cells for which conditions on the columns of both tables hold."""
-        return Tables(self.cells.filter(*conditions), lambda: self.groups.filter(*conditions))
+        parts = [part.filter(*conditions) for part in self._parts]
+        return Tables(self.cells.filter(*conditions), lambda: self.groups.filter(*conditions), parts)
 
     def values(self, measure: str) -> NDArray[np.float64]:
         """A column of `groups` as an array (cell, group); NaN for null."""
@@ -200,7 +212,8 @@ class Tables:
 
     def groups_with(self, column: str) -> tuple[str, ...]:
         """The groups that have more than 0 in a column of a cell, in the order of the grouping."""
-        return tuple(self.groups.filter(pl.col(column) > 0)["group"].unique(maintain_order=True))
+        having = {name for part in self.parts for name in part.groups.filter(pl.col(column) > 0)["group"].unique()}
+        return tuple(name for name in self.parts[0].groups["group"].unique(maintain_order=True) if name in having)
 
     def by_group(self, *by: str) -> dict[tuple[Any, ...], dict[str, Any]]:
         """Rows of `groups` by the values of the columns `by` and the group, as in `tables.by_group("layer")[layer, name]`."""
@@ -209,7 +222,7 @@ class Tables:
 
 def concat_tables(parts: Sequence[Tables]) -> Tables:
     """The rows of all parts, in order; `groups` is made when it is asked for."""
-    return Tables(pl.concat([part.cells for part in parts]), lambda: pl.concat([part.groups for part in parts]))
+    return Tables(pl.concat([part.cells for part in parts]), lambda: pl.concat([part.groups for part in parts]), parts)
 
 
 def named_tables(name: str, level: Tables) -> dict[str, pl.DataFrame]:

@@ -116,9 +116,9 @@ def _episode_means(table: pl.DataFrame, measure: pl.Expr, *by: str) -> pl.DataFr
     )
 
 
-def norms_by_layer(groups: pl.DataFrame) -> dict[tuple[str, str], float]:
+def norms_by_layer(tables: Tables) -> dict[tuple[str, str], float]:
     """By (layer, group): mean over episodes of the mean norm."""
-    episodes = _episode_means(groups, pl.col("norm").mean(), "group")
+    episodes = pl.concat([_episode_means(part.groups, pl.col("norm").mean(), "group") for part in tables.parts])
     means = episodes.group_by("layer", "group", maintain_order=True).agg(pl.col("norm").mean())
     return {(layer, group): norm for layer, group, norm in means.iter_rows()}
 

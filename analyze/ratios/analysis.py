@@ -11,7 +11,7 @@ from typing import Any
 import polars as pl
 
 from vla_attention.analyze.measures.aggregate import (
-    measured_episode_tables,
+    episode_tables,
     overall_layer,
     overall_rows,
     replan_tables,
@@ -116,7 +116,7 @@ def analyse(question: Question) -> Analysis:
     resolved = resolve_all(grouping, question.selected, question.vocabulary)
     measured = measure_episodes(question, resolved)
     replans = replan_tables(measured, grouping)
-    episodes = measured_episode_tables(measured, grouping)
+    episodes = episode_tables(replans, grouping)
     tasks = task_tables(episodes, grouping, seed=question.settings.seed)
     return Analysis(question, resolved, measured, replans, episodes, tasks)
 

@@ -37,7 +37,7 @@ def contributions_section(table: pl.DataFrame, seed: int) -> str:
 def group_contributions_section(tables: Tables | None, grouping: Grouping, site: str, seed: int) -> str:
     """The summary's section: per layer the mean norms of the groups and the ratio of norms with a two-level interval."""
     title = f"CONTRIBUTIONS OF GROUPS  norms of what they add to the residual stream at site '{site}'"
-    measured = [] if tables is None else tables.groups["group"].unique(maintain_order=True).to_list()
+    measured = [] if tables is None else tables.parts[0].groups["group"].unique(maintain_order=True).to_list()
     cut = [name for name in grouping.names if name not in measured]
     note = (
         f"Not of {listing(cut)}: contributions are stored for whole segments (a span's keys of one role), and "
@@ -52,7 +52,7 @@ def group_contributions_section(tables: Tables | None, grouping: Grouping, site:
     nothing = [name for name in measured if name not in shown]
     if nothing:
         note = f"The keys of {listing(nothing)} add exactly nothing. {note}".strip()
-    norms = norms_by_layer(tables.groups)
+    norms = norms_by_layer(tables)
     ratios = ratios_by_layer(tables.cells, seed)
     rows = []
     for layer in tables.cells.select("layer").to_series().unique(maintain_order=True).cast(pl.String).to_list() + [
