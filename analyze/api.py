@@ -14,7 +14,7 @@ import polars as pl
 
 from vla_attention.analyze.measures.frames import Tables
 from vla_attention.analyze.measures.question import Question, ask
-from vla_attention.analyze.measures.settings import AnalysisSettings, SettingKeywords, settings_from_keywords
+from vla_attention.analyze.measures.question_settings import AnalysisSettings, SettingKeywords, settings_from_keywords
 from vla_attention.analyze.ratios.analysis import Analysis, analyse
 from vla_attention.analyze.stores.contents import describe_store, episodes_table, header_lines, one_line
 from vla_attention.analyze.stores.selection import check_combinable
@@ -43,7 +43,7 @@ def open_stores(stores: str | Path | Sequence[str | Path]) -> OpenStores:
 class OpenStores:
     """One or several stores, opened for questions. Made by `va.open`; holds the episodes that were complete then.
 
-    Every method takes the keywords of `vla_attention.analyze.measures.settings.SettingKeywords`, reads only what it
+    Every method takes the keywords of `vla_attention.analyze.measures.question_settings.SettingKeywords`, reads only what it
     needs and returns a polars frame; where there are several, `table` or `level` chooses one. Mistakes raise a
     `va.UserError` that says what exists.
 
@@ -369,7 +369,7 @@ class OpenStores:
         '<!doctype html>'
         """
         from vla_attention.analyze.report.page import write_report
-        from vla_attention.analyze.report.settings import ReportSettings
+        from vla_attention.analyze.report.report_settings import ReportSettings
 
         shown: dict[str, Any] = {
             name: count for name, count in (("episodes", episodes), ("replans", replans)) if count is not None

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from vla_attention.analyze.measures.settings import AnalysisSettings
+    from vla_attention.analyze.measures.question_settings import AnalysisSettings
     from vla_attention.analyze.measures.sinks import SinkRule
     from vla_attention.schemas.stores.reader import Store
 
@@ -103,7 +103,7 @@ def settings_of(arguments: argparse.Namespace) -> AnalysisSettings:
     """The settings in the parsed arguments; those that a command has no argument for keep their defaults."""
     from dataclasses import fields
 
-    from vla_attention.analyze.measures.settings import AnalysisSettings
+    from vla_attention.analyze.measures.question_settings import AnalysisSettings
 
     given = {"groups": "group"}
     values: dict[str, Any] = {}

@@ -144,7 +144,7 @@ def span_tables(store: Path) -> None:
     One BLAS thread, as in `vla-analyze`, which measures episodes in threads of its own.
     """
     from vla_attention.analyze.measures.question import ask
-    from vla_attention.analyze.measures.settings import AnalysisSettings
+    from vla_attention.analyze.measures.question_settings import AnalysisSettings
     from vla_attention.analyze.ratios.analysis import analyse
     from vla_attention.schemas.stores.reader import open_store
 

@@ -150,7 +150,7 @@ def simulate(case: Case, num_stores: int, seed: int) -> dict[tuple[str, str], fl
 def through_files(case: Case, num_stores: int, seed: int) -> dict[tuple[str, str], float]:
     """The same with stores on disk: written by the real writer, read back and analysed."""
     from vla_attention.analyze.measures.question import ask
-    from vla_attention.analyze.measures.settings import AnalysisSettings
+    from vla_attention.analyze.measures.question_settings import AnalysisSettings
     from vla_attention.analyze.ratios.analysis import analyse
     from vla_attention.schemas.layout import Role
     from vla_attention.schemas.stores.reader import open_store

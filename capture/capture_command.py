@@ -12,7 +12,7 @@ from vla_attention.capture.policies.family import PolicyFamily
 
 def run_capture_of_family(arguments: argparse.Namespace, termination: Termination) -> int:
     """Run `vla-capture FAMILY` on parsed arguments; returns the exit code."""
-    from vla_attention.capture.settings import run_settings
+    from vla_attention.capture.run_settings import run_settings
     from vla_attention.capture.store.store_writer import refuse_existing
 
     settings = run_settings(arguments)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Literal, cast
 
 from vla_attention.capture.environments.base import check_initial_state_index
-from vla_attention.capture.environments.protocol import WAIT_STEPS
+from vla_attention.capture.environments.episode_protocol import WAIT_STEPS
 from vla_attention.capture.environments.suites import list_tasks
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.jobs.worker import this_worker
@@ -22,7 +22,7 @@ from vla_attention.capture.provenance import describe_machine
 from vla_attention.capture.rollout.episode import EpisodeResult, check_protocol, max_replans
 from vla_attention.capture.rollout.episode_loop import EpisodeLoop
 from vla_attention.capture.rollout.progress import say
-from vla_attention.capture.settings import RecordingSettings, RunSettings
+from vla_attention.capture.run_settings import RecordingSettings, RunSettings
 from vla_attention.capture.store.disk_estimate import describe, estimate_disk
 from vla_attention.capture.store.store_writer import RunStore, open_run
 from vla_attention.schemas.errors import BadArgument, listing

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from vla_attention.analyze.measures.question import Question, ask
-from vla_attention.analyze.measures.settings import AnalysisSettings
+from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.schemas.errors import BadArgument, UnknownName, UserError, did_you_mean, listing
 from vla_attention.schemas.stores.reader import Store, open_store
 

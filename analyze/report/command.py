@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from vla_attention.analyze.arguments import add_grouping, add_selection, add_stores, settings_of
-from vla_attention.analyze.report.settings import ReportSettings
+from vla_attention.analyze.report.report_settings import ReportSettings
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:

@@ -11,7 +11,7 @@ import polars as pl
 from vla_attention.analyze.measures.aggregate import overall_layer
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.question import Question, ask
-from vla_attention.analyze.measures.settings import AnalysisSettings
+from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_SEED, POSITIVE, SHARE
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
 from vla_attention.analyze.stores.selection import site_that

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol
 
-from vla_attention.capture.environments.protocol import IMAGE_SIZE
+from vla_attention.capture.environments.episode_protocol import IMAGE_SIZE
 from vla_attention.schemas.errors import BadArgument
 
 # Command lines read suites and settings from here, and print their help without waiting for a library.

@@ -29,7 +29,7 @@ from vla_attention.capture.environments.base import (
     Task,
     check_initial_state_index,
 )
-from vla_attention.capture.environments.protocol import ACTION_SIZE, CAMERAS, CONTROL_FREQUENCY_HZ
+from vla_attention.capture.environments.episode_protocol import ACTION_SIZE, CAMERAS, CONTROL_FREQUENCY_HZ
 from vla_attention.capture.environments.robosuite_installation import import_robosuite, readable_device_choice
 from vla_attention.schemas.errors import BadArgument, unknown_name
 from vla_attention.schemas.groupings.vocabulary import SceneObject

@@ -27,7 +27,7 @@ from vla_attention.schemas.errors import BadArgument, unknown_name
 from vla_attention.schemas.layers import select_layers
 
 if TYPE_CHECKING:
-    from vla_attention.capture.settings import RunSettings
+    from vla_attention.capture.run_settings import RunSettings
 
 _FROM_ENVIRONMENT = "--from-environment"
 
@@ -104,7 +104,7 @@ def _evaluate(arguments: argparse.Namespace, script: PublishedScript, terminatio
 def _jobs(arguments: argparse.Namespace) -> list[_Job]:
     from vla_attention.capture.environments.suites import ALL_SUITES, STANDARD_SUITES, SUITES
     from vla_attention.capture.jobs.slurm import array_task_ids
-    from vla_attention.capture.settings import run_settings
+    from vla_attention.capture.run_settings import run_settings
 
     existing = [*(suite.name for suite in SUITES), ALL_SUITES]
     if arguments.task_suite not in existing:

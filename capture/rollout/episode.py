@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import Environment, Observation, Task
 from vla_attention.capture.environments.coverage import patch_coverage
-from vla_attention.capture.environments.protocol import WAIT_ACTION
+from vla_attention.capture.environments.episode_protocol import WAIT_ACTION
 from vla_attention.capture.policies.policy import Policy, camera_grid
 from vla_attention.capture.recording.recorder import make_recorders
 from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord

@@ -15,17 +15,17 @@ from polars.testing import assert_frame_equal
 
 import vla_attention as va
 import vla_attention.analyze.api
-import vla_attention.analyze.measures.settings
+import vla_attention.analyze.measures.question_settings
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.api import OpenStores
-from vla_attention.analyze.measures.settings import AnalysisSettings, SettingKeywords, settings_from_keywords
+from vla_attention.analyze.measures.question_settings import AnalysisSettings, SettingKeywords, settings_from_keywords
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.precision import mass_error_bound
 from vla_attention.schemas.stores.store_format import StoreError, StoreNotFound
 from vla_attention.testing.stores import write_store
 from vla_attention.testing.tokens import small_layout
 
-MODULES = (va, vla_attention.analyze.api, vla_attention.analyze.measures.settings)
+MODULES = (va, vla_attention.analyze.api, vla_attention.analyze.measures.question_settings)
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from vla_attention.analyze.compare.runs import (
     parse_runs,
 )
 from vla_attention.analyze.compare.text import comparison_text
-from vla_attention.analyze.measures.settings import AnalysisSettings
+from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.layout import Role
 from vla_attention.testing.stores import StoreSpec, write_store

@@ -21,8 +21,8 @@ from vla_attention.analyze.report.caveats import caveats
 from vla_attention.analyze.report.overlay_section import choose_episodes
 from vla_attention.analyze.report.page import report_html, templates
 from vla_attention.analyze.report.ratio_curve import ratio_curve
+from vla_attention.analyze.report.report_settings import ReportSettings
 from vla_attention.analyze.report.section_parts import Cell, Table, interval_cell, number_cell
-from vla_attention.analyze.report.settings import ReportSettings
 from vla_attention.analyze.show.numbers import format_number
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role

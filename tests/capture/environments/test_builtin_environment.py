@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("robosuite")
 
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Observation
-from vla_attention.capture.environments.protocol import CAMERAS, WAIT_ACTION
+from vla_attention.capture.environments.episode_protocol import CAMERAS, WAIT_ACTION
 from vla_attention.capture.environments.robosuite_tasks import BUILTIN_TASKS, initial_state_seed
 from vla_attention.capture.environments.suites import find_suite, make_environment
 
@@ -149,7 +149,7 @@ def test_an_environment_left_open_ends_without_noise_or_log_file() -> None:
     code = (
         "import logging\n"
         "from vla_attention.capture.environments.base import EnvironmentSettings\n"
-        "from vla_attention.capture.environments.protocol import WAIT_ACTION\n"
+        "from vla_attention.capture.environments.episode_protocol import WAIT_ACTION\n"
         "from vla_attention.capture.environments.suites import find_suite, make_environment\n"
         "environment = make_environment(find_suite('robosuite'), 0, EnvironmentSettings(image_size=32))\n"
         "environment.reset(0, 7)\n"

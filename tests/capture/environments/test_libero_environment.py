@@ -13,9 +13,9 @@ pytest.importorskip("libero")
 pytest.importorskip("robosuite")
 
 from vla_attention.capture.environments.base import EnvironmentSettings, Observation
+from vla_attention.capture.environments.episode_protocol import CAMERAS, WAIT_ACTION, WAIT_STEPS
 from vla_attention.capture.environments.libero import LiberoEnvironment, load_initial_states, parent_of_region
 from vla_attention.capture.environments.libero_installation import load_libero, package_folder
-from vla_attention.capture.environments.protocol import CAMERAS, WAIT_ACTION, WAIT_STEPS
 from vla_attention.capture.environments.suites import find_suite, make_environment
 from vla_attention.schemas.errors import BadArgument, UnknownName
 

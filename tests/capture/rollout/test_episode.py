@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from vla_attention.capture.environments.base import Observation, StepResult, Task
-from vla_attention.capture.environments.protocol import WAIT_ACTION, WAIT_STEPS
+from vla_attention.capture.environments.episode_protocol import WAIT_ACTION, WAIT_STEPS
 from vla_attention.capture.policies.policy import PolicyInput
 from vla_attention.capture.rollout.episode import check_protocol, max_replans, record_episode
 from vla_attention.capture.store.episode_writer import ReplanRecord
