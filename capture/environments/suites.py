@@ -9,7 +9,7 @@ from __future__ import annotations
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Suite, Task, check_task_id
 from vla_attention.schemas.errors import BadArgument, unknown_name
 
-#: Every suite. The numbers of steps are those of the published evaluations (see `protocol.py`).
+#: Every suite. The numbers of steps are those of the published evaluations (see `episode_protocol.py`).
 SUITES: tuple[Suite, ...] = (
     Suite("libero_spatial", "libero", num_tasks=10, max_steps=220, initial_states_per_task=50),
     Suite("libero_object", "libero", num_tasks=10, max_steps=280, initial_states_per_task=50),
