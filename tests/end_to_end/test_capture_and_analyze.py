@@ -14,6 +14,7 @@ import pytest
 import xarray as xr
 import zarr
 
+from tests.kit.written_tables import written_steps
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 
@@ -70,6 +71,7 @@ def test_default_analysis_writes_every_documented_file(captured_store, tmp_path,
         "steps.parquet",
         "episodes.parquet",
         "tasks.parquet",
+        "tasks_groups.parquet",
         "summary.txt",
         "attention_ratio_results_robosuite.json",
         "ratio_distribution.png",
@@ -135,7 +137,7 @@ def test_three_groupings_of_one_store_need_no_model(captured_store, tmp_path, mo
         folder = tmp_path / Path(grouping).stem
         arguments = ["--grouping", grouping, "--tasks", "1", "--output", str(folder), "--no-plots"]
         assert analyze([str(captured_store), *arguments]) == 0
-        tables[folder.name] = pl.read_parquet(folder / "steps.parquet")
+        tables[folder.name] = written_steps(folder)
     sides = ["base_0_rgb_mass", "left_wrist_0_rgb_mass"]
     both = tables["cameras"].select(pl.sum_horizontal(sides)).to_series()
     np.testing.assert_allclose(both, tables["default"]["visual_mass"], rtol=1e-5)
@@ -148,7 +150,7 @@ def test_three_groupings_of_one_store_need_no_model(captured_store, tmp_path, mo
 def test_masses_equal_a_computation_by_hand_from_the_raw_arrays(captured_store, tmp_path):
     groups = ["--group", "left=patch:base_0_rgb[0:2,0:1]", "--group", "cube=word:cube"]
     assert analyze([str(captured_store), *groups, "--per-head", "--output", str(tmp_path), "--no-plots"]) == 0
-    steps = pl.read_parquet(tmp_path / "steps.parquet").filter(task_id=1, episode_index=1)
+    steps = written_steps(tmp_path).filter(task_id=1, episode_index=1)
     raw = zarr.open_group(captured_store / "episodes/task001_episode001", mode="r")
     rows = raw["joint/rows"][:].astype(np.float64)[..., 0, :]
     assert len(steps) == np.prod(rows.shape[:-1])
@@ -264,7 +266,7 @@ def test_real_libero_from_capture_to_word_and_object_groups(libero_assets, run_c
     )
     arguments = ["--group", "soup=object:alphabet_soup_1", "--group", "named=word:soup", "--ratio", "soup/named"]
     assert analyze([str(store), *arguments, "--output", str(tmp_path / "soup"), "--no-plots"]) == 0
-    steps = pl.read_parquet(tmp_path / "soup" / "steps.parquet")
+    steps = written_steps(tmp_path / "soup")
     assert steps["instruction"][0] == "put both the alphabet soup and the tomato sauce in the basket"
     assert (steps["soup_keys"] > 0).all()
     assert steps["ratio"].is_finite().all()

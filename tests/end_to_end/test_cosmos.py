@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import polars as pl
 import pytest
 import zarr
 
+from tests.kit.written_tables import written_steps
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 
@@ -75,12 +75,12 @@ def test_each_site_is_analysed_by_itself(cosmos_store, tmp_path, capsys):
     assert analyze([str(cosmos_store), "--output", str(tmp_path / "self"), "--no-plots"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "must not be divided by a mass of another" in printed
-    steps = pl.read_parquet(tmp_path / "self" / "steps.parquet")
+    steps = written_steps(tmp_path / "self")
     assert "ratio" not in steps.columns
     assert (steps["visual_mass"] > 0).all()
     words = ["--site", "cross", "--group", "red=word:red", "--output", str(tmp_path / "cross"), "--no-plots"]
     assert analyze([str(cosmos_store), *words]) == 0
-    assert (pl.read_parquet(tmp_path / "cross" / "steps.parquet")["red_mass"] > 0).all()
+    assert (written_steps(tmp_path / "cross")["red_mass"] > 0).all()
     assert analyze([str(cosmos_store), "--group", "red=word:red", "--output", str(tmp_path / "none")]) == 2
     assert "choose a site with text by --site" in capsys.readouterr().err
 
@@ -90,7 +90,7 @@ def test_the_published_frame_proxy_is_named_by_its_frames(tmp_path):
         capture([*ONE_LAYER, "--output-dir", str(tmp_path), "--visual-frame", "curr_last", "--text-frame", "frame0"])
         == 0
     )
-    steps = pl.read_parquet(tmp_path / "steps.parquet")
+    steps = written_steps(tmp_path)
     np.testing.assert_allclose(steps["ratio"], steps["curr_last_mass"] / steps["frame0_mass"], rtol=1e-6)
     assert (tmp_path / "attention_ratio_results_robosuite.json").is_file()
 

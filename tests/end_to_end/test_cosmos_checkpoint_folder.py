@@ -17,6 +17,7 @@ import torch
 import zarr
 
 from tests.kit.cosmos_checkpoint import WEIGHTS_NAME, write_dummy_folder
+from tests.kit.written_tables import written_steps
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.environments.suites import find_suite, list_tasks
@@ -85,6 +86,7 @@ def rows_of(store: Path, site: str) -> np.ndarray:
 
 
 @pytest.mark.libero
+@pytest.mark.simulator
 def test_the_store_has_the_published_sizes_and_both_sites(libero_store, capsys):
     assert analyze(["verify", str(libero_store)]) == 0
     # 20 steps, 16 actions a call: two replans; layers 25 to 27; the first and the last of five calls.
@@ -104,6 +106,7 @@ def test_the_store_has_the_published_sizes_and_both_sites(libero_store, capsys):
 
 
 @pytest.mark.libero
+@pytest.mark.simulator
 def test_the_results_of_the_command_have_the_published_fields_and_sums(libero_run, libero_store):
     (episode,) = json.loads((libero_run / "attention_ratio_results_libero_10.json").read_text())
     assert list(episode["per_step_ratios"]) == ["layer_25", "layer_26", "layer_27", "layers_avg"]
@@ -123,6 +126,7 @@ def test_the_results_of_the_command_have_the_published_fields_and_sums(libero_ru
 
 
 @pytest.mark.libero
+@pytest.mark.simulator
 def test_default_and_reference_with_pictures(libero_store, tmp_path, capsys):
     for grouping, site in (("default", "self"), ("default", "cross"), ("reference", "self")):
         folder = tmp_path / f"{grouping}_{site}"
@@ -137,7 +141,7 @@ def test_default_and_reference_with_pictures(libero_store, tmp_path, capsys):
     proxy = pl.read_parquet(libero_store.parent / "steps.parquet")
     last = steps.filter(denoise_step=4).sort("replan", "layer")["ratio"]
     np.testing.assert_allclose(last, proxy.sort("replan", "layer")["ratio"], rtol=1e-6)
-    cross = pl.read_parquet(tmp_path / "default_cross/steps.parquet")
+    cross = written_steps(tmp_path / "default_cross")
     # Padded positions get attention and are no language.
     assert (cross["null_mass"] > 0).all()
     np.testing.assert_allclose(cross["linguistic_mass"] + cross["null_mass"], cross["row_sum"], rtol=1e-3)
@@ -244,7 +248,7 @@ def test_without_t5s_tokenizer_words_cannot_be_selected_and_the_text_as_a_whole_
     folder = write_dummy_folder(tmp_path / "checkpoint", DUMMY_CONFIG, [task.instruction], dtype=torch.float32)
     store = str(tmp_path / "a.zarr")
     assert capture(["cosmos", "--ckpt-path", str(folder), *SHORT, "--store", store]) == 0
-    assert "give --t5-tokenizer to have words" in capsys.readouterr().err
+    assert "give --t5-tokenizer to select words" in capsys.readouterr().err
     asked = [store, "--site", "cross", "--no-plots", "--output", str(tmp_path / "out")]
     for words in (
         ["--group", "cube=word:cube"],
@@ -257,7 +261,7 @@ def test_without_t5s_tokenizer_words_cannot_be_selected_and_the_text_as_a_whole_
         assert "\n" not in said
     assert not (tmp_path / "out").exists()
     assert analyze([*asked, "--group", "text=role:text"]) == 0
-    assert (pl.read_parquet(tmp_path / "out/steps.parquet")["text_mass"] > 0).all()
+    assert (written_steps(tmp_path / "out")["text_mass"] > 0).all()
 
 
 def test_latents_that_are_no_whole_number_of_patches(tmp_path, capsys):
