@@ -305,16 +305,15 @@ class OpenStores:
             MixedPolicies, RunsDiffer: the runs differ in more than their weights and `allow_mismatch` does not name it;
                 see `vla_attention.analyze.compare.runs`.
         """
-        from vla_attention.analyze.compare.comparison import compare
-        from vla_attention.analyze.compare.runs import RunArgument, open_runs
+        from vla_attention.analyze.compare.comparison import compare_stores
+        from vla_attention.analyze.compare.runs import RunArgument
 
         _check_name("table", table, ("differences", "estimates", "pairs", "unpaired"))
         both = self, other if isinstance(other, OpenStores) else open_stores(other)
         arguments = [
             RunArgument(name, tuple(one.path for one in run.stores)) for name, run in zip(names, both, strict=True)
         ]
-        runs = open_runs(arguments, settings_from_keywords(**settings), allow_mismatch)
-        return _frame(compare(runs, allow_mismatch), table)
+        return _frame(compare_stores(arguments, settings_from_keywords(**settings), allow_mismatch), table)
 
     def overlay(
         self,

@@ -50,18 +50,16 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the comparison; write tables and pictures."""
-    from vla_attention.analyze.compare.comparison import compare
-    from vla_attention.analyze.compare.runs import open_runs, parse_runs
+    from vla_attention.analyze.compare.comparison import compare_stores
+    from vla_attention.analyze.compare.runs import parse_runs
     from vla_attention.analyze.compare.text import comparison_text
     from vla_attention.analyze.show.output_files import write_parquet
+    from vla_attention.analyze.show.plot_text import shortened
 
-    runs = open_runs(parse_runs(arguments.runs), settings_of(arguments), arguments.allow_mismatch)
-    comparison = compare(runs, arguments.allow_mismatch)
-    print(comparison_text(comparison, runs))
-    joined = "-vs-".join(comparison.names).replace("/", "-")
-    folder: Path = (
-        arguments.output or Path("results") / (joined if len(joined) <= 100 else f"{joined[:99]}…") / "compare"
-    )
+    comparison = compare_stores(parse_runs(arguments.runs), settings_of(arguments), arguments.allow_mismatch)
+    print(comparison_text(comparison))
+    joined = shortened("-vs-".join(comparison.names).replace("/", "-"), 100)
+    folder: Path = arguments.output or Path("results") / joined / "compare"
     files = write_parquet(
         folder,
         comparison=comparison.differences,

@@ -1,8 +1,9 @@
 """Differences between runs: paired where they share initial states and seeds, otherwise between independent episodes.
 
-Two episodes are a pair when suite, task, initial state (by its digest) and seed are equal: the same scene, the same noise,
-other weights. Differences inside pairs are free of what makes scenes differ, and their intervals are two-level bootstraps over
-tasks and pairs. The first run is what the others are compared with; every difference is other run minus first run.
+Two episodes are a pair when suite, task, initial state (by its digest) and seed are equal: the same scene, the same
+noise, other weights. Differences inside pairs are free of what makes scenes differ, and their intervals are two-level
+bootstraps over tasks and pairs. The first run is what the others are compared with; every difference is other run minus
+first run.
 
 Quantities, one value per episode: `log2_ratio` (mean over replans of log2 of the ratio: 1 more is twice the ratio),
 `{group}_fraction` (mean over replans), and `success` (0 or 1).
@@ -18,9 +19,10 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.compare.runs import Run, check_comparable, noted_differences
-from vla_attention.analyze.measures.aggregate import episode_tables, replans_of
-from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables
+from vla_attention.analyze.compare.runs import Run, RunArgument, check_comparable, noted_differences, open_runs
+from vla_attention.analyze.measures.aggregate import episode_tables, overall_layer, replans_of
+from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables, float_values
+from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.statistics.bootstrap import (
     POSITIVE,
     SHARE,
@@ -44,21 +46,24 @@ class Comparison:
     """Runs side by side.
 
     Attributes:
-        names: the runs, the first one being what the others are compared with.
+        runs: the runs; the others are compared with the first one.
         grouping: groups of the comparison.
         quantities: what is compared, in order.
-        estimates: one row per (run, suite, layer, quantity): `num_tasks`, `num_episodes`, `value`, `low`, `high`. Quantities are
-            `ratio` (geometric mean), `ratio_lift`, every fraction and `success`. On rows of the ratio also `uniform_ratio`,
-            `episodes_without_ratio` (no finite positive ratio in any replan) and `num_nonfinite` (replans without a finite ratio).
+        estimates: one row per (run, suite, layer, quantity): `num_tasks`, `num_episodes`, `value`, `low`, `high`.
+            Quantities are `ratio` (geometric mean), `ratio_lift`, every fraction and `success`. On rows of the ratio
+            also `uniform_ratio`, `episodes_without_ratio` (no finite positive ratio in any replan) and `num_nonfinite`
+            (replans without a finite ratio).
         differences: one row per (run, scope, layer, quantity) for every run but the first: scope "task", "suite" (only
-            when there are several) or "all"; `paired`; `num_pairs`, `num_first`, `num_other`, `num_tasks`; `mean_first`, `mean_other`,
-            `difference`, `low`, `high`; `effect` (mean / standard deviation of the paired differences, or Hedges' g).
-        pairs: one row per (run, pair, layer, quantity): `episode_first`, `episode_other`, `first`, `other`, `difference`.
+            when there are several) or "all"; `paired`; `num_pairs`, `num_first`, `num_other`, `num_tasks`;
+            `mean_first`, `mean_other`, `difference`, `low`, `high`; `effect` (mean / standard deviation of the paired
+            differences, or Hedges' g).
+        pairs: one row per (run, pair, layer, quantity): `episode_first`, `episode_other`, `first`, `other`,
+            `difference`.
         unpaired: one row per episode that has no partner: `run`, `compared_with`, its suite, task and episode index.
         notes: lines on what differs between the runs and was allowed or does not matter.
     """
 
-    names: tuple[str, ...]
+    runs: tuple[Run, ...]
     grouping: Grouping
     quantities: tuple[str, ...]
     estimates: pl.DataFrame
@@ -68,19 +73,35 @@ class Comparison:
     notes: tuple[str, ...]
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the runs."""
+        return tuple(run.name for run in self.runs)
+
+    @property
+    def overall_layer(self) -> str:
+        """The layer that numbers over all tasks are about, see `aggregate.overall_layer`."""
+        return overall_layer(self.estimates.select("layer", pl.col("block").alias("layer_number")))
+
+    @property
     def runs_with_common_tasks(self) -> tuple[str, ...]:
         """The runs that have a task in common with the first one."""
         known = set(self.differences.filter(pl.col("scope") == "task")["run"])
         return tuple(name for name in self.names if name in known)
 
 
-def compare(runs: Sequence[Run], allowed: Sequence[str] = (), seed: int | None = None) -> Comparison:
+def compare_stores(
+    arguments: Sequence[RunArgument], settings: AnalysisSettings, allowed: Sequence[str] = ()
+) -> Comparison:
+    """Open runs (`runs.open_runs`) and compare every one with the first (`compare`)."""
+    return compare(open_runs(arguments, settings, allowed), allowed)
+
+
+def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
     """Compare every run with the first one.
 
     Args:
         runs: two or more, see `runs.open_runs`.
         allowed: fields that may differ, see `runs.check_comparable`.
-        seed: of the bootstrap; the first run's setting unless given.
 
     Raises:
         MixedPolicies, RunsDiffer: see `runs.check_comparable`.
@@ -88,7 +109,7 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = (), seed: int | None =
     notes = [*check_comparable(runs, allowed), *noted_differences(runs)]
     notes += [line for run in runs for line in run.question.skipped]
     grouping = runs[0].question.grouping
-    seed = runs[0].question.settings.seed if seed is None else seed
+    seed = runs[0].question.settings.seed
     levels = [episode_tables(replans_of(run.question), run.question.grouping) for run in runs]
     having = {name for level in levels for name in level.groups_with_mass()}
     filled = [name for name in grouping.names if name in having]
@@ -106,7 +127,7 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = (), seed: int | None =
         rows = _paired(joined, quantities, seed) if joined.height else _unpaired(tables[0], table, quantities, seed)
         differences.append(rows.select(pl.lit(run.name).alias("run"), pl.all()))
     return Comparison(
-        names=tuple(run.name for run in runs),
+        runs=tuple(runs),
         grouping=grouping,
         quantities=quantities,
         estimates=estimates,
@@ -236,7 +257,10 @@ def _paired(joined: pl.DataFrame, quantities: Sequence[str], seed: int) -> pl.Da
 
 
 def _unpaired(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str], seed: int) -> pl.DataFrame:
-    """Differences of means of independent episodes. Tasks that both runs have are drawn together, others in each run alone."""
+    """Differences of means of independent episodes.
+
+    Tasks that both runs have are drawn together, others in each run alone.
+    """
     both = pl.concat(
         [
             table.select(*PAIR_KEYS, "instruction", "layer", "block", *quantities, pl.lit(number).alias("_run"))
@@ -371,7 +395,7 @@ def _tasks(part: pl.DataFrame) -> NDArray[np.int64]:
 
 
 def _numbers(part: pl.DataFrame, column: str) -> NDArray[np.float64]:
-    return part[column].cast(pl.Float64).fill_null(float("nan")).to_numpy()
+    return float_values(part[column])
 
 
 def _mean(values: NDArray[np.float64]) -> float | None:

@@ -1,4 +1,6 @@
-"""`forest`: every run in every suite with its interval and uniform baseline, and beside it its difference to the first run."""
+"""`forest`: every run in every suite with its interval and uniform baseline, and beside it its difference to the first
+run.
+"""
 
 from __future__ import annotations
 
@@ -10,30 +12,31 @@ import numpy as np
 import polars as pl
 
 from vla_attention.analyze.compare.comparison import LOG2_RATIO, Comparison
-from vla_attention.analyze.compare.text import overall_layer_of
-from vla_attention.analyze.measures.frames import LAYERS_AVG
+from vla_attention.analyze.measures.frames import layer_name
 from vla_attention.analyze.show.numbers import interval_name, plural
 from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, legend_above, note_at_row, ratio_axis
-from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, NOTE_COLOR
+from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, NOTE_COLOR, SERIES_COLORS
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, ratio_name, title, wrapped
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 STEM = "forest"
-#: Okabe & Ito, in an order in which neighbours differ in lightness too; the marker tells runs apart without colour.
-RUN_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+#: Markers tell runs apart without colour.
 RUN_MARKERS = "osD^vP"
 
 
 def run_style(number: int) -> dict[str, str]:
     """Colour and marker of a run by its place in the comparison."""
-    return {"color": RUN_COLORS[number % len(RUN_COLORS)], "marker": RUN_MARKERS[number % len(RUN_MARKERS)]}
+    return {"color": SERIES_COLORS[number % len(SERIES_COLORS)], "marker": RUN_MARKERS[number % len(RUN_MARKERS)]}
 
 
 def factor_axis(axis: Any, factors: Any) -> None:
-    """Make an axis logarithmic around factors near 1, with more labels than a ratio's axis would have in so small a range."""
+    """Make an axis logarithmic around factors near 1, with more labels than a ratio's axis would have in so small a
+    range.
+    """
     from matplotlib.ticker import LogLocator
 
     ratio_axis(axis, factors)
@@ -43,14 +46,16 @@ def factor_axis(axis: Any, factors: Any) -> None:
 
 
 @drawn_in_our_style
-def plot_forest(comparison: Comparison, folder: Path, layer: str | None = None, level: float = 0.95) -> list[Path]:
+def plot_forest(
+    comparison: Comparison, folder: Path, layer: str | None = None, level: float = DEFAULT_LEVEL
+) -> list[Path]:
     """Draw from `comparison.compare`; returns the paths of png, pdf and csv. `layer`: "layers_avg" unless given."""
-    layer = layer or overall_layer_of(comparison.estimates)
+    layer = layer or comparison.overall_layer
     quantity = comparison.quantities[0]
     shown = "ratio" if quantity == LOG2_RATIO else quantity
     rows = _rows(comparison, layer, quantity, shown)
     figure = new_figure(10, 1.9 + 0.34 * (rows.height + rows["suite"].n_unique()))
-    which = "mean over layers" if layer == LAYERS_AVG else f"block {layer}"
+    which = layer_name(layer, "mean over layers", "block")
     note = f"n counts episodes (pairs where runs are paired). Bars: {interval_name(level, 'bootstrap')}s over tasks and episodes."
     if not comparison.differences["paired"].all():
         note += " Not every run is paired with the first one: those differences hold differences between scenes."

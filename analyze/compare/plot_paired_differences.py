@@ -1,4 +1,6 @@
-"""`paired_differences_RUN`: every pair's difference, per task, with the task's mean and interval, and the mean over tasks."""
+"""`paired_differences_RUN`: every pair's difference, per task, with the task's mean and interval, and the mean over
+tasks.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +13,13 @@ import polars as pl
 
 from vla_attention.analyze.compare.comparison import LOG2_RATIO, Comparison
 from vla_attention.analyze.compare.plot_forest import factor_axis
-from vla_attention.analyze.compare.text import overall_layer_of
-from vla_attention.analyze.measures.frames import LAYERS_AVG
+from vla_attention.analyze.measures.frames import layer_name
 from vla_attention.analyze.show.numbers import interval_name, plural
-from vla_attention.analyze.show.plot_axes import legend_above, note_at_row
+from vla_attention.analyze.show.plot_axes import legend_above, note_at_row, scattered
 from vla_attention.analyze.show.plot_colours import DATA_COLOR, DOT_COLOR, NOTE_COLOR, STRIPE_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
-from vla_attention.analyze.show.plot_text import explain, named, title, wrapped
+from vla_attention.analyze.show.plot_text import explain, named, task_label, title, wrapped
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,10 +35,10 @@ def stem_of(name: str) -> str:
 
 @drawn_in_our_style
 def plot_paired_differences(
-    comparison: Comparison, name: str, folder: Path, layer: str | None = None, level: float = 0.95
+    comparison: Comparison, name: str, folder: Path, layer: str | None = None, level: float = DEFAULT_LEVEL
 ) -> list[Path]:
     """Draw one run against the first one; returns the paths of png, pdf and csv. `layer`: "layers_avg" unless given."""
-    layer = layer or overall_layer_of(comparison.estimates)
+    layer = layer or comparison.overall_layer
     quantity = comparison.quantities[0]
     of_run = (pl.col("run") == name, pl.col("layer") == layer)
     rows = comparison.differences.filter(*of_run, pl.col("quantity") == quantity, pl.col("scope") != "suite")
@@ -44,7 +46,7 @@ def plot_paired_differences(
     tasks = rows.filter(pl.col("scope") == "task")
     few = tasks.height <= _MANY
     figure = new_figure(9, 1.7 + (0.42 if few else 0.2) * (rows.height + 0.5))
-    which = "mean over layers" if layer == LAYERS_AVG else f"block {layer}"
+    which = layer_name(layer, "mean over layers", "block")
     first = comparison.names[0]
     paired = pairs.height > 0
     note = (
@@ -107,10 +109,8 @@ def _draw_row(
         own = pairs.filter((pl.col("suite") == row["suite"]) & (pl.col("task_id") == row["task_id"]))
         values = own["difference"].drop_nulls().to_numpy()
         values = values[np.isfinite(values)]
-        jitter = generator.uniform(-0.22, 0.22, len(values)) if len(values) > 1 else np.zeros(len(values))
-        axes.scatter(
-            scaled(values), place + jitter, s=14 if few else 8, color=DOT_COLOR, alpha=0.8, linewidths=0, zorder=2
-        )
+        places = scattered(generator, place, len(values))
+        axes.scatter(scaled(values), places, s=14 if few else 8, color=DOT_COLOR, alpha=0.8, linewidths=0, zorder=2)
     if row["low"] is not None:
         ends = [scaled(row["low"]), scaled(row["high"])]
         axes.plot(ends, [place, place], color=DATA_COLOR, linewidth=2.0 if few else 1.4, zorder=3)
@@ -128,5 +128,4 @@ def _draw_row(
 def _label(row: dict[str, Any], several: bool, few: bool) -> str:
     if row["scope"] == "all":
         return "all tasks"
-    number = f"{row['suite']} {row['task_id']}" if several else str(row["task_id"])
-    return wrapped(f"{number}: {row['instruction']}", 52 if few else 60, 2 if few else 1)
+    return task_label(row, several, few)

@@ -1,8 +1,8 @@
 """Runs to be compared: which stores belong to each, and in which fields they must agree.
 
-Two runs may differ in what is being compared: the weights and what names them (policy name, checkpoint, digest). Everything
-else that has a say in the numbers must be equal, or be allowed by name (`--allow-mismatch FIELD`). Versions of Python,
-torch and the like have next to none and are named in a note.
+Two runs may differ in what is being compared: the weights and what names them (policy name, checkpoint, digest).
+Everything else that has a say in the numbers must be equal, or be allowed by name (`--allow-mismatch FIELD`). Versions
+of Python, torch and the like have next to none and are named in a note.
 """
 
 from __future__ import annotations
@@ -55,7 +55,8 @@ class Run:
 def parse_runs(words: Sequence[str]) -> list[RunArgument]:
     """Read STORE or NAME=STORE[,STORE ...], two or more of them; a store alone is named after its file.
 
-    Stores of one file name (one folder per policy, one store per suite) are named with as many of their folders as tells them apart.
+    Stores of one file name (one folder per policy, one store per suite) are named with as many of their folders as
+    tells them apart.
 
     Raises:
         BadArgument: fewer than two, a name or a store given twice, an empty name or path.
@@ -170,7 +171,8 @@ def check_fields(allowed: Sequence[str]) -> None:
     for field in allowed:
         if field not in FIELDS:
             raise UnknownName(
-                f"Unknown field '{field}' in --allow-mismatch.{did_you_mean(field, FIELDS)} Existing: {listing(FIELDS, 40)}."
+                f"Unknown field '{field}' in --allow-mismatch.{did_you_mean(field, FIELDS)} Existing: "
+                f"{listing(FIELDS, 40)}."
             )
 
 
@@ -188,8 +190,8 @@ def check_comparable(runs: Sequence[Run], allowed: Sequence[str]) -> list[str]:
         if run.question.site != first.question.site:
             raise MixedPolicies(
                 f"Runs {first.name} and {run.name} would be compared at different sites ({first.question.site} and "
-                f"{run.question.site}): different softmaxes over different keys, whose masses cannot be compared; choose a site that "
-                "both have with --site."
+                f"{run.question.site}): different softmaxes over different keys, whose masses cannot be compared; "
+                "choose a site that both have with --site."
             )
     waived = {*allowed, *(("max_steps",) if "suite" in allowed and _several(run.suites for run in runs) else ())}
     notes = []
@@ -203,8 +205,9 @@ def check_comparable(runs: Sequence[Run], allowed: Sequence[str]) -> list[str]:
             to_allow = [name for name in refused if name != "max_steps" or "suite" not in refused]
             flags = " ".join(f"--allow-mismatch {name}" for name in to_allow)
             raise RunsDiffer(
-                f"Runs {first.name} and {run.name} differ in more than their weights ({named}): {_FIELDS[refused[0]][1]}; capture "
-                f"them alike{_selection_hint(refused)}, or compare all the same with {flags}."
+                f"Runs {first.name} and {run.name} differ in more than their weights ({named}): "
+                f"{_FIELDS[refused[0]][1]}; capture them alike{_selection_hint(refused)}, or compare all the same with "
+                f"{flags}."
             )
         notes += [f"{first.name} and {run.name} differ in {name} ({text}), as allowed." for name, text in found.items()]
     return notes
@@ -232,13 +235,14 @@ def _refuse_families(stores: Sequence[tuple[str, Store]], allowed: bool) -> None
         what = f"Runs {name} and {other_name} mix policies, {first.attributes.policy.family} and {other.attributes.policy.family}"
         if not set(sites) & set(other_sites):
             raise MixedPolicies(
-                f"{what}, which have no site in common ({listing(sites)}; {listing(other_sites)}): their softmaxes are over different "
-                "keys, and masses of one say nothing beside masses of the other; look at each with vla-analyze ratios."
+                f"{what}, which have no site in common ({listing(sites)}; {listing(other_sites)}): their softmaxes are "
+                "over different keys, and masses of one say nothing beside masses of the other; look at each with "
+                "vla-analyze ratios."
             )
         if not allowed:
             raise MixedPolicies(
-                f"{what}, which attend over different keys with different uniform baselines; if lifts and ratios at a site of the "
-                "same name are to be set side by side all the same, say --allow-mismatch family."
+                f"{what}, which attend over different keys with different uniform baselines; if lifts and ratios at a "
+                "site of the same name are to be set side by side all the same, say --allow-mismatch family."
             )
 
 

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import polars as pl
 
 from vla_attention.analyze.compare.comparison import LOG2_RATIO, SUCCESS, Comparison
-from vla_attention.analyze.compare.runs import Run
-from vla_attention.analyze.measures.frames import LAYERS_AVG
+from vla_attention.analyze.measures.frames import LAYERS_AVG, layer_name
 from vla_attention.analyze.show.headings import (
     WIDTH,
     heading,
@@ -18,23 +15,18 @@ from vla_attention.analyze.show.headings import (
     untrained_warning,
     wrap,
 )
-from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent
+from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent, format_signed, plural
+from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.stores.store_format import episode_name
 
 
-def overall_layer_of(table: pl.DataFrame) -> str:
-    """The layer that speaks for the whole: "layers_avg" where there is one."""
-    layers = table["layer"].unique(maintain_order=True).to_list()
-    return LAYERS_AVG if LAYERS_AVG in layers else layers[0]
-
-
-def comparison_text(comparison: Comparison, runs: Sequence[Run]) -> str:
+def comparison_text(comparison: Comparison) -> str:
     """The whole text, at most 100 columns wide."""
-    layer = overall_layer_of(comparison.estimates)
-    parts = [_header(comparison, runs, layer), _estimates_section(comparison, layer)]
+    layer = comparison.overall_layer
+    parts = [_header(comparison, layer), _estimates_section(comparison, layer)]
     for name in comparison.names[1:]:
         parts.append(_difference_section(comparison, name, layer))
         if name in comparison.runs_with_common_tasks:
@@ -43,17 +35,17 @@ def comparison_text(comparison: Comparison, runs: Sequence[Run]) -> str:
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def _header(comparison: Comparison, runs: Sequence[Run], layer: str) -> str:
+def _header(comparison: Comparison, layer: str) -> str:
     lines = title("COMPARISON OF RUNS")
-    if any(store.attributes.policy.untrained for run in runs for store in run.stores):
+    if any(store.attributes.policy.untrained for run in comparison.runs for store in run.stores):
         lines += wrap(untrained_warning("a policy has"))
-    for run in runs:
+    for run in comparison.runs:
         policy = run.stores[0].attributes.policy
         stores = ", ".join(str(store.path) for store in run.stores)
         lines += wrap(f"{run.name}: {policy.name} ({policy.checkpoint}), {listing(run.suites)}; {stores}", rest="  ")
-    which = layer if layer == LAYERS_AVG else f"block {layer}"
+    which = layer_name(layer, LAYERS_AVG, "block")
     lines += wrap(
-        f"Grouping '{comparison.grouping.name}', site {runs[0].question.site}, {which}; differences are run "
+        f"Grouping '{comparison.grouping.name}', site {comparison.runs[0].question.site}, {which}; differences are run "
         f"minus {comparison.names[0]}. {interval_note(DEFAULT_LEVEL)}",
     )
     lines += note_lines(comparison.notes)
@@ -70,7 +62,7 @@ def _estimates_section(comparison: Comparison, layer: str) -> str:
     body = []
     for of in estimates:
         row = of[SUCCESS]
-        cells = [row["run"][:24], row["suite"][:16], str(row["num_episodes"]), f"{100 * row['value']:.0f}%"]
+        cells = [row["run"][:24], row["suite"][:16], str(row["num_episodes"]), format_percent(row["value"], 0)]
         if ratio:
             row = of["ratio"]
             cells += [format_number(row["value"]), format_interval(row["low"], row["high"])]
@@ -85,8 +77,8 @@ def _estimates_section(comparison: Comparison, layer: str) -> str:
     for row in (of["ratio"] for of in estimates) if ratio else ():
         if row["num_nonfinite"] or row["episodes_without_ratio"]:
             lines += wrap(
-                f"{row['run']}, {row['suite']}: {row['num_nonfinite']} replans have no finite ratio and are in no ratio; "
-                f"{row['episodes_without_ratio']} of {row['num_episodes']} episodes have none at all.",
+                f"{row['run']}, {row['suite']}: {row['num_nonfinite']} replans have no finite ratio and are in no "
+                f"ratio; {row['episodes_without_ratio']} of {row['num_episodes']} episodes have none at all.",
             )
     return "\n".join(lines)
 
@@ -104,14 +96,14 @@ def _difference_section(comparison: Comparison, name: str, layer: str) -> str:
         factor = "" if not is_ratio or row["difference"] is None else f"x {format_number(2.0 ** row['difference'])}"
         body.append(
             [
-                row["quantity"] if len(row["quantity"]) <= 26 else f"{row['quantity'][:25]}…",
+                shortened(row["quantity"], 26),
                 n,
                 format_number(row["mean_first"]),
                 format_number(row["mean_other"]),
-                _signed(row["difference"]),
+                format_signed(row["difference"]),
                 format_interval(row["low"], row["high"]),
                 factor,
-                _signed(row["effect"]),
+                format_signed(row["effect"]),
             ]
         )
     lines.append(text_table(header, body, left=(0,)))
@@ -129,11 +121,12 @@ def _pairing(comparison: Comparison, name: str, rows: pl.DataFrame) -> list[str]
     }
     if not rows["paired"].any():
         return wrap(
-            f"NOT PAIRED: no episode of {name} has the suite, task, initial state and seed of one of {first}, so this compares means "
-            "of independent episodes; differences between scenes are in it, and intervals are wider for that.",
+            f"NOT PAIRED: no episode of {name} has the suite, task, initial state and seed of one of {first}, so this "
+            "compares means of independent episodes; differences between scenes are in it, and intervals are wider for "
+            "that.",
         )
     pairs = comparison.pairs.filter(pl.col("run") == name).select("suite", "task_id", "episode_first").unique().height
-    text = f"{pairs} pair{'' if pairs == 1 else 's'} of episodes with the same task, initial state and seed."
+    text = f"{plural(pairs, 'pair')} of episodes with the same task, initial state and seed."
     for run, table in alone.items():
         if table.height:
             names = [episode_name(row["task_id"], row["episode_index"]) for row in table.iter_rows(named=True)]
@@ -152,7 +145,7 @@ def _tasks_section(comparison: Comparison, name: str, layer: str) -> str:
         [
             f"{row['suite']} {'all' if row['task_id'] is None else row['task_id']}" if several else str(row["task_id"]),
             str(row["num_pairs"]) if row["paired"] else f"{row['num_first']}/{row['num_other']}",
-            _signed(row["difference"]),
+            format_signed(row["difference"]),
             format_interval(row["low"], row["high"]),
         ]
         for row in rows.iter_rows(named=True)
@@ -176,7 +169,9 @@ def _layers_section(comparison: Comparison) -> str:
         for name in others:
             row = cells.get((name, layer))
             line += (
-                ["-", "-"] if row is None else [_signed(row["difference"]), format_interval(row["low"], row["high"])]
+                ["-", "-"]
+                if row is None
+                else [format_signed(row["difference"]), format_interval(row["low"], row["high"])]
             )
         body.append(line)
     more = (
@@ -184,9 +179,5 @@ def _layers_section(comparison: Comparison) -> str:
         if len(others) < len(comparison.names) - 1
         else ""
     )
-    title = f"PER LAYER  {comparison.quantities[0]}, run minus {comparison.names[0]}{more}"
-    return "\n".join([heading(title), text_table(header, body, left=(0,))])
-
-
-def _signed(value: float | None) -> str:
-    return format_number(value) if value is None or value <= 0 else f"+{format_number(value)}"
+    per_layer = f"PER LAYER  {comparison.quantities[0]}, run minus {comparison.names[0]}{more}"
+    return "\n".join([heading(per_layer), text_table(header, body, left=(0,))])

@@ -5,12 +5,20 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vla_attention.analyze.arguments import add_grouping, add_selection, add_stores, output_folder, settings_of
+from vla_attention.analyze.arguments import (
+    add_grouping,
+    add_selection,
+    add_stores,
+    output_folder,
+    settings_of,
+    stores_of,
+)
 from vla_attention.analyze.show.output_files import report_files
 from vla_attention.schemas.command_line import command_parser
 from vla_attention.schemas.errors import BadArgument
 
 _TABLES = ("steps", "replans", "episodes", "tasks", "contributions")
+_DEFAULT_TABLES = ("episodes", "tasks", "steps")
 _EXAMPLES = """examples:
   vla-analyze export runs/libero_10.zarr --csv
   vla-analyze export runs/libero_10.zarr --parquet --table steps --per-head --grouping cameras
@@ -40,10 +48,10 @@ def build_parser() -> argparse.ArgumentParser:
         action="append",
         choices=_TABLES,
         metavar="NAME",
-        help=f"which table; may be repeated: {', '.join(_TABLES)} (default: episodes, tasks, steps)",
+        help=f"which table; may be repeated: {', '.join(_TABLES)} (default: {', '.join(_DEFAULT_TABLES)})",
     )
     kinds.add_argument(
-        "--rows", action="store_true", help="with --netcdf: also the rows themselves; size is said first"
+        "--rows", action="store_true", help="with --netcdf: also the rows themselves; their size is printed first"
     )
     add_grouping(parser)
     selection = add_selection(parser)
@@ -55,7 +63,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write what was asked for."""
+    """Write the tables and arrays."""
     kinds = [kind for kind in ("csv", "parquet", "netcdf") if getattr(arguments, kind)]
     tables_wanted = arguments.csv or arguments.parquet
     if not kinds:
@@ -64,20 +72,19 @@ def run(arguments: argparse.Namespace) -> int:
         raise BadArgument("--rows goes with --netcdf: rows do not fit into a table.")
     if arguments.table and not tables_wanted:
         raise BadArgument("--table goes with --csv or --parquet; --netcdf always holds masses.")
-    # Imported after the arguments were read: `--help` must not wait for polars and zarr.
+    # Imported here, so that `--help` does not wait for polars and zarr.
     from vla_attention.analyze.measures.question import ask
-    from vla_attention.schemas.stores.reader import open_store
 
-    question = ask([open_store(path) for path in arguments.stores], settings_of(arguments))
+    question = ask(stores_of(arguments), settings_of(arguments))
     for line in question.skipped:
         print(line)
     folder = output_folder(arguments, "export")
     written: list[Path] = []
     if tables_wanted:
-        from vla_attention.analyze.export.tables import DEFAULT_TABLES, chosen_tables, write_tables
+        from vla_attention.analyze.export.tables import chosen_tables, write_tables
         from vla_attention.analyze.ratios.analysis import analyse
 
-        names = list(dict.fromkeys(arguments.table or DEFAULT_TABLES))
+        names = list(dict.fromkeys(arguments.table or _DEFAULT_TABLES))
         written += write_tables(folder, chosen_tables(analyse(question), names), kinds)
     if arguments.netcdf:
         from vla_attention.analyze.export.labelled_arrays import rows_size, write_netcdf

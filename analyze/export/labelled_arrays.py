@@ -1,6 +1,6 @@
 """Masses and rows as labelled arrays (xarray), and as NetCDF files.
 
-Episodes have different lengths, so that (episode, replan) is one axis, `sample`, with coordinates that say which
+Episodes have different lengths. Therefore (episode, replan) is one axis, `sample`, with coordinates that say which
 episode and which environment step each sample is; nothing is padded. Heads are always kept apart; stored queries are
 averaged.
 
@@ -168,7 +168,7 @@ def _write_rows(file: Any, question: Question, progress: Callable[[int], object]
     )
     for key, value in _rows_attributes(question).items():
         variable.attrs[key] = value
-    # What tells xarray which variables describe axes.
+    # From this attribute xarray reads which variables describe axes.
     about_keys = [name for name, *_ in _key_variables(question)]
     variable.attrs["coordinates"] = " ".join([*_SAMPLE_COORDINATES, "block", "denoise_time", *about_keys])
     for part, values in _parts(question, progress):
@@ -193,7 +193,7 @@ _SAMPLE_COORDINATES = (
 
 
 def _sample_coordinates(question: Question) -> dict[str, tuple[str, NDArray[Any]]]:
-    """Which episode and which environment step every sample is."""
+    """Episode and environment step of every sample."""
     columns: dict[str, list[Any]] = {name: [] for name in _SAMPLE_COORDINATES}
     for item in question.selected:
         attributes = item.episode.attributes
@@ -227,7 +227,7 @@ def _axis_coordinates(question: Question) -> dict[str, Any]:
 
 
 def _key_variables(question: Question) -> list[tuple[str, tuple[str, ...], NDArray[Any], Mapping[str, Any]]]:
-    """Name, dimensions, values and attributes of what every key is."""
+    """Name, dimensions, values and attributes of the variables that describe keys."""
     layout = question.selected[0].tokens.layout
     codes = {"flag_values": np.array([int(role) for role in Role], dtype=np.uint8)}
     roles = []
@@ -270,7 +270,7 @@ def _rows_attributes(question: Question) -> dict[str, Any]:
 
 
 def _attributes(question: Question) -> dict[str, Any]:
-    """What the arrays are about; text and numbers only, so that every format can hold it."""
+    """Attributes of the dataset: text and numbers only, because not every format holds more."""
     root, grouping = question.stores[0].attributes, question.grouping
     attributes: dict[str, Any] = {
         "title": f"attention of the action queries, site '{question.site}'",

@@ -12,19 +12,11 @@ from vla_attention.analyze.ratios.analysis import Analysis
 from vla_attention.analyze.show.output_files import write_csv, write_parquet
 from vla_attention.schemas.errors import BadArgument
 
-#: Tables that can be exported, and what a row of each is.
-TABLES = {
-    "steps": "one row per episode, replan, layer, denoise step (and head, with --per-head)",
-    "replans": "one row per episode, replan, layer",
-    "episodes": "one row per episode, layer",
-    "tasks": "one row per task or all tasks, layer; with intervals",
-    "contributions": "norms of contributions, where they were recorded",
-}
-DEFAULT_TABLES = ("episodes", "tasks", "steps")
-
 
 def chosen_tables(analysis: Analysis, names: Sequence[str]) -> dict[str, pl.DataFrame]:
-    """Tables of an analysis by the names of their files; steps, replans, episodes and tasks are two each, NAME and NAME_groups.
+    """Tables of an analysis by the names of their files.
+
+    Steps, replans, episodes and tasks are two tables each, NAME and NAME_groups.
 
     Raises:
         BadArgument: contributions are wanted and were not recorded.
@@ -34,7 +26,7 @@ def chosen_tables(analysis: Analysis, names: Sequence[str]) -> dict[str, pl.Data
         table: Tables | pl.DataFrame | None = getattr(analysis, name)
         if table is None:
             raise BadArgument(
-                "These stores hold no contributions, so that there is no such table; record them with vla-capture "
+                "These stores hold no contributions; record them with vla-capture "
                 "--contributions, or choose other tables."
             )
         tables |= named_tables(name, table) if isinstance(table, Tables) else {name: table}

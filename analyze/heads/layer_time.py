@@ -13,7 +13,7 @@ from vla_attention.analyze.statistics.bootstrap import (
     mean_over_episodes,
     resample_episodes,
 )
-from vla_attention.analyze.time.phases import on_episode_time
+from vla_attention.analyze.time.alignment import on_episode_time
 from vla_attention.schemas.groupings.grouping import Grouping
 
 MOST_BINS = 20

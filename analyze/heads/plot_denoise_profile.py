@@ -6,8 +6,9 @@ from pathlib import Path
 
 import polars as pl
 
+from vla_attention.analyze.measures.aggregate import FRACTION_COLUMNS
 from vla_attention.analyze.measures.frames import Tables
-from vla_attention.analyze.ratios.profile_panels import FRACTION_COLUMNS, draw_profile, shown_groups
+from vla_attention.analyze.ratios.plot_profile_panels import draw_profile, shown_groups
 from vla_attention.analyze.show.numbers import of_tasks
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import named, title

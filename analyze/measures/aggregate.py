@@ -204,6 +204,10 @@ def task_tables(
     return Tables(_task_frame(rows, _cell_schema(grouping)), _task_frame(group_rows, _GROUP_SCHEMA))
 
 
+#: The columns of `task_tables(...).groups` with a fraction and its interval.
+FRACTION_COLUMNS = ("fraction", "fraction_low", "fraction_high")
+
+
 def layer_order(table: pl.DataFrame) -> list[str]:
     """The layers of any of these tables by number, "layers_avg" last."""
     layers = table.select("layer", "layer_number").unique().sort("layer_number", "layer", nulls_last=True)
@@ -306,7 +310,7 @@ _NAMES: dict[str, type[pl.DataType]] = {
 _GROUP_SCHEMA: dict[str, type[pl.DataType]] = {
     **_NAMES,
     "group": pl.String,
-    **dict.fromkeys(("mass", "keys", "density", "lift", "fraction", "fraction_low", "fraction_high"), pl.Float64),
+    **dict.fromkeys(("mass", "keys", "density", "lift", *FRACTION_COLUMNS), pl.Float64),
 }
 
 

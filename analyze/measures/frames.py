@@ -83,9 +83,14 @@ def rows_of_episode(table: pl.DataFrame, item: SelectedEpisode) -> pl.DataFrame:
     )
 
 
-def layer_name(layer: str) -> str:
-    """A layer's label in tables as text: `layer 5`, or `all layers` for the mean over the selected ones."""
-    return "all layers" if layer == LAYERS_AVG else f"layer {layer}"
+def layer_name(layer: str, average: str = "all layers", noun: str = "layer") -> str:
+    """A layer's label in tables as text: `layer 5`, or `average` for the mean over the selected ones."""
+    return average if layer == LAYERS_AVG else f"{noun} {layer}"
+
+
+def float_values(column: pl.Series) -> NDArray[np.float64]:
+    """A column of numbers as an array; NaN for null."""
+    return column.cast(pl.Float64).fill_null(float("nan")).to_numpy()
 
 
 def replan_axis(item: SelectedEpisode) -> Axis:
@@ -193,8 +198,7 @@ class Tables:
 
     def values(self, measure: str) -> NDArray[np.float64]:
         """A column of `groups` as an array (cell, group); NaN for null."""
-        column = self.groups[measure].cast(pl.Float64).fill_null(float("nan")).to_numpy()
-        return column.reshape(self.cells.height, -1)
+        return float_values(self.groups[measure]).reshape(self.cells.height, -1)
 
     def of_group(self, name: str) -> pl.DataFrame:
         """The rows of one group, one per cell, in the order of the cells."""

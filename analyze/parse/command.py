@@ -77,8 +77,8 @@ def run(arguments: argparse.Namespace) -> int:
     paths = find_results(arguments.results)
     if arguments.plot_comparison and len(paths) < 2:
         raise BadArgument(
-            f"--plot-comparison compares several results files, and --results leads to one ({paths[0]}); name more, or leave "
-            "--plot-comparison out."
+            f"--plot-comparison compares several results files, and --results leads to one ({paths[0]}); name more, or "
+            "leave --plot-comparison out."
         )
     files = []
     with progress_bar(len(paths), "files") as advance:
@@ -103,7 +103,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _why_not_pooled(files: Sequence[ResultsFile], side_by_side: bool) -> str:
-    """Why there is no COMBINED, empty when there is one; files of different kinds are refused unless compared side by side."""
+    """Why there is no COMBINED, empty when there is one; files of different kinds are refused unless compared side by
+    side.
+    """
     from vla_attention.analyze.published.results_tables import by_kind
     from vla_attention.schemas.errors import listing
     from vla_attention.schemas.results import ResultsError
@@ -113,15 +115,16 @@ def _why_not_pooled(files: Sequence[ResultsFile], side_by_side: bool) -> str:
         parts = "; ".join(f"{listing([file.path for file in of_kind], 3)}: {kind}" for kind, of_kind in kinds.items())
         if not side_by_side:
             raise ResultsError(
-                f"These results files hold masses of different kinds, which cannot be summarised together ({parts}); give one kind at "
-                "a time, or see them side by side with --plot-comparison."
+                f"These results files hold masses of different kinds, which cannot be summarised together ({parts}); "
+                "give one kind at a time, or see them side by side with --plot-comparison."
             )
         return _wrapped(f"No COMBINED: the files hold masses of different kinds ({parts}).")
     repeated = sorted({file.suite for file in files if sum(file.suite == other.suite for other in files) > 1})
     if repeated:
         paths = [file.path for file in files if file.suite in repeated]
         return _wrapped(
-            f"No COMBINED: {listing(paths, 4)} are about the same suite ({listing(repeated)}), that is, different runs of it."
+            f"No COMBINED: {listing(paths, 4)} are about the same suite ({listing(repeated)}), that is, different runs "
+            "of it."
         )
     return ""
 

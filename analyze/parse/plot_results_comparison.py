@@ -1,4 +1,6 @@
-"""`results_comparison`: several results files side by side: mean ratio with its interval, episodes as dots, and fractions."""
+"""`results_comparison`: several results files side by side: mean ratio with its interval, episodes as dots, and
+fractions.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import overall_layer, overall_rows
-from vla_attention.analyze.measures.frames import LAYERS_AVG
+from vla_attention.analyze.measures.aggregate import FRACTION_COLUMNS, overall_layer, overall_rows
+from vla_attention.analyze.measures.frames import LAYERS_AVG, layer_name
 from vla_attention.analyze.published.results_tables import ResultsTables
-from vla_attention.analyze.ratios.profile_panels import FRACTION_COLUMNS
 from vla_attention.analyze.show.numbers import interval_name, plural
-from vla_attention.analyze.show.plot_axes import note_at_row, ratio_axis, share_ticks
-from vla_attention.analyze.show.plot_colours import FIXED_COLORS, NOTE_COLOR
+from vla_attention.analyze.show.plot_axes import note_at_row, ratio_axis, scattered, share_ticks
+from vla_attention.analyze.show.plot_colours import FIXED_COLORS, NOTE_COLOR, SERIES_COLORS
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import title, wrapped
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
@@ -25,15 +26,15 @@ if TYPE_CHECKING:
 
 STEM = "results_comparison"
 #: Colour and marker of each kind of masses, in order of appearance.
-_KINDS = (("#0072B2", "o"), ("#D55E00", "D"), ("#009E73", "s"), ("#CC79A7", "^"), ("#E69F00", "v"), ("#56B4E9", "P"))
+_KINDS = tuple(zip(SERIES_COLORS, "oDs^vP", strict=True))
 _FRACTIONS = ("visual", "linguistic", "action", "rest")
 
 
 def comparison_table(tables: Sequence[ResultsTables], labels: Sequence[str]) -> pl.DataFrame:
     """One row per results file, over all its episodes, in the layer that speaks for it ("layers_avg", else the first).
 
-    Columns: file, kind, layer, num_tasks, num_episodes, episodes_without_ratio, num_replans, num_nonfinite, success_rate,
-    ratio_mean with ratio_mean_low and ratio_mean_high (two-level bootstrap), ratio_std (over episodes).
+    Columns: file, kind, layer, num_tasks, num_episodes, episodes_without_ratio, num_replans, num_nonfinite,
+    success_rate, ratio_mean with ratio_mean_low and ratio_mean_high (two-level bootstrap), ratio_std (over episodes).
     """
     columns = ["num_tasks", "num_episodes", "episodes_without_ratio", "num_replans", "num_nonfinite", "success_rate"]
     columns += ["ratio_mean", "ratio_mean_low", "ratio_mean_high", "ratio_std"]
@@ -48,7 +49,9 @@ def comparison_table(tables: Sequence[ResultsTables], labels: Sequence[str]) -> 
 
 
 def fractions_table(tables: Sequence[ResultsTables], labels: Sequence[str]) -> pl.DataFrame:
-    """Mean fractions of the files' groups in the layer of `comparison_table`: file, group, fraction, fraction_low, fraction_high."""
+    """Mean fractions of the files' groups in the layer of `comparison_table`: file, group, fraction, fraction_low,
+    fraction_high.
+    """
     parts = []
     for table, label in zip(tables, labels, strict=True):
         rows = overall_rows(table.tasks).filter(pl.col("layer") == overall_layer(table.tasks.cells)).groups
@@ -64,13 +67,13 @@ def plot_results_comparison(tables: Sequence[ResultsTables], labels: Sequence[st
     kinds = data["kind"].unique(maintain_order=True).to_list()
     figure = new_figure(10, 1.9 + (0.42 if few else 0.22) * (data.height + 0.5) + 0.16 * len(kinds))
     note = (
-        f"n counts episodes. Means over episodes with {interval_name(DEFAULT_LEVEL)}s (two-level bootstrap over tasks and episodes). "
-        "No uniform baseline: results files do not hold the numbers of keys."
+        f"n counts episodes. Means over episodes with {interval_name(DEFAULT_LEVEL)}s (two-level bootstrap over tasks "
+        "and episodes). No uniform baseline: results files do not hold the numbers of keys."
     )
     if len(kinds) > 1:
         note += " Files of different kinds measure different things: compare within a kind."
     layers = data["layer"].unique(maintain_order=True).to_list()
-    which = ", ".join(layer if layer == LAYERS_AVG else f"layer {layer}" for layer in layers)
+    which = ", ".join(layer_name(layer, LAYERS_AVG) for layer in layers)
     suite = _common_suite(data)
     of = f" of {suite}" if suite else ""
     title(figure, f"{plural(data.height, 'results file')}{of}, {which}", note)
@@ -91,7 +94,7 @@ def row_names(data: pl.DataFrame, few: bool) -> list[str]:
 
     A suite that all files share is in the title, and layers are named only where files differ in them.
     """
-    layers = [layer if layer == LAYERS_AVG else f"layer {layer}" for layer in data["layer"]]
+    layers = [layer_name(layer, LAYERS_AVG) for layer in data["layer"]]
     names = []
     for label, layer in zip(data["file"], layers, strict=True):
         folder, _, suite = label.rpartition("/")
@@ -134,8 +137,8 @@ def _ratios(axes: Axes, data: pl.DataFrame, tables: Sequence[ResultsTables], kin
     for position, (row, values) in enumerate(zip(data.iter_rows(named=True), dots, strict=True)):
         color, marker = _KINDS[kinds.index(row["kind"]) % len(_KINDS)]
         values = values[values > 0]
-        jitter = generator.uniform(-0.22, 0.22, len(values)) if len(values) > 1 else np.zeros(len(values))
-        axes.scatter(values, position + jitter, s=10 if few else 6, color=color, alpha=0.35, linewidths=0, zorder=2)
+        places = scattered(generator, position, len(values))
+        axes.scatter(values, places, s=10 if few else 6, color=color, alpha=0.35, linewidths=0, zorder=2)
         if row["ratio_mean"] is None or row["ratio_mean"] <= 0:
             text = "no finite ratio" if row["ratio_mean"] is None else "mean ratio 0"
             note_at_row(axes, position, text, x=0.01)

@@ -8,13 +8,12 @@ from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import overall_rows
-from vla_attention.analyze.measures.frames import LAYERS_AVG
+from vla_attention.analyze.measures.aggregate import overall_layer, overall_rows
+from vla_attention.analyze.measures.frames import LAYERS_AVG, layer_name
 from vla_attention.analyze.published.results_reader import ResultsFile
 from vla_attention.analyze.published.results_tables import (
     ResultsTables,
     Spread,
-    chosen_layer,
     disagreements,
     layers_of,
     spread_of,
@@ -32,13 +31,15 @@ _VERDICTS = {
     "balanced": "Model shows BALANCED attention between visual and linguistic",
 }
 _CAVEAT = (
-    "Results files do not say how many keys are on each side, so there is no uniform baseline here. With hundreds of image keys and "
-    "a dozen words, uniform attention alone gives ratios of 35 to 50: the verdict (above "
-    f"{VISUAL_ABOVE} visual, below {LINGUISTIC_BELOW} linguistic) means little without it. vla-analyze prints it beside every ratio."
+    "Results files do not say how many keys are on each side, so there is no uniform baseline here. With hundreds of "
+    "image keys and a dozen words, uniform attention alone gives ratios of 35 to 50: the verdict (above "
+    f"{VISUAL_ABOVE} visual, below {LINGUISTIC_BELOW} linguistic) means little without it. vla-analyze prints it "
+    "beside every ratio."
 )
 _FRAMES_CAVEAT = (
-    "Latent frames have equally many keys: uniform attention gives a ratio of 1. The usual text frame, frame0, is a blank placeholder "
-    "without language: an instruction enters through cross-attention, which these masses are not of. Masses may be sums over queries."
+    "Latent frames have equally many keys: uniform attention gives a ratio of 1. The usual text frame, frame0, is a "
+    "blank placeholder without language: an instruction enters through cross-attention, which these masses are not of. "
+    "Masses may be sums over queries."
 )
 
 
@@ -81,7 +82,7 @@ def _rows_of(files: Sequence[ResultsFile], layer: str) -> list[pl.DataFrame]:
     """Steps of that layer; where a pooled file does not have it, of the layer that speaks for the file."""
     parts = []
     for i, file in enumerate(files):
-        own = layer if layer in layers_of(file) else chosen_layer(file)
+        own = layer if layer in layers_of(file) else overall_layer(file.steps)
         parts.append(file.steps.filter(pl.col("layer") == own).with_columns(pl.lit(i).alias("file")))
     return parts
 
@@ -192,18 +193,20 @@ def _notes(file: ResultsFile, layer: str, named: bool) -> list[str]:
     of = f"{file.path}: " if named else ""
     notes = []
     if layer not in layers_of(file) or (layer != LAYERS_AVG and not named and len(layers_of(file)) > 1):
-        own = chosen_layer(file)
+        own = overall_layer(file.steps)
         notes.append(f"{of}There is no {LAYERS_AVG}; layer {own} speaks for the file, as in the published parser.")
     lacking = (
         file.episodes.filter(pl.col("num_replans") > 0).height
-        - file.steps.filter(layer=chosen_layer(file))["episode"].n_unique()
+        - file.steps.filter(layer=overall_layer(file.steps))["episode"].n_unique()
     )
     if lacking:
-        notes.append(f"{of}{plural(lacking, 'episode')} with steps, but without any in {_named(chosen_layer(file))}.")
+        notes.append(
+            f"{of}{plural(lacking, 'episode')} with steps, but without any in {_named(overall_layer(file.steps))}."
+        )
     if file.zeros:
         notes.append(
-            f"{of}{file.zeros} ratios of 0 stand for 'no ratio' (nothing on either side, or no layer with a finite ratio) and are "
-            "read as undefined; the published parser counts them as 0."
+            f"{of}{file.zeros} ratios of 0 stand for 'no ratio' (nothing on either side, or no layer with a finite "
+            "ratio) and are read as undefined; the published parser counts them as 0."
         )
     found = disagreements(file)
     for reason in sorted({item.reason for item in found if item.reason}):
@@ -214,10 +217,10 @@ def _notes(file: ResultsFile, layer: str, named: bool) -> list[str]:
         first = unexplained[0]
         episode = file.episodes.row(first.claim.episode, named=True)
         notes.append(
-            f"{of}The file's own summary disagrees with its steps in {plural(len(unexplained), 'number')}; the first: task "
-            f"{episode['task_id']} episode {episode['episode_index']}, {_named(first.claim.layer)}, {first.claim.measure} "
-            f"{first.claim.statistic}: summary {format_number(first.claim.value)}, from the steps {format_number(first.computed)}. "
-            "Everything here is computed from the steps."
+            f"{of}The file's own summary disagrees with its steps in {plural(len(unexplained), 'number')}; the first: "
+            f"task {episode['task_id']} episode {episode['episode_index']}, {_named(first.claim.layer)}, "
+            f"{first.claim.measure} {first.claim.statistic}: summary {format_number(first.claim.value)}, from the "
+            f"steps {format_number(first.computed)}. Everything here is computed from the steps."
         )
     if file.unused:
         notes.append(f"{of}Fields that are not used: {listing(file.unused, 20)}.")
@@ -229,7 +232,7 @@ def _mean_std(spread: Spread) -> str:
 
 
 def _named(layer: str) -> str:
-    return layer if layer == LAYERS_AVG else f"layer {layer}"
+    return layer_name(layer, LAYERS_AVG)
 
 
 def _float(value: object) -> float | None:

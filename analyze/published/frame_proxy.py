@@ -10,7 +10,9 @@ from vla_attention.schemas.stores.store_format import RootAttributes
 
 
 def frame_proxy(root: RootAttributes, layout: SiteLayout, grouping: Grouping) -> FrameProxy | None:
-    """The proxy that a ratio is, or None: each side is one group of one `frame:` selector, at the site of the latent frames."""
+    """The proxy that a ratio is, or None: each side is one group of one `frame:` selector, at the site of the latent
+    frames.
+    """
     if grouping.ratio is None or not any(span.kind == "latent" for span in layout.spans):
         return None
     visual, text = (_frame_of(grouping, side) for side in (grouping.ratio.numerator, grouping.ratio.denominator))

@@ -1,10 +1,11 @@
 """Results files of anybody: finding them, and reading ours and those of the published scripts into one table.
 
-`vla_attention.analyze.published.results_file.read_results` is strict and reads what this tool wrote. Here the differences of the published scripts' files
-are accepted, and nothing else:
+`vla_attention.analyze.published.results_file.read_results` is strict and reads what this tool wrote. Here the
+differences of the published scripts' files are accepted, and nothing else:
 
     Infinity and NaN as ratios                       they become infinite and undefined, as null does in our files
-    a ratio of 0 where no ratio exists               undefined: both masses 0, or "layers_avg" of layers without a finite ratio
+    a ratio of 0 where no ratio exists               undefined: both masses 0, or "layers_avg" of layers without a
+                                                     finite ratio
     no "layers_avg", no action fields, no summary    as they are; see `ResultsFile`
     fields that are not known here                   read over, and named in `ResultsFile.unused`
     one episode that is not in a list                a list of one
@@ -37,7 +38,8 @@ from vla_attention.schemas.results import (
 _LAYER = re.compile(r"layer_(\d+)$")
 #: The published scripts call a mass of up to this nothing, and write a ratio of 0 where both sides have nothing.
 NO_MASS = 1e-8
-#: Which latent frames stand for what in the Cosmos scripts' files; a file that names them is one of theirs, or compares with them.
+#: Which latent frames stand for what in the Cosmos scripts' files; a file that names them is one of theirs, or compares
+#: with them.
 FRAME_FIELDS = ("query_frame", "visual_frame", "text_frame")
 _MASSES = ("visual_mass", "linguistic_mass")
 _FRACTIONS = ("visual_fraction", "linguistic_fraction")
@@ -50,7 +52,8 @@ class ResultsKind:
     """What a file's masses are, as far as the file says: numbers of different kinds are not pooled.
 
     Attributes:
-        frames: the latent frames that stand for queries, seeing and reading (Cosmos scripts); None in the others' files.
+        frames: the latent frames that stand for queries, seeing and reading (Cosmos scripts); None in the others'
+            files.
         has_action: there is an action mass, and it is part of what fractions are fractions of.
     """
 
@@ -85,11 +88,12 @@ class ResultsFile:
         path: where it lies.
         suite: the suite that it is about, from its name.
         kind: what its masses are.
-        episodes: one row per episode, in the file's order: episode (position), task_id, instruction, episode_index, success,
-            num_steps, num_replans (0 for an episode without steps).
-        steps: one row per (episode, replan, layer): episode (position), replan, env_step, layer (the number as a string, or
-            "layers_avg"), layer_number, ratio (infinite; null where undefined), visual_mass, linguistic_mass, visual_fraction,
-            linguistic_fraction (null where undefined) and, with `kind.has_action`, action_mass and action_fraction.
+        episodes: one row per episode, in the file's order: episode (position), task_id, instruction, episode_index,
+            success, num_steps, num_replans (0 for an episode without steps).
+        steps: one row per (episode, replan, layer): episode (position), replan, env_step, layer (the number as a
+            string, or "layers_avg"), layer_number, ratio (infinite; null where undefined), visual_mass,
+            linguistic_mass, visual_fraction, linguistic_fraction (null where undefined) and, with `kind.has_action`,
+            action_mass and action_fraction.
         claims: the numbers of the file's own summaries.
         zeros: how many ratios of 0 stand for "no ratio" and were read as undefined.
         unused: names of fields that nothing here knows.

@@ -1,7 +1,8 @@
-"""Results files as the tables of `vla_attention.analyze.measures.aggregate`, so that pictures and intervals are the same as those from stores.
+"""Results files as the tables of `vla_attention.analyze.measures.aggregate`, so that pictures and intervals are the
+same as those from stores.
 
-A results file knows masses and fractions, but neither how many keys are on each side nor row sums: those columns are null, and
-with them the uniform baseline and every lift.
+A results file knows masses and fractions, but neither how many keys are on each side nor row sums: those columns are
+null, and with them the uniform baseline and every lift.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.aggregate import episode_tables, layer_order, task_tables
-from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
+from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables, float_values
 from vla_attention.analyze.published.results_reader import Claim, ResultsFile, ResultsKind
 from vla_attention.analyze.statistics.bootstrap import SampleSummary, summarize
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
@@ -31,7 +32,9 @@ _UNKNOWN = pl.lit(None, dtype=pl.Float64)
 
 @dataclass(frozen=True)
 class ResultsTables:
-    """Tables of one or several results files; column `suite` holds the files' labels, so that equal task ids stay apart."""
+    """Tables of one or several results files; column `suite` holds the files' labels, so that equal task ids stay
+    apart.
+    """
 
     grouping: Grouping
     replans: Tables
@@ -62,7 +65,7 @@ class Spread:
 
 def spread_of(ratios: pl.Series) -> Spread:
     """Summarise ratios (null: undefined)."""
-    values = ratios.cast(pl.Float64).fill_null(float("nan")).to_numpy()
+    values = float_values(ratios)
     finite = values[np.isfinite(values)]
     known = summarize(values)
     low, high = np.percentile(finite, [25, 75]).tolist() if finite.size else (None, None)
@@ -161,15 +164,11 @@ def layers_of(file: ResultsFile) -> list[str]:
     return layer_order(file.steps)
 
 
-def chosen_layer(file: ResultsFile) -> str:
-    """The layer that speaks for a file, as in the published parser: "layers_avg" where there is one, else the first."""
-    layers = layers_of(file)
-    return LAYERS_AVG if LAYERS_AVG in layers else layers[0]
-
-
 @dataclass(frozen=True)
 class Disagreement:
-    """A claim of a file's summary that its own steps do not bear out; `reason` where the cause is a known other definition."""
+    """A claim of a file's summary that its own steps do not bear out; `reason` where the cause is a known other
+    definition.
+    """
 
     claim: Claim
     computed: float | None
@@ -196,7 +195,7 @@ def disagreements(file: ResultsFile) -> list[Disagreement]:
         key = (claim.episode, claim.layer, column)
         if key not in known:
             rows = parts.get(key[:2])
-            values = np.zeros(0) if rows is None else rows[column].cast(pl.Float64).fill_null(float("nan")).to_numpy()
+            values = np.zeros(0) if rows is None else float_values(rows[column])
             known[key] = (values, summarize(values))
         values, summary = known[key]
         computed = getattr(summary, claim.statistic)

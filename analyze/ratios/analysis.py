@@ -1,9 +1,9 @@
-"""The whole default analysis: stores in, tables, results files, summary and pictures out."""
+"""The analysis of `vla-analyze ratios`: the tables of one question, the summary, and the files with both."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,12 +22,14 @@ from vla_attention.analyze.measures.frames import Tables, named_tables
 from vla_attention.analyze.measures.group_contributions import group_contribution_tables
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import resolve_all
+from vla_attention.analyze.measures.sinks import SinkRule, sinks_table
+from vla_attention.analyze.measures.sinks import without_sinks as question_without_sinks
 from vla_attention.analyze.measures.steps import MeasuredEpisode, measure_episodes, step_tables
 from vla_attention.analyze.published.frame_proxy import frame_proxy
-from vla_attention.analyze.published.results_file import write_results_of_suites
+from vla_attention.analyze.published.results_writer import write_results_of_suites
 from vla_attention.analyze.ratios.contribution_text import contributions_section, group_contributions_section
-from vla_attention.analyze.ratios.summary import AnalysedRun, summary_text, write_summary
-from vla_attention.analyze.show.output_files import write_parquet, writing
+from vla_attention.analyze.ratios.summary_text import AnalysedRun, summary_text
+from vla_attention.analyze.show.output_files import write_parquet, write_text, writing
 from vla_attention.analyze.stores.selection import Selection, heads_text
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
@@ -39,8 +41,9 @@ from vla_attention.schemas.stores.store_format import RootAttributes
 class Analysis:
     """The tables of one grouping over one selection of episodes, as pairs of cells and groups (`frames.Tables`).
 
-    `step_tables` and the functions of `measures.aggregate` list their columns. Steps, contributions and the summary are computed when they
-    are first asked for.
+    `step_tables` and the functions of `measures.aggregate` list their columns. Steps, contributions and the summary are
+    computed when they are first asked for. `sinks` is the table of the keys that were left out (`measures.sinks`), None
+    when none were looked for.
     """
 
     question: Question
@@ -49,10 +52,11 @@ class Analysis:
     replans: Tables
     episodes: Tables
     tasks: Tables
+    sinks: pl.DataFrame | None = None
 
     @property
     def grouping(self) -> Grouping:
-        """The groups of keys that everything is about."""
+        """The groups of keys and the ratio that the tables are about."""
         return self.question.grouping
 
     @cached_property
@@ -92,7 +96,7 @@ class Analysis:
 
     @cached_property
     def summary(self) -> str:
-        """Everything as text."""
+        """The printed text: `summary_text`, then the sections on contributions where these were recorded."""
         question, grouping, seed = self.question, self.grouping, self.question.settings.seed
         parts = [summary_text(_described(question), grouping, self.episodes, self.tasks)]
         if self.contributions is not None:
@@ -102,27 +106,29 @@ class Analysis:
         return "\n".join(parts)
 
 
-@dataclass
-class WrittenFiles:
-    """Where results went."""
+def analyse(question: Question, without_sinks: SinkRule | None = None) -> Analysis:
+    """Compute the tables. A terminal shows the progress.
 
-    folder: Path
-    files: list[Path] = field(default_factory=list)
-
-
-def analyse(question: Question) -> Analysis:
-    """Compute the tables. Shows progress at a terminal when it takes longer than a moment."""
+    Args:
+        question: stores, selection and grouping.
+        without_sinks: take the keys that are sinks by this rule out of every group and of the valid keys. Reads all
+            selected rows.
+    """
+    sinks = None
+    if without_sinks is not None:
+        sinks = sinks_table(question, without_sinks)
+        question = question_without_sinks(question, sinks, without_sinks)
     grouping = question.grouping
     resolved = resolve_all(grouping, question.selected, question.vocabulary)
     measured = measure_episodes(question, resolved)
     replans = replan_tables(measured, grouping)
     episodes = episode_tables(replans, grouping)
     tasks = task_tables(episodes, grouping, seed=question.settings.seed)
-    return Analysis(question, resolved, measured, replans, episodes, tasks)
+    return Analysis(question, resolved, measured, replans, episodes, tasks, sinks)
 
 
 def _described(question: Question) -> AnalysedRun:
-    """What the summary says about where the numbers come from."""
+    """The lines of the summary's header that the tables do not hold."""
     root = question.stores[0].attributes
     policy = root.policy
     return AnalysedRun(
@@ -135,26 +141,31 @@ def _described(question: Question) -> AnalysedRun:
     )
 
 
-def write_tables(analysis: Analysis, folder: Path) -> WrittenFiles:
-    """Write the results JSON (when the grouping has a ratio), the tables and the summary; each file appears whole."""
-    written = WrittenFiles(folder)
+def write_tables(analysis: Analysis, folder: Path) -> list[Path]:
+    """Write the results JSON (when the grouping has a ratio), the tables and the summary; returns the paths.
+
+    Each file appears whole or not at all.
+    """
+    written: list[Path] = []
     for name in ("steps", "episodes", "tasks"):
-        written.files += write_parquet(folder, **named_tables(name, getattr(analysis, name)))
-    further: dict[str, pl.DataFrame] = {}
+        written += write_parquet(folder, **named_tables(name, getattr(analysis, name)))
+    recorded: dict[str, pl.DataFrame] = {}
     if analysis.contributions is not None:
-        further["contributions"] = analysis.contributions
+        recorded["contributions"] = analysis.contributions
     if analysis.group_contributions is not None:
-        further["group_contributions"] = analysis.group_contributions.groups
+        recorded["group_contributions"] = analysis.group_contributions.groups
         if "contribution_ratio" in analysis.group_contributions.cells.columns:
-            further["group_contribution_ratios"] = analysis.group_contributions.cells
-    written.files += write_parquet(folder, **further)
+            recorded["group_contribution_ratios"] = analysis.group_contributions.cells
+    written += write_parquet(folder, **recorded)
     with writing("results", folder):
         if analysis.grouping.ratio is not None:
             question = analysis.question
             proxy = frame_proxy(question.stores[0].attributes, question.selected[0].tokens.layout, analysis.grouping)
-            written.files += write_results_of_suites(folder, analysis.replans, analysis.grouping, proxy)
-        write_summary(folder / "summary.txt", analysis.summary)
-    written.files.append(folder / "summary.txt")
+            written += write_results_of_suites(folder, analysis.replans, analysis.grouping, proxy)
+        write_text(folder / "summary.txt", analysis.summary)
+    written.append(folder / "summary.txt")
+    if analysis.sinks is not None:
+        written += write_parquet(folder, sinks=analysis.sinks)
     return written
 
 
@@ -163,14 +174,14 @@ def _notes(root: RootAttributes, selection: Selection, site: str) -> list[str]:
     others = [other.name for other in root.sites if other.name != site]
     if others:
         notes.append(
-            f"Masses of the site '{site}' only; the other sites ({listing(others)}) are softmaxes of their own, and a mass of one "
-            "must not be divided by a mass of another. Choose with --site."
+            f"Masses of the site '{site}' only; the other sites ({listing(others)}) are softmaxes of their own, and a "
+            "mass of one must not be divided by a mass of another. Choose with --site."
         )
     return notes
 
 
 def describe_heads(selection: Selection, num_heads: int) -> str:
-    """What was done about heads, in words."""
+    """How heads were averaged, as text."""
     return f"mean over {heads_text(selection, num_heads)}" + (
         " (kept apart in the steps table)" if selection.per_head else ""
     )

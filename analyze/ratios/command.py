@@ -1,4 +1,4 @@
-"""`vla-analyze ratios`, and `vla-analyze STORE` alone: masses, fractions and ratios, with intervals, tables and pictures."""
+"""`vla-analyze ratios`, and `vla-analyze STORE` alone: masses, fractions and ratios with intervals."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from vla_attention.analyze.arguments import (
     output_folder,
     settings_of,
     sink_rule,
+    stores_of,
 )
 from vla_attention.analyze.commands import list_of_commands
 from vla_attention.analyze.show.output_files import report_files
@@ -27,7 +28,7 @@ _EXAMPLES = """examples:
   vla-analyze heads runs/libero_10.zarr
   vla-analyze compare runs/base.zarr runs/finetuned.zarr
 
-`vla-analyze COMMAND --help` has more of each.
+`vla-analyze COMMAND --help` explains each command.
 """
 
 
@@ -41,7 +42,7 @@ def build_parser(prog: str = "vla-analyze") -> argparse.ArgumentParser:
     )
     add_stores(parser)
     parser.add_argument(
-        "--list", action="store_true", help="say what the stores hold (layout, words, objects) and stop"
+        "--list", action="store_true", help="print what the stores hold (layout, words, objects) and stop"
     )
     add_grouping(parser)
     selection = add_selection(parser)
@@ -50,7 +51,7 @@ def build_parser(prog: str = "vla-analyze") -> argparse.ArgumentParser:
     sinks.add_argument(
         "--without-sinks",
         action="store_true",
-        help="take keys that are sinks out of every group and of the valid keys, and say which (reads all selected rows)",
+        help="take keys that are sinks out of every group and of the valid keys, and list them (reads all rows)",
     )
     add_sink_rule(sinks)
     output = add_output(parser)
@@ -60,39 +61,27 @@ def build_parser(prog: str = "vla-analyze") -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Analyse, print the summary, and write tables and pictures."""
-    # Imported after the arguments were read: `--help` must not wait for polars and zarr.
+    # Imported here, so that `--help` does not wait for polars and zarr.
     from vla_attention.analyze.measures.question import ask
     from vla_attention.analyze.ratios.analysis import analyse, write_tables
     from vla_attention.schemas.errors import BadArgument
-    from vla_attention.schemas.stores.reader import open_store
 
-    stores = [open_store(path) for path in arguments.stores]
+    stores = stores_of(arguments)
     if arguments.list:
         from vla_attention.analyze.stores.contents import describe_store
 
         print("\n\n".join(describe_store(store, arguments.tasks) for store in stores))
         return 0
-    question = ask(stores, settings_of(arguments))
-    sinks = None
-    if arguments.without_sinks:
-        from vla_attention.analyze.measures.sinks import sinks_table, without_sinks
-
-        rule = sink_rule(arguments)
-        sinks = sinks_table(question, rule)
-        question = without_sinks(question, sinks, rule)
-    elif arguments.sink_factor is not None or arguments.sink_share is not None:
-        raise BadArgument("--sink-factor and --sink-share say what a sink is for --without-sinks; give that too.")
-    analysis = analyse(question)
-    folder = output_folder(arguments, question.grouping.name)
+    if not arguments.without_sinks and (arguments.sink_factor, arguments.sink_share) != (None, None):
+        raise BadArgument("--sink-factor and --sink-share define a sink for --without-sinks; give --without-sinks too.")
+    rule = sink_rule(arguments) if arguments.without_sinks else None
+    analysis = analyse(ask(stores, settings_of(arguments)), without_sinks=rule)
+    folder = output_folder(arguments, analysis.grouping.name)
     written = write_tables(analysis, folder)
-    if sinks is not None:
-        from vla_attention.analyze.show.output_files import write_parquet
-
-        written.files += write_parquet(folder, sinks=sinks)
     print(analysis.summary)
     if not arguments.no_plots:
         from vla_attention.analyze.ratios.default_plots import write_plots
 
-        written.files += write_plots(analysis, folder, arguments.save_viz)
-    report_files(folder, written.files)
+        written += write_plots(analysis, folder, arguments.save_viz)
+    report_files(folder, written)
     return 0

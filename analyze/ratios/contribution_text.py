@@ -27,15 +27,16 @@ def contributions_section(table: pl.DataFrame, seed: int) -> str:
     ]
     title = "CONTRIBUTIONS  |visual| / |linguistic|, norms of what the keys add to the residual stream"
     note = (
-        "Value-weighted, through output projection and gate; root mean square over action queries, mean over replans and denoise "
-        "steps. ratio: mean over episodes of the mean ratio of norms. Norms of different sites may be divided; masses may not."
+        "Value-weighted, through output projection and gate; root mean square over action queries, mean over replans "
+        "and denoise steps. ratio: mean over episodes of the mean ratio of norms. Norms of different sites may be "
+        "divided; masses may not."
     )
     header = ["layer", "|visual|", "|linguistic|", "ratio", interval_name(DEFAULT_LEVEL)]
     return "\n".join([heading(title), text_table(header, rows, left=(0,)), "", *wrap(note), ""])
 
 
 def group_contributions_section(tables: Tables | None, grouping: Grouping, site: str, seed: int) -> str:
-    """The summary's section: per layer the mean norms of the groups and the ratio of norms with a two-level interval."""
+    """The summary's section: per layer the groups' mean norms and the ratio of norms with a two-level interval."""
     title = f"CONTRIBUTIONS OF GROUPS  norms of what they add to the residual stream at site '{site}'"
     measured = [] if tables is None else tables.parts[0].groups["group"].unique(maintain_order=True).to_list()
     cut = [name for name in grouping.names if name not in measured]
@@ -55,9 +56,7 @@ def group_contributions_section(tables: Tables | None, grouping: Grouping, site:
     norms = norms_by_layer(tables)
     ratios = ratios_by_layer(tables.cells, seed)
     rows = []
-    for layer in tables.cells.select("layer").to_series().unique(maintain_order=True).cast(pl.String).to_list() + [
-        LAYERS_AVG
-    ]:
+    for layer in (*tables.cells["layer"].unique(maintain_order=True).cast(pl.String), LAYERS_AVG):
         cells = [layer, *(format_number(norms[layer, name]) for name in shown)]
         if layer in ratios:
             row = ratios[layer]

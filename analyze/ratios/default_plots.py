@@ -1,4 +1,4 @@
-"""Which pictures belong to an analysis."""
+"""The pictures that `vla-analyze ratios` draws by default, and those of single episodes (`--save-viz`)."""
 
 from __future__ import annotations
 

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import layer_order, overall_layer, overall_rows
+from vla_attention.analyze.measures.aggregate import FRACTION_COLUMNS, layer_order, overall_layer, overall_rows
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables
-from vla_attention.analyze.ratios.profile_panels import FRACTION_COLUMNS
 from vla_attention.analyze.show.numbers import of_tasks
 from vla_attention.analyze.show.plot_axes import legend_beside, share_ticks
 from vla_attention.analyze.show.plot_colours import group_styles
@@ -31,10 +30,18 @@ def plot_attention_fractions(
     about: str | None = None,
     note: str = "",
 ) -> list[Path]:
-    """Draw from `aggregate.task_tables` (its rows over everything); returns the paths of png, pdf and csv.
+    """Draw the rows over all tasks; returns the paths of png, pdf and csv.
 
-    `stem`: the files' name. `about`: what the title says the fractions are of, the grouping unless given. `note`: a further sentence.
-    Fractions are means over episodes; they sum to 1 also where groups overlap, because each is a share of the summed masses.
+    Fractions are means over episodes; they sum to 1 also where groups overlap, because each is a share of the summed
+    masses.
+
+    Args:
+        tasks: `aggregate.task_tables`.
+        grouping: its groups and ratio.
+        folder: where the files go.
+        stem: name of the files, without ending.
+        about: what the title names as the source; the grouping unless given.
+        note: a sentence to add below the title.
     """
     level = overall_rows(tasks)
     rows, of_group, with_keys = level.cells, level.by_group("layer"), level.groups_with_keys()
@@ -57,7 +64,7 @@ def plot_attention_fractions(
     bottom = np.zeros(len(layers))
     for i, name in enumerate(grouping.names):
         if name not in with_keys:
-            continue  # a group without a key, like state digits where the prompt has none
+            continue  # no key at all, like state digits in a prompt without state
         style = styles[name]
         empty = not fractions[:, i].any()
         label = wrapped(name, 28, 1) + (" (0)" if empty else "")
@@ -66,7 +73,7 @@ def plot_attention_fractions(
             linewidth=0.4, label=label,
         )  # fmt: skip
         for position, start, share in zip(positions, bottom, fractions[:, i], strict=True):
-            # Numbers only where they fit into their piece: height of the piece, width of the bar.
+            # A number only where its piece of the bar is high enough.
             if share >= 0.045:
                 axes.text(
                     position, start + share / 2, f"{100 * share:.0f}", ha="center", va="center", size=7,

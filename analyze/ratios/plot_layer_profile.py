@@ -6,9 +6,9 @@ from pathlib import Path
 
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import layer_order, overall_rows
+from vla_attention.analyze.measures.aggregate import FRACTION_COLUMNS, layer_order, overall_rows
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables
-from vla_attention.analyze.ratios.profile_panels import FRACTION_COLUMNS, draw_profile, shown_groups
+from vla_attention.analyze.ratios.plot_profile_panels import draw_profile, shown_groups
 from vla_attention.analyze.show.numbers import of_tasks
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import named, title
@@ -20,7 +20,7 @@ STEM = "layer_profile"
 
 @drawn_in_our_style
 def plot_layer_profile(tasks: Tables, grouping: Grouping, folder: Path) -> list[Path]:
-    """Draw from `aggregate.task_tables` (its rows over everything); returns the paths of the pictures and their data."""
+    """Draw the rows of `aggregate.task_tables` over all tasks; returns the paths of pictures and data."""
     level = overall_rows(tasks).filter(pl.col("layer") != LAYERS_AVG)
     rows, layers = level.cells, layer_order(level.cells)
     figure = new_figure(max(6.6, 3.2 + 0.3 * min(len(layers), 28)), 3.1 if grouping.ratio is None else 5.0)

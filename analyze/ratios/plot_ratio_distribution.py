@@ -10,13 +10,14 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.aggregate import layer_order, overall_layer
-from vla_attention.analyze.measures.frames import LAYERS_AVG
+from vla_attention.analyze.measures.frames import LAYERS_AVG, layer_name
 from vla_attention.analyze.show.numbers import of_tasks, plural
 from vla_attention.analyze.show.plot_axes import (
     BASELINE_LABEL,
     legend_beside,
     note_at_row,
     ratio_axis,
+    scattered,
     uniform_line,
     whole_numbers,
 )
@@ -44,13 +45,19 @@ def plot_ratio_distribution(
     about: str | None = None,
     note: str = "",
 ) -> list[Path]:
-    """Draw from the cells of `aggregate.replan_tables`; returns the paths of png, pdf and csv.
+    """Draw the ratios of all replans; returns the paths of png, pdf and csv.
 
-    `stem`: the files' name. `about`: what the title says the ratios are of, the grouping unless given. `note`: a further sentence.
+    Args:
+        replans: the cells of `aggregate.replan_tables`.
+        grouping: its groups and ratio.
+        folder: where the files go.
+        stem: name of the files, without ending.
+        about: what the title names as the source; the grouping unless given.
+        note: a sentence to add below the title.
     """
     layers = layer_order(replans)
     if len(layers) == 2 and LAYERS_AVG in layers:
-        layers.remove(LAYERS_AVG)  # of a single layer: the same numbers once more
+        layers.remove(LAYERS_AVG)  # of one layer, the mean over layers has the same numbers
     chosen = overall_layer(replans) if len(layers) > 1 else layers[0]
     rows = replans.filter(pl.col("layer").is_in(layers))
     columns = ["suite", "task_id", "episode_index", "replan", "env_step", "layer"]
@@ -91,7 +98,7 @@ def _drawable() -> pl.Expr:
 
 def _histogram(axes: Axes, overall: pl.DataFrame, chosen: str) -> None:
     values = overall.filter(_drawable())["ratio"].to_numpy()
-    name = chosen if chosen == LAYERS_AVG else f"layer {chosen}"
+    name = layer_name(chosen, LAYERS_AVG)
     axes.set_title(f"{name}: {plural(len(values), 'replan')}", loc="left")
     axes.set_ylabel("replans")
     whole_numbers(axes.yaxis)
@@ -119,10 +126,8 @@ def _boxes(axes: Axes, shown: pl.DataFrame, layers: list[str]) -> None:
         axes.barh(position, high - low, 0.62, low, color=_BOX_COLOR, edgecolor=DATA_COLOR, linewidth=0.9, zorder=2)
         axes.plot([middle, middle], [position - 0.31, position + 0.31], color=_MEDIAN_COLOR, linewidth=1.4, zorder=4)
         means = rows.group_by("suite", "task_id", "episode_index", maintain_order=True).agg(pl.col("ratio").mean())
-        jitter = generator.uniform(-0.2, 0.2, means.height) if means.height > 1 else np.zeros(1)
-        axes.scatter(
-            means["ratio"].to_numpy(), position + jitter, s=6, color=_DOT_COLOR, alpha=0.55, linewidths=0, zorder=5
-        )
+        places = scattered(generator, position, means.height, 0.2)
+        axes.scatter(means["ratio"].to_numpy(), places, s=6, color=_DOT_COLOR, alpha=0.55, linewidths=0, zorder=5)
     axes.set_yticks(positions, layers)
     axes.set_ylim(len(layers) - 0.4, -0.6)
     axes.set_ylabel("layer")
@@ -166,7 +171,7 @@ def _counts(overall: pl.DataFrame, rows: pl.DataFrame, chosen: str) -> str:
     tasks = overall.select("suite", "task_id").n_unique()
     left_out = overall.height - int(overall["ratio"].is_finite().fill_null(False).sum())
     zeros = int((overall["ratio"] == 0).fill_null(False).sum())
-    name = chosen if chosen == LAYERS_AVG else f"layer {chosen}"
+    name = layer_name(chosen, LAYERS_AVG)
     text = f"n = {of_tasks(episodes, tasks)}, {plural(overall.height, 'replan')}."
     if left_out:
         text += f" {left_out} of {overall.height} ratios of {name} are not finite and not drawn."
@@ -181,7 +186,7 @@ def _counts(overall: pl.DataFrame, rows: pl.DataFrame, chosen: str) -> str:
 
 def _why_empty(rows: pl.DataFrame) -> str:
     if rows["layer"].n_unique() > 1:
-        rows = rows.filter(pl.col("layer") != LAYERS_AVG)  # whose ratio is only ever missing because theirs are
+        rows = rows.filter(pl.col("layer") != LAYERS_AVG)  # its ratio is missing only where those of all layers are
     infinite = int(rows["ratio"].is_infinite().fill_null(False).sum())
     undefined = rows["ratio"].null_count()
     counts = {

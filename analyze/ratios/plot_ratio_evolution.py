@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
+from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables, float_values, layer_name
 from vla_attention.analyze.show.numbers import format_number, plural
 from vla_attention.analyze.show.plot_axes import (
     BASELINE_LABEL,
@@ -21,7 +21,7 @@ from vla_attention.analyze.show.plot_axes import (
     uniform_line,
     whole_numbers,
 )
-from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, NOTE_COLOR, group_styles
+from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, LINE_OF_HATCH, NOTE_COLOR, group_styles
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, ratio_name, title, wrapped
 from vla_attention.analyze.statistics.bootstrap import geometric_mean, ratio_of_means_over_episodes, summarize
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SLUG_LENGTH = 60
-#: By group, its rows over the replans; and how it is drawn.
+#: Group -> its rows, one per replan; group -> its colour and hatch.
 Groups = Mapping[str, pl.DataFrame]
 Styles = Mapping[str, Mapping[str, str]]
 
 
 def evolution_stem(task_id: int, instruction: str, episode_index: int, layer: str) -> str:
-    """File name without ending: `task{id}_{slug}_ep{k}_layer{N}_ratio_evolution`, or `..._layers_avg_ratio_evolution`."""
+    """File name: `task{id}_{slug}_ep{k}_layer{N}_ratio_evolution`, or `..._layers_avg_...`, without ending."""
     slug = re.sub(r"[^a-z0-9]+", "_", instruction.lower()).strip("_")[:_SLUG_LENGTH].rstrip("_") or "task"
     of_layer = layer if layer == LAYERS_AVG else f"layer{layer}"
     return f"task{task_id}_{slug}_ep{episode_index}_{of_layer}_ratio_evolution"
@@ -48,18 +48,22 @@ def evolution_stem(task_id: int, instruction: str, episode_index: int, layer: st
 def plot_ratio_evolution(
     level: Tables, grouping: Grouping, folder: Path, formats: Sequence[str] = ("png", "pdf")
 ) -> list[Path]:
-    """Draw one episode in one layer: the part of `aggregate.replan_tables` that belongs to them. Returns png, pdf and csv.
+    """Draw one episode in one layer; returns the paths of png, pdf and csv.
 
-    Groups without mass in this episode are left out of the legend.
+    `level`: the rows of `aggregate.replan_tables` of this episode and layer. Groups without mass in the episode are
+    left out of the legend.
     """
     episode = level.cells.sort("replan")
     groups = {name: level.of_group(name).sort("replan") for name in grouping.names}
     first = episode.row(0, named=True)
     layer = first["layer"]
     figure = new_figure(10, 6.8)
-    of_layer = "mean over layers" if layer == LAYERS_AVG else f"layer {layer} (block {first['block']})"
+    of_layer = layer_name(layer, "mean over layers") + (f" (block {first['block']})" if layer != LAYERS_AVG else "")
     outcome = "success" if first["success"] else "failure"
-    note = f"{of_layer}; {outcome} after {first['num_steps']} steps; {plural(episode.height, 'replan')}; grouping '{grouping.name}'"
+    note = (
+        f"{of_layer}; {outcome} after {first['num_steps']} steps; {plural(episode.height, 'replan')}; "
+        f"grouping '{grouping.name}'"
+    )
     heading = f"{first['suite']} task {first['task_id']}, episode {first['episode_index']}: {first['instruction']}"
     title(figure, heading, note)
     ((ratio_axes, mass_axes), (fraction_axes, statistics_axes)) = figure.subplots(2, 2)
@@ -70,7 +74,7 @@ def plot_ratio_evolution(
     _mass_panel(mass_axes, groups, steps, drawn, styles)
     _fraction_panel(fraction_axes, groups, steps, drawn, styles)
     _statistics_panel(statistics_axes, episode, groups, grouping, drawn)
-    # Room at either end, so that a marker on the first or last replan does not sit on the frame.
+    # Room at either end for the markers of the first and the last replan.
     room = 0.02 * (steps[-1] - steps[0]) or 2.5
     for axes in (ratio_axes, mass_axes, fraction_axes):
         if axes.spines["left"].get_visible():  # not those that hold an explanation
@@ -117,20 +121,21 @@ def _ratio_panel(axes: Axes, episode: pl.DataFrame, steps: NDArray[np.int64], gr
     if grouping.ratio is None:
         explain(axes, f"Grouping '{grouping.name}' defines no ratio.")
         return
-    ratio = episode["ratio"].fill_null(float("nan")).to_numpy()
-    uniform = episode["uniform_ratio"].fill_null(float("nan")).to_numpy()
+    ratio = float_values(episode["ratio"])
+    uniform = float_values(episode["uniform_ratio"])
     drawable = np.isfinite(ratio) & (ratio > 0)
     if not drawable.any():
         infinite = int(np.isinf(ratio).sum())
         explain(
             axes,
-            f"No finite ratio: {infinite} of {len(ratio)} are infinite (no denominator mass), the others undefined or 0.",
+            f"No finite ratio: {infinite} of {len(ratio)} are infinite (no denominator mass), the others undefined or "
+            "0.",
         )
         return
     ratio_axis(axes.yaxis, np.concatenate([ratio, uniform]))
     axes.plot(steps, np.where(drawable, ratio, np.nan), "o-", color=DATA_COLOR, markersize=3.5, label="ratio")
     if np.isfinite(uniform).any():
-        # One point is no line: it is drawn across the panel.
+        # A line through one point is invisible: it is drawn across the panel.
         if len(steps) == 1:
             uniform_line(axes, uniform[0], linewidth=1.2, label=BASELINE_LABEL)
         else:
@@ -148,12 +153,16 @@ def _ratio_panel(axes: Axes, episode: pl.DataFrame, steps: NDArray[np.int64], gr
 
 def _mass_panel(axes: Axes, groups: Groups, steps: NDArray[np.int64], drawn: Sequence[str], styles: Styles) -> None:
     axes.set_title("mass", loc="left")
-    dashes = {"": "-", "///": "--", "...": ":", "xxx": "-."}
     for name in drawn:
         style = styles[name]
         axes.plot(
-            steps, groups[name]["mass"].to_numpy(), dashes[style["hatch"]], marker="o", markersize=2.5, color=style["color"],
-        )  # fmt: skip
+            steps,
+            groups[name]["mass"].to_numpy(),
+            LINE_OF_HATCH[style["hatch"]],
+            marker="o",
+            markersize=2.5,
+            color=style["color"],
+        )
     axes.set_ylim(bottom=0)
     axes.set_ylabel("mass (mean over action queries)")
     axes.grid(axis="y")
@@ -190,7 +199,7 @@ def _statistics_panel(
     explain(axes, "")
     lines: list[tuple[str, str]] = []
     if grouping.ratio:
-        values = episode["ratio"].fill_null(float("nan")).to_numpy()
+        values = float_values(episode["ratio"])
         summary = summarize(values)
         geometric, _ = geometric_mean(values)
         of_means = ratio_of_means_over_episodes(episode["numerator_mass"], episode["denominator_mass"]).value
@@ -205,11 +214,11 @@ def _statistics_panel(
             ("lift (ratio / uniform)", format_number(_finite_mean(episode["ratio_lift"]))),
         ]
     room = 14 - len(lines)
-    means = {name: summarize(groups[name]["fraction"].fill_null(float("nan")).to_numpy()).mean for name in drawn}
+    means = {name: summarize(float_values(groups[name]["fraction"])).mean for name in drawn}
     largest = sorted(drawn, key=lambda name: -(means[name] or 0.0))
     shown = [name for name in drawn if name in largest[: room - (len(drawn) > room)]]
     for name in shown:
-        fraction = summarize(groups[name]["fraction"].fill_null(float("nan")).to_numpy())
+        fraction = summarize(float_values(groups[name]["fraction"]))
         text = "-"
         if fraction.mean is not None:
             spread = f"{100 * (fraction.std or 0):.1f}"
@@ -224,12 +233,12 @@ def _statistics_panel(
 
 
 def _with_spread(mean: str, spread: str, count: int) -> str:
-    """A single replan has no spread, and nothing finite has neither."""
+    """`mean ± std`; the mean alone for a single replan, or where there is no finite value."""
     return mean if count < 2 or mean == "-" else f"{mean} ± {spread}"
 
 
 def _finite_mean(series: pl.Series) -> float | None:
-    return summarize(series.cast(pl.Float64).fill_null(float("nan")).to_numpy()).mean
+    return summarize(float_values(series)).mean
 
 
 def _group_legend(figure: Figure, drawn: Sequence[str], styles: Styles) -> None:

@@ -1,4 +1,4 @@
-"""`ratio_per_task`: every task's mean ratio with its interval, single episodes as dots, and each task's uniform baseline."""
+"""`ratio_per_task`: mean ratio of every task with interval and uniform baseline, single episodes as dots."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import numpy as np
 import polars as pl
 
 from vla_attention.analyze.measures.aggregate import overall_layer
-from vla_attention.analyze.measures.frames import LAYERS_AVG
+from vla_attention.analyze.measures.frames import LAYERS_AVG, layer_name
 from vla_attention.analyze.show.numbers import interval_name, of_tasks
-from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, legend_above, note_at_row, ratio_axis
-from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, DOT_COLOR, NOTE_COLOR, STRIPE_COLOR
+from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, legend_above, note_at_row, ratio_axis, scattered
+from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, DOT_COLOR, STRIPE_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
-from vla_attention.analyze.show.plot_text import explain, named, ratio_name, title, wrapped
+from vla_attention.analyze.show.plot_text import explain, named, ratio_name, task_label, title
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 from vla_attention.schemas.groupings.grouping import Grouping
 
 if TYPE_CHECKING:
@@ -40,16 +41,24 @@ def plot_ratio_per_task(
     grouping: Grouping,
     folder: Path,
     layer: str | None = None,
-    level: float = 0.95,
+    level: float = DEFAULT_LEVEL,
     *,
     stem: str = STEM,
     about: str | None = None,
     note: str = "",
 ) -> list[Path]:
-    """Draw from the cells of `aggregate.episode_tables` and `aggregate.task_tables`; returns the paths of png, pdf and csv.
+    """Draw one layer; returns the paths of png, pdf and csv.
 
-    `layer`: which one, "layers_avg" unless given. `level` is that of the intervals in `tasks`. `stem`: the files' name.
-    `about`: what the title says the ratios are of, the grouping unless given. `note`: a further sentence.
+    Args:
+        episodes: the cells of `aggregate.episode_tables`.
+        tasks: the cells of `aggregate.task_tables`.
+        grouping: its groups and ratio.
+        folder: where the files go.
+        layer: "layers_avg" unless given.
+        level: level of the intervals in `tasks`.
+        stem: name of the files, without ending.
+        about: what the title names as the source; the grouping unless given.
+        note: a sentence to add below the title.
     """
     layer = layer or overall_layer(tasks)
     rows = tasks.filter((pl.col("layer") == layer) & (pl.col("scope") == "task"))
@@ -61,11 +70,11 @@ def plot_ratio_per_task(
         explain(figure.subplots(), f"Grouping '{grouping.name}' defines no ratio.")
         return save_figure(figure, folder, stem, rows.select(identity))
     data = pl.concat([rows, overall]).select(*identity, *_COLUMNS)
-    # One task is its own total.
+    # With one task, the row over all tasks would repeat it.
     shown = pl.concat([rows, overall]) if rows.height > 1 else rows
     few = rows.height <= _MANY
     figure = new_figure(9, 1.6 + (0.46 if few else 0.2) * (shown.height + 0.5))
-    name = layer if layer == LAYERS_AVG else f"layer {layer}"
+    name = layer_name(layer, LAYERS_AVG)
     title(figure, f"Ratio per task, {name}, {about or named(grouping)}", f"{_counts(rows, dots)} {note}")
     axes = figure.subplots()
     values = [data[column].drop_nulls().to_numpy() for column in _COLUMNS[:4]] + [
@@ -105,10 +114,8 @@ def _draw_rows(axes: Axes, shown: pl.DataFrame, dots: pl.DataFrame, few: bool) -
             own = dots.filter((pl.col("suite") == row["suite"]) & (pl.col("task_id") == row["task_id"]))
             values = own["ratio_mean"].drop_nulls().to_numpy()
             values = values[values > 0]
-            jitter = generator.uniform(-0.22, 0.22, len(values)) if len(values) > 1 else np.zeros(len(values))
-            axes.scatter(
-                values, position + jitter, s=14 if few else 8, color=DOT_COLOR, alpha=0.8, linewidths=0, zorder=2
-            )
+            places = scattered(generator, position, len(values))
+            axes.scatter(values, places, s=14 if few else 8, color=DOT_COLOR, alpha=0.8, linewidths=0, zorder=2)
         mean, low, high = row["ratio_mean"], row["ratio_mean_low"], row["ratio_mean_high"]
         if mean is not None and mean > 0:
             if low is not None and high is not None:
@@ -124,8 +131,7 @@ def _draw_rows(axes: Axes, shown: pl.DataFrame, dots: pl.DataFrame, few: bool) -
                 markeredgecolor="white",
             )
         else:
-            where = axes.get_yaxis_transform()
-            axes.text(0.01, position, "no finite ratio", transform=where, va="center", size=7, color=NOTE_COLOR)
+            note_at_row(axes, position, "no finite ratio", x=0.01)
         uniform = row["uniform_ratio"]
         if uniform is not None and uniform > 0:
             axes.plot(
@@ -146,8 +152,7 @@ def _label(row: dict[str, Any], several: bool, few: bool) -> str:
         return "all suites"
     if row["scope"] == "all":
         return f"all tasks of {row['suite']}"
-    number = f"{row['suite']} {row['task_id']}" if several else str(row["task_id"])
-    return wrapped(f"{number}: {row['instruction']}", 52 if few else 60, 2 if few else 1)
+    return task_label(row, several, few)
 
 
 def _legend(axes: Axes, level: float, with_interval: bool, with_baseline: bool) -> None:

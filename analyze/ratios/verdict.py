@@ -12,7 +12,7 @@ VISUAL_ABOVE, LINGUISTIC_BELOW = 1.5, 0.67
 
 
 def verdict(ratio: float | None) -> str:
-    """The guide's word for a mean ratio: above 1.5, below 0.67, or between; "undefined" without one."""
+    """The guide's name for a mean ratio: above 1.5, below 0.67, or between; "undefined" without a ratio."""
     if ratio is None or math.isnan(ratio):
         return "undefined"
     if ratio > VISUAL_ABOVE:
@@ -21,7 +21,7 @@ def verdict(ratio: float | None) -> str:
 
 
 def verdict_sentence(grouping: Grouping, ratio: float | None, uniform: float | None) -> str:
-    """The guide's word for a ratio beside its word for uniform attention; empty where the guide does not apply."""
+    """The guide's names for a ratio and for that of uniform attention; empty where the guide does not apply."""
     if not grouping.compares_modalities or ratio is None or uniform is None:
         return ""
     word, of_uniform = verdict(ratio), verdict(uniform)

@@ -10,7 +10,7 @@ import polars as pl
 
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.ratios.analysis import Analysis
-from vla_attention.analyze.ratios.summary import FEW_EPISODES
+from vla_attention.analyze.ratios.summary_text import FEW_EPISODES
 from vla_attention.analyze.report.section_parts import Section
 from vla_attention.analyze.show.headings import untrained_sentence
 from vla_attention.analyze.show.numbers import format_number, format_percent, plural

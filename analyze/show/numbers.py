@@ -24,6 +24,11 @@ def format_number(value: float | None) -> str:
     return f"{value:.0f}" if value == round(value) else text
 
 
+def format_signed(value: float | None) -> str:
+    """As `format_number`, with a + before positive numbers: for differences and effect sizes."""
+    return format_number(value) if value is None or not value > 0 else f"+{format_number(value)}"
+
+
 def format_interval(low: float | None, high: float | None) -> str:
     """`[low, high]`; - when there is no interval."""
     return "-" if low is None or high is None else f"[{format_number(low)}, {format_number(high)}]"

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, NOTE_COLOR
 
@@ -72,6 +73,12 @@ def uniform_line(
     """A dashed line across the axes at the value of uniform attention on the y axis (or with `along`, the x axis)."""
     line = axes.axhline if along == "y" else axes.axvline
     line(value, color=BASELINE_COLOR, linestyle="--", linewidth=linewidth, label=label)
+
+
+def scattered(generator: np.random.Generator, position: float, count: int, spread: float = 0.22) -> NDArray[np.float64]:
+    """`count` positions around the middle of a row, at most `spread` from it, so that points do not hide each other."""
+    offsets = generator.uniform(-spread, spread, count) if count > 1 else np.zeros(count)
+    return np.asarray(position + offsets)
 
 
 def note_at_row(axes: Axes, position: float, text: str, x: float = 1.01, size: float = 7) -> None:

@@ -27,6 +27,10 @@ FIXED_COLORS = {
 FURTHER_COLORS = ("#E69F00", "#56B4E9", "#F0E442", "#332288", "#117733", "#882255", "#44AA99", "#999933", "#AA4499")
 #: Patterns that tell groups apart when there are more groups than colours.
 _HATCHES = ("", "///", "...", "xxx")
+#: Lines of groups whose areas have these patterns.
+LINE_OF_HATCH = {"": "-", "///": "--", "...": ":", "xxx": "-."}
+#: Colours of runs, files and the like, in this order (Okabe & Ito's; neighbours differ in lightness too).
+SERIES_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 #: Colours of a single series, of the value that uniform attention gives, and of small print.
 DATA_COLOR, BASELINE_COLOR, NOTE_COLOR = "#0072B2", "#000000", "#555555"
 #: Single episodes beside their mean, the stripe behind every second row, and lines that lead the eye.

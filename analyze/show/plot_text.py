@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import textwrap
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from vla_attention.analyze.show.plot_axes import hide_frame
 from vla_attention.analyze.show.plot_colours import NOTE_COLOR
@@ -25,6 +26,15 @@ def wrapped(text: str, width: int, lines: int) -> str:
 def shortened(name: str, width: int) -> str:
     """A name that must not be broken at spaces, in at most so many characters, with … where it was cut."""
     return name if len(name) <= width else f"{name[: width - 1]}…"
+
+
+def task_label(row: Mapping[str, Any], several_suites: bool, few: bool) -> str:
+    """The label of a task's row: number (after its suite where there are several) and instruction.
+
+    The instruction is cut after one line, or with `few` rows in the plot, after two.
+    """
+    number = f"{row['suite']} {row['task_id']}" if several_suites else str(row["task_id"])
+    return wrapped(f"{number}: {row['instruction']}", 52 if few else 60, 2 if few else 1)
 
 
 def explain(axes: Axes, text: str) -> None:

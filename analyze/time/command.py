@@ -12,6 +12,7 @@ from vla_attention.analyze.arguments import (
     add_stores,
     output_folder,
     settings_of,
+    stores_of,
 )
 from vla_attention.analyze.show.output_files import report_files
 from vla_attention.schemas.command_line import command_parser
@@ -25,7 +26,7 @@ _EXAMPLES = """examples:
   vla-analyze time runs/libero_10.zarr --grouping objects --window 5
   vla-analyze time runs/libero_goal.zarr runs/libero_10.zarr --no-plots
 
-A replan's value stands until the next replan, as its actions do; a bin of the episode's time is the
+A replan's value holds until the next replan, as its actions do; a bin of the episode's time is the
 mean of that step function. The gripper closes at the first replan one of whose executed actions has a
 last number above 0 (robosuite's Panda gripper, which every suite of vla-capture drives).
 """
@@ -57,10 +58,9 @@ def run(arguments: argparse.Namespace) -> int:
     from vla_attention.analyze.show.output_files import write_parquet
     from vla_attention.analyze.time.text import time_text
     from vla_attention.analyze.time.time_courses import TimeSettings, time_courses
-    from vla_attention.schemas.stores.reader import open_store
 
     settings = TimeSettings(arguments.bins, arguments.window)
-    question = ask([open_store(path) for path in arguments.stores], settings_of(arguments))
+    question = ask(stores_of(arguments), settings_of(arguments))
     courses = time_courses(question, settings)
     print(time_text(question, courses, settings))
     folder: Path = output_folder(arguments, "time")

@@ -1,4 +1,4 @@
-"""How many independent replans each episode is worth."""
+"""The number of independent replans in each episode, from the autocorrelation of its ratio."""
 
 from __future__ import annotations
 

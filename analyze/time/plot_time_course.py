@@ -1,7 +1,7 @@
 """`time_course` and `time_course_gripper`: ratio and fractions over an episode, and around the first gripper closing.
 
-Left the ratio (or the first group's fraction), success and failure apart when there are both; right every group's fraction over all
-episodes. Bands are pointwise intervals; the strips below say how many episodes each point is a mean of.
+Left: the ratio (or the first group's fraction), one line for success and one for failure where both occur. Right: every
+group's fraction over all episodes. Bands are pointwise intervals; the strips below count the episodes of each point.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.frames import LAYERS_AVG
+from vla_attention.analyze.measures.frames import float_values, layer_name
 from vla_attention.analyze.show.numbers import interval_name, of_tasks
 from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, legend_above, ratio_axis, whole_numbers
-from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, NOTE_COLOR, group_styles
+from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, LINE_OF_HATCH, NOTE_COLOR, group_styles
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
-from vla_attention.analyze.show.plot_text import explain, named, ratio_name, title
+from vla_attention.analyze.show.plot_text import explain, named, ratio_name, shortened, title
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 from vla_attention.analyze.time.time_courses import (
     ALL,
     EPISODE_TIME,
@@ -46,7 +46,9 @@ _X_LABELS = {
 _HEADINGS = {EPISODE_TIME: "Over the course of an episode", GRIPPER_CLOSING: "Around the first gripper closing"}
 
 
-def plot_time_courses(courses: TimeCourses, grouping: Grouping, folder: Path, level: float = 0.95) -> list[Path]:
+def plot_time_courses(
+    courses: TimeCourses, grouping: Grouping, folder: Path, level: float = DEFAULT_LEVEL
+) -> list[Path]:
     """Draw one picture per alignment that the stores allow; returns the paths of png, pdf and csv."""
     paths = []
     for alignment, stem in STEMS.items():
@@ -57,12 +59,12 @@ def plot_time_courses(courses: TimeCourses, grouping: Grouping, folder: Path, le
 
 @drawn_in_our_style
 def plot_time_course(
-    courses: TimeCourses, grouping: Grouping, alignment: str, folder: Path, stem: str, level: float = 0.95
+    courses: TimeCourses, grouping: Grouping, alignment: str, folder: Path, stem: str, level: float = DEFAULT_LEVEL
 ) -> list[Path]:
     """Draw one alignment of `time_courses.time_courses`."""
     data = courses.course.filter(pl.col("alignment") == alignment)
     figure = new_figure(11, 5.2)
-    layer = "mean over layers" if courses.layer == LAYERS_AVG else f"layer {courses.layer}"
+    layer = layer_name(courses.layer, "mean over layers")
     title(figure, f"{_HEADINGS[alignment]}: {named(grouping)}, {layer}", _note(courses, alignment, level))
     if data.is_empty():
         explain(figure.subplots(), f"The gripper never closes in any of the {courses.closing.height} episodes.")
@@ -109,7 +111,7 @@ def _contrast_panel(axes: Axes, data: pl.DataFrame, outcomes: list[str], groupin
         part = data.filter(pl.col("outcome") == outcomes[0]).sort("position")
         axes.plot(
             part["position"].to_numpy(),
-            _numbers(part["uniform"]),
+            float_values(part["uniform"]),
             "--",
             color=BASELINE_COLOR,
             linewidth=1.2,
@@ -122,15 +124,14 @@ def _contrast_panel(axes: Axes, data: pl.DataFrame, outcomes: list[str], groupin
 def _fraction_panel(axes: Axes, data: pl.DataFrame, grouping: Grouping, level: float) -> None:
     axes.set_title("fractions, all episodes", loc="left")
     styles = group_styles(grouping.names)
-    dashes = {"": "-", "///": "--", "...": ":", "xxx": "-."}
     for name in data["quantity"].unique(maintain_order=True):
         part = data.filter(pl.col("quantity") == name).sort("position")
-        # A group that takes nothing anywhere is a line on the axis; its name would only crowd the legend.
+        # A group without mass would be a line on the axis, and its name would crowd the legend.
         if not (part["value"].fill_null(0) > 0).any():
             continue
         style = styles[name]
-        label = name if len(name) <= 24 else name[:23] + "…"
-        _line_with_band(axes, part, style["color"], dashes[style["hatch"]], label, alpha=0.22)
+        label = shortened(name, 24)
+        _line_with_band(axes, part, style["color"], LINE_OF_HATCH[style["hatch"]], label, alpha=0.22)
     axes.set_ylim(0, None)
     axes.set_ylabel("fraction of the groups' summed mass")
     axes.grid(axis="y")
@@ -140,11 +141,11 @@ def _fraction_panel(axes: Axes, data: pl.DataFrame, grouping: Grouping, level: f
 
 def _line_with_band(axes: Axes, part: pl.DataFrame, color: str, dash: str, label: str, alpha: float) -> None:
     where = part["position"].to_numpy()
-    low, high = _numbers(part["low"]), _numbers(part["high"])
+    low, high = float_values(part["low"]), float_values(part["high"])
     axes.fill_between(where, low, high, color=color, alpha=alpha, linewidth=0)
-    values, counts = _numbers(part["value"]), part["num_episodes"].to_numpy()
+    values, counts = float_values(part["value"]), part["num_episodes"].to_numpy()
     axes.plot(where, values, dash, color=color, label=label)
-    # A mean of fewer episodes is one of other episodes: a step there is no change within any of them.
+    # Where fewer episodes take part, a step can come from which ones they are, without a change in any of them.
     whole = counts == counts.max(initial=0)
     axes.plot(where[whole], values[whole], "o", color=color, markersize=3.4)
     axes.plot(
@@ -180,7 +181,3 @@ def _note(courses: TimeCourses, alignment: str, level: float) -> str:
     if courses.course.filter(pl.col("alignment") == alignment)["low"].null_count():
         text += " No band where fewer than two episodes take part."
     return text
-
-
-def _numbers(column: pl.Series) -> NDArray[np.float64]:
-    return column.cast(pl.Float64).fill_null(float("nan")).to_numpy()

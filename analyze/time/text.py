@@ -7,10 +7,11 @@ from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.measures.frames import LAYERS_AVG
+from vla_attention.analyze.measures.frames import LAYERS_AVG, layer_name
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.show.headings import heading, interval_note, title, untrained_warning, wrap
-from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent, of_tasks
+from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent, format_signed, of_tasks
+from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 from vla_attention.analyze.time.time_courses import (
@@ -38,7 +39,7 @@ def time_text(question: Question, courses: TimeCourses, settings: TimeSettings) 
 
 def _header(question: Question, courses: TimeCourses) -> str:
     of = courses.autocorrelation
-    layer = courses.layer if courses.layer == LAYERS_AVG else f"layer {courses.layer}"
+    layer = layer_name(courses.layer, LAYERS_AVG)
     lines = title("TIME COURSES")
     if question.untrained:
         lines += wrap(untrained_warning())
@@ -56,7 +57,7 @@ def _course_section(courses: TimeCourses, settings: TimeSettings) -> str:
     rows = courses.course.filter(pl.col("alignment") == EPISODE_TIME, pl.col("outcome") == ALL)
     groups = [name for name in courses.quantities if name != RATIO][:_MOST_GROUPS]
     header = ["time"] + (["ratio", "interval", "uniform"] if RATIO in courses.quantities else [])
-    header += [_short(name, 12) for name in groups]
+    header += [shortened(name, 12) for name in groups]
     stride = max(1, -(-settings.num_bins // _SHOWN))
     body = []
     for part in rows.partition_by("position", maintain_order=True)[::stride]:
@@ -67,7 +68,7 @@ def _course_section(courses: TimeCourses, settings: TimeSettings) -> str:
             cells += [format_number(of[RATIO]["value"]), _interval(of[RATIO]), format_number(of[RATIO]["uniform"])]
         body.append(cells + [format_percent(of[name]["value"]) for name in groups])
     every = f" (one bin in {stride}; all are in the table)" if stride > 1 else ""
-    note = "The ratio is a geometric mean over episodes, fractions are means; a replan stands until the next one."
+    note = "The ratio is a geometric mean over episodes, fractions are means; a value holds until the next replan."
     if courses.num_nonfinite:
         note += f" {courses.num_nonfinite} replans without a finite ratio take no part in its course."
     return "\n".join(
@@ -81,8 +82,8 @@ def _gripper_section(courses: TimeCourses, settings: TimeSettings) -> str:
         return f"{above}\nThe stores hold no actions, so there is nothing to align at."
     closed = courses.closing.drop_nulls("closing_replan")
     rule = (
-        f"The gripper closes in {closed.height} of {courses.closing.height} episodes (the first replan one of whose executed actions "
-        "has a last number above 0)"
+        f"The gripper closes in {closed.height} of {courses.closing.height} episodes (the first replan one of whose "
+        "executed actions has a last number above 0)"
     )
     if closed.is_empty():
         return "\n".join([above, *wrap(f"{rule}.")])
@@ -92,10 +93,10 @@ def _gripper_section(courses: TimeCourses, settings: TimeSettings) -> str:
     )
     at_once = int((closed["closing_replan"] == 0).sum())
     if at_once:
-        rule += f" In {at_once} of them it closes at the first replan, and there is no before."
+        rule += f" In {at_once} of them it closes at the first replan, so that no replan lies before it."
     body = [
         [
-            _short(row["quantity"], 40),
+            shortened(row["quantity"], 40),
             ("x " if row["quantity"] == RATIO else "") + format_number(row["change"]),
             _interval(row),
             str(row["num_episodes"]),
@@ -103,8 +104,9 @@ def _gripper_section(courses: TimeCourses, settings: TimeSettings) -> str:
         for row in courses.change.iter_rows(named=True)
     ]
     note = (
-        f"change: mean over the {settings.window + 1} replans from the closing on, against the {settings.window} before it, within "
-        "each episode; a factor for the ratio, a difference of fractions for groups. No causal claim: much else changes then."
+        f"change: mean over the {settings.window + 1} replans from the closing on, against the {settings.window} "
+        "before it, within each episode; a factor for the ratio, a difference of fractions for groups. No causal "
+        "claim: much else changes then."
     )
     if not courses.change["num_episodes"].max():
         return "\n".join([above, *wrap(f"{rule} No episode shows both sides of a closing.")])
@@ -124,22 +126,23 @@ def outcomes_section(outcomes: pl.DataFrame) -> str:
     header = ["quantity", "n", "difference", "interval", "in tasks", "interval", "g", "delta"]
     body = [
         [
-            _short(row["quantity"], 24),
+            shortened(row["quantity"], 24),
             f"{row[f'num_{SUCCESS}']}/{row[f'num_{FAILURE}']}",
-            _signed(row["difference"]),
+            format_signed(row["difference"]),
             _interval(row, "difference"),
-            _signed(row["within_tasks"]),
+            format_signed(row["within_tasks"]),
             _interval(row, "within_tasks"),
-            _signed(row["hedges_g"]),
-            _signed(row["cliffs_delta"]),
+            format_signed(row["hedges_g"]),
+            format_signed(row["cliffs_delta"]),
         ]
         for row in outcomes.iter_rows(named=True)
     ]
     both = max(outcomes["num_tasks_with_both"])
     note = (
-        "n: solved / failed episodes. difference: solved minus failed (for log2_ratio, 1 is a factor of 2). in tasks: the same inside "
-        f"tasks ({both} hold both outcomes), free of differences between tasks. g: Hedges' g, in standard deviations. delta: Cliff's "
-        "delta, P(solved > failed) - P(solved < failed). Their intervals are in the table."
+        "n: solved / failed episodes. difference: solved minus failed (for log2_ratio, 1 is a factor of 2). in tasks: "
+        f"the same inside tasks ({both} hold both outcomes), free of differences between tasks. g: Hedges' g, in "
+        "standard deviations. delta: Cliff's delta, P(solved > failed) - P(solved < failed). Their intervals are in "
+        "the table."
     )
     return "\n".join([above, text_table(header, body, left=(0,)), *wrap(note), *(w for n in notes for w in wrap(n))])
 
@@ -149,17 +152,22 @@ def _counts_section(courses: TimeCourses) -> str:
     known = table.drop_nulls("effective_replans")
     above = heading("INDEPENDENT REPLANS  how many an episode is worth")
     if known.is_empty():
-        why = f"Cannot be estimated in any of the {table.height} episodes: too few replans, no change, or ratios that are not finite."
+        why = (
+            f"Cannot be estimated in any of the {table.height} episodes: too few replans, no change, or ratios that "
+            "are not finite."
+        )
         return "\n".join([above, *wrap(why)])
     series = known["series"][0]
     text = (
         f"{int(known['num_replans'].sum())} replans of {known.height} episodes are worth "
-        f"{format_number(float(known['effective_replans'].sum()))} independent ones for {series} (integrated autocorrelation time "
-        f"{format_number(_median(known['autocorrelation_time']))} replans in the median; initial positive sequence, Geyer 1992). "
-        "In series this short that is an upper bound. No interval counts replans: the episode is the unit."
+        f"{format_number(float(known['effective_replans'].sum()))} independent ones for {series} (integrated "
+        f"autocorrelation time {format_number(_median(known['autocorrelation_time']))} replans in the median; initial "
+        "positive sequence, Geyer 1992). In series this short that is an upper bound. No interval counts replans: the "
+        "episode is the unit."
     )
     if known.height < table.height:
-        text += f" {table.height - known.height} of {table.height} episodes are left out: too few replans, no change, or gaps."
+        left_out = table.height - known.height
+        text += f" {left_out} of {table.height} episodes are left out: too few replans, no change, or gaps."
     return "\n".join([above, *wrap(text)])
 
 
@@ -171,11 +179,3 @@ def _median(column: pl.Series) -> float | None:
 def _interval(row: Mapping[str, Any], name: str = "") -> str:
     prefix = f"{name}_" if name else ""
     return format_interval(row[f"{prefix}low"], row[f"{prefix}high"])
-
-
-def _short(name: str, width: int) -> str:
-    return name if len(name) <= width else f"{name[: width - 1]}…"
-
-
-def _signed(value: float | None) -> str:
-    return format_number(value) if value is None or value <= 0 else f"+{format_number(value)}"

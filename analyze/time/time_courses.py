@@ -1,8 +1,8 @@
-"""Time courses: means over episodes on the episode's own time and around the first gripper closing, with pointwise intervals.
+"""Time courses: means over episodes on episode time and around the first gripper closing, with pointwise intervals.
 
-Quantities are the ratio (its geometric mean: the course of a mean of ratios is that of its largest episode) and the
-fractions of all groups that take any mass, for the layer that speaks for the whole ("layers_avg" unless one layer is chosen).
-Intervals are pointwise two-level bootstraps: each point's own, not a band for the whole curve.
+Quantities are the ratio and the fractions of all groups that take any mass, in one layer ("layers_avg" unless one layer
+is chosen). The ratio is averaged geometrically, because an arithmetic mean follows the episode with the largest ratio.
+Intervals are pointwise two-level bootstraps: each holds for its point, not for the whole curve.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.aggregate import overall_layer, replans_of
-from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, Tables
+from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, Tables, float_values
+from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.statistics.bootstrap import (
@@ -29,14 +30,14 @@ from vla_attention.analyze.statistics.bootstrap import (
     resample_episodes,
 )
 from vla_attention.analyze.statistics.effect_sizes import contrast, contrast_row
-from vla_attention.analyze.time.effective_replans import effective_replans_table
-from vla_attention.analyze.time.phases import (
+from vla_attention.analyze.time.alignment import (
     around_event,
     change_at_event,
     closing_replan,
     on_episode_time,
     replan_starts,
 )
+from vla_attention.analyze.time.effective_replans import effective_replans_table
 from vla_attention.schemas.errors import BadArgument
 
 RATIO = "ratio"
@@ -62,18 +63,20 @@ class TimeSettings:
 
 @dataclass(frozen=True)
 class TimeCourses:
-    """What `time_courses` finds; all tables are about one layer.
+    """The results of `time_courses`; all tables are about one layer.
 
     Attributes:
-        layer: which one.
+        layer: the layer.
         quantities: "ratio" (when the grouping has one) and the groups whose fractions are followed.
-        course: one row per (alignment, outcome, quantity, position): `position_low`, `position`, `position_high` (episode time 0 to
-            1, or replans from the closing), `value`, `low`, `high`, `num_episodes`, `num_tasks`, `uniform` (of the ratio).
-        closing: one row per episode: its identity, `closing_replan` (null when the gripper never closes) and `closing_time`
-            (0 to 1); empty when the stores hold no actions.
-        change: one row per quantity: mean change from before to after the closing (a factor for the ratio, a difference for
-            fractions) with `low` and `high`, and how many episodes show both sides.
-        outcomes: success against failure, one row per quantity, columns of `effect_sizes.contrast_row`; the ratio as log2.
+        course: one row per (alignment, outcome, quantity, position): `position_low`, `position`, `position_high`
+            (episode time 0 to 1, or replans from the closing), `value`, `low`, `high`, `num_episodes`, `num_tasks`,
+            `uniform` (of the ratio).
+        closing: one row per episode: its identity, `closing_replan` (null when the gripper never closes) and
+            `closing_time` (0 to 1); empty when the stores hold no actions.
+        change: one row per quantity: mean change from before to after the closing (a factor for the ratio, a difference
+            for fractions) with `low` and `high`, and how many episodes show both sides.
+        outcomes: success against failure, one row per quantity, columns of `effect_sizes.contrast_row`; the ratio as
+            log2.
         autocorrelation: one row per episode, see `effective_replans.effective_replans_table`.
         num_nonfinite: (episode, replan) pairs without a finite log ratio, which take no part in the ratio's course.
     """
@@ -105,7 +108,7 @@ class _Episode:
 def time_courses(
     question: Question, settings: TimeSettings | None = None, replans: Tables | None = None
 ) -> TimeCourses:
-    """Everything about the course of episodes.
+    """Courses, the change at the gripper's closing, success against failure, and autocorrelation.
 
     Args:
         question: stores, selection and grouping.
@@ -165,7 +168,7 @@ def _episode(item: SelectedEpisode, level: Tables, quantities: Sequence[str], ha
         identity=part.select(EPISODE_KEYS).row(0),
         task=(item.store.suite, attributes.task_id),
         success=attributes.success,
-        values=np.stack([column.fill_null(float("nan")).to_numpy() for column in columns], axis=1),
+        values=np.stack([float_values(column) for column in columns], axis=1),
         uniform=uniform if isinstance(uniform, float) else float("nan"),
         starts=starts,
         num_steps=attributes.num_steps,
@@ -209,7 +212,7 @@ def _course(
         known = np.array([episode.uniform for episode in episodes])
         for number, (statistic, interval) in enumerate(zip(statistics, intervals, strict=True)):
             quantity, position = quantities[number // len(places)], number % len(places)
-            # The baseline is known where no ratio is finite, too.
+            # The baseline is known also where no ratio is finite.
             of = statistic.used if statistic.used.any() else np.isfinite(known)
             uniform = mean_over_episodes(known[of]).value if quantity == RATIO else None
             num_tasks = len(np.unique(resamples.task_of[statistic.used]))
@@ -278,18 +281,13 @@ def _outcomes_table(episodes: Sequence[_Episode], quantities: Sequence[str], see
     """Success against failure on the episodes' means over replans: log2 of the ratio, and fractions."""
     resamples = _resamples(episodes, seed)
     solved = np.array([episode.success for episode in episodes])
+    means = np.stack([finite_mean(episode.values) for episode in episodes])
     rows = []
     for i, quantity in enumerate(quantities):
-        means = np.array([_finite_mean(episode.values[:, i]) for episode in episodes])
-        values = means / np.log(2.0) if quantity == RATIO else means
+        values = means[:, i] / np.log(2.0) if quantity == RATIO else means[:, i]
         name = "log2_ratio" if quantity == RATIO else f"{quantity}_fraction"
         rows.append({"quantity": name, **contrast_row(contrast(values, solved, resamples), SUCCESS, FAILURE)})
     texts = {"quantity": pl.String, "note": pl.String}
     return pl.DataFrame(rows, schema_overrides=texts, infer_schema_length=None).with_columns(
         pl.col(pl.Null).cast(pl.Float64)
     )
-
-
-def _finite_mean(values: NDArray[np.float64]) -> float:
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if finite.size else float("nan")

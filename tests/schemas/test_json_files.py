@@ -7,7 +7,7 @@ import jsonschema
 import pytest
 
 from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, replans_of
-from vla_attention.analyze.published.results_file import write_results_of_suites
+from vla_attention.analyze.published.results_writer import write_results_of_suites
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.json_files import FOLDER, schema_documents, schema_text, write_schema_files
 from vla_attention.schemas.jsonable import to_json

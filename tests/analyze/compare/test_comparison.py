@@ -48,8 +48,8 @@ def planting(run):
 
 
 PLAIN = StoreSpec(
-    tasks=TASKS, episodes=EPISODES, replans=2, layers=(0, 1), heads=(0,), denoise_steps=(9,), frames=False, coverage=False,
-    mantissa_bits=23,
+    tasks=TASKS, episodes=EPISODES, replans=2, layers=(0, 1), heads=(0,), denoise_steps=(9,), frames=False,
+    coverage=False, mantissa_bits=23,
 )  # fmt: skip
 
 
@@ -130,7 +130,7 @@ def test_episodes_without_a_partner_are_counted_and_named(stores):
     alone = found.unpaired.group_by("run").len().sort("run").rows()
     assert alone == [("base", 4), ("lower", 3)]
     assert one(found.differences, scope="all", layer="layers_avg", quantity="log2_ratio")["num_pairs"] == 12
-    text = comparison_text(found, runs)
+    text = comparison_text(found)
     assert "task000_episode000" in text
     assert "task001_episode004" in text
     assert max(map(len, text.splitlines())) <= 101
@@ -160,7 +160,7 @@ def test_nothing_that_pairs_is_compared_unpaired_and_said(stores):
     assert row["high"] - row["low"] > 1.0  # scenes are in it
     assert found.pairs.is_empty()
     assert found.unpaired.height == 32
-    assert "NOT PAIRED" in comparison_text(found, runs)
+    assert "NOT PAIRED" in comparison_text(found)
     assert found.runs_with_common_tasks == ()
 
 

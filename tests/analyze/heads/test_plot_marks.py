@@ -12,7 +12,7 @@ from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_groupi
 from vla_attention.analyze.heads import plot_layer_time as layer_time
 from vla_attention.analyze.measures.aggregate import episode_tables, overall_rows, task_tables
 from vla_attention.analyze.measures.frames import LAYERS_AVG
-from vla_attention.analyze.ratios.profile_panels import draw_profile
+from vla_attention.analyze.ratios.plot_profile_panels import draw_profile
 from vla_attention.analyze.show.plot_heat_map import draw_log2_map, map_height
 from vla_attention.analyze.show.plot_style import new_figure
 from vla_attention.schemas.groupings.grouping import Grouping

@@ -23,7 +23,6 @@ from tests.kit.published_results import (
     published_episode,
     write_published,
 )
-from vla_attention.analyze.published.results_file import write_results_of_suites
 from vla_attention.analyze.published.results_reader import find_results, read_results_file
 from vla_attention.analyze.published.results_tables import (
     NO_FINITE_AS_ZERO,
@@ -33,6 +32,7 @@ from vla_attention.analyze.published.results_tables import (
     results_tables,
     spread_of,
 )
+from vla_attention.analyze.published.results_writer import write_results_of_suites
 from vla_attention.schemas.results import ResultsError, ResultsNotFound
 
 GROUPING = default_grouping()

@@ -11,7 +11,7 @@ from scipy import stats
 
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.time.phases import (
+from vla_attention.analyze.time.alignment import (
     around_event,
     change_at_event,
     closing_replan,
@@ -68,8 +68,8 @@ def plant_rows(task, episode, tokens, rows):
 
 
 SPEC = StoreSpec(
-    tasks=(0, 1, 2, 3), episodes=4, replans=REPLANS, layers=(0,), heads=(0,), denoise_steps=(9,), frames=False, coverage=False,
-    plant_rows=plant_rows, plant_actions=actions, plant_success=solved, mantissa_bits=23,
+    tasks=(0, 1, 2, 3), episodes=4, replans=REPLANS, layers=(0,), heads=(0,), denoise_steps=(9,), frames=False,
+    coverage=False, plant_rows=plant_rows, plant_actions=actions, plant_success=solved, mantissa_bits=23,
 )  # fmt: skip
 NAMES = SPEC.names
 

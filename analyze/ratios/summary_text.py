@@ -1,38 +1,37 @@
-"""The text summary: what was analysed, ratios beside what uniform attention would give, fractions, tasks, and what was left out."""
+"""The text summary: run and selection, ratios beside those of uniform attention, fractions, lifts, tasks."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import polars as pl
 
 from vla_attention.analyze.measures.aggregate import layer_order, overall_layer, overall_rows
-from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables
+from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables, layer_name
 from vla_attention.analyze.ratios.verdict import LINGUISTIC_BELOW, VISUAL_ABOVE, verdict
 from vla_attention.analyze.show.headings import WIDTH, heading, title, untrained_warning, wrap
-from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent, interval_name
-from vla_attention.analyze.show.output_files import write_text
+from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent, interval_name, plural
+from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
 
-#: Below this, intervals of single tasks are so wide that a word on it is due.
+#: With fewer episodes of a task, the summary warns that the interval of the task is wide.
 FEW_EPISODES = 5
 
 
 @dataclass(frozen=True)
 class AnalysedRun:
-    """What the header of the summary says about the source of the numbers; the rest is read off the tables.
+    """The lines of the summary's header that the tables do not hold.
 
     Attributes:
         stores: paths or names of the stores.
         policy: name of the policy and its checkpoint, as it should be shown.
-        untrained: the weights were never trained, and the numbers are no finding about any policy.
+        untrained: whether the weights are random.
         denoise_steps: denoise steps that were averaged over.
-        heads: what was done about heads, in words.
+        heads: how heads were averaged, as text.
         level: level of the intervals in `tasks_table`.
         notes: further lines, for instance about translated layer numbers.
     """
@@ -61,11 +60,6 @@ def summary_text(run: AnalysedRun, grouping: Grouping, episodes: Tables, tasks: 
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def write_summary(path: Path, text: str) -> None:
-    """Write the summary into a file, atomically."""
-    write_text(path, text)
-
-
 def _header(run: AnalysedRun, grouping: Grouping, episodes: Tables) -> str:
     of_layer = episodes.filter(pl.col("layer") == overall_layer(episodes.cells))
     overall = of_layer.cells
@@ -82,7 +76,7 @@ def _header(run: AnalysedRun, grouping: Grouping, episodes: Tables) -> str:
     lines += _labelled("suite", ", ".join(sorted(overall["suite"].unique())))
     lines += _labelled(
         "episodes",
-        f"{overall.height} of {num_tasks} task{'' if num_tasks == 1 else 's'}, {successes} successful "
+        f"{overall.height} of {plural(num_tasks, 'task')}, {successes} successful "
         f"({format_percent(successes / overall.height)}); {int(overall['num_replans'].sum())} replans",
     )
     lines += _labelled("layers", listing(layers, 40) + (f" ({', '.join(translated)})" if translated else ""))
@@ -118,9 +112,9 @@ def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: Tables) -> str:
     ]
     overall = rows.filter(pl.col("layer") == overall_layer(rows)).row(0, named=True)
     legend = (
-        f"mean, std, median: of the episodes' mean ratios (n = {overall['num_episodes']}). of means: mean numerator mass / "
-        "mean denominator mass. geom.: geometric mean of the ratios. lift: ratio / uniform ratio, 1 = what uniform "
-        f"attention gives. {_interval_note(run, overall)}"
+        f"mean, std, median: of the episodes' mean ratios (n = {overall['num_episodes']}). of means: mean numerator "
+        "mass / mean denominator mass. geom.: geometric mean of the ratios. lift: ratio / uniform ratio, 1 = what "
+        f"uniform attention gives. {_interval_note(run, overall)}"
     )
     return "\n".join(
         [
@@ -151,21 +145,21 @@ def _baseline_sentence(grouping: Grouping, uniform: float | None, level: Tables)
     above = sum(of_group[layer, name]["keys"] for name in grouping.ratio.numerator)
     below = sum(of_group[layer, name]["keys"] for name in grouping.ratio.denominator)
     baseline = (
-        f"Uniform attention alone gives ratio = {format_number(uniform)}, because there are on average {format_number(above)} keys "
-        f"on one side and {format_number(below)} on the other"
+        f"Uniform attention alone gives ratio = {format_number(uniform)}, because there are on average "
+        f"{format_number(above)} keys on one side and {format_number(below)} on the other"
     )
     if not grouping.compares_modalities:
         return f"{baseline}: read the ratio beside it, or read the lift."
     return (
-        f"{baseline}, and that alone would be called '{verdict(uniform)}': the verdict (above {VISUAL_ABOVE} visual, below "
-        f"{LINGUISTIC_BELOW} linguistic) means little without the lift."
+        f"{baseline}, and that alone would be called '{verdict(uniform)}': the verdict (above {VISUAL_ABOVE} visual, "
+        f"below {LINGUISTIC_BELOW} linguistic) means little without the lift."
     )
 
 
 def _nonfinite_section(rows: pl.DataFrame) -> str:
     lines = []
     for row in _by_layer(rows):
-        of = f"layer {row['layer']}" if row["layer"] != LAYERS_AVG else LAYERS_AVG
+        of = layer_name(row["layer"], LAYERS_AVG)
         if row["num_nonfinite"]:
             without = row["episodes_without_ratio"]
             lines.append(
@@ -190,7 +184,7 @@ def _groups_section(grouping: Grouping, tasks: Tables, kind: str) -> str:
     """Layers by groups that have keys; in blocks of as many groups as the width allows."""
     level = overall_rows(tasks)
     groups = level.groups_with_keys()
-    names = [name if len(name) <= 24 else name[:23] + "…" for name in groups]
+    names = [shortened(name, 24) for name in groups]
     layers, of_group = layer_order(level.cells), level.by_group("layer")
     show = format_percent if kind == "fraction" else format_number
     cells = {group: [show(of_group[layer, group][kind]) for layer in layers] for group in groups}
@@ -213,12 +207,12 @@ def _groups_section(grouping: Grouping, tasks: Tables, kind: str) -> str:
         for block in blocks
     ]
     if kind == "fraction":
-        title = "FRACTION of the summed masses of all groups" + (" (groups overlap)" if grouping.overlap else "")
+        of_groups = "FRACTION of the summed masses of all groups" + (" (groups overlap)" if grouping.overlap else "")
         note = ""
     else:
-        title = "LIFT  mass per key, against the mean over valid keys"
+        of_groups = "LIFT  mass per key, against the mean over valid keys"
         note = "\n1 = what uniform attention gives."
-    return "\n".join([heading(title), "\n\n".join(tables)]) + note
+    return "\n".join([heading(of_groups), "\n\n".join(tables)]) + note
 
 
 def _across_section(run: AnalysedRun, grouping: Grouping, tasks: Tables, scope: str, of: str = "") -> str:
@@ -231,7 +225,7 @@ def _across_section(run: AnalysedRun, grouping: Grouping, tasks: Tables, scope: 
     if grouping.ratio:
         header += ["mean", interval_name(run.level), "of means", "geom.", "uniform", "lift"]
     else:
-        header += [group if len(group) <= 12 else group[:11] + "…" for group in grouping.names[:5]]
+        header += [shortened(group, 12) for group in grouping.names[:5]]
     body = []
     for row in rows.iter_rows(named=True):
         cells = [
@@ -253,14 +247,14 @@ def _across_section(run: AnalysedRun, grouping: Grouping, tasks: Tables, scope: 
         body.append(cells)
     last = "" if scope == "all" else "instruction"
     texts = [row["instruction"] or "" for row in rows.iter_rows(named=True)]
-    shown = layer if layer == LAYERS_AVG else f"layer {layer}"
+    shown = layer_name(layer, LAYERS_AVG)
     what = "ratio" if grouping.ratio else f"fractions of {listing(grouping.names[:5])}"
     table = text_table(header, body, left=(0,), last=last, texts=texts if last else None, width=WIDTH)
     fewest = rows["num_episodes"].min()
     if grouping.ratio and scope == "task" and isinstance(fewest, int) and 1 < fewest < FEW_EPISODES:
         warning = (
-            f"Intervals over fewer than {FEW_EPISODES} episodes of a task are wide, because so few show little of how much episodes "
-            "differ; more episodes narrow them quickly."
+            f"Intervals over fewer than {FEW_EPISODES} episodes of a task are wide, because so few show little of how "
+            "much episodes differ; more episodes narrow them quickly."
         )
         table = "\n".join([table, *wrap(warning)])
     return "\n".join([heading(f"PER {name.upper()}{of}  {what}, {shown}"), table])
@@ -271,7 +265,7 @@ def _by_layer(rows: pl.DataFrame) -> list[dict[str, Any]]:
 
 
 def _mean_and_spread(row: dict[str, Any]) -> str:
-    # One episode has no spread; its std of 0 would read as certainty.
+    # The std of a single episode is 0, which would suggest certainty.
     if row["num_episodes"] - row["episodes_without_ratio"] < 2:
         return format_number(row["ratio_mean"])
     return f"{format_number(row['ratio_mean'])} ± {format_number(row['ratio_std'])}"
@@ -281,7 +275,7 @@ def _ratio_definition(grouping: Grouping) -> str:
     assert grouping.ratio is not None
     sides = []
     for names in (grouping.ratio.numerator, grouping.ratio.denominator):
-        # Sets of many objects are listed in full among the groups; here their names would hide the numbers.
+        # The list of groups names all of them; here many names would hide the numbers.
         shown = " + ".join(names[:4]) + (f" + {len(names) - 4} more" if len(names) > 4 else "")
         sides.append(f"({shown})" if len(names) > 1 else shown)
     return " / ".join(sides)

@@ -1,7 +1,7 @@
-"""Where in an episode a replan is: on the episode's own time from 0 to 1, and around the first closing of the gripper.
+"""Align episodes: on episode time from 0 to 1, and around the first closing of the gripper.
 
-Pure functions on one episode's arrays. What lies between two replans is not made up: a replan's value stands until the next
-one, exactly as its actions do.
+Pure functions on one episode's arrays. Values are not interpolated: a replan's value holds until the next replan, as
+its actions do.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.schemas.stores.store_format import StoreError
 
-#: Every suite of the capture side drives robosuite's one-number Panda gripper: of the command, the last number of an action,
-#: only the sign counts; above 0 closes, below 0 opens, 0 leaves the fingers where they are. Episodes wait with -1: open.
+#: Position of the gripper command in an action. Every suite of the capture side drives robosuite's Panda gripper: a
+#: command above 0 closes it, one below 0 opens it, 0 leaves it as it is. While an episode waits, the command is -1.
 GRIPPER = -1
 
 
@@ -26,8 +26,8 @@ def replan_starts(env_step: NDArray[np.int64], wait_steps: int, num_steps: int, 
     starts = np.asarray(env_step, dtype=np.int64) - wait_steps
     if len(starts) == 0 or starts[0] != 0 or (np.diff(starts) <= 0).any() or starts[-1] >= num_steps:
         raise StoreError(
-            f"The replans of {name} do not fit into its {num_steps} steps after {wait_steps} steps of waiting; check the store "
-            "with vla-analyze verify."
+            f"The replans of {name} do not fit into its {num_steps} steps after {wait_steps} steps of waiting; check "
+            "the store with vla-analyze verify."
         )
     return starts
 
@@ -37,9 +37,9 @@ def on_episode_time(
 ) -> NDArray[np.float64]:
     """Means (bin, quantity) over equal parts of an episode's time, of values (replan, quantity).
 
-    The value at policy step s is that of the last replan at or before s. A bin's value is the mean of this step function over the
-    bin, that is the replans' mean with the shares of the bin that they last as weights. Values that are not finite take no
-    part; a bin with nothing else is NaN.
+    The value at policy step s is that of the last replan at or before s. A bin's value is the mean of this step
+    function over the bin, that is the replans' mean with the shares of the bin that they last as weights. Values that
+    are not finite take no part; a bin with nothing else is NaN.
 
     Args:
         values: (replan, quantity).
@@ -51,7 +51,7 @@ def on_episode_time(
     edges = np.linspace(0.0, 1.0, num_bins + 1)
     from_ = np.maximum(edges[:-1, None], starts[None, :] / num_steps)
     to = np.minimum(edges[1:, None], ends[None, :] / num_steps)
-    # Ends that are equal but for rounding are no overlap.
+    # Rounding can make neighbours overlap by a tiny amount.
     share = np.where(to - from_ > 1e-12, to - from_, 0.0)
     finite = np.isfinite(values)
     weight = share @ finite.astype(np.float64)
@@ -62,8 +62,8 @@ def on_episode_time(
 def closing_replan(actions: NDArray[np.float64], starts: NDArray[np.int64], num_steps: int) -> int | None:
     """The first replan one of whose executed actions closes the gripper; None when none does.
 
-    A replan's chunk is longer than what is executed of it: its first actions, up to the next replan or the end of the episode.
-    With an open gripper to begin with, this is the first closing command of the episode.
+    A replan's chunk is longer than what is executed of it: its first actions, up to the next replan or the end of the
+    episode. With an open gripper to begin with, this is the first closing command of the episode.
 
     Args:
         actions: (replan, horizon, action dimension), as given to the environment.
@@ -89,5 +89,8 @@ def around_event(values: NDArray[np.float64], event: int, window: int) -> NDArra
 
 
 def change_at_event(around: NDArray[np.float64], window: int) -> NDArray[np.float64]:
-    """Mean from offset 0 on minus mean before (quantity,), of finite values (offset, quantity); NaN when a side has none."""
+    """Mean of the finite values (offset, quantity) from offset 0 on minus the mean before: (quantity,).
+
+    NaN where a side has no finite value.
+    """
     return finite_mean(around[window:]) - finite_mean(around[:window])

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.measures.frames import Tables
+from vla_attention.analyze.measures.aggregate import FRACTION_COLUMNS
+from vla_attention.analyze.measures.frames import Tables, float_values
 from vla_attention.analyze.show.numbers import interval_name
 from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, label_positions, legend_beside, ratio_axis
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, group_styles
@@ -19,9 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: A fraction with its interval.
-FRACTION_COLUMNS = ("fraction", "fraction_low", "fraction_high")
-#: Lines that one panel carries.
+#: The most groups in a panel, and labels below it.
 _MOST_GROUPS = 6
 _MOST_LABELS = 20
 
@@ -57,8 +56,7 @@ def shown_groups(tables: Tables, grouping: Grouping) -> list[str]:
 def _ratio_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping, level: float) -> None:
     assert grouping.ratio is not None
     mean, low, high, uniform = (
-        rows[column].cast(pl.Float64).fill_null(float("nan")).to_numpy()
-        for column in ("ratio_mean", "ratio_mean_low", "ratio_mean_high", "uniform_ratio")
+        float_values(rows[column]) for column in ("ratio_mean", "ratio_mean_low", "ratio_mean_high", "uniform_ratio")
     )
     drawn = np.isfinite(mean) & (mean > 0)
     if not drawn.any():
@@ -69,7 +67,7 @@ def _ratio_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping, level: floa
         return
     ratio_axis(axes.yaxis, np.concatenate([mean, low, high, uniform]))
     at = np.arange(len(mean))
-    # An interval may reach 0, which a logarithmic axis does not have: there it runs to the edge.
+    # A logarithmic axis has no 0: an interval that reaches it is drawn to the edge.
     low = np.where(low > 0, low, np.where(np.isnan(low), np.nan, axes.get_ylim()[0]))
     # The line breaks where there is no ratio.
     shown = np.where(drawn, mean, np.nan)
@@ -92,9 +90,7 @@ def _fraction_panel(axes: Axes, tables: Tables, grouping: Grouping) -> None:
     apart = min(0.08, 0.012 * (len(at) + 0.2))
     for i, name in enumerate(groups):
         rows = tables.of_group(name)
-        mean, low, high = (
-            rows[column].cast(pl.Float64).fill_null(float("nan")).to_numpy() for column in FRACTION_COLUMNS
-        )
+        mean, low, high = (float_values(rows[column]) for column in FRACTION_COLUMNS)
         where = at + (i - (len(groups) - 1) / 2) * apart
         color = styles[name]["color"]
         line = "--" if styles[name]["hatch"] else "-"

@@ -1,19 +1,18 @@
-"""The results file: from the table of replans to `attention_ratio_results_<suite>.json`, and back into objects."""
+"""Write the results file: from the table of replans to `attention_ratio_results_<suite>.json`."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import polars as pl
 
 from vla_attention.analyze.measures.frames import EPISODE_KEYS, LAYERS_AVG, Tables
 from vla_attention.analyze.show.output_files import replacing
 from vla_attention.schemas.groupings.grouping import Grouping
-from vla_attention.schemas.jsonable import MalformedDocument, from_json
-from vla_attention.schemas.results import EpisodeResult, FrameProxy, ResultsError, ResultsNotFound, results_file_name
+from vla_attention.schemas.results import FrameProxy, ResultsError, results_file_name
 
 #: Fields that are absent, not null, when the grouping has no group of this name.
 _ACTION = "action"
@@ -24,16 +23,17 @@ _RATIO = "visual_linguistic_ratio"
 def episode_documents(replans: Tables, grouping: Grouping, proxy: FrameProxy | None = None) -> Iterator[dict[str, Any]]:
     """Episodes of one or more suites from `aggregate.replan_tables`, in their order, as JSON documents.
 
-    visual is the sum of the ratio's numerator groups, linguistic that of its denominator groups; the fraction of either is
-    its mass / sum of all groups' masses. With a `proxy` the numbers are those of the published Cosmos scripts instead: masses are
-    sums over the queries (ours are means), and fractions are of visual + linguistic only.
+    visual is the sum of the ratio's numerator groups, linguistic that of its denominator groups; the fraction of either
+    is its mass / sum of all groups' masses. With a `proxy` the numbers are those of the published Cosmos scripts
+    instead: masses are sums over the queries (ours are means), and fractions are of visual + linguistic only.
 
-    Plain values rather than `vla_attention.schemas.results.EpisodeResult` objects, which describe them: a suite has a hundred thousand steps.
+    Plain values rather than `vla_attention.schemas.results.EpisodeResult` objects, which describe them: a suite has a
+    hundred thousand steps.
     """
     if grouping.ratio is None:
         raise ResultsError(
-            f"Grouping '{grouping.name}' defines no ratio, so there is no visual/linguistic ratio to write into a results "
-            "file; expected a [ratio] with numerator and denominator groups (or --ratio A,B/C)."
+            f"Grouping '{grouping.name}' defines no ratio, so there is no visual/linguistic ratio to write into a "
+            "results file; expected a [ratio] with numerator and denominator groups (or --ratio A,B/C)."
         )
     sides = [*_SIDES, _ACTION] if _ACTION in grouping.names and proxy is None else list(_SIDES)
     kinds = [f"{side}_{kind}" for side in sides for kind in ("mass", "fraction")]
@@ -51,17 +51,12 @@ def episode_documents(replans: Tables, grouping: Grouping, proxy: FrameProxy | N
             "task_description": identity["instruction"],
             "success": identity["success"],
             "num_steps": identity["num_steps"],
-            "summary": {_layer_name(layer): _summary_document(summaries[layer], kinds) for layer in steps},
+            "summary": {_field_of_layer(layer): _summary_document(summaries[layer], kinds) for layer in steps},
             "per_step_ratios": {
-                _layer_name(layer): [step | extra for step in rows.to_dicts()] if extra else rows.to_dicts()
+                _field_of_layer(layer): [step | extra for step in rows.to_dicts()] if extra else rows.to_dicts()
                 for layer, rows in steps.items()
             },
         }
-
-
-def episode_results(replans: Tables, grouping: Grouping, proxy: FrameProxy | None = None) -> list[EpisodeResult]:
-    """`episode_documents` as objects."""
-    return from_json(list[EpisodeResult], list(episode_documents(replans, grouping, proxy)))
 
 
 def write_results(path: Path, episodes: Iterable[dict[str, Any]]) -> None:
@@ -84,26 +79,6 @@ def write_results_of_suites(
         write_results(path, episode_documents(replans.filter(pl.col("suite") == suite).kept(), grouping, proxy))
         paths.append(path)
     return paths
-
-
-def read_results(path: Path) -> list[EpisodeResult]:
-    """Read a results file that this tool wrote; strict, and every error names the file."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ResultsNotFound(f"Cannot read results file {path}: {error}.") from None
-    try:
-        return from_json(list[EpisodeResult], json.loads(text, parse_constant=_refuse_constant))
-    except json.JSONDecodeError as error:
-        raise ResultsError(f"Results file {path} is not valid JSON: {error}.") from None
-    except (MalformedDocument, ResultsError) as error:
-        raise ResultsError(f"Results file {path}: {error}") from None
-
-
-def _refuse_constant(constant: str) -> NoReturn:
-    raise ResultsError(
-        f"it holds {constant}, which JSON does not have; files of the published scripts do, files of this tool write null."
-    )
 
 
 def _with_sides(replans: Tables, grouping: Grouping, proxy: FrameProxy | None) -> pl.DataFrame:
@@ -146,5 +121,5 @@ def _summary_document(row: dict[str, Any], kinds: Sequence[str]) -> dict[str, An
     }
 
 
-def _layer_name(layer: str) -> str:
+def _field_of_layer(layer: str) -> str:
     return layer if layer == LAYERS_AVG else f"layer_{layer}"

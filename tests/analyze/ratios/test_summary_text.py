@@ -5,7 +5,7 @@ import pytest
 
 from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups, replans_of
 from vla_attention.analyze.measures.aggregate import episode_tables, task_tables
-from vla_attention.analyze.ratios.summary import AnalysedRun, summary_text, write_summary
+from vla_attention.analyze.ratios.summary_text import AnalysedRun, summary_text
 from vla_attention.analyze.ratios.verdict import verdict
 
 RUN = AnalysedRun(
@@ -121,8 +121,3 @@ def test_every_task_and_suite_has_a_row():
 )
 def test_verdict_has_the_published_thresholds(ratio, word):
     assert verdict(ratio) == word
-
-
-def test_written_file_is_the_text(tmp_path):
-    write_summary(tmp_path / "summary.txt", "ratio ± 1\n")
-    assert (tmp_path / "summary.txt").read_text(encoding="utf-8") == "ratio ± 1\n"

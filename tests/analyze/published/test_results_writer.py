@@ -8,17 +8,16 @@ import pytest
 
 from tests.kit import made_up_steps
 from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, flat, make_steps
-from vla_attention.analyze.published.results_file import (
+from vla_attention.analyze.published.results_writer import (
     episode_documents,
-    episode_results,
-    read_results,
     write_results,
     write_results_of_suites,
 )
+from vla_attention.schemas.jsonable import from_json
 from vla_attention.schemas.results import (
+    EpisodeResult,
     FrameProxy,
     ResultsError,
-    ResultsNotFound,
     results_file_name,
     suite_of_results_file,
 )
@@ -28,6 +27,14 @@ GROUPING = default_grouping()
 
 def replans_of(steps, grouping=GROUPING):
     return made_up_steps.replans_of(steps, grouping)
+
+
+def episode_results(replans, grouping):
+    return from_json(list[EpisodeResult], list(episode_documents(replans, grouping)))
+
+
+def read_results(path):
+    return from_json(list[EpisodeResult], json.loads(path.read_text(encoding="utf-8")))
 
 
 def test_file_has_the_published_structure(tmp_path):
@@ -162,25 +169,3 @@ def test_a_grouping_without_a_ratio_says_what_is_missing():
     replans = replans_of(make_steps(grouping, CUSTOM_KEYS), grouping)
     with pytest.raises(ResultsError, match=r"cameras-and-words.*defines no ratio"):
         episode_results(replans, grouping)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("[{]", "not valid JSON"),
-        ('[{"task_id": Infinity}]', "holds Infinity"),
-        ('[{"task_id": 1}]', r"\$\[0\] lacks the field 'episode_idx'"),
-        ("{}", "expected list"),
-    ],
-)
-def test_errors_of_unreadable_files_name_the_file(tmp_path, text, message):
-    path = tmp_path / "broken.json"
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(ResultsError, match=rf"broken\.json.*{message}"):
-        read_results(path)
-
-
-def test_a_missing_file_is_also_a_file_not_found_error(tmp_path):
-    with pytest.raises(FileNotFoundError, match="absent") as caught:
-        read_results(tmp_path / "absent.json")
-    assert isinstance(caught.value, ResultsNotFound)
