@@ -1,7 +1,7 @@
 """Differences between runs: paired where they share initial states and seeds, otherwise between independent episodes.
 
 Two episodes are a pair when suite, task, initial state (by its digest) and seed are equal: the same scene, the same
-noise, other weights. Differences inside pairs are free of what makes scenes differ, and their intervals are two-level
+noise, other weights. Differences within pairs do not contain differences between scenes; their intervals are two-level
 bootstraps over tasks and pairs. The first run is what the others are compared with; every difference is other run minus
 first run.
 
@@ -37,13 +37,13 @@ from vla_attention.analyze.statistics.effect_sizes import contrast
 from vla_attention.schemas.groupings.grouping import Grouping
 
 LOG2_RATIO, SUCCESS = "log2_ratio", "success"
-#: What makes two episodes a pair; `occurrence` tells apart episodes of one run that began alike.
+#: Two episodes with equal values here are a pair; `occurrence` counts the episodes of a run with the same first state.
 PAIR_KEYS = ("suite", "task_id", "initial_state_digest", "seed", "occurrence")
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Runs side by side.
+    """The results of `compare`.
 
     Attributes:
         runs: the runs; the others are compared with the first one.
@@ -60,7 +60,7 @@ class Comparison:
         pairs: one row per (run, pair, layer, quantity): `episode_first`, `episode_other`, `first`, `other`,
             `difference`.
         unpaired: one row per episode that has no partner: `run`, `compared_with`, its suite, task and episode index.
-        notes: lines on what differs between the runs and was allowed or does not matter.
+        notes: one line per difference between the runs that was allowed, or that has no effect on the numbers.
     """
 
     runs: tuple[Run, ...]
@@ -170,7 +170,7 @@ def _episode_values(run: Run, episodes: Tables, groups: Sequence[str], ignore_se
         .over("suite", "task_id", "initial_state_digest", "seed")
         .alias("occurrence")
     )
-    # Two runs may name one block by different numbers (7 and 25); what is compared is the block.
+    # Two runs may name one block by different numbers (7 and 25): layers are compared by block.
     table = table.with_columns(
         pl.when(pl.col("layer") == LAYERS_AVG)
         .then(pl.lit(LAYERS_AVG))
@@ -234,7 +234,7 @@ def _paired(joined: pl.DataFrame, quantities: Sequence[str], seed: int) -> pl.Da
         for quantity, value, statistic, interval in zip(quantities, values, statistics, intervals, strict=True):
             used = statistic.used
             certain = quantity == SUCCESS and bool(used.any()) and not np.ptp(value[used])
-            # When all pairs end alike, all resamples do so too: that is no certainty about success.
+            # Where all pairs end alike, all resamples do too, and the interval would have no width.
             low, high = ends(None if certain else interval)
             rows.append(
                 {
@@ -301,7 +301,7 @@ def _unpaired(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str
 
 def _independent_draws(tasks: NDArray[np.int64], is_other: NDArray[np.bool_], seed: int) -> Resamples:
     if set(tasks[is_other]) == set(tasks[~is_other]):
-        # Both runs have the same tasks: what a draw of tasks does to one, it does to the other.
+        # Both runs have the same tasks, which are drawn for both at once.
         return resample_episodes(tasks, seed=seed)
     parts = [
         resample_episodes(tasks[member], seed=seed + number) for number, member in enumerate((~is_other, is_other))
@@ -312,24 +312,14 @@ def _independent_draws(tasks: NDArray[np.int64], is_other: NDArray[np.bool_], se
 
 
 _DIFFERENCE_SCHEMA = {
-    "scope": pl.String,
-    "suite": pl.String,
+    **dict.fromkeys(("scope", "suite"), pl.String),
     "task_id": pl.Int64,
-    "instruction": pl.String,
-    "layer": pl.String,
+    **dict.fromkeys(("instruction", "layer"), pl.String),
     "block": pl.Int64,
     "quantity": pl.String,
     "paired": pl.Boolean,
-    "num_tasks": pl.Int64,
-    "num_pairs": pl.Int64,
-    "num_first": pl.Int64,
-    "num_other": pl.Int64,
-    "mean_first": pl.Float64,
-    "mean_other": pl.Float64,
-    "difference": pl.Float64,
-    "low": pl.Float64,
-    "high": pl.Float64,
-    "effect": pl.Float64,
+    **dict.fromkeys(("num_tasks", "num_pairs", "num_first", "num_other"), pl.Int64),
+    **dict.fromkeys(("mean_first", "mean_other", "difference", "low", "high", "effect"), pl.Float64),
 }
 
 
@@ -369,7 +359,7 @@ def _estimates(run: str, table: pl.DataFrame, quantities: Sequence[str], seed: i
         counts = {"num_tasks": len(set(tasks)), "num_episodes": part.height}
         intervals = bootstrap_intervals(list(statistics.values()), resample_episodes(tasks, seed=seed))
         for (name, statistic), interval in zip(statistics.items(), intervals, strict=True):
-            # When all episodes end alike, all resamples do so too: that is no certainty about a success rate.
+            # Where all episodes end alike, all resamples do too, and the interval would have no width.
             certain = name == SUCCESS and statistic.value in (0.0, 1.0)
             low, high = ends(None if certain else interval)
             row = {**names, **counts, "quantity": name, "value": statistic.value, "low": low, "high": high}

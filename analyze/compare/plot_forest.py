@@ -1,6 +1,4 @@
-"""`forest`: every run in every suite with its interval and uniform baseline, and beside it its difference to the first
-run.
-"""
+"""`forest`: every run in every suite with interval and uniform baseline, and its difference to the first run."""
 
 from __future__ import annotations
 
@@ -34,9 +32,7 @@ def run_style(number: int) -> dict[str, str]:
 
 
 def factor_axis(axis: Any, factors: Any) -> None:
-    """Make an axis logarithmic around factors near 1, with more labels than a ratio's axis would have in so small a
-    range.
-    """
+    """Make an axis logarithmic around factors near 1, with more labels than `ratio_axis` gives a small range."""
     from matplotlib.ticker import LogLocator
 
     ratio_axis(axis, factors)
@@ -56,7 +52,8 @@ def plot_forest(
     rows = _rows(comparison, layer, quantity, shown)
     figure = new_figure(10, 1.9 + 0.34 * (rows.height + rows["suite"].n_unique()))
     which = layer_name(layer, "mean over layers", "block")
-    note = f"n counts episodes (pairs where runs are paired). Bars: {interval_name(level, 'bootstrap')}s over tasks and episodes."
+    bars = f"{interval_name(level, 'bootstrap')}s over tasks and episodes"
+    note = f"n counts episodes (pairs where runs are paired). Bars: {bars}."
     if not comparison.differences["paired"].all():
         note += " Not every run is paired with the first one: those differences hold differences between scenes."
     if rows["low"].null_count():
@@ -78,7 +75,7 @@ def plot_forest(
 
 
 def _rows(comparison: Comparison, layer: str, quantity: str, shown: str) -> pl.DataFrame:
-    """One row per (suite, run), suites together, with the estimate and the difference to the first run in that suite."""
+    """One row per (suite, run), sorted by suite, with the estimate and the difference to the first run in the suite."""
     columns = ["suite", "run", "num_tasks", "num_episodes", "quantity", "value", "low", "high"]
     columns += ["uniform_ratio"] if shown == "ratio" else []
     estimates = comparison.estimates.filter(pl.col("layer") == layer, pl.col("quantity") == shown).select(columns)

@@ -1,6 +1,4 @@
-"""`paired_differences_RUN`: every pair's difference, per task, with the task's mean and interval, and the mean over
-tasks.
-"""
+"""`paired_differences_RUN`: the differences of all pairs per task, with the means of tasks and over tasks."""
 
 from __future__ import annotations
 

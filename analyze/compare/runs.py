@@ -1,8 +1,8 @@
-"""Runs to be compared: which stores belong to each, and in which fields they must agree.
+"""The runs of a comparison: their stores, and the fields in which they must agree.
 
-Two runs may differ in what is being compared: the weights and what names them (policy name, checkpoint, digest).
-Everything else that has a say in the numbers must be equal, or be allowed by name (`--allow-mismatch FIELD`). Versions
-of Python, torch and the like have next to none and are named in a note.
+Two runs may differ in the weights and in their names (policy name, checkpoint, digest). Everything else that affects
+the numbers must be equal, or be allowed by name (`--allow-mismatch FIELD`). A note names different versions of Python,
+torch and the like, which hardly affect them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class RunsDiffer(UserError, ValueError):
 
 @dataclass(frozen=True)
 class RunArgument:
-    """What a user names as one run: a name, and the stores that make it."""
+    """One run as the user gives it: a name and the paths of its stores."""
 
     name: str
     paths: tuple[Path, ...]
@@ -36,7 +36,7 @@ class RunArgument:
 
 @dataclass(frozen=True)
 class Run:
-    """A run's name and its question: the same settings asked of its own stores."""
+    """A run: its name, and the question about its own stores. All runs of a comparison have the same settings."""
 
     name: str
     question: Question
@@ -52,7 +52,7 @@ class Run:
         return tuple(sorted({store.suite for store in self.stores}))
 
 
-def parse_runs(words: Sequence[str]) -> list[RunArgument]:
+def parse_runs(texts: Sequence[str]) -> list[RunArgument]:
     """Read STORE or NAME=STORE[,STORE ...], two or more of them; a store alone is named after its file.
 
     Stores of one file name (one folder per policy, one store per suite) are named with as many of their folders as
@@ -62,14 +62,14 @@ def parse_runs(words: Sequence[str]) -> list[RunArgument]:
         BadArgument: fewer than two, a name or a store given twice, an empty name or path.
     """
     runs = []
-    for word in words:
+    for text in texts:
         # A path may hold '=' too: what exists as it stands is a path.
-        name, given, rest = ("", "", word) if Path(word).exists() else word.rpartition("=")
+        name, given, rest = ("", "", text) if Path(text).exists() else text.rpartition("=")
         paths = tuple(Path(part) for part in rest.split(","))
         if (given and not name) or not all(rest.split(",")):
-            raise BadArgument(f"Cannot read the run '{word}'; expected STORE or NAME=STORE[,STORE ...].")
+            raise BadArgument(f"Cannot read the run '{text}'; expected STORE or NAME=STORE[,STORE ...].")
         if not given and len(paths) > 1:
-            raise BadArgument(f"The run '{word}' has {len(paths)} stores and no name; write NAME={word}.")
+            raise BadArgument(f"The run '{text}' has {len(paths)} stores and no name; write NAME={text}.")
         runs.append(RunArgument(name, paths))
     unnamed = [run.paths[0] for run in runs if not run.name]
     runs = [run if run.name else RunArgument(_name_among(run.paths[0], unnamed), run.paths) for run in runs]
@@ -130,12 +130,12 @@ def open_runs(arguments: Sequence[RunArgument], settings: AnalysisSettings, allo
     return runs
 
 
-#: Entries of the provenance that have a say in what the policy sees; others are only noted.
+#: Entries of the provenance that affect what the policy sees; differences in others are only noted.
 _SIMULATOR = ("mujoco", "robosuite", "hf-libero", "assets")
-#: Entries of the policy's configuration that come with the weights.
+#: Entries of the policy's configuration that belong to the weights.
 _NAMES_OF_WEIGHTS = ("configuration", "statistics")
 
-#: Field: (its value in a run, why it matters). In the order in which they are named.
+#: Field -> (its value in a run, why it matters), in the order of messages.
 _FIELDS: dict[str, tuple[Callable[[Run], Any], str]] = {
     "family": (lambda run: run.stores[0].attributes.policy.family, "policies of other families attend over other keys"),
     "suite": (lambda run: run.suites, "other suites have other tasks"),
@@ -182,7 +182,7 @@ def check_comparable(runs: Sequence[Run], allowed: Sequence[str]) -> list[str]:
     With `suite` allowed, `max_steps` may differ as well: it belongs to the suite.
 
     Raises:
-        MixedPolicies: the runs are looked at at different sites, which cannot be allowed.
+        MixedPolicies: the runs' sites differ, which cannot be allowed.
         RunsDiffer: any field.
     """
     first = runs[0]
@@ -232,17 +232,17 @@ def _refuse_families(stores: Sequence[tuple[str, Store]], allowed: bool) -> None
         if first.attributes.policy.family == other.attributes.policy.family:
             continue
         sites, other_sites = ([site.name for site in store.attributes.sites] for store in (first, other))
-        what = f"Runs {name} and {other_name} mix policies, {first.attributes.policy.family} and {other.attributes.policy.family}"
+        families = f"{first.attributes.policy.family} and {other.attributes.policy.family}"
+        what = f"Runs {name} and {other_name} mix policies, {families}"
         if not set(sites) & set(other_sites):
             raise MixedPolicies(
                 f"{what}, which have no site in common ({listing(sites)}; {listing(other_sites)}): their softmaxes are "
-                "over different keys, and masses of one say nothing beside masses of the other; look at each with "
-                "vla-analyze ratios."
+                "over different keys, and their masses cannot be compared; analyse each with vla-analyze ratios."
             )
         if not allowed:
             raise MixedPolicies(
                 f"{what}, which attend over different keys with different uniform baselines; if lifts and ratios at a "
-                "site of the same name are to be set side by side all the same, say --allow-mismatch family."
+                "site of the same name are to be compared all the same, give --allow-mismatch family."
             )
 
 
@@ -280,7 +280,7 @@ def _protocol(run: Run, name: str) -> tuple[int, ...]:
 
 
 def _layout(run: Run) -> dict[str, str]:
-    """The spans of the site that is looked at, each as text: name, kind, place, grid."""
+    """Span of the run's site -> its keys and grid, as text."""
     site = next(site for site in run.stores[0].attributes.sites if site.name == run.question.site)
     spans = {}
     for span in site.spans:

@@ -1,4 +1,4 @@
-"""What `vla-analyze compare` prints."""
+"""The text of `vla-analyze compare`."""
 
 from __future__ import annotations
 

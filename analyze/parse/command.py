@@ -1,4 +1,4 @@
-"""`parse-attention-ratio-results`: summaries and pictures from results files, ours and those of the published scripts."""
+"""`parse-attention-ratio-results`: summaries and pictures from results files, ours or the published scripts'."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 PROGRAM = "parse-attention-ratio-results"
 _EXAMPLES = """examples:
   parse-attention-ratio-results --results results/attention_ratio/attention_ratio_results_libero_10.json
-  parse-attention-ratio-results --results results/libero_10/default --plot-all --output summary.txt --output-dir pictures
-  parse-attention-ratio-results --results 'results/attention_ratio_cosmos_*/attention_ratio_results_*.json' --plot-comparison
+  parse-attention-ratio-results --results results/libero_10/default --plot-all --output summary.txt
+  parse-attention-ratio-results --results 'results/cosmos_*/attention_ratio_results_*.json' --plot-comparison
 
-Several files of one kind are also summarised together (COMBINED). Masses of latent frames (Cosmos scripts) are never pooled with
-masses of image and text keys; --plot-comparison shows both side by side.
+Several files of one kind are also summarised together (COMBINED). Masses of latent frames (Cosmos scripts) are
+never pooled with masses of image and text keys; --plot-comparison shows both side by side.
 """
 
 
@@ -60,17 +60,18 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code (2: a mistake in what was given, said in one sentence)."""
+    """Run the command line; returns the exit code (2: wrong input, which one sentence explains)."""
     arguments = build_parser().parse_args(argv)
     return run_command(PROGRAM, lambda: run(arguments), "nothing was left half written.")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read, summarise, and draw what was asked for."""
-    # Imported after the arguments were read: `--help` must not wait for polars.
-    from vla_attention.analyze.parse.text import summary_of_files
+    """Read the files, print and write the summary, draw the chosen pictures."""
+    # Imported here, so that `--help` does not wait for polars.
+    from vla_attention.analyze.parse.text import summary_of_files, why_not_pooled
     from vla_attention.analyze.published.results_reader import find_results, read_results_file
     from vla_attention.analyze.published.results_tables import labels_of, results_tables
+    from vla_attention.analyze.show.output_files import write_text, writing
     from vla_attention.analyze.show.progress import progress_bar
     from vla_attention.schemas.errors import BadArgument
 
@@ -86,67 +87,28 @@ def run(arguments: argparse.Namespace) -> int:
             files.append(read_results_file(path))
             advance(1)
     labels = labels_of(files)
-    not_pooled = _why_not_pooled(files, arguments.plot_comparison)
+    not_pooled = why_not_pooled(files, arguments.plot_comparison)
     tables = [results_tables([file], [label]) for file, label in zip(files, labels, strict=True)]
     blocks = [summary_of_files(label, [file], table) for label, file, table in zip(labels, files, tables, strict=True)]
     if len(files) > 1:
         blocks.append(not_pooled or summary_of_files("COMBINED", files, results_tables(files, labels)))
     text = "\n".join(blocks)
     print(text)
-    written = []
+    written: list[Path] = []
     if arguments.output is not None:
-        written += _write_summary(arguments.output, text)
+        with writing("the summary", arguments.output):
+            write_text(arguments.output, text)
+        written.append(arguments.output)
     written += _draw(arguments, files, labels, tables)
     for path in written:
         print(f"written: {path}")
     return 0
 
 
-def _why_not_pooled(files: Sequence[ResultsFile], side_by_side: bool) -> str:
-    """Why there is no COMBINED, empty when there is one; files of different kinds are refused unless compared side by
-    side.
-    """
-    from vla_attention.analyze.published.results_tables import by_kind
-    from vla_attention.schemas.errors import listing
-    from vla_attention.schemas.results import ResultsError
-
-    kinds = by_kind(files)
-    if len(kinds) > 1:
-        parts = "; ".join(f"{listing([file.path for file in of_kind], 3)}: {kind}" for kind, of_kind in kinds.items())
-        if not side_by_side:
-            raise ResultsError(
-                f"These results files hold masses of different kinds, which cannot be summarised together ({parts}); "
-                "give one kind at a time, or see them side by side with --plot-comparison."
-            )
-        return _wrapped(f"No COMBINED: the files hold masses of different kinds ({parts}).")
-    repeated = sorted({file.suite for file in files if sum(file.suite == other.suite for other in files) > 1})
-    if repeated:
-        paths = [file.path for file in files if file.suite in repeated]
-        return _wrapped(
-            f"No COMBINED: {listing(paths, 4)} are about the same suite ({listing(repeated)}), that is, different runs "
-            "of it."
-        )
-    return ""
-
-
-def _wrapped(text: str) -> str:
-    import textwrap
-
-    return textwrap.fill(text, 100, break_long_words=False, break_on_hyphens=False) + "\n"
-
-
-def _write_summary(path: Path, text: str) -> list[Path]:
-    from vla_attention.analyze.show.output_files import write_text, writing
-
-    with writing("the summary", path):
-        write_text(path, text)
-    return [path]
-
-
 def _draw(
     arguments: argparse.Namespace, files: Sequence[ResultsFile], labels: Sequence[str], tables: Sequence[ResultsTables]
 ) -> list[Path]:
-    """The pictures that were asked for; with several files, each file's label stands behind the picture's name."""
+    """Draw the chosen pictures; with several files, the picture's name ends with the label of its file."""
     from vla_attention.analyze.show.output_files import writing
 
     wanted = [

@@ -1,6 +1,4 @@
-"""`results_comparison`: several results files side by side: mean ratio with its interval, episodes as dots, and
-fractions.
-"""
+"""`results_comparison`: results files side by side: mean ratio with interval, single episodes, fractions."""
 
 from __future__ import annotations
 
@@ -31,7 +29,7 @@ _FRACTIONS = ("visual", "linguistic", "action", "rest")
 
 
 def comparison_table(tables: Sequence[ResultsTables], labels: Sequence[str]) -> pl.DataFrame:
-    """One row per results file, over all its episodes, in the layer that speaks for it ("layers_avg", else the first).
+    """One row per results file, over all its episodes, in its overall layer ("layers_avg", else the first).
 
     Columns: file, kind, layer, num_tasks, num_episodes, episodes_without_ratio, num_replans, num_nonfinite,
     success_rate, ratio_mean with ratio_mean_low and ratio_mean_high (two-level bootstrap), ratio_std (over episodes).
@@ -49,8 +47,9 @@ def comparison_table(tables: Sequence[ResultsTables], labels: Sequence[str]) -> 
 
 
 def fractions_table(tables: Sequence[ResultsTables], labels: Sequence[str]) -> pl.DataFrame:
-    """Mean fractions of the files' groups in the layer of `comparison_table`: file, group, fraction, fraction_low,
-    fraction_high.
+    """Mean fractions of the files' groups in the layer of `comparison_table`.
+
+    Columns: file, group, fraction, fraction_low, fraction_high.
     """
     parts = []
     for table, label in zip(tables, labels, strict=True):
@@ -61,7 +60,7 @@ def fractions_table(tables: Sequence[ResultsTables], labels: Sequence[str]) -> p
 
 @drawn_in_our_style
 def plot_results_comparison(tables: Sequence[ResultsTables], labels: Sequence[str], folder: Path) -> list[Path]:
-    """Draw one row per results file; returns the paths of png, pdf and csv. A ratio that does not exist is said to."""
+    """Draw one row per results file; returns the paths of png, pdf and csv. A row without a finite ratio says so."""
     data = comparison_table(tables, labels)
     few = data.height <= 24
     kinds = data["kind"].unique(maintain_order=True).to_list()
@@ -90,9 +89,9 @@ def plot_results_comparison(tables: Sequence[ResultsTables], labels: Sequence[st
 
 
 def row_names(data: pl.DataFrame, few: bool) -> list[str]:
-    """Labels of the rows, as long as there is room; with their row number in the data where shortening made two equal.
+    """Labels of the rows, shortened to the room; with the row number where two would be equal.
 
-    A suite that all files share is in the title, and layers are named only where files differ in them.
+    The title names a suite that all files share; labels name layers only where files differ in them.
     """
     layers = [layer_name(layer, LAYERS_AVG) for layer in data["layer"]]
     names = []

@@ -1,10 +1,8 @@
-"""What `parse-attention-ratio-results` prints: the published parser's numbers, and what one should know beside them."""
+"""The text of `parse-attention-ratio-results`: the published parser's numbers, intervals, and notes on them."""
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
-from typing import Any
 
 import polars as pl
 
@@ -14,16 +12,18 @@ from vla_attention.analyze.published.results_reader import ResultsFile
 from vla_attention.analyze.published.results_tables import (
     ResultsTables,
     Spread,
+    by_kind,
     disagreements,
     layers_of,
     spread_of,
 )
 from vla_attention.analyze.ratios.verdict import LINGUISTIC_BELOW, VISUAL_ABOVE, verdict
-from vla_attention.analyze.show.headings import WIDTH
+from vla_attention.analyze.show.headings import WIDTH, wrap
 from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent, interval_name, plural
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 from vla_attention.schemas.errors import listing
+from vla_attention.schemas.results import ResultsError
 
 _VERDICTS = {
     "visual-dominant": "Model is VISUAL-dominant (prefers visual features)",
@@ -65,11 +65,37 @@ def summary_of_files(title: str, files: Sequence[ResultsFile], tables: ResultsTa
         _FRAMES_CAVEAT if files[0].kind.frames else _CAVEAT,
         *(note for file in files for note in _notes(file, layer, named=len(files) > 1)),
     ]
-    lines += ["", "Notes", *(line for note in notes for line in textwrap.wrap(note, WIDTH, **_BULLET))]
+    lines += ["", "Notes", *(line for note in notes for line in wrap(note, first="  - ", rest="    "))]
     return "\n".join(lines) + "\n"
 
 
-_BULLET: dict[str, Any] = {"initial_indent": "  - ", "subsequent_indent": "    ", "break_on_hyphens": False}
+def why_not_pooled(files: Sequence[ResultsFile], side_by_side: bool) -> str:
+    """The reason why several files have no COMBINED block; empty where they have one.
+
+    Raises:
+        ResultsError: the files hold masses of different kinds, and are not to be compared `side_by_side`.
+    """
+    kinds = by_kind(files)
+    if len(kinds) > 1:
+        parts = "; ".join(f"{listing([file.path for file in of_kind], 3)}: {kind}" for kind, of_kind in kinds.items())
+        if not side_by_side:
+            raise ResultsError(
+                f"These results files hold masses of different kinds, which cannot be summarised together ({parts}); "
+                "give one kind at a time, or see them side by side with --plot-comparison."
+            )
+        return _paragraph(f"No COMBINED: the files hold masses of different kinds ({parts}).")
+    repeated = sorted({file.suite for file in files if sum(file.suite == other.suite for other in files) > 1})
+    if repeated:
+        paths = [file.path for file in files if file.suite in repeated]
+        return _paragraph(
+            f"No COMBINED: {listing(paths, 4)} are about the same suite ({listing(repeated)}), that is, different runs "
+            "of it."
+        )
+    return ""
+
+
+def _paragraph(text: str) -> str:
+    return "\n".join(wrap(text)) + "\n"
 
 
 def _layers(files: Sequence[ResultsFile]) -> list[str]:
@@ -79,7 +105,7 @@ def _layers(files: Sequence[ResultsFile]) -> list[str]:
 
 
 def _rows_of(files: Sequence[ResultsFile], layer: str) -> list[pl.DataFrame]:
-    """Steps of that layer; where a pooled file does not have it, of the layer that speaks for the file."""
+    """Steps of that layer; of a pooled file without this layer, those of its overall layer."""
     parts = []
     for i, file in enumerate(files):
         own = layer if layer in layers_of(file) else overall_layer(file.steps)
@@ -89,7 +115,7 @@ def _rows_of(files: Sequence[ResultsFile], layer: str) -> list[pl.DataFrame]:
 
 def _origin(files: Sequence[ResultsFile]) -> list[str]:
     lines = [f"file:   {file.path}" for file in files]
-    return [*lines, *textwrap.wrap(f"masses: {files[0].kind}", WIDTH, subsequent_indent=" " * 8)]
+    return [*lines, *wrap(f"masses: {files[0].kind}", rest=" " * 8)]
 
 
 def _dataset(episodes: pl.DataFrame) -> list[str]:
@@ -194,7 +220,7 @@ def _notes(file: ResultsFile, layer: str, named: bool) -> list[str]:
     notes = []
     if layer not in layers_of(file) or (layer != LAYERS_AVG and not named and len(layers_of(file)) > 1):
         own = overall_layer(file.steps)
-        notes.append(f"{of}There is no {LAYERS_AVG}; layer {own} speaks for the file, as in the published parser.")
+        notes.append(f"{of}There is no {LAYERS_AVG}; layer {own} is used instead, as in the published parser.")
     lacking = (
         file.episodes.filter(pl.col("num_replans") > 0).height
         - file.steps.filter(layer=overall_layer(file.steps))["episode"].n_unique()
@@ -215,11 +241,11 @@ def _notes(file: ResultsFile, layer: str, named: bool) -> list[str]:
     unexplained = [item for item in found if not item.reason]
     if unexplained:
         first = unexplained[0]
-        episode = file.episodes.row(first.claim.episode, named=True)
+        episode = file.episodes.row(first.stated.episode, named=True)
         notes.append(
             f"{of}The file's own summary disagrees with its steps in {plural(len(unexplained), 'number')}; the first: "
-            f"task {episode['task_id']} episode {episode['episode_index']}, {_named(first.claim.layer)}, "
-            f"{first.claim.measure} {first.claim.statistic}: summary {format_number(first.claim.value)}, from the "
+            f"task {episode['task_id']} episode {episode['episode_index']}, {_named(first.stated.layer)}, "
+            f"{first.stated.measure} {first.stated.statistic}: summary {format_number(first.stated.value)}, from the "
             f"steps {format_number(first.computed)}. Everything here is computed from the steps."
         )
     if file.unused:

@@ -1,4 +1,4 @@
-"""When an analysis is the published Cosmos scripts' own measure: one latent frame over another."""
+"""Recognise the ratio of the published Cosmos scripts: one latent frame over another."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from vla_attention.schemas.stores.store_format import RootAttributes
 
 
 def frame_proxy(root: RootAttributes, layout: SiteLayout, grouping: Grouping) -> FrameProxy | None:
-    """The proxy that a ratio is, or None: each side is one group of one `frame:` selector, at the site of the latent
+    """The published ratio that a grouping asks for: one `frame:` selector on each side, at the site of the latent
     frames.
+
+    None for every other ratio.
     """
     if grouping.ratio is None or not any(span.kind == "latent" for span in layout.spans):
         return None

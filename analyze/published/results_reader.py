@@ -1,13 +1,13 @@
-"""Results files of anybody: finding them, and reading ours and those of the published scripts into one table.
+"""Find results files, and read ours and those of the published scripts into the same tables.
 
-`vla_attention.analyze.published.results_file.read_results` is strict and reads what this tool wrote. Here the
-differences of the published scripts' files are accepted, and nothing else:
+Our files follow `vla_attention.schemas.results` strictly. Files of the published scripts may differ from that in these
+points, and in no other:
 
     Infinity and NaN as ratios                       they become infinite and undefined, as null does in our files
     a ratio of 0 where no ratio exists               undefined: both masses 0, or "layers_avg" of layers without a
                                                      finite ratio
     no "layers_avg", no action fields, no summary    as they are; see `ResultsFile`
-    fields that are not known here                   read over, and named in `ResultsFile.unused`
+    unknown fields                                   skipped, and named in `ResultsFile.unused`
     one episode that is not in a list                a list of one
 """
 
@@ -36,25 +36,23 @@ from vla_attention.schemas.results import (
 )
 
 _LAYER = re.compile(r"layer_(\d+)$")
-#: The published scripts call a mass of up to this nothing, and write a ratio of 0 where both sides have nothing.
+#: The published scripts treat a mass of up to this as zero, and write a ratio of 0 where both masses are zero.
 NO_MASS = 1e-8
-#: Which latent frames stand for what in the Cosmos scripts' files; a file that names them is one of theirs, or compares
-#: with them.
+#: The fields of the Cosmos scripts that name the latent frames of the queries, the visual and the text side.
 FRAME_FIELDS = ("query_frame", "visual_frame", "text_frame")
 _MASSES = ("visual_mass", "linguistic_mass")
 _FRACTIONS = ("visual_fraction", "linguistic_fraction")
-#: Fractions are quotients of sums in float32 or better.
+#: The largest accepted fraction: fractions are quotients of sums in float32.
 _ONE = 1 + 1e-4
 
 
 @dataclass(frozen=True)
 class ResultsKind:
-    """What a file's masses are, as far as the file says: numbers of different kinds are not pooled.
+    """The definition of a file's masses, as far as the file states it. Files of different kinds are not pooled.
 
     Attributes:
-        frames: the latent frames that stand for queries, seeing and reading (Cosmos scripts); None in the others'
-            files.
-        has_action: there is an action mass, and it is part of what fractions are fractions of.
+        frames: the latent frames of the queries, the visual and the text side (Cosmos scripts); None in other files.
+        has_action: the file has an action mass, which is part of the sum in every fraction.
     """
 
     frames: tuple[str, str, str] | None
@@ -70,8 +68,8 @@ class ResultsKind:
 
 
 @dataclass(frozen=True)
-class Claim:
-    """A number of a file's own summary: of which episode (position in the file), layer, measure and statistic."""
+class SummaryNumber:
+    """A number in a file's own summary, with its episode (position in the file), layer, measure and statistic."""
 
     episode: int
     layer: str
@@ -85,18 +83,18 @@ class ResultsFile:
     """One results file.
 
     Attributes:
-        path: where it lies.
-        suite: the suite that it is about, from its name.
-        kind: what its masses are.
+        path: its path.
+        suite: its suite, from the file name.
+        kind: the definition of its masses.
         episodes: one row per episode, in the file's order: episode (position), task_id, instruction, episode_index,
             success, num_steps, num_replans (0 for an episode without steps).
         steps: one row per (episode, replan, layer): episode (position), replan, env_step, layer (the number as a
             string, or "layers_avg"), layer_number, ratio (infinite; null where undefined), visual_mass,
             linguistic_mass, visual_fraction, linguistic_fraction (null where undefined) and, with `kind.has_action`,
             action_mass and action_fraction.
-        claims: the numbers of the file's own summaries.
+        summary_numbers: the numbers of the file's own summaries.
         zeros: how many ratios of 0 stand for "no ratio" and were read as undefined.
-        unused: names of fields that nothing here knows.
+        unused: names of unknown fields, which were skipped.
     """
 
     path: Path
@@ -104,7 +102,7 @@ class ResultsFile:
     kind: ResultsKind
     episodes: pl.DataFrame
     steps: pl.DataFrame
-    claims: tuple[Claim, ...]
+    summary_numbers: tuple[SummaryNumber, ...]
     zeros: int
     unused: tuple[str, ...]
 
@@ -113,7 +111,7 @@ def find_results(given: Sequence[str]) -> list[Path]:
     """Files that `--results` names: files, folders (their results files, or else every .json), or patterns for either.
 
     Raises:
-        ResultsNotFound: one of the arguments leads to no file.
+        ResultsNotFound: one of the arguments matches no file.
     """
     try:
         return _found(given)
@@ -158,7 +156,7 @@ def read_results_file(path: Path) -> ResultsFile:
 
     Raises:
         ResultsNotFound: it cannot be opened.
-        ResultsError: it is no results file, or something in it does not fit; names the file, the episode and the field.
+        ResultsError: it is no results file, or a field is wrong; names the file, the episode and the field.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -174,16 +172,16 @@ def read_results_file(path: Path) -> ResultsFile:
 
 
 class _Problem(ValueError):
-    """What does not fit, without the file's name."""
+    """A fault in a results file; the message does not name the file."""
 
 
 class _Reading:
-    """One pass over a document; collects rows, claims and what was noticed on the way."""
+    """One pass over a document: collects rows, numbers of summaries, kinds of masses and unknown fields."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.rows: list[dict[str, Any]] = []
-        self.claims: list[Claim] = []
+        self.summary_numbers: list[SummaryNumber] = []
         self.unused: dict[str, None] = {}
         self.kinds: dict[ResultsKind, str] = {}
         self.zeros = 0
@@ -215,7 +213,7 @@ class _Reading:
             steps=pl.DataFrame(
                 self.rows, schema_overrides={**schema, "layer_number": pl.Int64}, infer_schema_length=None
             ),
-            claims=tuple(self.claims),
+            summary_numbers=tuple(self.summary_numbers),
             zeros=self.zeros,
             unused=tuple(self.unused),
         )
@@ -252,7 +250,7 @@ class _Reading:
                 at = f"{where}, {name}[{position}]"
                 row = self._step(_expect(step, dict, at), at)
                 if step["visual_linguistic_ratio"] is None and label != LAYERS_AVG:
-                    # Our files write null for infinite and for undefined; the masses tell which of them it was.
+                    # Our files write null for infinite and for undefined ratios; the masses tell which it is.
                     row["ratio"] = math.inf if row["visual_mass"] > NO_MASS >= row["linguistic_mass"] else None
                 if row["env_step"] <= before:
                     raise _Problem(f"{at}.step is {row['env_step']}, after {before}: steps must rise.")
@@ -318,8 +316,8 @@ class _Reading:
                 at = f"{where}, summary.{name}.{measure}"
                 for statistic, value in _expect(statistics, dict, at).items():
                     if statistic != "num_nonfinite":
-                        claimed = _number(value, f"{at}.{statistic}", math.inf)
-                        self.claims.append(Claim(number, label, measure, statistic, claimed))
+                        stated = _number(value, f"{at}.{statistic}", math.inf)
+                        self.summary_numbers.append(SummaryNumber(number, label, measure, statistic, stated))
 
     def _note_unused(self, given: Mapping[str, object], known: Sequence[str]) -> None:
         for name in given:

@@ -1,8 +1,7 @@
-"""Results files as the tables of `vla_attention.analyze.measures.aggregate`, so that pictures and intervals are the
-same as those from stores.
+"""Results files as the tables of `measures.aggregate`, so that pictures and intervals are those of stores.
 
-A results file knows masses and fractions, but neither how many keys are on each side nor row sums: those columns are
-null, and with them the uniform baseline and every lift.
+A results file holds masses and fractions, but no row sums and no numbers of keys. Those columns are null, and so are
+the uniform baseline and every lift.
 """
 
 from __future__ import annotations
@@ -16,11 +15,11 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.aggregate import episode_tables, layer_order, task_tables
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables, float_values
-from vla_attention.analyze.published.results_reader import Claim, ResultsFile, ResultsKind
+from vla_attention.analyze.published.results_reader import ResultsFile, ResultsKind, SummaryNumber
 from vla_attention.analyze.statistics.bootstrap import SampleSummary, summarize
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 
-#: What neither visual nor linguistic nor action keys get, as far as the fractions tell.
+#: The group of what is left: 1 minus the known fractions.
 REST = "rest"
 #: Fractions that sum to 1 within this have no rest.
 _NO_REST = 1e-4
@@ -32,9 +31,7 @@ _UNKNOWN = pl.lit(None, dtype=pl.Float64)
 
 @dataclass(frozen=True)
 class ResultsTables:
-    """Tables of one or several results files; column `suite` holds the files' labels, so that equal task ids stay
-    apart.
-    """
+    """Tables of one or several results files; `suite` holds the files' labels, which keep equal task ids apart."""
 
     grouping: Grouping
     replans: Tables
@@ -166,57 +163,58 @@ def layers_of(file: ResultsFile) -> list[str]:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """A claim of a file's summary that its own steps do not bear out; `reason` where the cause is a known other
-    definition.
+    """A number in a file's summary that differs from the one computed from its steps.
+
+    `reason` names the cause where it is a known other definition, and is empty otherwise.
     """
 
-    claim: Claim
+    stated: SummaryNumber
     computed: float | None
     reason: str
 
 
-#: Why a summary's number may rightly differ from the one computed here.
+#: Known causes of a difference.
 NO_FINITE_AS_ZERO = "its summary gives 0 where no ratio is finite; such a mean is undefined here"
 ZEROS_COUNTED = "its summary counts steps without a ratio as ratios of 0; here they are left out"
 
 
 def disagreements(file: ResultsFile) -> list[Disagreement]:
-    """Hold a file's own summaries against its steps; measures and statistics that are not known here are passed over."""
+    """Compare a file's own summaries with its steps; measures and statistics that are unknown here are skipped."""
     parts = {
         (int(str(episode)), str(layer)): rows
         for (episode, layer), rows in file.steps.partition_by("episode", "layer", as_dict=True).items()
     }
     known: dict[tuple[int, str, str], tuple[NDArray[np.float64], SampleSummary]] = {}
     found = []
-    for claim in file.claims:
-        column = "ratio" if claim.measure == "visual_linguistic_ratio" else claim.measure
-        if column not in file.steps.columns or claim.statistic not in _STATISTICS:
+    for stated in file.summary_numbers:
+        column = "ratio" if stated.measure == "visual_linguistic_ratio" else stated.measure
+        if column not in file.steps.columns or stated.statistic not in _STATISTICS:
             continue
-        key = (claim.episode, claim.layer, column)
+        key = (stated.episode, stated.layer, column)
         if key not in known:
             rows = parts.get(key[:2])
             values = np.zeros(0) if rows is None else float_values(rows[column])
             known[key] = (values, summarize(values))
         values, summary = known[key]
-        computed = getattr(summary, claim.statistic)
-        if not _agrees(claim.value, computed):
-            found.append(Disagreement(claim, computed, _reason(claim, values)))
+        computed = getattr(summary, stated.statistic)
+        if not _agrees(stated.value, computed):
+            found.append(Disagreement(stated, computed, _reason(stated, values)))
     return found
 
 
-def _agrees(claimed: float | None, computed: float | None) -> bool:
-    if claimed is None or computed is None:
-        return claimed is computed
-    return abs(claimed - computed) <= _TOLERANCE * max(1.0, abs(claimed), abs(computed))
+def _agrees(stated: float | None, computed: float | None) -> bool:
+    if stated is None or computed is None:
+        return stated is computed
+    return abs(stated - computed) <= _TOLERANCE * max(1.0, abs(stated), abs(computed))
 
 
-def _reason(claim: Claim, values: NDArray[np.float64]) -> str:
-    if claim.measure != "visual_linguistic_ratio" or values.size == 0:
+def _reason(stated: SummaryNumber, values: NDArray[np.float64]) -> str:
+    if stated.measure != "visual_linguistic_ratio" or values.size == 0:
         return ""
-    if not np.isfinite(values).any() and claim.value == 0:
+    if not np.isfinite(values).any() and stated.value == 0:
         return NO_FINITE_AS_ZERO
     counted = np.where(np.isnan(values), 0.0, values)
-    return ZEROS_COUNTED if _agrees(claim.value, getattr(summarize(counted), claim.statistic)) else ""
+    return ZEROS_COUNTED if _agrees(stated.value, getattr(summarize(counted), stated.statistic)) else ""
 
 
 def labels_of(files: Sequence[ResultsFile]) -> list[str]:
@@ -230,7 +228,7 @@ def _label(number: int, files: Sequence[ResultsFile]) -> str:
     own = (*file.path.resolve().parent.parts[1:], file.path.stem)
     if len(same) == 1:
         return file.suite
-    # x.json and attention_ratio_results_x.json are about one suite: there the file's name tells, else the folders do.
+    # x.json and attention_ratio_results_x.json are about one suite: their file names tell them apart, else folders do.
     depth = next(depth for depth in range(1, len(own) + 1) if sum(path[-depth:] == own[-depth:] for path in same) == 1)
     return file.path.stem if depth == 1 else "/".join((*own[-depth:-1], file.suite))
 

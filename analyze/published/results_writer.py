@@ -27,8 +27,8 @@ def episode_documents(replans: Tables, grouping: Grouping, proxy: FrameProxy | N
     is its mass / sum of all groups' masses. With a `proxy` the numbers are those of the published Cosmos scripts
     instead: masses are sums over the queries (ours are means), and fractions are of visual + linguistic only.
 
-    Plain values rather than `vla_attention.schemas.results.EpisodeResult` objects, which describe them: a suite has a
-    hundred thousand steps.
+    The documents follow `vla_attention.schemas.results.EpisodeResult`. They are plain dictionaries, because a suite has
+    a hundred thousand steps.
     """
     if grouping.ratio is None:
         raise ResultsError(

@@ -1,4 +1,4 @@
-"""What `vla-analyze time` prints."""
+"""The text of `vla-analyze time`."""
 
 from __future__ import annotations
 

@@ -91,10 +91,10 @@ def test_a_zero_that_stands_for_no_ratio_is_undefined_and_counted(tmp_path):
         step = episodes[0]["per_step_ratios"][name][0]
         step["visual_linguistic_ratio"] = 0.0 if name == "layers_avg" else float("inf")
     steps = episodes[0]["per_step_ratios"]["layers_avg"]
-    claimed = episodes[0]["summary"]["layers_avg"]["visual_linguistic_ratio"]
-    claimed["mean"] = float(np.mean([step["visual_linguistic_ratio"] for step in steps]))
+    stated = episodes[0]["summary"]["layers_avg"]["visual_linguistic_ratio"]
+    stated["mean"] = float(np.mean([step["visual_linguistic_ratio"] for step in steps]))
     file = read_results_file(write_published(tmp_path, "t", episodes))
-    mean = next(d for d in disagreements(file) if d.claim.layer == "layers_avg" and d.claim.statistic == "mean")
+    mean = next(d for d in disagreements(file) if d.stated.layer == "layers_avg" and d.stated.statistic == "mean")
     assert mean.reason == ZEROS_COUNTED
     assert mean.computed == pytest.approx(np.mean([step["visual_linguistic_ratio"] for step in steps[1:]]))
 
@@ -160,10 +160,10 @@ def test_a_summary_that_its_steps_do_not_bear_out_is_noticed(tmp_path):
     episodes[1]["summary"]["layer_26"]["visual_mass"]["std"] += 0.1
     episodes[0]["summary"]["layer_99"] = episodes[0]["summary"]["layer_26"]
     found = disagreements(read_results_file(write_published(tmp_path, "s", episodes)))
-    (changed,) = [item for item in found if item.claim.episode == 1]
-    assert (changed.claim.layer, changed.claim.measure, changed.claim.statistic) == ("26", "visual_mass", "std")
-    assert changed.claim.value - changed.computed == pytest.approx(0.1)
-    assert {item.claim.layer for item in found if item.claim.episode == 0} == {"99"}
+    (changed,) = [item for item in found if item.stated.episode == 1]
+    assert (changed.stated.layer, changed.stated.measure, changed.stated.statistic) == ("26", "visual_mass", "std")
+    assert changed.stated.value - changed.computed == pytest.approx(0.1)
+    assert {item.stated.layer for item in found if item.stated.episode == 0} == {"99"}
 
 
 def test_layers_that_an_episode_lacks_and_episodes_without_steps_are_kept(tmp_path):
