@@ -43,8 +43,8 @@ def open_stores(stores: str | Path | Sequence[str | Path]) -> OpenStores:
 class OpenStores:
     """One or several stores, opened for questions. Made by `va.open`; holds the episodes that were complete then.
 
-    Every method takes the keywords of `vla_attention.analyze.measures.question_settings.SettingKeywords`, reads only what it
-    needs and returns a polars frame; where there are several, `table` or `level` chooses one. Mistakes raise a
+    Every method takes the keywords of `vla_attention.analyze.measures.question_settings.SettingKeywords`, reads only
+    what it needs and returns a polars frame; where there are several, `table` or `level` chooses one. Mistakes raise a
     `va.UserError` that says what exists.
 
     Attributes:

@@ -20,7 +20,8 @@ from vla_attention.schemas.command_line import command_parser
 _EXAMPLES = """examples:
   vla-analyze heads runs/libero_10.zarr
   vla-analyze heads runs/libero_10.zarr --layers 5 6 7 --top 10
-  vla-analyze heads runs/libero_10.zarr --group bowl=object:akita_black_bowl_1 --group words=role:instruction --ratio bowl/words
+  vla-analyze heads runs/libero_10.zarr --group bowl=object:akita_black_bowl_1 --group words=role:instruction \\
+      --ratio bowl/words
   vla-analyze heads runs/libero_10.zarr --sink-factor 20 --sink-share 0.25
   vla-analyze heads runs/libero_10.zarr --no-rows     (masses only: a moment, also for large stores)
 
@@ -33,8 +34,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser = command_parser(
         "vla-analyze heads",
         "Who looks and who reads: the most visual and most linguistic heads, how much heads differ, layers, depth and "
-        "denoise steps, with intervals over tasks and episodes; and of single rows entropy, effective number of keys, mass of the "
-        "largest keys and sinks.",
+        "denoise steps, with intervals over tasks and episodes; and of single rows entropy, effective number of keys, "
+        "mass of the largest keys and sinks.",
         _EXAMPLES,
     )
     add_stores(parser)

@@ -1,4 +1,4 @@
-"""Denoise steps: the numbers of every denoise step alone."""
+"""Denoise steps: every denoise step by itself."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ from vla_attention.schemas.groupings.grouping import Grouping
 
 
 def denoise_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping, seed: int = DEFAULT_SEED) -> Tables:
-    """Every denoise step: what the whole analysis gives over all tasks and layers when only this step is selected.
+    """Every denoise step: the numbers over all tasks and layers of an analysis in which only this step is selected.
 
     Returns:
-        `denoise_step`, `denoise_time` (mean over episodes) and the columns of `aggregate.task_tables`, in the order of the steps.
+        `denoise_step`, `denoise_time` (mean over episodes) and the columns of `aggregate.task_tables`, in the order of
+        the steps.
     """
     selection = measured[0].selection
     parts = []

@@ -1,4 +1,4 @@
-"""Depth: at which layers a group is attended to, as a centre of gravity, by masses and by contributions."""
+"""Depth: the centre of gravity over layers of the attention on a group, by masses and by contributions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
 from vla_attention.analyze.measures.group_contributions import group_contribution_tables
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_SEED, NO_LIMITS
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL, DEFAULT_SEED, NO_LIMITS
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 
@@ -19,8 +19,8 @@ from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 def depth_centre(amounts: ArrayLike, blocks: ArrayLike) -> NDArray[np.float64]:
     """Centre of gravity over layers: sum over l of l x a_l / sum over l of a_l, with block indices l.
 
-    As the "center of gravity" of Tenney et al. (2019), "BERT Rediscovers the NLP Pipeline", section 3, which weighs layers in
-    the same way. The same amount at every layer gives the mean block.
+    The "center of gravity" of Tenney et al. (2019), "BERT Rediscovers the NLP Pipeline", section 3, which weighs layers
+    in the same way. The same amount at every layer gives the mean block.
 
     Args:
         amounts: (..., layer), at least 0: masses of a group, or norms of its contributions.
@@ -35,27 +35,30 @@ def depth_centre(amounts: ArrayLike, blocks: ArrayLike) -> NDArray[np.float64]:
     return centre
 
 
-def depth_table(episodes: Tables, norms: pl.DataFrame | None = None, seed: int = DEFAULT_SEED) -> pl.DataFrame:
-    """One row per group that has any amount: the mean over episodes of its centre, with a two-level interval (95 %).
+def depth_table(
+    episodes: Tables, norms: pl.DataFrame | None = None, seed: int = DEFAULT_SEED, level: float = DEFAULT_LEVEL
+) -> pl.DataFrame:
+    """One row per group that has any amount: the mean over episodes of its centre, with a two-level interval.
 
-    Columns: group; of: "mass", or "contribution" (the norm of what the group's keys add to the residual stream; norms grow with
-    depth where a network's updates do, so read this centre beside those of other groups); num_episodes, num_tasks,
-    centre_episodes (with a centre); centre, centre_low, centre_high; even: the centre of the same amount at every layer;
-    first_block, last_block, num_layers: the layers that it is a centre over.
+    Columns: group; of: "mass", or "contribution" (the norm of what the group's keys add to the residual stream; norms
+    may grow with depth, so compare this centre only with those of other groups); num_episodes, num_tasks,
+    centre_episodes (with a centre); centre, centre_low, centre_high; even: the centre of an amount that is the same at
+    every layer; first_block, last_block, num_layers: the layers that the centre is over.
 
     Args:
         episodes: `aggregate.episode_tables`. A block that was named by two layer numbers counts once.
         norms: suite, task_id, episode_index, block, group, norm (see `contribution_norms`), where there are any.
         seed: of the bootstrap.
+        level: of the intervals.
     """
     single = episodes.groups.filter(pl.col("layer") != LAYERS_AVG)
     parts = [_centres(single, "mass", "mass")]
     if norms is not None:
         parts.append(_centres(norms, "norm", "contribution"))
     blocks = single["block"].unique().sort()
-    # A single layer leaves a centre no room, and no interval could be widened inside of that.
+    # With a single layer both limits are equal, and no interval could be widened between them.
     limits = (float(blocks[0]), float(blocks[-1])) if len(blocks) > 1 else NO_LIMITS
-    table = means_with_intervals(pl.concat(parts), ("group", "of"), {"centre": limits}, seed)
+    table = means_with_intervals(pl.concat(parts), ("group", "of"), {"centre": limits}, seed, level)
     return table.filter(pl.col("centre").is_not_null()).with_columns(
         pl.lit(float(np.mean(blocks.to_numpy()))).alias("even"),
         pl.lit(blocks[0], dtype=pl.Int64).alias("first_block"),

@@ -1,4 +1,4 @@
-"""How spread out a row is: entropy, effective number of keys, mass of the largest keys. Pure arithmetic on arrays."""
+"""Spread of attention in a row: entropy, effective number of keys, mass of the largest keys. Pure arithmetic."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ def entropies(rows: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArra
 
         H = - sum over k of w_k (p_k / S) ln(p_k / S) = ln S - (sum over k of w_k p_k ln p_k) / S
 
-    With weights of 0 and 1 that is Shannon's entropy of the renormalised row, between 0 and ln(number of keys). A key that
-    belongs to a group by a fraction (an object on a part of a patch) counts as that fraction of a key: H = -KL(q || w), at most
-    ln(sum of w) and reached when attention is proportional to w, so that exp(H) is a number of whole keys, comparable with the
-    group's number of keys (and below 1 where all attention lies on less than one key). Keys with p = 0 add nothing.
+    With weights of 0 and 1 that is Shannon's entropy of the renormalised row, between 0 and ln(number of keys). A key
+    that belongs to a group by a fraction (an object on a part of a patch) counts as that fraction of a key:
+    H = -KL(q || w), at most ln(sum of w), which is reached when attention is proportional to w. exp(H) then is a number
+    of whole keys, comparable with the group's number of keys (and below 1 where all attention lies on less than one
+    key). Keys with p = 0 add nothing.
 
     Source: Shannon (1948); for attention rows Clark et al. (2019), "What Does BERT Look At?", section 3.3.
 
@@ -39,7 +40,7 @@ def entropies(rows: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArra
     total, inner = weighted_sums(rows, weights), weighted_sums(surprise, weights)
     with np.errstate(divide="ignore", invalid="ignore"):
         entropy = np.where(total > 0, np.log(total) - inner / total, np.nan)
-    # float32 leaves some 1e-7 below zero where a single key has it all; fractions of keys may really be below zero.
+    # In float32 the entropy of a single key may be some -1e-7. With fractions of keys it may truly be below zero.
     whole = ((weights == 0) | (weights == 1)).all(axis=(0, 1))
     return np.where(whole, np.maximum(entropy, 0.0), entropy).astype(np.float32)
 
@@ -55,7 +56,7 @@ def top_mass(rows: NDArray[np.float32], valid: NDArray[np.bool_], counts: Sequen
 
     Args:
         rows: probabilities (replan, ..., key).
-        valid: (replan or 1, key); what other keys take is no part of either sum.
+        valid: (replan or 1, key); other keys are in neither sum.
         counts: the numbers k, at least 1; where a row has fewer valid keys than k, the share is 1.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Heads: what each of them attends to, how much they differ within a layer, and which ones look most and read most."""
+"""Heads: what each of them attends to, how much the heads of a layer differ, and their ranking."""
 
 from __future__ import annotations
 
@@ -19,16 +19,19 @@ _HEAD = ("layer", "block", "head")
 
 
 def episode_heads(measured: MeasuredEpisode, grouping: Grouping) -> Tables:
-    """Every (layer, head) of one episode: means over replans of measures of the masses, which are averaged over denoise steps.
+    """Every (layer, head) of one episode: means over replans.
+
+    Masses are averaged over denoise steps first, and measures are those of these means.
 
     Args:
         measured: the episode with heads kept apart.
         grouping: the groups, and the ratio if it has one.
 
     Returns:
-        cells: suite, task_id, episode_index, layer, block, head; with a ratio `numerator_fraction`, `denominator_fraction`,
-            `numerator_mass` and `denominator_mass`; `log2_ratio` and `log2_lift` (over the uniform ratio), means over the replans where
-            they are finite; and `num_nonfinite`, the number of replans whose ratio is infinite, undefined or 0.
+        cells: suite, task_id, episode_index, layer, block, head; with a ratio `numerator_fraction`,
+            `denominator_fraction`, `numerator_mass` and `denominator_mass`; `log2_ratio` and `log2_lift` (over the
+            uniform ratio), means over the replans where they are finite; and `num_nonfinite`, the number of replans
+            whose ratio is infinite, undefined or 0.
         groups: the same names, group, fraction and lift (see `masses.group_measures`).
     """
     mass, valid_mass = measured.mass.mean(axis=2), measured.valid_mass.mean(axis=2)
@@ -55,10 +58,10 @@ def episode_heads(measured: MeasuredEpisode, grouping: Grouping) -> Tables:
 
 
 def dispersion(values: NDArray[np.float64], axis: int = -1) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Standard deviation over heads (ddof 0: a layer's heads are all there are) and coefficient of variation, std / mean.
+    """Standard deviation over heads (ddof 0) and coefficient of variation (standard deviation / mean).
 
-    Over the finite values; NaN with fewer than two of them, and the coefficient also where the mean is 0. Shape: that of `values`
-    without the axis.
+    Over the finite values; NaN with fewer than two of them, and the coefficient also where the mean is 0. Shape: that
+    of `values` without the axis.
     """
     finite = np.isfinite(values)
     count = finite.sum(axis=axis)
@@ -75,10 +78,10 @@ def heads_tables(episodes: Tables, grouping: Grouping, seed: int = DEFAULT_SEED)
     X_low and X_high bound X, and X_episodes says how many episodes have a finite value.
 
     Returns:
-        cells: layer, block, head, num_episodes, num_tasks; with a ratio, bounded, `numerator_fraction`, `log2_ratio` (two to its
-            power is the geometric mean that `task_tables` has) and `log2_lift`; without bounds `denominator_fraction`,
-            `ratio_of_means` (mean numerator mass / mean denominator mass) and `num_nonfinite`, the number of (episode, replan) left
-            out of the logarithms.
+        cells: layer, block, head, num_episodes, num_tasks; with a ratio, bounded, `numerator_fraction`, `log2_ratio`
+            (two to its power is the geometric mean that `task_tables` has) and `log2_lift`; without bounds
+            `denominator_fraction`, `ratio_of_means` (mean numerator mass / mean denominator mass) and `num_nonfinite`,
+            the number of (episode, replan) left out of the logarithms.
         groups: layer, block, head, group, num_episodes, num_tasks; bounded, `fraction` and `lift`.
     """
     ordered = Tables(
@@ -101,9 +104,10 @@ def heads_tables(episodes: Tables, grouping: Grouping, seed: int = DEFAULT_SEED)
 def dispersion_table(episodes: Tables, grouping: Grouping, seed: int = DEFAULT_SEED) -> pl.DataFrame:
     """How much the heads of a layer differ, one row per layer, from `episode_heads` of all episodes.
 
-    Means over episodes with two-level intervals: `fraction_std` and `fraction_cv`, standard deviation and coefficient of
-    variation over heads of the numerator's fraction (without a ratio: of `main_group`'s); with a ratio `log2_ratio_std`, over the
-    heads with a finite one. Further columns: layer, block, num_heads, num_episodes, num_tasks. Null with a single head.
+    Means over episodes with two-level intervals: `fraction_std` and `fraction_cv`, standard deviation and coefficient
+    of variation over heads of the numerator's fraction (without a ratio: of `main_group`'s); with a ratio
+    `log2_ratio_std`, over the heads with a finite one. Further columns: layer, block, num_heads, num_episodes,
+    num_tasks. Null with a single head.
     """
     cells = episodes.cells
     if grouping.ratio is None:
@@ -128,26 +132,27 @@ def dispersion_table(episodes: Tables, grouping: Grouping, seed: int = DEFAULT_S
 def ranked_heads(heads: Tables, grouping: Grouping) -> pl.DataFrame:
     """The cells of `heads_tables` from the most to the least on the numerator (without a ratio: on `main_group`).
 
-    By `log2_lift`, which is comparable where the numbers of keys differ, or the group's fraction. A head whose ratio is infinite at
-    every replan comes first, one whose ratio is always 0 last; heads without any mass on either side are left out. A block
+    By `log2_lift`, which is comparable where the numbers of keys differ; without a ratio by the group's fraction, heads
+    without one last. A head whose ratio is infinite at every replan comes first, one whose ratio is always 0 last;
+    heads without any mass on either side are left out. A block
     that was named by two layer numbers is listed once.
     """
     cells = heads.cells
     if grouping.ratio is None:
         fraction = heads.of_group(main_group(heads, grouping))["fraction"]
         once = cells.with_columns(fraction.alias("_order")).unique(["block", "head"], keep="first", maintain_order=True)
-        return once.sort("_order", "block", "head", descending=[True, False, False]).drop("_order")
+        return _descending(once)
     once = cells.unique(["block", "head"], keep="first", maintain_order=True)
     above, below = pl.col("numerator_fraction") > 0, pl.col("denominator_fraction") > 0
     limit = pl.when(above & ~below).then(float("inf")).when(below & ~above).then(float("-inf"))
     # Without a uniform baseline (a side without keys) the order is that of the ratio.
     order = pl.coalesce("log2_lift", "log2_ratio", limit)
-    return (
-        once.with_columns(order.alias("_order"))
-        .filter(pl.col("_order").is_not_null())
-        .sort("_order", "block", "head", descending=[True, False, False])
-        .drop("_order")
-    )
+    return _descending(once.with_columns(order.alias("_order")).filter(pl.col("_order").is_not_null()))
+
+
+def _descending(heads: pl.DataFrame) -> pl.DataFrame:
+    """From the largest to the smallest `_order`, heads without one last."""
+    return heads.sort("_order", "block", "head", descending=[True, False, False], nulls_last=True).drop("_order")
 
 
 def main_group(heads: Tables, grouping: Grouping) -> str:

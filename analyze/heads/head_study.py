@@ -1,4 +1,4 @@
-"""Everything about heads, layers and denoise steps of one question, and the tables alone for those who want one of them."""
+"""All tables on heads, layers, depth, denoise steps and rows of one question."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from vla_attention.analyze.stores.parallel import map_episodes
 
 @dataclass(frozen=True)
 class HeadStudy:
-    """What `study_heads` finds.
+    """The result of `study_heads`.
 
     Attributes:
-        question: what was asked.
+        question: the question.
         options: how rows were measured; None when they were not read.
         replans: `aggregate.replan_tables`, mean over heads.
         tasks: `aggregate.task_tables`, mean over heads.
@@ -59,7 +59,7 @@ class HeadStudy:
     sinks: pl.DataFrame | None
 
     def tables(self) -> dict[str, pl.DataFrame]:
-        """What is written to files, by the files' names."""
+        """The tables that are written to files, by the files' names."""
         tables = named_tables("heads", self.heads) | {"dispersion": self.dispersion, "depth": self.depth}
         tables |= named_tables("denoise", self.denoise)
         if self.rows is not None and self.sinks is not None:
@@ -70,14 +70,14 @@ class HeadStudy:
 def study_heads(question: Question, options: RowOptions | None = None) -> HeadStudy:
     """Measure heads, layers, denoise steps and, with `options`, rows. Rows are read at most once.
 
-    Without `options` they are only read when a group cuts through a stored segment (a word, an object).
+    Without `options` rows are only read when a group cuts a stored segment (a word, an object).
     """
     grouping, seed, selection = question.grouping, question.settings.seed, question.selection
     resolved = resolve_all(grouping, question.selected, question.vocabulary)
     shown = groups_with_valid_keys(question.selected, resolved)
     measures = None
     if options is not None:
-        # Stored segment masses are those of the rows as computed; rows are rounded. So the former, wherever they suffice.
+        # Segment masses were stored exactly, rows were rounded: masses of segments are used where they suffice.
         cut = [
             segment_weights(item, with_valid(groups.weights, item.valid), question.site) is None
             for item, groups in zip(question.selected, resolved, strict=True)

@@ -1,4 +1,4 @@
-"""Layers over the course of episodes: what each layer does at each part of the episodes' time."""
+"""Layers over the course of episodes: every layer in equal parts of the episodes' time."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import polars as pl
 from vla_attention.analyze.measures.aggregate import layer_order
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
 from vla_attention.analyze.statistics.bootstrap import (
+    DEFAULT_LEVEL,
     DEFAULT_SEED,
     bootstrap_intervals,
     mean_over_episodes,
@@ -17,35 +18,41 @@ from vla_attention.analyze.time.alignment import on_episode_time
 from vla_attention.schemas.groupings.grouping import Grouping
 
 MOST_BINS = 20
-#: Of a grouping without a ratio, so many groups are followed.
+#: Number of groups that are shown of a grouping without a ratio.
 _MOST_GROUPS = 3
 
 
 def layer_time_table(
-    replans: Tables, grouping: Grouping, num_bins: int | None = None, seed: int = DEFAULT_SEED
+    replans: Tables,
+    grouping: Grouping,
+    num_bins: int | None = None,
+    seed: int = DEFAULT_SEED,
+    level: float = DEFAULT_LEVEL,
 ) -> pl.DataFrame:
-    """Means over episodes with two-level intervals (95 %) for every layer and equal part of the episodes' time.
+    """Means over episodes with two-level intervals for every layer and equal part of the episodes' time.
 
-    An episode's time is divided as in `phases.on_episode_time`. Columns: quantity, layer, block, bin, start, stop (0..1), num_episodes
-    (with a finite value), mean, low, high. The quantity with a ratio is `log2_lift`, log2 of ratio over uniform ratio (`log2_ratio`
-    where a side has no keys and there is no uniform ratio); else the fraction `{g}_fraction` of each of the first groups with mass.
+    An episode's time is divided as in `on_episode_time`. Columns: quantity, layer, block, bin, start, stop
+    (0..1), num_episodes (with a finite value), mean, low, high. The quantity with a ratio is `log2_lift`, log2 of ratio
+    over uniform ratio (`log2_ratio` where a side has no keys and there is no uniform ratio); else the fraction
+    `{g}_fraction` of each of the first groups with mass.
 
     Args:
         replans: `aggregate.replan_tables`.
         grouping: the groups.
         num_bins: parts of the time; `MOST_BINS` unless no episode has as many replans.
         seed: of the bootstrap.
+        level: of the intervals.
     """
-    level = replans.filter(pl.col("layer") != LAYERS_AVG)
-    level = level if grouping.ratio is not None else level.kept()
-    single = level.cells
+    tables = replans.filter(pl.col("layer") != LAYERS_AVG)
+    tables = tables if grouping.ratio is not None else tables.kept()
+    single = tables.cells
     if grouping.ratio is not None:
         quantities = ["log2_ratio" if single["uniform_ratio"].is_null().all() else "log2_lift"]
         single = single.with_columns(pl.col("ratio_lift").log(2.0).alias("log2_lift"))
     else:
-        having = (level.groups_with_mass() or grouping.names)[:_MOST_GROUPS]
+        having = (tables.groups_with_mass() or grouping.names)[:_MOST_GROUPS]
         quantities = [f"{name}_fraction" for name in having]
-        single = single.with_columns(level.of_group(name)["fraction"].alias(f"{name}_fraction") for name in having)
+        single = single.with_columns(tables.of_group(name)["fraction"].alias(f"{name}_fraction") for name in having)
     layers = [layer for layer in layer_order(single) if layer != LAYERS_AVG]
     blocks = dict(single.select("layer", "block").unique().iter_rows())
     bins = num_bins or min(MOST_BINS, int(single["replan"].to_numpy().max()) + 1)
@@ -62,7 +69,7 @@ def layer_time_table(
         tasks.append(f"{key[0]}\t{key[1]}")
     stacked = np.stack(values).transpose(0, 3, 2, 1).reshape(len(values), -1)  # (episode, quantity x layer x bin)
     statistics = [mean_over_episodes(stacked[:, i]) for i in range(stacked.shape[1])]
-    intervals = bootstrap_intervals(statistics, resample_episodes(np.array(tasks), seed=seed))
+    intervals = bootstrap_intervals(statistics, resample_episodes(np.array(tasks), seed=seed), level)
     quantity, layer, part_of = (axis.ravel() for axis in np.indices((len(quantities), len(layers), bins)))
     return pl.DataFrame(
         {

@@ -1,4 +1,4 @@
-"""`denoise_profile`: ratio and fractions at every recorded denoise step, with intervals over episodes and the uniform baseline."""
+"""`denoise_profile`: ratio and fractions at every recorded denoise step, with intervals and the uniform baseline."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`head_grid`: every head of every layer, coloured by how much more or less than uniform attention it gives to one side."""
+"""`head_grid`: every head of every layer, coloured by its lift over uniform attention."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.heads.head_measures import main_group
 from vla_attention.analyze.measures.frames import Tables
-from vla_attention.analyze.show.numbers import interval_name, of_tasks, plural
+from vla_attention.analyze.show.numbers import format_percent, interval_name, of_tasks, plural
 from vla_attention.analyze.show.plot_heat_map import draw_log2_map, label_axis, map_height
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, ratio_name, title
@@ -25,7 +25,7 @@ def plot_head_grid(heads: Tables, grouping: Grouping, folder: Path) -> list[Path
     """Draw from `head_measures.heads_tables`; returns the paths of png, pdf and csv.
 
     With a ratio its lift over the uniform ratio (the ratio itself where a side has no keys), else the lift of the first
-    group that has mass. A dot: the 95 % interval of the head holds the uniform value.
+    group that has mass. A dot: the interval of the head holds the uniform value.
     """
     cells = heads.cells
     quantity = _quantity(cells, grouping)
@@ -75,7 +75,7 @@ def _grid(heads: pl.DataFrame, column: str, num_layers: int) -> NDArray[np.float
 
 
 def _with_limits(heads: pl.DataFrame, log2: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where no replan of no episode has a finite logarithm: infinite or zero, whichever side has all the mass."""
+    """Infinite or zero where no replan of any episode has a finite logarithm, by the side that has all the mass."""
     above, below = (_grid(heads, f"{side}_fraction", len(log2)) > 0 for side in ("numerator", "denominator"))
     missing = np.isnan(log2)
     return np.where(missing & above & ~below, np.inf, np.where(missing & below & ~above, -np.inf, log2))
@@ -85,7 +85,8 @@ def _note(heads: pl.DataFrame, log2: NDArray[np.float64], dots: bool) -> str:
     episodes, tasks = int(heads["num_episodes"][0]), int(heads["num_tasks"][0])
     text = f"Means over {of_tasks(episodes, tasks)}."
     if dots:
-        text += f" Dot: the head's {interval_name(DEFAULT_LEVEL, 'bootstrap')} holds the uniform value. By chance alone one head in twenty lacks its dot."
+        text += f" Dot: the head's {interval_name(DEFAULT_LEVEL, 'bootstrap')} holds the uniform value."
+        text += f" By chance alone, {format_percent(1 - DEFAULT_LEVEL, 0)} of the heads have no dot."
     infinite = int(np.isinf(log2).sum())
     if infinite:
         text += f" ∞ or 0: {plural(infinite, 'head')} with no mass on one side at any replan."

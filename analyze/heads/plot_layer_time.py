@@ -1,4 +1,4 @@
-"""`layer_time`: every layer over the course of the episodes, coloured around the uniform baseline."""
+"""`layer_time`: every layer over the course of the episodes, coloured by its lift over uniform attention."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ STEM = "layer_time"
 def plot_layer_time(replans: Tables, grouping: Grouping, folder: Path, seed: int = DEFAULT_SEED) -> list[Path]:
     """Draw from `aggregate.replan_tables`; returns the paths of png, pdf and csv.
 
-    With a ratio one map of its lift over the uniform ratio; else a map of fractions for each of the first groups. A dot: the 95 %
-    interval of the cell holds the uniform value.
+    With a ratio one map of its lift over the uniform ratio; else a map of fractions for each of the first groups. A
+    dot: the interval of the cell holds the uniform value.
     """
-    table = layer_time_table(replans, grouping, seed=seed)
+    table = layer_time_table(replans, grouping, seed=seed, level=DEFAULT_LEVEL)
     quantities = table["quantity"].unique(maintain_order=True).to_list()
     layers, bins = table["layer"].unique(maintain_order=True).to_list(), table["bin"].n_unique()
     figure = new_figure(max(6.4, 3.6 * len(quantities) + 1.0), max(2.7, 1.6 + map_height(len(layers), bins)))

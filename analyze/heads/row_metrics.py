@@ -14,7 +14,7 @@ from vla_attention.analyze.measures.frames import EPISODE_ID, Tables, denoise_ax
 from vla_attention.analyze.measures.masses import masses
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
-from vla_attention.analyze.measures.sinks import KeyShares, SinkRule, is_first, key_sums
+from vla_attention.analyze.measures.sinks import KeyShares, SinkRule, key_sums
 from vla_attention.analyze.measures.steps import with_valid
 from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.parallel import map_episodes
@@ -28,7 +28,7 @@ DEFAULT_TOP = (1, 5, 10)
 
 @dataclass(frozen=True)
 class RowOptions:
-    """What is measured on rows: the numbers k of keys in top-k masses, and the rule for sinks.
+    """How rows are measured: the numbers k of keys in top-k masses, and the rule for sinks.
 
     Raises `BadArgument` for a k below 1, or one that is named twice.
     """
@@ -46,12 +46,13 @@ class RowOptions:
 
 @dataclass(frozen=True)
 class RowMeasures:
-    """What one episode's rows give. Axes begin with (replan, layer, denoise, head).
+    """The measures of one episode's rows. Axes begin with (replan, layer, denoise, head).
 
     Attributes:
         entropy: nats, over the chosen groups and, last, over all valid keys: (..., group + 1) float32.
         top: share of the k largest keys: (..., k) float32.
-        mass: masses of all groups and, last, of all valid keys: (..., group + 1) float32, or None when they are not wanted.
+        mass: masses of all groups and, last, of all valid keys: (..., group + 1) float32, or None when they are not
+            wanted.
         shares: how much each key takes.
     """
 
@@ -68,10 +69,10 @@ def empty_measures(
     num_entropies: int,
     num_masses: int | None = None,
 ) -> list[RowMeasures]:
-    """Room for every episode's measures, to be filled by `measure_rows`: parts of a few large arrays.
+    """Arrays for every episode's measures, which `measure_rows` fills: parts of a few large arrays.
 
-    Allocated before anything is read: small results between the large passing arrays of the reading would leave the heap
-    full of holes, and the process twice as large.
+    They are allocated before anything is read. Small results between the large temporary arrays of reading would
+    fragment the heap, and the process would take twice the memory.
     """
     cells = (len(selection.layers), len(selection.denoise), len(selection.heads))
     ends = np.cumsum([item.tokens.num_replans for item in items])
@@ -102,11 +103,11 @@ def measure_rows(
         question: the site and the selection; heads are always kept apart.
         options: what is measured.
         shown: the groups inside which an entropy is wanted, over their valid keys.
-        out: takes the measures; masses if it has room for them.
+        out: is filled; with masses where it has an array for them.
     """
     valid, selection = item.valid, question.selection
     weights = with_valid(resolved.weights, valid)
-    # Keys that can never hold information are half of a usual site: without them everything takes half the time.
+    # Half of the keys of a usual site are never valid: without them the measures take half the time.
     used = np.flatnonzero(valid.any(axis=0))
     inside = valid[:, used]
     columns = [*(resolved.names.index(name) for name in shown), weights.shape[2] - 1]
@@ -118,7 +119,7 @@ def measure_rows(
         out.top[:, part.layer, part.denoise] = top_mass(rows, inside, options.top)
         if out.mass is not None:
             out.mass[:, part.layer, part.denoise] = masses(part.rows, weights)
-        if is_first(selection, part.layer):
+        if selection.is_first_of_block(part.layer):
             more, sums = key_sums(rows, inside, options.rule.factor)
             above, held, count = above + more, held + sums, count + rows.shape[0] * rows.shape[1]
     out.shares.above[used], out.shares.held[used] = above / count, held / count
@@ -134,10 +135,11 @@ def row_tables(
     """Every row (episode, replan, layer, denoise step, head).
 
     Returns:
-        cells: row (its number), suite, task_id, episode_index, replan, layer, block, denoise_step, head; `entropy` (nats) and
-            `effective_keys` (its exp) over the valid keys; `top{k}_mass`, the share of the valid keys' mass on the k largest.
-        groups: row, group, `entropy` and `effective_keys` inside each group, over its valid keys; null where it has no mass or no
-            such key. There are millions of them, so that they name their cell by its number alone.
+        cells: row (its number), suite, task_id, episode_index, replan, layer, block, denoise_step, head; `entropy`
+            (nats) and `effective_keys` (its exp) over the valid keys; `top{k}_mass`, the share of the valid keys' mass
+            on the k largest.
+        groups: row, group, `entropy` and `effective_keys` inside each group, over its valid keys; null where it has no
+            mass or no such key. There are millions of them: they name their cell by its number alone.
     """
     axes_of = replace(selection, per_head=True)
     cells = []
@@ -164,7 +166,8 @@ def episode_layer_means(rows: Tables, items: Sequence[SelectedEpisode]) -> Table
     """Means of `row_tables` (of these episodes) over replans, denoise steps and heads, float64.
 
     Returns:
-        cells: suite, task_id, episode_index, layer, block and the measures; groups: the same names, group, entropy, effective_keys.
+        cells: suite, task_id, episode_index, layer, block and the measures; groups: the same names, group, entropy,
+            effective_keys.
     """
     keys = (*EPISODE_ID, "layer", "block")
     names = rows.groups["group"].unique(maintain_order=True).cast(pl.String).to_list()
@@ -175,7 +178,7 @@ def episode_layer_means(rows: Tables, items: Sequence[SelectedEpisode]) -> Table
         measured = pl.col(pl.Float32).mean().cast(pl.Float64)
         return part.group_by(keys, maintain_order=True).agg(measured)
 
-    # A million rows grouped at once would take as much memory as all that came before.
+    # Grouping a million rows at once would double the memory of the process.
     for item in items:
         part = rows.cells.slice(start, item.tokens.num_replans * per_replan)
         cells.append(means(part))
@@ -192,7 +195,7 @@ def episode_layer_means(rows: Tables, items: Sequence[SelectedEpisode]) -> Table
 
 
 def groups_with_valid_keys(items: Sequence[SelectedEpisode], resolved: Sequence[ResolvedGrouping]) -> tuple[str, ...]:
-    """The groups that have a valid key anywhere: only inside these is there an entropy."""
+    """The groups that have a valid key in an episode; only these have an entropy."""
     having: set[int] = set()
     for item, groups in zip(items, resolved, strict=True):
         having |= set(np.flatnonzero(groups.weights.max(axis=0)[item.valid.any(axis=0)].any(axis=0)).tolist())

@@ -1,4 +1,4 @@
-"""What `vla-analyze heads` prints."""
+"""The text that `vla-analyze heads` prints."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vla_attention.analyze.heads.row_metrics import episode_layer_means
 from vla_attention.analyze.measures.aggregate import overall_rows
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
 from vla_attention.analyze.measures.sinks import SinkRule, merged_sinks
-from vla_attention.analyze.show.headings import WIDTH, heading, interval_note, wrap
+from vla_attention.analyze.show.headings import WIDTH, heading, interval_note, wrap, wrap_all
 from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent, format_percent_interval
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL, NO_LIMITS, POSITIVE
@@ -34,7 +34,7 @@ def heads_text(study: HeadStudy, top: int) -> str:
 
 
 def row_summary(study: HeadStudy) -> Tables:
-    """Every layer: means over episodes, with two-level intervals, of what `rows` holds."""
+    """Every layer: means over episodes of the columns of `rows`, with two-level intervals."""
     assert study.rows is not None
     episodes = episode_layer_means(study.rows, study.question.selected)
     order = study.tasks.cells.filter(pl.col("layer") != LAYERS_AVG)["layer_number"].unique().sort().to_list()
@@ -56,7 +56,7 @@ def _header(study: HeadStudy) -> str:
     question, chosen = study.question, study.question.selection
     layer = LAYERS_AVG if len(chosen.layer_labels) > 1 else str(chosen.layer_labels[0])
     lines = question.header("HEADS, LAYERS, DENOISE STEPS", layer)
-    told = [
+    about = [
         f"Layers {listing(chosen.layer_labels, 40)}; denoise steps {listing(chosen.denoise_steps, 40)}; heads "
         f"{listing(chosen.head_numbers, 40)}",
         f"Grouping '{question.grouping.name}'; {_measure_name(study.heads, question.grouping)}",
@@ -64,7 +64,7 @@ def _header(study: HeadStudy) -> str:
         *question.notes,
         interval_note(DEFAULT_LEVEL),
     ]
-    return "\n".join([*lines, *(part for line in told for part in wrap(line))])
+    return "\n".join([*lines, *wrap_all(about)])
 
 
 def _measure_name(heads: Tables, grouping: Grouping) -> str:
@@ -90,8 +90,8 @@ def _ranking(study: HeadStudy, top: int) -> str:
     if last.height:
         lines += ["", heading(least), _head_rows(last, study)]
     note = (
-        f"{ranked.height} heads. The ends of so many are extreme partly by chance: their intervals are those of heads chosen "
-        "beforehand."
+        f"{ranked.height} heads. The ends of so many are extreme partly by chance: their intervals are those of heads "
+        "chosen beforehand."
     )
     if grouping.ratio is not None:
         note = (
@@ -212,8 +212,8 @@ def _depth(study: HeadStudy) -> str:
     whole = every and first == 0 and last + 1 == study.question.stores[0].attributes.policy.num_layers
     over = "all" if whole else f"only {count} of {study.question.stores[0].attributes.policy.num_layers}"
     note = (
-        f"Mean block, weighted by a group's mass (or the norm of its contribution) at each, over {over} blocks, {first} to "
-        f"{last}; the same amount everywhere gives {format_number(table['even'][0])}."
+        f"Mean block, weighted by a group's mass (or the norm of its contribution) at each, over {over} blocks, "
+        f"{first} to {last}; the same amount everywhere gives {format_number(table['even'][0])}."
     )
     return "\n".join(
         [
@@ -257,9 +257,10 @@ def _rows_by_layer(study: HeadStudy) -> str:
         rows.append(cells)
     keys = [item.valid.sum(axis=1).mean() for item in study.question.selected]
     note = (
-        "Of single rows, renormalised over valid keys (masked and padded ones excluded), then averaged. entropy: nats. eff. keys: "
-        f"exp(entropy), the number of keys that sharing evenly would have it, of {format_number(sum(keys) / len(keys))}. top k: "
-        "share of the k largest keys. in GROUP: effective keys of the row cut down to the group."
+        "Of single rows, renormalised over valid keys (masked and padded ones excluded), then averaged. entropy: nats. "
+        "eff. keys: exp(entropy), the number of keys that sharing evenly would have it, of "
+        f"{format_number(sum(keys) / len(keys))}. top k: share of the k largest keys. in GROUP: effective keys of the "
+        "row cut down to the group."
     )
     return "\n".join([heading("ROWS  how spread out attention is"), text_table(header, rows), *wrap(note)])
 
@@ -301,9 +302,9 @@ def sinks_text(sinks: pl.DataFrame, key_shares: pl.DataFrame, rule: SinkRule) ->
     if merged.height > _MOST_SINKS:
         lines.append(f"{merged.height - _MOST_SINKS} more in sinks.parquet.")
     note = (
-        "Searched task by task. rows: share of the (replan, layer, denoise step, head) rows in which the key takes that much; mass: "
-        "mean share of the valid keys' mass. Numbers without these keys: vla-analyze ratios --without-sinks, with the same "
-        "--sink-factor and --sink-share."
+        "Searched task by task. rows: share of the (replan, layer, denoise step, head) rows in which the key takes "
+        "that much; mass: mean share of the valid keys' mass. Numbers without these keys: vla-analyze ratios "
+        "--without-sinks, with the same --sink-factor and --sink-share."
     )
     return "\n".join([*lines, *wrap(note)])
 

@@ -1,1 +1,1 @@
-"""From a question to tables: masses, aggregation over replans and episodes, contribution norms, sinks, maps of patches."""
+"""From a question to tables: masses, means over replans and episodes, contribution norms, sinks, maps of patches."""

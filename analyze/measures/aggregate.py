@@ -1,4 +1,4 @@
-"""From steps to replans, episodes and tasks. Every level is a pair of tables (`frames.Tables`): cells, and cells by group.
+"""From steps to replans, episodes and tasks. Every level is a pair of tables (`frames.Tables`): cells and groups.
 
     level      a row of `cells` is                                        made by
     steps      (episode, replan, layer, denoise step[, head])             `steps.step_tables`
@@ -6,8 +6,8 @@
     episodes   (episode, layer or "layers_avg")                           `episode_tables`
     tasks      (task, all tasks or all suites; layer or "layers_avg")     `task_tables`
 
-From replans on, `layer` is a string (the number that the user typed, or "layers_avg") and `layer_number` the number, null for
-the average. Ratios that are not finite are never dropped silently: every table has a column that counts them.
+From replans on, `layer` is a string (the number that the user typed, or "layers_avg") and `layer_number` the number,
+null for the average. Ratios that are not finite are never dropped silently: every table has a column that counts them.
 """
 
 from __future__ import annotations
@@ -67,17 +67,18 @@ def replans_of(question: Question) -> Tables:
 
 
 def replan_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Tables:
-    """Every (episode, replan, layer): masses averaged over denoise steps and heads, and what follows from these means.
+    """Every (episode, replan, layer): masses averaged over denoise steps and heads, then fractions, lifts and ratios.
 
-    In "layers_avg", as the published scripts define it, masses are means over the layers, fractions and lifts follow from these
-    means, and the ratio is the mean of the layers' finite ratios (null when none is finite; the published scripts write 0 there).
+    In "layers_avg", as the published scripts define it, masses are means over the layers, fractions and lifts follow
+    from these means, and the ratio is the mean of the layers' finite ratios (null when none is finite; the published
+    scripts write 0 there).
 
     Returns:
-        cells: `EPISODE_KEYS`, replan, env_step, layer, layer_number, block, row_sum, valid_mass, num_valid; with a ratio
-            numerator_mass, denominator_mass, uniform_ratio, ratio, nonfinite_layers (1 where the ratio is infinite or
-            undefined; in "layers_avg" the number of layers left out), ratio_lift, log2_ratio.
-        groups: suite, task_id, episode_index, replan, env_step, layer, layer_number, block, group, mass, fraction, keys, density,
-            lift.
+        cells: `EPISODE_KEYS`, replan, env_step, layer, layer_number, block, row_sum, valid_mass, num_valid; with a
+            ratio numerator_mass, denominator_mass, uniform_ratio, ratio, nonfinite_layers (1 where the ratio is
+            infinite or undefined; in "layers_avg" the number of layers left out), ratio_lift, log2_ratio.
+        groups: suite, task_id, episode_index, replan, env_step, layer, layer_number, block, group, mass, fraction,
+            keys, density, lift.
     """
     return concat_tables([_episode_replans(episode, grouping) for episode in measured])
 
@@ -127,8 +128,8 @@ def episode_tables(replans: Tables, grouping: Grouping) -> Tables:
             nonfinite_layers    sum over replans of the layers left out of "layers_avg"
             uniform_ratio       mean of the ratios that uniform attention would give
             ratio_lift          mean over replans of ratio / uniform_ratio, finite ones
-        groups: suite, task_id, episode_index, layer, layer_number, block, group; mass, mass_std, fraction, fraction_std, keys,
-            density (means over replans), lift (over replans where it is finite).
+        groups: suite, task_id, episode_index, layer, layer_number, block, group; mass, mass_std, fraction,
+            fraction_std, keys, density (means over replans), lift (over replans where it is finite).
     """
     columns = [pl.len().cast(pl.Int64).alias("num_replans"), pl.col("row_sum").mean(), pl.col("num_valid").mean()]
     if grouping.ratio:
@@ -176,16 +177,17 @@ def task_tables(
     """Every (task, layer) and, over tasks, cells with `task_id` null. Episodes are the unit and weigh the same.
 
     `scope` is "task", "all" (every task of one suite) or "combined" (every suite; only when there are several).
-    `X_low` and `X_high` bound the interval of X (see `statistics`): over episodes inside a task, two-level over tasks; null
-    with fewer than two episodes.
+    `X_low` and `X_high` bound the interval of X (see `statistics`): over episodes inside a task, two-level over tasks;
+    null with fewer than two episodes.
 
     Returns:
-        cells: scope, suite, task_id, instruction, layer, layer_number, block, num_tasks, num_episodes, num_replans, success_rate;
-            with a ratio ratio_std, ratio_median, ratio_min, ratio_max (over the episodes' mean ratios), episodes_without_ratio
-            (episodes without a single finite ratio), num_nonfinite, geometric_left_out, nonfinite_layers (sums), numerator_mass,
-            denominator_mass, uniform_ratio (means), and with bounds ratio_mean, ratio_of_means, geometric_mean, ratio_lift.
-        groups: scope, suite, task_id, instruction, layer, layer_number, block, group; mass, keys, density, lift (means);
-            fraction, fraction_low, fraction_high.
+        cells: scope, suite, task_id, instruction, layer, layer_number, block, num_tasks, num_episodes, num_replans,
+            success_rate; with a ratio ratio_std, ratio_median, ratio_min, ratio_max (over the episodes' mean ratios),
+            episodes_without_ratio (episodes without a single finite ratio), num_nonfinite, geometric_left_out,
+            nonfinite_layers (sums), numerator_mass, denominator_mass, uniform_ratio (means), and with bounds
+            ratio_mean, ratio_of_means, geometric_mean, ratio_lift.
+        groups: scope, suite, task_id, instruction, layer, layer_number, block, group; mass, keys, density, lift
+            (means); fraction, fraction_low, fraction_high.
     """
     # NaN instead of null, once: there can be thousands of (task, layer) pairs, and numpy has no null.
     cells = _sorted(episodes.cells).with_columns(pl.col(pl.Float64).fill_null(float("nan")))
@@ -315,7 +317,7 @@ _GROUP_SCHEMA: dict[str, type[pl.DataType]] = {
 
 
 def _cell_schema(grouping: Grouping) -> dict[str, type[pl.DataType]]:
-    """Columns of the cells and their types: a column may hold nothing but null."""
+    """Columns of the cells and their types, which cannot be taken from a column that is null throughout."""
     counts = dict.fromkeys(("num_tasks", "num_episodes", "num_replans"), pl.Int64)
     schema: dict[str, type[pl.DataType]] = {**_NAMES, **counts, "success_rate": pl.Float64}
     if grouping.ratio:
@@ -349,5 +351,5 @@ def _finite(column: str) -> pl.Expr:
 
 
 def _sorted(table: pl.DataFrame) -> pl.DataFrame:
-    """In the order of identity, so that nothing downstream depends on the order in which episodes were read."""
+    """Sorted by episode and layer: results do not depend on the order in which episodes were read."""
     return table.sort(*EPISODE_ID, "layer_number", nulls_last=True, maintain_order=True)

@@ -1,7 +1,7 @@
-"""From arrays of one episode to rows of a table. Every table of `analyze` that comes from arrays is made here.
+"""Arrays of one episode as rows of a table. Every table of `analyze` that comes from arrays is made here.
 
-Tables are tidy: one row per cell (replan, layer, ...), or per cell and group, with measures as columns. NaN (undefined) is null in
-a table; infinite ratios stay infinite.
+Tables are tidy: one row per cell (replan, layer, ...), or per cell and group, with measures as columns. NaN (undefined)
+is null in a table; infinite ratios stay infinite.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ def long_table(
         keys: which columns describe the episode, of `EPISODE_KEYS`.
 
     Returns:
-        The columns `keys`, the labels of the axes, then `values`. Labels are Int64, Float64, Boolean or String; None is null.
+        The columns `keys`, the labels of the axes, then `values`. Labels are Int64, Float64, Boolean or String; None is
+        null.
     """
     shape = tuple(len(next(iter(axis.values()))) for axis in axes)
     height = int(np.prod(shape))
@@ -65,7 +66,7 @@ def _constant(name: str, item: SelectedEpisode, height: int) -> pl.Series:
 
 
 def _labels(name: str, labels: Sequence[Any] | NDArray[Any] | pl.Series) -> pl.Series:
-    if isinstance(labels, pl.Series):  # labels that may all be null have a type of their own
+    if isinstance(labels, pl.Series):  # a Series keeps its type where all labels are null
         return labels
     given = labels.tolist() if isinstance(labels, np.ndarray) else list(labels)
     known = next((label for label in given if label is not None), 0)
@@ -135,7 +136,7 @@ class LayerAxis:
         """The layers of a selection. `average_one`: append the average also where there is a single layer."""
         labels = tuple(str(label) for label in selection.layer_labels)
         numbers, blocks = tuple(selection.layer_labels), tuple(selection.blocks)
-        once = tuple(i for i, block in enumerate(blocks) if blocks.index(block) == i)
+        once = tuple(i for i in range(len(blocks)) if selection.is_first_of_block(i))
         if len(labels) == 1 and not average_one:
             return cls(labels, numbers, blocks, once)
         return cls((*labels, LAYERS_AVG), (*numbers, None), (*blocks, None), once)
@@ -163,8 +164,9 @@ class Tables:
 
     Attributes:
         cells: one row per cell, with the measures of the whole row and of the ratio.
-        groups: one row per cell and group: cells in the same order as in `cells`, groups in that of the grouping; column `group`.
-            Of steps and replans it is made at every access, and not kept: it is several times as large as the masses.
+        groups: one row per cell and group: cells in the same order as in `cells`, groups in that of the grouping;
+            column `group`. Of steps and replans it is made at every access, and not kept: it is several times as large
+            as the masses.
     """
 
     def __init__(
@@ -179,7 +181,7 @@ class Tables:
 
     @property
     def parts(self) -> Sequence[Tables]:
-        """The same rows in parts of whole episodes, whose `groups` can be aggregated one after the other to save memory."""
+        """The same rows in parts of whole episodes; aggregating `groups` part by part saves memory."""
         return self._parts or (self,)
 
     @property
@@ -209,7 +211,7 @@ class Tables:
         return self.groups_with("mass")
 
     def groups_with_keys(self) -> tuple[str, ...]:
-        """The groups that have a key in a cell, or of which the number of keys is unknown, in the order of the grouping."""
+        """The groups that have a key in a cell or an unknown number of keys, in the order of the grouping."""
         unknown = self.groups.filter(pl.col("keys").is_null())["group"].unique()
         having = {*self.groups_with("keys"), *unknown}
         return tuple(name for name in self.groups["group"].unique(maintain_order=True) if name in having)
@@ -220,7 +222,7 @@ class Tables:
         return tuple(name for name in self.parts[0].groups["group"].unique(maintain_order=True) if name in having)
 
     def by_group(self, *by: str) -> dict[tuple[Any, ...], dict[str, Any]]:
-        """Rows of `groups` by the values of the columns `by` and the group, as in `tables.by_group("layer")[layer, name]`."""
+        """Rows of `groups` by the columns `by` and the group, as in `tables.by_group("layer")[layer, name]`."""
         return {(*(row[name] for name in by), row["group"]): row for row in self.groups.iter_rows(named=True)}
 
 

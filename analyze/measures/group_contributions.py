@@ -1,7 +1,8 @@
-"""What the keys of each group of a grouping add to the residual stream at one site, from stored Gram matrices.
+"""Norms of the contribution of each group of a grouping to the residual stream at one site, from stored Gram matrices.
 
-The matrices are of whole segments (a span's keys of one role), because contributions add up as vectors and not as lengths: the
-norm of a union of segments is sqrt(wᵀ G w). A group that takes part of a segment only (a word, a patch, an object) has none.
+The matrices are of whole segments (a span's keys of one role). Contributions add up as vectors and not as lengths: the
+norm of a union of segments is sqrt(wᵀ G w). A group that takes only a part of a segment (a word, a patch, an object)
+has no norm.
 """
 
 from __future__ import annotations
@@ -35,10 +36,10 @@ from vla_attention.schemas.segments import segment_members, weights_on_segments
 
 
 def whole_segments(item: SelectedEpisode, resolved: ResolvedGrouping, site: str) -> dict[str, NDArray[np.bool_]]:
-    """By group, which parts of the Gram matrix are its own, (part,) bool; groups that cut a segment are left out.
+    """The parts of the Gram matrix that each group takes, (part,) bool; groups that cut a segment are left out.
 
-    A group must take a segment whole or not at all, and the same ones at every replan that has the segment. The matrix's last
-    part is the block's whole update, and belongs to no group.
+    A group must take a segment whole or not at all, and the same ones at every replan that has the segment. The
+    matrix's last part is the block's whole update, and belongs to no group.
     """
     tokens, segments = item.tokens, item.episode.attributes.segments[site]
     members = segment_members(tokens.layout, tokens.static_roles, segments)
@@ -55,14 +56,14 @@ def whole_segments(item: SelectedEpisode, resolved: ResolvedGrouping, site: str)
 
 
 def group_contribution_tables(question: Question, resolved: Sequence[ResolvedGrouping]) -> Tables | None:
-    """Norms for every (episode, replan, layer, denoise step), or None when nothing was recorded or every group cuts a segment.
+    """Norms for every (episode, replan, layer, denoise step); None without records or where every group cuts a segment.
 
     Norms are root mean squares over the action queries.
 
     Returns:
-        cells: suite, task_id, episode_index, replan, env_step, layer, block, denoise_step; when the grouping has a ratio of groups
-            that can be measured, numerator_norm, denominator_norm (of the vector sum of a side's groups) and contribution_ratio,
-            their quotient.
+        cells: suite, task_id, episode_index, replan, env_step, layer, block, denoise_step; when the grouping has a
+            ratio of groups that can be measured, numerator_norm, denominator_norm (of the vector sum of a side's
+            groups) and contribution_ratio, their quotient.
         groups: the same names, group, norm; of every group that is made of whole segments in all episodes.
     """
     if not all(store.attributes.recording.contributions for store in question.stores):

@@ -36,7 +36,7 @@ def weighted_sums(values: NDArray[np.float32], weights: NDArray[np.float32]) -> 
 
 @dataclass(frozen=True)
 class GroupMeasures:
-    """What is said about every group, each of shape (replan, ..., group)."""
+    """The measures of every group, each of shape (replan, ..., group)."""
 
     mass: NDArray[np.float64]
     fraction: NDArray[np.float64]
@@ -58,8 +58,8 @@ def group_measures(
     """Fractions, densities and lifts of masses.
 
     fraction = mass / sum of the masses of all groups; density = mass / number of keys;
-    lift = density / (mass of all valid keys / their number), so that attention that is uniform over the valid keys gives 1. Keys of
-    a null sink (Cosmos's padded text) are not valid, and what they take is no part of the comparison.
+    lift = density / (mass of all valid keys / their number), so that attention that is uniform over the valid keys
+    gives 1. Keys of a null sink (Cosmos's padded text) are not valid: their mass is not in the mass of all valid keys.
 
     Args:
         mass: (replan, ..., group).

@@ -12,7 +12,7 @@ from vla_attention.schemas.layout import Role
 
 
 def seen_cameras(item: SelectedEpisode) -> tuple[str, ...]:
-    """Cameras of the site that show the policy something (their patches are not masked), in key order."""
+    """Cameras of the site whose patches are not all masked, in key order."""
     layout, roles = item.tokens.layout, item.tokens.static_roles
     spans = [(camera, layout.camera_span(camera)) for camera in layout.cameras]
     return tuple(
@@ -29,6 +29,6 @@ def mean_rows(item: SelectedEpisode, selection: Selection, site: str) -> NDArray
     """
     total, count = 0.0, 0
     for part in layer_rows(item.episode, selection, site):
-        if selection.blocks.index(selection.blocks[part.layer]) == part.layer:
+        if selection.is_first_of_block(part.layer):
             total, count = total + part.rows.mean(axis=1, dtype=np.float64), count + 1
     return np.asarray(total) / count

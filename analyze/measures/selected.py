@@ -19,7 +19,8 @@ from vla_attention.schemas.stores.reader import Store, StoredEpisode
 class SelectedEpisode:
     """An episode together with its store and its tokens.
 
-    `without`: keys that are taken out of every group and of the valid keys (sinks; see `vla_attention.analyze.measures.sinks`).
+    `without`: keys that are taken out of every group and of the valid keys (sinks; see
+    `vla_attention.analyze.measures.sinks`).
     """
 
     store: Store
@@ -36,7 +37,7 @@ class SelectedEpisode:
 
 
 def load_tokens(chosen: Sequence[tuple[Store, StoredEpisode]], site: str) -> list[SelectedEpisode]:
-    """Read the small part of every episode: what its keys are."""
+    """Read the tokens of every episode; reads no rows."""
     return [SelectedEpisode(store, episode, episode.tokens(store.attributes, site)) for store, episode in chosen]
 
 
@@ -78,7 +79,7 @@ def resolve_all(
 ) -> list[ResolvedGrouping]:
     """Resolve a grouping on every episode, with the checks that need all of them.
 
-    `vocabulary` is what `vocabulary_of` says of the episodes, where that is known already.
+    `vocabulary`: that of the episodes; collected from them unless it is given.
 
     Raises:
         SelectorError: a name exists in no selected episode.

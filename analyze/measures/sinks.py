@@ -1,16 +1,15 @@
 """Sinks: keys that take far more than their share in most rows, and masses without them.
 
-The rule. In a row whose n valid keys hold the mass S, a key's uniform share is S / n. A key is a sink of a task when it takes more
-than `factor` times that share in at least the share `share` of the task's rows (every selected replan, layer, denoise step and head;
-the mean over the task's episodes, which weigh the same). It is the metric of Gu et al. (2024), "When Attention Sink Emerges in
-Language Models", section 3: the share of heads in which a key's attention exceeds a threshold. Their threshold of 0.3 is
-taken relative to the uniform share here, because a row may have thirty keys or a thousand. That such keys are wells for
-attention that has nowhere else to go, rather than something that is read, was observed by Xiao et al. (2023), "Efficient
-Streaming Language Models with Attention Sinks".
+The rule. In a row whose n valid keys hold the mass S, the uniform share of a key is S / n. A key is a sink of a task
+when it takes more than `factor` times that share in at least the share `share` of the task's rows (every selected
+replan, layer, denoise step and head; the mean over the task's episodes, which weigh the same). It is the metric of Gu
+et al. (2024), "When Attention Sink Emerges in Language Models", section 3: the share of heads in which a key's
+attention exceeds a threshold. Their threshold is 0.3; here it is relative to the uniform share, because a row may have
+thirty keys or a thousand. Xiao et al. (2023), "Efficient Streaming Language Models with Attention Sinks", found that
+such keys get attention that no other key needs, whatever they hold.
 
-Why a task: what stands at a position of the text depends on the instruction and its length, and the scene on the task; within a
-task both stay. The rule cannot tell a well from something that deserves to be looked at in most rows. Look at what is listed before
-you believe a corrected number.
+Sinks are found per task, because the text depends on the instruction and the scene on the task. The rule cannot tell a
+sink from a key that deserves attention in most rows: look at the listed keys before you use a corrected number.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from vla_attention.schemas.layout import Role
 
 DEFAULT_FACTOR = 10.0
 DEFAULT_SHARE = 0.5
-#: What is above a limit by less than this, relative to it, is above it by rounding only.
+#: A value that exceeds a limit by less than this share of it may exceed it by rounding only.
 _ROUNDING = 5e-6
 
 
@@ -49,7 +48,7 @@ class SinkRule:
     share: float = DEFAULT_SHARE
 
     def __post_init__(self) -> None:
-        """Check that the rule can single anything out."""
+        """Check factor and share."""
         if not 1.0 <= self.factor < np.inf:
             raise BadArgument(
                 f"The sink factor {self.factor:g} must be at least 1: at 1 a key takes its uniform share."
@@ -63,7 +62,7 @@ class SinkRule:
 
 @dataclass(frozen=True)
 class KeyShares:
-    """Of one episode: how much each key takes, and how often it takes far too much.
+    """How much each key of an episode takes, and in how many rows it takes more than the factor allows.
 
     Attributes:
         above: share of the rows in which the key takes more than the factor, shape (key,).
@@ -77,7 +76,7 @@ class KeyShares:
 def key_sums(
     rows: NDArray[np.float32], valid: NDArray[np.bool_], factor: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """In how many rows each key takes more than factor / n of the mass of the n valid keys, and its summed share of it.
+    """Number of rows in which a key takes more than factor / n of the mass of the n valid keys, and its summed share.
 
     Args:
         rows: probabilities (replan, head, key).
@@ -92,7 +91,7 @@ def key_sums(
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.where(total > 0, 1.0 / total, 0.0).astype(np.float32)
         limit = np.where(total > 0, factor * total / valid.sum(axis=1)[:, None], np.inf)
-    # Sums in float32 err by some 1e-6: with a factor of 1, keys that share evenly must not be above their share.
+    # Sums in float32 err by some 1e-6: with a factor of 1, keys that share evenly must not exceed their share.
     limit = (limit * (1.0 + _ROUNDING)).astype(np.float32)
     above = (seen > limit[:, :, None]).sum(axis=(0, 1))
     held = inverse.reshape(1, -1) @ seen.reshape(-1, seen.shape[2])
@@ -104,23 +103,18 @@ def episode_key_shares(item: SelectedEpisode, selection: Selection, site: str, r
     valid = item.valid
     above, held, count = np.zeros(valid.shape[1], np.int64), np.zeros(valid.shape[1]), 0
     for part in layer_rows(item.episode, selection, site):
-        if is_first(selection, part.layer):
+        if selection.is_first_of_block(part.layer):
             more, mass = key_sums(part.rows, valid, rule.factor)
             above, held, count = above + more, held + mass, count + part.rows.shape[0] * part.rows.shape[1]
     return KeyShares(above / count, held / count)
 
 
-def is_first(selection: Selection, layer: int) -> bool:
-    """Whether this position of the selection's layers is the first that names its block."""
-    return selection.blocks.index(selection.blocks[layer]) == layer
-
-
 def key_shares_table(question: Question, shares: Sequence[KeyShares]) -> pl.DataFrame:
     """One row per (task, key that is valid in one of its episodes), episodes weighing the same.
 
-    Columns: suite, task_id, num_episodes; key, span, role (the commonest over the replans at which the key is valid), patch_row,
-    patch_column (null unless the key is a patch), description (in words); share_of_rows, mean_mass (share of the valid keys'
-    mass), times_uniform (mean_mass x mean number of valid keys).
+    Columns: suite, task_id, num_episodes; key, span, role (the commonest over the replans at which the key is valid),
+    patch_row, patch_column (null unless the key is a patch), description (in words); share_of_rows, mean_mass (share of
+    the valid keys' mass), times_uniform (mean_mass x mean number of valid keys).
     """
     frames = []
     for (suite, task), positions in _tasks(question).items():
@@ -130,9 +124,9 @@ def key_shares_table(question: Question, shares: Sequence[KeyShares]) -> pl.Data
         valid = [item.valid for item in items]
         num_valid = np.mean([part.sum(axis=1).mean() for part in valid])
         keys = np.flatnonzero(np.any([part.any(axis=0) for part in valid], axis=0))
-        told = pl.DataFrame([_told(int(key), items, valid) for key in keys], schema=_TOLD, orient="row")
+        described = pl.DataFrame([_describe(int(key), items, valid) for key in keys], schema=_DESCRIPTION, orient="row")
         frames.append(
-            told.select(
+            described.select(
                 pl.lit(suite).alias("suite"),
                 pl.lit(task, dtype=pl.Int64).alias("task_id"),
                 pl.lit(len(items), dtype=pl.Int64).alias("num_episodes"),
@@ -147,7 +141,7 @@ def key_shares_table(question: Question, shares: Sequence[KeyShares]) -> pl.Data
 
 def sinks_of(key_shares: pl.DataFrame, rule: SinkRule) -> pl.DataFrame:
     """The rows of `key_shares_table` that are sinks, the strongest of each task first."""
-    # A hair of tolerance: a share is a mean of quotients, and 0.5 must not miss one half.
+    # A share is a mean of quotients: rounding must not put one half below 0.5.
     found = key_shares.filter(pl.col("share_of_rows") >= rule.share - 1e-9)
     return found.sort("suite", "task_id", "mean_mass", "key", descending=[False, False, True, False])
 
@@ -167,9 +161,9 @@ def sinks_table(question: Question, rule: SinkRule | None = None) -> pl.DataFram
 def without_sinks(question: Question, sinks: pl.DataFrame, rule: SinkRule) -> Question:
     """The same question with every task's sinks taken out of all groups and of the valid keys.
 
-    Masses, fractions, lifts, ratios and uniform baselines then all are those of the remaining keys. The grouping is called
-    NAME-without-sinks, so that its results are not taken for those with all keys, and a note says what was taken out.
-    Norms of contributions cannot be corrected: their Gram matrices are of whole segments.
+    Masses, fractions, lifts, ratios and uniform baselines then all are those of the remaining keys. The grouping is
+    called NAME-without-sinks, so that its results are not taken for those with all keys, and a note says what was taken
+    out. Norms of contributions cannot be corrected: their Gram matrices are of whole segments.
     """
     keys: dict[tuple[str, int], tuple[int, ...]] = {}
     for suite, task, key in sinks.select("suite", "task_id", "key").iter_rows():
@@ -194,7 +188,7 @@ def merged_sinks(sinks: pl.DataFrame) -> pl.DataFrame:
 
 
 def describe_sinks(sinks: pl.DataFrame, num_tasks: int, rule: SinkRule) -> str:
-    """What was taken out, in a sentence for a summary."""
+    """The keys that were taken out, as a sentence for a summary."""
     if sinks.is_empty():
         return f"Without sinks: no key takes {rule}, so nothing was taken out."
     of = f"of {num_tasks} tasks" if num_tasks > 1 else "of the one task"
@@ -203,12 +197,13 @@ def describe_sinks(sinks: pl.DataFrame, num_tasks: int, rule: SinkRule) -> str:
         for row in merged_sinks(sinks).iter_rows(named=True)
     ]
     return (
-        f"Without sinks, keys that take {rule}: {listing(named, 6)} {'is' if len(named) == 1 else 'are'} out of every group and "
-        "of the valid keys (but not of norms of contributions)."
+        f"Without sinks, keys that take {rule}: {listing(named, 6)} {'is' if len(named) == 1 else 'are'} out of every "
+        "group and of the valid keys (but not of norms of contributions)."
     )
 
 
-_TOLD = {
+#: Columns that describe a key.
+_DESCRIPTION = {
     "key": pl.Int64,
     "span": pl.String,
     "role": pl.String,
@@ -218,12 +213,13 @@ _TOLD = {
 }
 
 
-def _told(
+def _describe(
     key: int, items: Sequence[SelectedEpisode], valid: Sequence[NDArray[np.bool_]]
 ) -> tuple[int, str, str, int | None, int | None, str]:
-    """What a key is in a task's episodes, in the columns of `_TOLD`; `valid`: each episode's valid keys (replan or 1, key).
+    """The columns `_DESCRIPTION` of a key in a task's episodes; `valid`: each episode's valid keys (replan or 1, key).
 
-    Prompts differ in length: what is a state digit here is padding there. The key is what it is where it can hold information.
+    Prompts differ in length: a key may be a state digit at one replan and padding at another. Its role is the commonest
+    over the replans at which it is valid.
     """
     roles = [item.tokens.static_roles[part[:, key], key] for item, part in zip(items, valid, strict=True)]
     role = Role(int(np.bincount(np.concatenate(roles)).argmax())).label

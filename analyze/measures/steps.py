@@ -1,4 +1,4 @@
-"""Masses of every selected episode, as arrays, and the tables of steps: one row per replan, layer, denoise step (and head)."""
+"""Masses of every selected episode as arrays, and as tables: a row per replan, layer, denoise step (and head)."""
 
 from __future__ import annotations
 
@@ -39,11 +39,12 @@ from vla_attention.schemas.segments import segment_members, weights_on_segments
 
 @dataclass(frozen=True)
 class MeasuredEpisode:
-    """What the groups of a grouping get in one episode. All further numbers follow from these arrays.
+    """The masses of a grouping's groups in one episode. All further numbers follow from these arrays.
 
     Attributes:
         item: the episode.
-        selection: which layers, denoise steps and heads the axes hold; with `per_head` false the axis of heads has length 1.
+        selection: which layers, denoise steps and heads the axes hold; with `per_head` false the axis of heads has
+            length 1.
         mass: (replan, layer, denoise, head, group), mean over the stored queries.
         valid_mass: (replan, layer, denoise, head), mass of all valid keys.
         row_sum: (replan, layer, denoise, head), sums of the rows before storage rounded them.
@@ -86,7 +87,7 @@ def measure_episode(
 ) -> MeasuredEpisode:
     """Masses of one episode.
 
-    Takes the stored segment masses when the grouping does not cut through a segment, and reads rows otherwise.
+    Uses the stored segment masses when no group cuts a segment, and reads rows otherwise.
     """
     row_sum = row_sums(item, selection, site)
     weights = with_valid(resolved.weights, item.valid)
@@ -109,7 +110,7 @@ def measured_from(
     mass: NDArray[np.float64],
     row_sum: NDArray[np.float64],
 ) -> MeasuredEpisode:
-    """A `MeasuredEpisode` from masses (replan, layer, denoise, head, group + 1), the last one that of all valid keys."""
+    """A `MeasuredEpisode` from masses (replan, layer, denoise, head, group + 1); the last mass is of all valid keys."""
     return MeasuredEpisode(
         item, selection, mass[..., :-1], mass[..., -1], row_sum, resolved.num_keys, resolved.num_valid
     )
@@ -125,9 +126,9 @@ def measure_episodes(
 
     Args:
         question: stores, selection and grouping.
-        resolved: the grouping on every episode, where it is known already.
+        resolved: the grouping on every episode; resolved here unless it is given.
         progress: called with 1 after each episode.
-        per_head: keep heads apart; as the question says unless given.
+        per_head: keep heads apart; as in the question unless it is given.
     """
     known = resolved or resolve_all(question.grouping, question.selected, question.vocabulary)
     selection = question.selection if per_head is None else replace(question.selection, per_head=per_head)
@@ -146,11 +147,11 @@ def step_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Tabl
     """Every (episode, replan, layer, denoise step[, head]).
 
     Returns:
-        cells: `EPISODE_KEYS`, replan, env_step, layer, block, denoise_step, denoise_time, head (null where heads were averaged),
-            row_sum, valid_mass, num_valid; with a ratio numerator_mass, denominator_mass, ratio, uniform_ratio, ratio_lift (ratio /
-            uniform_ratio), log2_ratio.
-        groups: suite, task_id, episode_index, replan, layer, block, denoise_step, head, group, mass, fraction, keys, density,
-            lift (see `masses.group_measures`).
+        cells: `EPISODE_KEYS`, replan, env_step, layer, block, denoise_step, denoise_time, head (null where heads were
+            averaged), row_sum, valid_mass, num_valid; with a ratio numerator_mass, denominator_mass, ratio,
+            uniform_ratio, ratio_lift (ratio / uniform_ratio), log2_ratio.
+        groups: suite, task_id, episode_index, replan, layer, block, denoise_step, head, group, mass, fraction, keys,
+            density, lift (see `masses.group_measures`).
     """
     return concat_tables([_episode_steps(episode, grouping) for episode in measured])
 
@@ -192,7 +193,7 @@ def row_sums(item: SelectedEpisode, selection: Selection, site: str) -> NDArray[
 
 
 def segment_weights(item: SelectedEpisode, weights: NDArray[np.float32], site: str) -> NDArray[np.float32] | None:
-    """Weights (replan or 1, key, group) on the stored segments (replan or 1, segment, group); None where a group cuts one."""
+    """Weights (replan or 1, key, group) as weights (replan or 1, segment, group); None where a group cuts a segment."""
     tokens, segments = item.tokens, item.episode.attributes.segments[site]
     return weights_on_segments(weights, segment_members(tokens.layout, tokens.static_roles, segments))
 

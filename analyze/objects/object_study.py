@@ -11,8 +11,8 @@ import polars as pl
 from vla_attention.analyze.measures.aggregate import overall_layer
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.question import Question, ask
-from vla_attention.analyze.measures.selected import SelectedEpisode, find_episode
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.measures.selected import SelectedEpisode, find_episode
 from vla_attention.analyze.objects.object_attention import ObjectTables, object_tables
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_views import ALL_CAMERAS, CLASSES, site_of_pictures

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import polars as pl
 
 from vla_attention.analyze.measures.question import Question, ask
-from vla_attention.analyze.measures.selected import find_episode
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.measures.selected import find_episode
 from vla_attention.analyze.overlay.overlay_data import (
     EpisodeOverlay,
     camera_names,

@@ -24,8 +24,8 @@ from vla_attention.analyze.overlay.overlay_data import (
 )
 from vla_attention.analyze.report.pictures import photograph, png_address
 from vla_attention.analyze.report.ratio_curve import RatioCurve, ratio_curve
-from vla_attention.analyze.report.section_parts import Paragraph, Section
 from vla_attention.analyze.report.report_settings import ReportSettings
+from vla_attention.analyze.report.section_parts import Paragraph, Section
 from vla_attention.analyze.show.numbers import format_number, format_percent
 from vla_attention.analyze.show.patch_pictures import upright
 from vla_attention.analyze.show.progress import progress_bar

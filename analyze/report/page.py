@@ -20,9 +20,9 @@ from vla_attention.analyze.report.methods import method_section
 from vla_attention.analyze.report.overlay_section import overlay_section
 from vla_attention.analyze.report.question_sections import object_section, sink_section, time_section, word_section
 from vla_attention.analyze.report.ratio_sections import contribution_section, layer_section, task_section
+from vla_attention.analyze.report.report_settings import ReportSettings
 from vla_attention.analyze.report.run_section import run_section
 from vla_attention.analyze.report.section_parts import Section
-from vla_attention.analyze.report.report_settings import ReportSettings
 from vla_attention.analyze.show.numbers import of_tasks
 from vla_attention.analyze.show.output_files import write_text, writing
 from vla_attention.analyze.show.progress import progress_bar

@@ -31,6 +31,10 @@ class Selection:
     per_head: bool
     note: str | None = None
 
+    def is_first_of_block(self, layer: int) -> bool:
+        """Whether the layer at this position is the first that names its block. Sums and means count a block once."""
+        return self.blocks.index(self.blocks[layer]) == layer
+
 
 def select(
     root: RootAttributes,

@@ -18,6 +18,7 @@ from tests.kit.raw_rows import FEW, leaky, raw_episodes, weights_of
 from vla_attention.analyze.heads.head_measures import ranked_heads
 from vla_attention.analyze.heads.head_study import HeadStudy, study_heads
 from vla_attention.analyze.heads.row_metrics import RowOptions
+from vla_attention.analyze.measures.frames import Tables
 from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.testing.stores import StoreSpec, write_store
@@ -246,6 +247,13 @@ def test_without_a_ratio_heads_are_ranked_by_the_first_group_that_has_mass(tmp_p
     assert shares == sorted(shares, reverse=True)
     assert "log2_ratio" not in study.heads.cells.columns
     assert "log2_ratio_std" not in study.dispersion.columns
+
+
+def test_without_a_ratio_heads_without_a_fraction_are_last():
+    cells = pl.DataFrame({"layer": [0, 0, 0], "block": [0, 0, 0], "head": [0, 1, 2]})
+    groups = cells.with_columns(pl.lit("words").alias("group"), pl.Series("fraction", [None, 0.25, 0.5]))
+    ranked = ranked_heads(Tables(cells, groups), Grouping("bare", {"words": ("*",)}))
+    assert ranked["head"].to_list() == [2, 1, 0]
 
 
 def test_intervals_of_heads_hold_what_was_planted_and_not_the_uniform_value(tmp_path):
