@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.aggregate import overall_layer, replans_of
 from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, Tables, float_values
-from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.statistics.bootstrap import (
@@ -28,6 +27,7 @@ from vla_attention.analyze.statistics.bootstrap import (
     geometric_mean_over_episodes,
     mean_over_episodes,
     resample_episodes,
+    summarize,
 )
 from vla_attention.analyze.statistics.effect_sizes import contrast, contrast_row
 from vla_attention.analyze.time.alignment import (
@@ -281,7 +281,7 @@ def _outcomes_table(episodes: Sequence[_Episode], quantities: Sequence[str], see
     """Success against failure on the episodes' means over replans: log2 of the ratio, and fractions."""
     resamples = _resamples(episodes, seed)
     solved = np.array([episode.success for episode in episodes])
-    means = np.stack([finite_mean(episode.values) for episode in episodes])
+    means = np.array([[summarize(column).mean for column in episode.values.T] for episode in episodes], np.float64)
     rows = []
     for i, quantity in enumerate(quantities):
         values = means[:, i] / np.log(2.0) if quantity == RATIO else means[:, i]

@@ -293,7 +293,7 @@ def test_the_summary_without_sinks_names_the_keys_and_takes_a_folder_of_its_own(
     assert main([str(sunken), "--without-sinks", "--sink-factor", "1000", "--no-plots"]) == 0
     assert "nothing was taken out" in " ".join(capsys.readouterr().out.split())
     assert main([str(sunken), "--sink-factor", "5", "--no-plots"]) == 2
-    assert "give that too" in capsys.readouterr().err
+    assert "give --without-sinks too" in capsys.readouterr().err
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
