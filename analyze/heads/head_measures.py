@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.frames import EPISODE_ID, Tables, head_axis, layer_axis, long_table
+from vla_attention.analyze.measures.frames import EPISODE_ID, Tables, float_values, head_axis, layer_axis, long_table
 from vla_attention.analyze.measures.masses import finite_mean, group_measures, ratio, sides, uniform_ratio
 from vla_attention.analyze.measures.steps import MeasuredEpisode
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_SEED, NO_LIMITS, POSITIVE, SHARE
@@ -120,7 +120,7 @@ def dispersion_table(episodes: Tables, grouping: Grouping, seed: int = DEFAULT_S
     for key, part in cells.group_by(by, maintain_order=True):
         row = dict(zip(by, key, strict=True)) | {"num_heads": part.height}
         for name, column in measured.items():
-            std, cv = dispersion(part[column].fill_null(float("nan")).to_numpy())
+            std, cv = dispersion(float_values(part[column]))
             row |= {f"{name}_std": float(std), f"{name}_cv": float(cv)}
         rows.append(row)
     table = pl.DataFrame(rows).sort(*EPISODE_ID, maintain_order=True)

@@ -9,7 +9,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.heads.head_measures import main_group
-from vla_attention.analyze.measures.frames import Tables
+from vla_attention.analyze.measures.frames import Tables, float_values
 from vla_attention.analyze.show.numbers import format_percent, interval_name, of_tasks, plural
 from vla_attention.analyze.show.plot_heat_map import draw_log2_map, label_axis, map_height
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
@@ -71,7 +71,7 @@ def _name(grouping: Grouping, heads: Tables) -> str:
 
 
 def _grid(heads: pl.DataFrame, column: str, num_layers: int) -> NDArray[np.float64]:
-    return heads[column].cast(pl.Float64).fill_null(float("nan")).to_numpy().reshape(num_layers, -1)
+    return float_values(heads[column]).reshape(num_layers, -1)
 
 
 def _with_limits(heads: pl.DataFrame, log2: NDArray[np.float64]) -> NDArray[np.float64]:

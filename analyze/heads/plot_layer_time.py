@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from vla_attention.analyze.heads.layer_time import layer_time_table
-from vla_attention.analyze.measures.frames import Tables
+from vla_attention.analyze.measures.frames import Tables, float_values
 from vla_attention.analyze.show.numbers import interval_name, of_tasks
 from vla_attention.analyze.show.plot_heat_map import draw_log2_map, label_axis, map_height
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
@@ -40,10 +40,7 @@ def plot_layer_time(replans: Tables, grouping: Grouping, folder: Path, seed: int
     undefined, dots = False, False
     for axes, quantity in zip(shared, quantities, strict=True):
         part = table.filter(pl.col("quantity") == quantity)
-        mean, low, high = (
-            part[column].fill_null(float("nan")).to_numpy().reshape(len(layers), bins)
-            for column in ("mean", "low", "high")
-        )
+        mean, low, high = (float_values(part[column]).reshape(len(layers), bins) for column in ("mean", "low", "high"))
         if np.isnan(mean).all():
             explain(axes, "No ratio is finite and above 0." if grouping.ratio else "No group has any mass.")
             continue

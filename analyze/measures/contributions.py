@@ -14,7 +14,14 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.frames import LAYERS_AVG, denoise_axis, layer_axis, long_table, replan_axis
+from vla_attention.analyze.measures.frames import (
+    LAYERS_AVG,
+    denoise_axis,
+    float_values,
+    layer_axis,
+    long_table,
+    replan_axis,
+)
 from vla_attention.analyze.measures.masses import ratio
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL, POSITIVE, bootstrap_interval, mean_over_episodes
@@ -106,7 +113,7 @@ def _summary_row(part: pl.DataFrame, label: str, number: int | None, seed: int, 
     episodes = part.group_by("suite", "task_id", "episode_index", maintain_order=True).agg(
         pl.col("visual_norm", "linguistic_norm").mean(), finite.mean().alias("ratio")
     )
-    values = mean_over_episodes(episodes["ratio"].cast(pl.Float64).fill_null(float("nan")).to_numpy(), POSITIVE)
+    values = mean_over_episodes(float_values(episodes["ratio"]), POSITIVE)
     tasks = episodes.select(pl.struct("suite", "task_id").rank("dense")).to_series().to_numpy()
     interval = bootstrap_interval(values, tasks, level=level, seed=seed)
     norms = [episodes[f"{side}_norm"].cast(pl.Float64).mean() for side in ("visual", "linguistic")]

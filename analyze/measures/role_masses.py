@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.steps import selected_cells
 
 
 def role_masses(question: Question) -> dict[str, float]:
@@ -16,8 +17,7 @@ def role_masses(question: Question) -> dict[str, float]:
     selection = question.selection
     totals: dict[str, float] = {}
     for item in question.selected:
-        atoms = item.episode.read(f"{question.site}/atoms")
-        atoms = atoms[:, list(selection.layers)][:, :, list(selection.denoise)][:, :, :, list(selection.heads)]
+        atoms = selected_cells(item.episode.read(f"{question.site}/atoms"), selection)
         masses = atoms.reshape(-1, atoms.shape[-1]).mean(axis=0, dtype=np.float64)
         for segment, mass in zip(item.episode.attributes.segments[question.site], masses.tolist(), strict=True):
             totals[segment.role] = totals.get(segment.role, 0.0) + mass

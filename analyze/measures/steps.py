@@ -93,7 +93,7 @@ def measure_episode(
     weights = with_valid(resolved.weights, item.valid)
     of_segments = segment_weights(item, weights, site)
     if of_segments is not None:
-        atoms = _cells(item.episode.read(f"{site}/atoms"), selection)
+        atoms = selected_cells(item.episode.read(f"{site}/atoms"), selection)
         mass = masses(_reduce(atoms, selection, axis=-2), of_segments)
     else:
         mass = np.empty((*row_sum.shape, weights.shape[2]))
@@ -189,7 +189,7 @@ def _per_replan(values: NDArray[np.float64] | NDArray[np.int64]) -> NDArray[np.f
 
 def row_sums(item: SelectedEpisode, selection: Selection, site: str) -> NDArray[np.float64]:
     """Stored sums of the rows (replan, layer, denoise, head or 1), as they were before storage rounded the rows."""
-    return _reduce(_cells(item.episode.read(f"{site}/row_sum"), selection), selection).astype(np.float64)
+    return _reduce(selected_cells(item.episode.read(f"{site}/row_sum"), selection), selection).astype(np.float64)
 
 
 def segment_weights(item: SelectedEpisode, weights: NDArray[np.float32], site: str) -> NDArray[np.float32] | None:
@@ -207,7 +207,7 @@ def with_valid(weights: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArra
     return np.concatenate(parts, axis=2)
 
 
-def _cells(values: NDArray[np.float32], selection: Selection) -> NDArray[np.float32]:
+def selected_cells(values: NDArray[np.float32], selection: Selection) -> NDArray[np.float32]:
     """The selected layers, denoise steps and heads of an array whose axes begin with (replan, layer, denoise, head)."""
     return values[:, list(selection.layers)][:, :, list(selection.denoise)][:, :, :, list(selection.heads)]
 

@@ -48,7 +48,7 @@ def test_the_centre_of_planted_masses_is_where_they_were_planted(tmp_path):
     assert (row["first_block"], row["last_block"], row["num_layers"]) == (0, 4, 3)
     assert (row["num_episodes"], row["centre_episodes"], row["num_tasks"]) == (4, 4, 2)
     assert depth.filter(group="action")["centre"][0] == pytest.approx((0.8 * 3 + 0.5 * 4) / (0.9 + 0.8 + 0.5), rel=1e-6)
-    # What has no mass anywhere has no centre, and is not there: not at 0, and not in the middle.
+    # A group without mass has no centre and no row.
     assert set(depth["group"]) == {"visual", "action"}
 
 
@@ -94,7 +94,7 @@ def test_centres_of_contributions_are_those_of_the_vectors(tmp_path):
     assert 0 <= found["centre_low"] < found["centre"] < found["centre_high"] <= 3
 
 
-def test_one_layer_has_its_own_number_for_a_centre(tmp_path):
+def test_the_centre_of_one_layer_is_its_number(tmp_path):
     spec = StoreSpec(layers=(2,), contributions=True)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -126,7 +126,7 @@ def test_no_mass_at_all_gives_an_empty_table():
 
 
 @pytest.mark.parametrize("num_bins", [1, 4, None])
-def test_a_part_of_the_time_holds_what_lies_in_it_by_share(num_bins):
+def test_a_part_of_the_time_weighs_replans_by_their_share_of_it(num_bins):
     """Replans and episodes of unequal lengths, cut into pieces so small that each lies in one replan and one part."""
     grouping = default_grouping()
     steps = make_steps(
@@ -156,7 +156,7 @@ def test_a_part_of_the_time_holds_what_lies_in_it_by_share(num_bins):
         assert (row["start"], row["stop"]) == pytest.approx((row["bin"] / bins, (row["bin"] + 1) / bins))
 
 
-def test_time_has_no_more_parts_than_replans_and_groups_stand_in_where_there_is_no_ratio():
+def test_time_has_no_more_parts_than_replans_and_groups_are_shown_without_a_ratio():
     grouping = custom_grouping(with_ratio=False)
     steps = make_steps(grouping, CUSTOM_KEYS, num_replans=3)
     short = layer_time_table(replans_of(steps, grouping), grouping)

@@ -64,7 +64,7 @@ def test_top_masses_do_not_depend_on_the_order_of_their_numbers():
 
 @FEW
 @given(data=st.data())
-def test_the_table_of_rows_holds_what_scipy_and_sorting_say_of_the_raw_rows(data):
+def test_the_table_of_rows_equals_scipy_and_sorting_on_raw_rows(data):
     tokens = data.draw(episode_tokens())
     grouping = data.draw(groupings(tokens))
     spec = StoreSpec(

@@ -46,7 +46,7 @@ def close(found: float | None, expected: float | None, **tolerance: float) -> bo
 
 @FEW
 @given(data=st.data())
-def test_every_number_of_a_head_is_that_of_loops_over_raw_rows(data):
+def test_numbers_of_heads_equal_loops_over_raw_rows(data):
     tokens = data.draw(episode_tokens())
     grouping = data.draw(groupings(tokens))
     names = list(grouping.names)
@@ -132,7 +132,7 @@ def test_every_number_of_a_head_is_that_of_loops_over_raw_rows(data):
 
 @FEW
 @given(data=st.data())
-def test_a_study_says_of_layers_what_the_whole_analysis_says(data):
+def test_layers_of_a_study_equal_those_of_the_whole_analysis(data):
     """With and without reading rows, and whether or not a group cuts a segment."""
     tokens = data.draw(episode_tokens())
     grouping = data.draw(groupings(tokens))
@@ -186,7 +186,7 @@ def test_a_block_that_is_named_twice_is_ranked_once(tmp_path):
     assert set(ranked["layer"]) == {0, 2}
 
 
-def test_heads_without_a_finite_ratio_stand_at_the_ends_and_those_without_mass_nowhere(tmp_path):
+def test_heads_without_a_finite_ratio_are_ranked_at_the_ends_and_heads_without_mass_are_left_out(tmp_path):
     def plant(task, episode, tokens, rows):
         rows = planted({})(task, episode, tokens, rows)
         rows[:, 0, :, 0, :, BOS : BOS + 14] = 0.0  # only sees
@@ -207,7 +207,7 @@ def test_heads_without_a_finite_ratio_stand_at_the_ends_and_those_without_mass_n
     assert sees["num_nonfinite"] == reads["num_nonfinite"] == 2 * 2 * 3
 
 
-def test_all_ratios_infinite_is_said_and_nothing_breaks(tmp_path):
+def test_all_ratios_infinite_are_reported(tmp_path):
     grouping = Grouping(
         "blind",
         {"seen": ("role:image",), "masked": ("role:masked_image",), "rest": ("*",)},
@@ -224,7 +224,7 @@ def test_all_ratios_infinite_is_said_and_nothing_breaks(tmp_path):
     assert study.denoise.cells["num_nonfinite"].to_list() == [2 * 2 * 3] * 2
 
 
-def test_one_of_everything_has_numbers_but_no_intervals_and_no_spread(tmp_path):
+def test_one_episode_and_one_head_have_numbers_but_no_intervals_and_no_spread(tmp_path):
     study = study_of(tmp_path, tasks=(0,), episodes=1, replans=1, layers=(2,), heads=(1,), denoise_steps=(9,))
     (row,) = study.heads.cells.iter_rows(named=True)
     assert row["log2_ratio"] is not None

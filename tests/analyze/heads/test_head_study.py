@@ -127,7 +127,7 @@ def test_heads_equal_sums_over_raw_rows(data):
         assert row["centre"] == pytest.approx(np.mean(centres), abs=10 * BOUND)
 
 
-def test_a_head_of_the_grid_is_what_the_whole_analysis_says_of_that_head_alone(tmp_path):
+def test_a_head_of_the_grid_equals_an_analysis_of_that_head_alone(tmp_path):
     path = write_store(tmp_path / "a.zarr", tasks=(0, 1), episodes=3)
     study = study_heads(question_about(path))
     alone = analyse(question_about(path, heads=(1,), layers=(2,)))
@@ -145,7 +145,7 @@ def test_a_head_of_the_grid_is_what_the_whole_analysis_says_of_that_head_alone(t
         assert found[name] == pytest.approx(step[name])
 
 
-def test_contribution_depth_is_there_where_gram_matrices_are(tmp_path):
+def test_contribution_depth_needs_gram_matrices(tmp_path):
     path = write_store(tmp_path / "a.zarr", contributions=True)
     depth = study_heads(question_about(path)).depth
     assert set(depth["of"]) == {"mass", "contribution"}
@@ -157,7 +157,7 @@ def test_contribution_depth_is_there_where_gram_matrices_are(tmp_path):
 
 
 def plant_specialists(task, episode, tokens, rows):
-    """Layer 2, head 1 looks; layer 0, head 0 reads; all others are alike."""
+    """Layer 2, head 1 attends to images; layer 0, head 0 to text; all others are alike."""
     valid = np.broadcast_to(tokens.valid, tokens.key_role.shape)
     planted = np.broadcast_to(valid[:, None, None, None, None, :], rows.shape).astype(np.float64).copy()
     planted[:, 1, :, 1, :, :16] *= 30.0
@@ -209,7 +209,7 @@ def sunken(tmp_path_factory) -> Path:
 RULE = SinkRule(factor=5.0, share=0.7)
 
 
-def test_planted_sinks_are_found_named_and_told_apart_by_task(sunken):
+def test_planted_sinks_are_found_and_named_per_task(sunken):
     question = question_about(sunken)
     sinks = sinks_table(question, RULE)
     bos = question.selected[0].tokens.layout.span("prompt").start
@@ -272,7 +272,7 @@ def test_masses_without_sinks_are_those_of_the_remaining_keys(sunken):
         np.testing.assert_allclose(part["visual_lift"].to_numpy().reshape(lift.shape), lift, rtol=3 * BOUND)
         uniform = weights[:, :, visual].sum(axis=1) / weights[:, :, linguistic].sum(axis=1)
         np.testing.assert_allclose(part["uniform_ratio"].to_numpy().reshape(lift.shape)[:, 0, 0], uniform, rtol=1e-6)
-        # And so it stays when denoise steps are averaged over: the baseline is that of the remaining keys, too.
+        # The same over all denoise steps: the baseline is that of the remaining keys, too.
         whole = replans.filter(task_id=task, episode_index=episode, layer="2").sort("replan")
         averaged = mass[:, 1, :, visual].mean(axis=1) / weights[:, :, visual].sum(axis=1)
         baseline = held[:, 1].mean(axis=1) / valid.sum(axis=1)

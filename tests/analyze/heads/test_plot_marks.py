@@ -101,7 +101,7 @@ def test_numbers_in_cells_never_touch(rows, columns, width):
     assert label.x1 <= figure.bbox.width
 
 
-def test_what_is_one_but_for_rounding_is_written_as_one():
+def test_a_value_that_rounds_to_one_is_written_as_one():
     figure = new_figure(5, 3)
     axes = figure.subplots()
     draw_log2_map(figure, axes, np.array([[-1e-4, 1e-4, -1.0]]), np.zeros((1, 3), dtype=bool), "times")

@@ -141,7 +141,7 @@ def test_depth_is_a_weighted_mean_of_blocks(seed, layers):
 
 
 @pytest.mark.parametrize("wrong", [{"factor": 0.5}, {"factor": float("inf")}, {"share": 0.0}, {"share": 1.1}])
-def test_a_rule_that_singles_nothing_out_is_refused(wrong):
+def test_a_useless_sink_rule_is_refused(wrong):
     with pytest.raises(BadArgument, match="sink"):
         SinkRule(**wrong)
 

@@ -52,7 +52,7 @@ def test_fractions_of_every_row_sum_to_one():
         assert tables.values("fraction").sum(axis=1) == pytest.approx(np.ones(tables.cells.height))
 
 
-def test_infinite_and_undefined_ratios_are_told_apart_and_counted():
+def test_infinite_and_undefined_ratios_differ_and_are_counted():
     steps = make_steps(num_tasks=1, num_episodes=1, num_replans=2, layers=(1,), denoise_steps=(0,))
     steps = steps.with_columns(
         linguistic_mass=pl.lit(0.0),
@@ -148,7 +148,7 @@ def test_one_episode_has_no_interval():
     assert all(tasks[name].null_count() == tasks.height for name in bounds)
 
 
-def test_nothing_depends_on_the_order_of_the_rows():
+def test_results_do_not_depend_on_the_order_of_the_rows():
     shuffled = STEPS.sample(fraction=1.0, shuffle=True, seed=1)
     first, second = (
         flat(task_tables(episode_tables(replans_of(steps), GROUPING), GROUPING)) for steps in (STEPS, shuffled)

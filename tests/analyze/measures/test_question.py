@@ -1,4 +1,4 @@
-"""Questions: what is selected, and what becomes of episodes that cannot be used."""
+"""Questions: the selection, and episodes that cannot be used."""
 
 from __future__ import annotations
 

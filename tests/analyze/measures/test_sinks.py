@@ -103,13 +103,13 @@ def test_rows_that_are_all_masked_count_for_nothing():
 
 
 def plant_late_sink(task, episode, tokens, rows):
-    """What is the third state digit, where there is one, takes half of every row."""
+    """The third state digit takes half of every row of the replans that have one."""
     planted = rows.astype(np.float64).copy()
     planted[..., BOS + 10] = np.where(planted[..., BOS + 10] > 0, 1.0, 0.0)
     return planted / planted.sum(axis=-1, keepdims=True)
 
 
-def test_a_sink_has_the_role_that_it_has_where_it_is_one(tmp_path):
+def test_a_sink_has_the_role_of_the_replans_at_which_it_is_valid(tmp_path):
     """Whether a late key of a changing prompt is a digit or padding depends on the replan, and on the episode."""
     spec = StoreSpec(tasks=(0,), episodes=6, replans=3, plant_rows=plant_late_sink)
     path = write_store(tmp_path / "a.zarr", spec=spec)
