@@ -99,7 +99,7 @@ class StepResult:
 class Environment(Protocol):
     """One task in one simulator.
 
-    An episode is one `reset`, the waiting steps of `episode_protocol.py`, and then the steps of the policy. No observation
+    An episode is one `reset`, the waiting steps of `episode_protocol.py`, and then the policy's steps. No observation
     exists before the first step: the first picture of the protocol is the one after the last waiting step, so request
     it there with `observe=True`.
 
