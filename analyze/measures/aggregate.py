@@ -26,6 +26,7 @@ from vla_attention.analyze.measures.frames import (
     LayerAxis,
     Tables,
     concat_tables,
+    episode_id,
     long_table,
     replan_axis,
 )
@@ -67,7 +68,9 @@ def replans_of(question: Question) -> Tables:
 
 
 def replan_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Tables:
-    """Every (episode, replan, layer): masses averaged over denoise steps and heads, then fractions, lifts and ratios.
+    """Every (episode, replan, layer), in the order of suite, task and episode.
+
+    Masses are averaged over denoise steps and heads first; fractions, lifts and ratios follow from these means.
 
     In "layers_avg", as the published scripts define it, masses are means over the layers, fractions and lifts follow
     from these means, and the ratio is the mean of the layers' finite ratios (null when none is finite; the published
@@ -80,7 +83,8 @@ def replan_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Ta
         groups: suite, task_id, episode_index, replan, env_step, layer, layer_number, block, group, mass, fraction,
             keys, density, lift.
     """
-    return concat_tables([_episode_replans(episode, grouping) for episode in measured])
+    in_order = sorted(measured, key=lambda episode: episode_id(episode.item))
+    return concat_tables([_episode_replans(episode, grouping) for episode in in_order])
 
 
 def _episode_replans(measured: MeasuredEpisode, grouping: Grouping) -> Tables:

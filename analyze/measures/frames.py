@@ -94,6 +94,12 @@ def float_values(column: pl.Series) -> NDArray[np.float64]:
     return column.cast(pl.Float64).fill_null(float("nan")).to_numpy()
 
 
+def episode_id(item: SelectedEpisode) -> tuple[str, int, int]:
+    """The values of `EPISODE_ID`."""
+    attributes = item.episode.attributes
+    return item.store.suite, attributes.task_id, attributes.episode_index
+
+
 def replan_axis(item: SelectedEpisode) -> Axis:
     """Labels `replan` and `env_step`."""
     steps = item.episode.read("env_step").astype(np.int64)
@@ -214,12 +220,19 @@ class Tables:
         """The groups that have a key in a cell or an unknown number of keys, in the order of the grouping."""
         unknown = self.groups.filter(pl.col("keys").is_null())["group"].unique()
         having = {*self.groups_with("keys"), *unknown}
-        return tuple(name for name in self.groups["group"].unique(maintain_order=True) if name in having)
+        return tuple(name for name in self.group_names() if name in having)
+
+    def group_names(self) -> tuple[str, ...]:
+        """The groups, in the order of the grouping."""
+        # A part may have no cell left; every cell has all groups in order.
+        return tuple(
+            dict.fromkeys(name for part in self.parts for name in part.groups["group"].unique(maintain_order=True))
+        )
 
     def groups_with(self, column: str) -> tuple[str, ...]:
         """The groups that have more than 0 in a column of a cell, in the order of the grouping."""
         having = {name for part in self.parts for name in part.groups.filter(pl.col(column) > 0)["group"].unique()}
-        return tuple(name for name in self.parts[0].groups["group"].unique(maintain_order=True) if name in having)
+        return tuple(name for name in self.group_names() if name in having)
 
     def by_group(self, *by: str) -> dict[tuple[Any, ...], dict[str, Any]]:
         """Rows of `groups` by the columns `by` and the group, as in `tables.by_group("layer")[layer, name]`."""

@@ -38,7 +38,7 @@ def contributions_section(table: pl.DataFrame, seed: int) -> str:
 def group_contributions_section(tables: Tables | None, grouping: Grouping, site: str, seed: int) -> str:
     """The summary's section: per layer the groups' mean norms and the ratio of norms with a two-level interval."""
     title = f"CONTRIBUTIONS OF GROUPS  norms of what they add to the residual stream at site '{site}'"
-    measured = [] if tables is None else tables.parts[0].groups["group"].unique(maintain_order=True).to_list()
+    measured = () if tables is None else tables.group_names()
     cut = [name for name in grouping.names if name not in measured]
     note = (
         f"Not of {listing(cut)}: contributions are stored for whole segments (a span's keys of one role), and "

@@ -187,3 +187,22 @@ def test_layers_are_in_the_order_of_their_numbers():
     assert layer_order(replans) == ["2", "9", "10", LAYERS_AVG]
     assert overall_layer(replans) == LAYERS_AVG
     assert overall_layer(replans.filter(pl.col("layer") != LAYERS_AVG)) == "2"
+
+
+def test_groups_keep_the_order_of_the_grouping_when_the_first_cells_lack_one():
+    first = (pl.col("task_id") == 0) & (pl.col("replan") < 3)
+    steps = STEPS.with_columns(visual_mass=pl.when(first).then(0.0).otherwise(pl.col("visual_mass")))
+    tables = replans_of(steps)
+    having = [name for name in GROUPING.names if (steps[f"{name}_mass"] > 0).any()]
+    assert tables.groups_with_mass() == tuple(having)
+    # The first episodes have no cell of the second task.
+    assert tables.filter(pl.col("task_id") == 1).groups_with_mass() == tuple(having)
+    assert tables.filter(pl.col("task_id") == 1).group_names() == GROUPING.names
+
+
+def test_replans_are_in_the_order_of_suite_task_and_episode():
+    steps = pl.concat([make_steps(suite="libero_goal"), make_steps()])
+    cells = replans_of(steps).cells
+    identity = ["suite", "task_id", "episode_index"]
+    assert cells.select(identity).equals(cells.select(identity).sort(identity))
+    assert cells["suite"][0] == "libero_10"
