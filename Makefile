@@ -47,7 +47,9 @@ capture: .venv/capture-installed
 analyze: .venv/analyze-installed
 	$(BIN)/vla-analyze $(STORE) --grouping $(GROUPING) --output $(OUTPUT) $(if $(LAYERS),--layers $(LAYERS)) $(ARGS)
 
-test: check unit package
+test: check
+	$(MAKE) unit ARGS="--slow $(ARGS)"
+	$(MAKE) package
 
 check: .venv/capture-installed
 	$(BIN)/ruff check $(SOURCES)

@@ -1,9 +1,12 @@
-"""Fixtures that several test folders share, and how many random examples property tests try."""
+"""What all tests share: which of them run, how many random examples they try, zarr without threads, LIBERO's assets."""
 
 from __future__ import annotations
 
+import asyncio
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -14,6 +17,36 @@ for _name, _count in PROFILES.items():
     settings.register_profile(_name, max_examples=_count, deadline=None)
 # `pytest --hypothesis-profile thorough` loads the other one afterwards, and before test modules are imported.
 settings.load_profile("fast")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--slow", action="store_true", help="run tests with the mark slow too; draw PDF files")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # `-m slow`, alone or in an expression, asks for these tests as well.
+    config.option.slow = config.option.slow or "slow" in config.option.markexpr
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.option.slow:
+        return
+    slow = [item for item in items if item.get_closest_marker("slow")]
+    if slow:
+        config.hook.pytest_deselected(items=slow)
+        items[:] = [item for item in items if not item.get_closest_marker("slow")]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _zarr_works_without_threads() -> Any:
+    """zarr hands every chunk to a pool of threads, which for the small chunks of tests is a third of its time."""
+
+    async def call(function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Any:
+        return function(*arguments, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(asyncio, "to_thread", call)
+        yield
 
 
 @pytest.fixture(scope="session")

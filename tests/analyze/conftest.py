@@ -1,4 +1,4 @@
-"""Tests draw pictures as PNG of low resolution. As in the product, and as PDF, only tests with the mark `pdf` do."""
+"""Tests draw pictures as PNG of low resolution. With `--slow`, those with the mark `pdf` draw as the product does."""
 
 from __future__ import annotations
 
@@ -29,5 +29,5 @@ def _pictures_are_drawn_quickly() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _pictures_are_drawn_as_they_are(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    if request.node.get_closest_marker("pdf"):
+    if request.config.option.slow and request.node.get_closest_marker("pdf"):
         monkeypatch.setattr(Figure, "savefig", DRAW)

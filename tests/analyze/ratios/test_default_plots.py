@@ -9,6 +9,7 @@ import polars as pl
 import pytest
 
 from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups, replans_of
+from tests.kit.slow import slow_except
 from vla_attention.analyze.measures.aggregate import episode_tables, task_tables
 from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.ratios.plot_attention_fractions import plot_attention_fractions
@@ -49,11 +50,12 @@ CASES = {
         default_grouping(),
     ),
 }
-#: Cases that are drawn as PDF too.
-AS_PDF = ("some infinite", "many groups")
+#: Cases that the fast part of the suite draws.
+FAST = ("one of everything", "some infinite", "many groups")
 
 
-@pytest.mark.parametrize("case", [pytest.param(case, marks=[pytest.mark.pdf] * (case in AS_PDF)) for case in CASES])
+@pytest.mark.pdf
+@pytest.mark.parametrize("case", slow_except(FAST, CASES))
 def test_every_picture_of_every_case_is_drawn_without_a_warning(case, tmp_path):
     steps, grouping = CASES[case]()
     replans = replans_of(steps, grouping)
@@ -100,6 +102,7 @@ def test_same_data_give_the_same_file(tmp_path):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_all_evolutions_keep_suites_apart(tmp_path):
     grouping = default_grouping()
     small = {"num_tasks": 1, "num_episodes": 1, "layers": (3, 4), "num_replans": 2}

@@ -15,7 +15,7 @@ import vla_attention.testing.stores as kit
 from vla_attention.analyze.__main__ import main
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium on the PATH")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(BROWSER is None, reason="no Chromium on the PATH")]
 
 #: Runs before the page's own script, and after it everything that a user would do; the findings go into the page.
 _LISTEN = """<script>

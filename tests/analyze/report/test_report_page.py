@@ -115,6 +115,7 @@ def test_what_a_store_says_is_text_and_never_markup(html: str) -> None:
     assert html.count("<script>") == 1
 
 
+@pytest.mark.slow
 def test_the_page_is_small_and_the_same_twice(analysis: Analysis, html: str) -> None:
     assert len(html.encode()) < 3_000_000
     assert report_html(analysis, ReportSettings()) == html
@@ -149,6 +150,7 @@ def test_episodes_have_a_slider_over_their_replans(analysis: Analysis, html: str
         assert base64.b64decode(content)[8:12] == b"WEBP"
 
 
+@pytest.mark.slow
 def test_a_slider_over_some_of_the_replans_says_so(analysis: Analysis) -> None:
     page = Page(report_html(analysis, ReportSettings(episodes=1, replans=2, rows=False)))
     assert "2 of 3 replans, from the first to the last." in page.text
@@ -178,6 +180,7 @@ def no_words(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -
     return rows / rows.sum(axis=-1, keepdims=True)
 
 
+@pytest.mark.slow
 def test_a_store_of_infinite_ratios_still_gives_a_page_that_says_so(tmp_path: Path) -> None:
     store = kit.write_store(tmp_path / "a.zarr", plant_rows=no_words, frames=False, coverage=False)
     assert main(["report", str(store), "--output", str(tmp_path / "a.html")]) == 0

@@ -10,6 +10,7 @@ from safetensors.torch import save_file
 
 from tests.kit.pi_golden import GOLDEN
 from tests.kit.policy_inputs import make_observation
+from tests.kit.slow import slow_except
 from vla_attention.capture.environments.base import Observation
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.noise import initial_noise
@@ -59,7 +60,7 @@ def dummy_pi0():
     )
 
 
-@pytest.fixture(params=["dummy", "dummy_pi0", "embedded"])
+@pytest.fixture(params=slow_except(["dummy", "dummy_pi0"], ["dummy", "dummy_pi0", "embedded"]))
 def policy(request):
     return request.getfixturevalue(request.param)
 
