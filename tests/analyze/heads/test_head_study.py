@@ -328,7 +328,7 @@ def test_the_command_writes_tables_and_pictures_and_names_the_nearest_key(tmp_pa
     [
         ["--layers", "2", "--heads", "1", "--denoise", "9"],
         ["--group", "base=camera:base_0_rgb", "--no-rows"],
-        ["--grouping", "objects"],
+        pytest.param(["--grouping", "objects"], marks=pytest.mark.slow),
         ["--group", "seen=role:image", "--group", "blind=span:right_wrist_0_rgb", "--ratio", "seen/blind"],
         ["--group", "seen=role:image", "--group", "blind=span:right_wrist_0_rgb", "--ratio", "blind/blind"],
     ],
