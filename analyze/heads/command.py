@@ -78,6 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     files = write_parquet(folder, **study.tables())
     print(heads_text(study, arguments.top))
     if not arguments.no_plots:
+        from vla_attention.analyze.heads.layer_time import layer_time_table
         from vla_attention.analyze.heads.plot_denoise_profile import plot_denoise_profile
         from vla_attention.analyze.heads.plot_head_grid import plot_head_grid
         from vla_attention.analyze.heads.plot_layer_time import plot_layer_time
@@ -86,7 +87,8 @@ def run(arguments: argparse.Namespace) -> int:
         grouping = question.grouping
         files += plot_head_grid(study.heads, grouping, folder)
         files += plot_layer_profile(study.tasks, grouping, folder)
-        files += plot_layer_time(study.replans, grouping, folder, arguments.seed)
+        time = layer_time_table(study.replans, grouping, seed=arguments.seed)
+        files += plot_layer_time(time, study.replans, grouping, folder)
         files += plot_denoise_profile(study.denoise, grouping, folder)
     report_files(folder, files)
     return 0

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.heads.layer_time import layer_time_table
 from vla_attention.analyze.measures.frames import Tables, float_values
 from vla_attention.analyze.show.numbers import interval_name, of_tasks
 from vla_attention.analyze.show.plot_heat_map import draw_log2_map, label_axis, map_height
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, ratio_name, title, wrapped
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL, DEFAULT_SEED
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 from vla_attention.schemas.groupings.grouping import Grouping
 
 if TYPE_CHECKING:
@@ -24,13 +23,12 @@ STEM = "layer_time"
 
 
 @drawn_in_our_style
-def plot_layer_time(replans: Tables, grouping: Grouping, folder: Path, seed: int = DEFAULT_SEED) -> list[Path]:
-    """Draw from `aggregate.replan_tables`; returns the paths of png, pdf and csv.
+def plot_layer_time(table: pl.DataFrame, replans: Tables, grouping: Grouping, folder: Path) -> list[Path]:
+    """Draw `layer_time.layer_time_table` of `aggregate.replan_tables`; returns the paths of png, pdf and csv.
 
     With a ratio one map of its lift over the uniform ratio; else a map of fractions for each of the first groups. A
     dot: the interval of the cell holds the uniform value.
     """
-    table = layer_time_table(replans, grouping, seed=seed, level=DEFAULT_LEVEL)
     quantities = table["quantity"].unique(maintain_order=True).to_list()
     layers, bins = table["layer"].unique(maintain_order=True).to_list(), table["bin"].n_unique()
     figure = new_figure(max(6.4, 3.6 * len(quantities) + 1.0), max(2.7, 1.6 + map_height(len(layers), bins)))

@@ -14,7 +14,13 @@ from vla_attention.analyze.measures.aggregate import overall_rows
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
 from vla_attention.analyze.measures.sinks import SinkRule, merged_sinks
 from vla_attention.analyze.show.headings import WIDTH, heading, interval_note, wrap, wrap_all
-from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent, format_percent_interval
+from vla_attention.analyze.show.numbers import (
+    format_interval,
+    format_number,
+    format_percent,
+    format_percent_interval,
+    row_interval,
+)
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL, NO_LIMITS, POSITIVE
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
@@ -114,9 +120,9 @@ def _head_rows(rows: pl.DataFrame, study: HeadStudy) -> str:
             limit = row["ratio_of_means"]  # where no replan has a finite logarithm: infinite, or 0
             cells += [
                 format_number(limit if row["log2_ratio"] is None else 2 ** row["log2_ratio"]),
-                _interval(row, "log2_ratio", power=True),
+                _power_interval(row, "log2_ratio"),
                 format_number(_power(row["log2_lift"])),
-                _interval(row, "log2_lift", power=True),
+                _power_interval(row, "log2_lift"),
                 format_percent(row["numerator_fraction"]),
                 format_percent(row["denominator_fraction"]),
             ]
@@ -126,7 +132,7 @@ def _head_rows(rows: pl.DataFrame, study: HeadStudy) -> str:
                 format_percent(own["fraction"]),
                 _percent_interval(own, "fraction"),
                 format_number(own["lift"]),
-                _interval(own, "lift"),
+                row_interval(own, "lift"),
             ]
         table.append(cells)
     header = ["layer", "head"]
@@ -151,7 +157,7 @@ def _dispersion(study: HeadStudy) -> str:
     for row in study.dispersion.iter_rows(named=True):
         cells = [str(row["layer"]), str(row["num_heads"])]
         for name in ("fraction_std", "fraction_cv", *(["log2_ratio_std"] if grouping.ratio else [])):
-            cells += [format_number(row[name]), _interval(row, name)]
+            cells += [format_number(row[name]), row_interval(row, name)]
         rows.append(cells)
     return "\n".join(
         [heading(f"HOW MUCH HEADS DIFFER  spread of {what} over the heads of a layer"), text_table(header, rows)]
@@ -171,11 +177,11 @@ def _profile(level: Tables, along: str, label: str, labels: Sequence[str], group
     of_group, groups = level.by_group(along), level.groups_with_mass()[:3]
     for name, row in zip(labels, level.cells.iter_rows(named=True), strict=True):
         if grouping.ratio is not None:
-            cells = [format_number(row["ratio_mean"]), _interval(row, "ratio_mean")]
+            cells = [format_number(row["ratio_mean"]), row_interval(row, "ratio_mean")]
             cells += [
                 format_number(row["uniform_ratio"]),
                 format_number(row["ratio_lift"]),
-                _interval(row, "ratio_lift"),
+                row_interval(row, "ratio_lift"),
             ]
         else:
             cells = [
@@ -204,7 +210,7 @@ def _depth(study: HeadStudy) -> str:
             row["group"][:30],
             "mass" if row["of"] == "mass" else "contribution",
             format_number(row["centre"]),
-            _interval(row, "centre"),
+            row_interval(row, "centre"),
         ]
         for row in table.iter_rows(named=True)
     ]
@@ -250,7 +256,7 @@ def _rows_by_layer(study: HeadStudy) -> str:
             str(row["layer"]),
             format_number(row["entropy"]),
             format_number(row["effective_keys"]),
-            _interval(row, "effective_keys"),
+            row_interval(row, "effective_keys"),
         ]
         cells += [format_percent(row[f"top{k}_mass"]) for k in study.options.top]
         cells += [format_number(of_group[row["layer"], name]["effective_keys"]) for name in groups]
@@ -313,9 +319,8 @@ def _power(value: float | None) -> float | None:
     return None if value is None else 2.0**value
 
 
-def _interval(row: dict[str, Any], name: str, power: bool = False) -> str:
-    low, high = row[f"{name}_low"], row[f"{name}_high"]
-    return format_interval(_power(low), _power(high)) if power else format_interval(low, high)
+def _power_interval(row: dict[str, Any], name: str) -> str:
+    return format_interval(_power(row[f"{name}_low"]), _power(row[f"{name}_high"]))
 
 
 def _percent_interval(row: dict[str, Any], name: str) -> str:

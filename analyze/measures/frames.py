@@ -76,12 +76,7 @@ def _labels(name: str, labels: Sequence[Any] | NDArray[Any] | pl.Series) -> pl.S
 
 def rows_of_episode(table: pl.DataFrame, item: SelectedEpisode) -> pl.DataFrame:
     """The rows of one episode."""
-    attributes = item.episode.attributes
-    return table.filter(
-        (pl.col("suite") == item.store.suite)
-        & (pl.col("task_id") == attributes.task_id)
-        & (pl.col("episode_index") == attributes.episode_index)
-    )
+    return table.filter(**dict(zip(EPISODE_ID, episode_id(item), strict=True)))
 
 
 def layer_name(layer: str, average: str = "all layers", noun: str = "layer") -> str:
@@ -201,8 +196,9 @@ class Tables:
 
     def filter(self, *conditions: pl.Expr) -> Tables:
         """The cells for which conditions on the columns of both tables hold."""
-        parts = [part.filter(*conditions) for part in self._parts]
-        return Tables(self.cells.filter(*conditions), lambda: self.groups.filter(*conditions), parts)
+        if self._parts:
+            return concat_tables([part.filter(*conditions) for part in self._parts])
+        return Tables(self.cells.filter(*conditions), lambda: self.groups.filter(*conditions))
 
     def values(self, measure: str) -> NDArray[np.float64]:
         """A column of `groups` as an array (cell, group); NaN for null."""
@@ -224,10 +220,7 @@ class Tables:
 
     def group_names(self) -> tuple[str, ...]:
         """The groups, in the order of the grouping."""
-        # A part may have no cell left; every cell has all groups in order.
-        return tuple(
-            dict.fromkeys(name for part in self.parts for name in part.groups["group"].unique(maintain_order=True))
-        )
+        return tuple(self.parts[0].groups["group"].unique(maintain_order=True))
 
     def groups_with(self, column: str) -> tuple[str, ...]:
         """The groups that have more than 0 in a column of a cell, in the order of the grouping."""
@@ -240,8 +233,11 @@ class Tables:
 
 
 def concat_tables(parts: Sequence[Tables]) -> Tables:
-    """The rows of all parts, in order; `groups` is made when it is asked for."""
-    return Tables(pl.concat([part.cells for part in parts]), lambda: pl.concat([part.groups for part in parts]), parts)
+    """The rows of all parts, in order; `groups` is made when it is asked for. Parts without a cell are dropped."""
+    filled = [part for part in parts if part.cells.height] or parts[:1]
+    return Tables(
+        pl.concat([part.cells for part in filled]), lambda: pl.concat([part.groups for part in filled]), filled
+    )
 
 
 def named_tables(name: str, level: Tables) -> dict[str, pl.DataFrame]:

@@ -13,6 +13,7 @@ from vla_attention.analyze.measures.frames import (
     Axis,
     Tables,
     concat_tables,
+    denoise_axis,
     head_axis,
     layer_axis,
     long_table,
@@ -98,8 +99,7 @@ def measure_episode(
     else:
         mass = np.empty((*row_sum.shape, weights.shape[2]))
         for part in layer_rows(item.episode, selection, site):
-            rows = part.rows if selection.per_head else part.rows.mean(axis=1, keepdims=True)
-            mass[:, part.layer, part.denoise] = masses(rows, weights)
+            mass[:, part.layer, part.denoise] = masses(part.of_heads(selection), weights)
     return measured_from(item, resolved, selection, mass, row_sum)
 
 
@@ -171,7 +171,7 @@ def _episode_steps(measured: MeasuredEpisode, grouping: Grouping) -> Tables:
         value, uniform = ratio(above, below), _per_replan(uniform_ratio(measured.num_keys, grouping))
         cells |= {"numerator_mass": above, "denominator_mass": below, "ratio": value, "uniform_ratio": uniform}
         cells |= relative_to_uniform(value, uniform)
-    brief: list[Axis] = [{"replan": replans["replan"]}, layers, {"denoise_step": selection.denoise_steps}, heads]
+    brief: list[Axis] = [{"replan": replans["replan"]}, layers, denoise_axis(selection), heads]
     return Tables(
         long_table(item, [replans, layers, steps, heads], cells, EPISODE_KEYS),
         lambda: long_table(

@@ -153,7 +153,7 @@ def _measure_episode(
     heads = len(selection.heads) if selection.per_head else 1
     cells = (item.tokens.num_replans, len(selection.layers), len(selection.denoise), heads)
     for part in layer_rows(item.episode, selection, site):
-        rows = part.rows if selection.per_head else part.rows.mean(axis=1, keepdims=True)
+        rows = part.of_heads(selection)
         if item.without:
             rows = rows.copy()
             rows[:, :, list(item.without)] = 0.0

@@ -125,8 +125,8 @@ def _layer_diagrams(analysis: Analysis, folder: Path) -> list[Diagram]:
     grouping, seed = analysis.grouping, analysis.question.settings.seed
     what = "fractions" if grouping.ratio is None else "ratio"
     extremes = ""
+    time = layer_time_table(analysis.replans, grouping, seed=seed)
     if grouping.ratio is not None:
-        time = layer_time_table(analysis.replans, grouping, seed=seed)
         known = time.filter(pl.col("mean").is_not_null()).sort("mean")["layer"].to_list()
         extremes = f" Lowest in layer {known[0]}, highest in layer {known[-1]}." if known else ""
     return [
@@ -137,7 +137,7 @@ def _layer_diagrams(analysis: Analysis, folder: Path) -> list[Diagram]:
             "Every layer with its interval over tasks and episodes.",
         ),
         drawn(
-            lambda where: plot_layer_time(analysis.replans, grouping, where, seed),
+            lambda where: plot_layer_time(time, analysis.replans, grouping, where),
             folder,
             f"A map of the {what} with layers from bottom to top and the episodes' time from left to right.{extremes}",
             "Layers over the course of the episodes, from the first replan (0) to the end (1).",

@@ -26,6 +26,10 @@ class LayerRows:
     denoise: int
     rows: NDArray[np.float32]
 
+    def of_heads(self, selection: Selection) -> NDArray[np.float32]:
+        """The rows (replan, head or 1, key): their mean over heads unless the selection keeps heads apart."""
+        return self.rows if selection.per_head else self.rows.mean(axis=1, keepdims=True)
+
 
 def layer_rows(episode: StoredEpisode, selection: Selection, site: str) -> Iterator[LayerRows]:
     """Read the selected layers and denoise steps of an episode one after the other."""

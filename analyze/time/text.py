@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import polars as pl
 
 from vla_attention.analyze.measures.frames import LAYERS_AVG, layer_name
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.show.headings import heading, interval_note, title, untrained_warning, wrap
-from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent, format_signed, of_tasks
+from vla_attention.analyze.show.numbers import (
+    format_number,
+    format_percent,
+    format_signed,
+    of_tasks,
+    row_interval,
+)
 from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
@@ -65,7 +68,7 @@ def _course_section(courses: TimeCourses, settings: TimeSettings) -> str:
         first = part.row(0, named=True)
         cells = [f"{first['position_low']:.2f}-{first['position_high']:.2f}"]
         if RATIO in of:
-            cells += [format_number(of[RATIO]["value"]), _interval(of[RATIO]), format_number(of[RATIO]["uniform"])]
+            cells += [format_number(of[RATIO]["value"]), row_interval(of[RATIO]), format_number(of[RATIO]["uniform"])]
         body.append(cells + [format_percent(of[name]["value"]) for name in groups])
     every = f" (one bin in {stride}; all are in the table)" if stride > 1 else ""
     note = "The ratio is a geometric mean over episodes, fractions are means; a value holds until the next replan."
@@ -98,7 +101,7 @@ def _gripper_section(courses: TimeCourses, settings: TimeSettings) -> str:
         [
             shortened(row["quantity"], 40),
             ("x " if row["quantity"] == RATIO else "") + format_number(row["change"]),
-            _interval(row),
+            row_interval(row),
             str(row["num_episodes"]),
         ]
         for row in courses.change.iter_rows(named=True)
@@ -129,9 +132,9 @@ def outcomes_section(outcomes: pl.DataFrame) -> str:
             shortened(row["quantity"], 24),
             f"{row[f'num_{SUCCESS}']}/{row[f'num_{FAILURE}']}",
             format_signed(row["difference"]),
-            _interval(row, "difference"),
+            row_interval(row, "difference"),
             format_signed(row["within_tasks"]),
-            _interval(row, "within_tasks"),
+            row_interval(row, "within_tasks"),
             format_signed(row["hedges_g"]),
             format_signed(row["cliffs_delta"]),
         ]
@@ -174,8 +177,3 @@ def _counts_section(courses: TimeCourses) -> str:
 def _median(column: pl.Series) -> float | None:
     value = column.median()
     return value if isinstance(value, float) else None
-
-
-def _interval(row: Mapping[str, Any], name: str = "") -> str:
-    prefix = f"{name}_" if name else ""
-    return format_interval(row[f"{prefix}low"], row[f"{prefix}high"])

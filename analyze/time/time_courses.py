@@ -15,7 +15,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.aggregate import overall_layer, replans_of
-from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, Tables, float_values
+from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, Tables, episode_id, float_values
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.statistics.bootstrap import (
@@ -123,9 +123,7 @@ def time_courses(
     rows, groups = of_layer.cells, of_layer.groups_with_mass()
     quantities = ((RATIO,) if grouping.ratio else ()) + groups
     has_actions = all("actions" in item.episode.attributes.arrays for item in question.selected)
-    by_name = {
-        (i.store.suite, i.episode.attributes.task_id, i.episode.attributes.episode_index): i for i in question.selected
-    }
+    by_name = {episode_id(item): item for item in question.selected}
     episodes = []
     fractions = of_layer.groups.partition_by(EPISODE_ID, as_dict=True)
     for key, part in rows.partition_by(EPISODE_ID, as_dict=True, maintain_order=True).items():

@@ -66,7 +66,7 @@ def test_every_picture_of_every_case_is_drawn_without_a_warning(case, tmp_path):
         warnings.simplefilter("error")
         paths = plot_head_grid(heads_tables(heads, grouping), grouping, tmp_path)
         paths += plot_layer_profile(tasks, grouping, tmp_path)
-        paths += plot_layer_time(replans, grouping, tmp_path)
+        paths += plot_layer_time(layer_time_table(replans, grouping), replans, grouping, tmp_path)
         paths += plot_denoise_profile(denoise_tables(measured, grouping), grouping, tmp_path)
     # Layers over time are one table; each of the others is one of cells and one of groups.
     stems = ("head_grid", "layer_profile", "layer_time", "denoise_profile")

@@ -10,6 +10,7 @@ import pytest
 
 from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, replans_of
 from vla_attention.analyze.heads import plot_layer_time as layer_time
+from vla_attention.analyze.heads.layer_time import layer_time_table
 from vla_attention.analyze.measures.aggregate import episode_tables, overall_rows, task_tables
 from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.ratios.plot_profile_panels import draw_profile
@@ -76,7 +77,8 @@ def test_a_note_on_grey_cells_only_where_there_are_some(tmp_path, monkeypatch):
     early = pl.col("replan") == 0
     some = some.with_columns(pl.when(early).then(0.0).otherwise(pl.col("linguistic_mass")).alias("linguistic_mass"))
     for steps in (make_steps(), make_steps(no_denominator=1.0), some):
-        layer_time.plot_layer_time(replans_of(steps, grouping), grouping, tmp_path)
+        replans = replans_of(steps, grouping)
+        layer_time.plot_layer_time(layer_time_table(replans, grouping), replans, grouping, tmp_path)
     assert ["Grey" in title for title in titles] == [False, False, True]
 
 
