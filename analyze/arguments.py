@@ -30,7 +30,7 @@ def add_grouping(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     grouping.add_argument(
         "--grouping",
         metavar="NAME|FILE",
-        help="default, instruction, cameras, objects, reference, or a TOML file (default: default)",
+        help="default, instruction, cameras, objects, reference[:N], or a TOML file (default: default)",
     )
     grouping.add_argument(
         "--group", action="append", default=[], metavar="NAME=SELECTOR", help="one more group; may be repeated"

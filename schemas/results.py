@@ -1,18 +1,23 @@
 """The results file `attention_ratio_results_<suite>.json`: a list of episodes, structured as by the published scripts.
 
-It differs from the published scripts' files in three points: a ratio that is not finite is null (they write Infinity,
-which is not JSON), summaries count such ratios in `num_nonfinite`, and a summary over no finite ratio is null (they
-write 0.0).
+It differs from the published scripts' files in four points: a ratio that is not finite is null (they write Infinity,
+which is not JSON), summaries count such ratios in `num_nonfinite`, a summary over no finite ratio is null (they write
+0.0), and steps and episodes have fields that theirs lack: what the fractions are of and how many keys each side has
+(which the published guide tells its readers to look at), and what the numbers are about. docs/published-numbers.md
+describes all of it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from vla_attention.schemas.errors import UserError
 
 RESULTS_PREFIX = "attention_ratio_results_"
+#: What `EpisodeResult.num_steps` counts: see `loop_counter`.
+NumStepsDefinition = Literal["loop_counter"]
 
 
 class ResultsError(UserError, ValueError):
@@ -52,7 +57,11 @@ class FrameProxy:
 class StepRatio:
     """One replan. `step` is the environment step index, waiting steps included; masses and fractions are without unit.
 
-    The last four fields are set only for a ratio of latent frames (see `FrameProxy`).
+    `total_mass` is what the fractions are of: the sum of all groups' masses (for a ratio of latent frames, of the two
+    frames' masses). `num_visual_tokens` and `num_text_tokens` are the numbers of keys on the two sides, fractional
+    where objects cover parts of patches; their quotient is the ratio that uniform attention gives. The three are absent
+    in files of the published scripts and in ours from before. The last four fields are set only for a ratio of latent
+    frames (see `FrameProxy`).
     """
 
     step: int
@@ -63,6 +72,9 @@ class StepRatio:
     linguistic_fraction: float | None
     action_mass: float | None = None
     action_fraction: float | None = None
+    total_mass: float | None = None
+    num_visual_tokens: float | None = None
+    num_text_tokens: float | None = None
     selected_call_S: int | None = None
     query_frame: str | None = None
     visual_frame: str | None = None
@@ -105,7 +117,13 @@ class LayerSummary:
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """One episode. Keys of `summary` and `per_step_ratios`: `layer_N` for every layer, and `layers_avg`."""
+    """One episode. Keys of `summary` and `per_step_ratios`: `layer_N` for every layer, and `layers_avg`.
+
+    `num_steps` is the counter of the published scripts' loop when it stops (`loop_counter`); `num_steps_definition`
+    says so, and is absent in their files and in ours from before, whose `num_steps` is the number of executed actions.
+    `grouping` and `grouping_description` say what visual and linguistic are, `denoise_steps` which denoise steps the
+    masses are means over; all three are absent in those files, too.
+    """
 
     task_id: int
     episode_idx: int
@@ -114,6 +132,19 @@ class EpisodeResult:
     num_steps: int
     summary: dict[str, LayerSummary]
     per_step_ratios: dict[str, list[StepRatio]]
+    num_steps_definition: NumStepsDefinition | None = None
+    grouping: str | None = None
+    grouping_description: str | None = None
+    denoise_steps: list[int] | None = None
+
+
+def loop_counter(wait_steps: int, num_actions: int, success: bool) -> int:
+    """The published scripts' counter when their loop stops: waiting steps and executed actions.
+
+    The loop is left before it counts the action that solves the task: an episode that the k-th action after 10 waiting
+    steps solves has 10 + k - 1.
+    """
+    return wait_steps + num_actions - success
 
 
 def results_file_name(suite: str) -> str:

@@ -107,7 +107,7 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
         MixedPolicies, RunsDiffer: see `runs.check_comparable`.
     """
     notes = [*check_comparable(runs, allowed), *noted_differences(runs)]
-    notes += [line for run in runs for line in run.question.skipped]
+    notes += dict.fromkeys(line for run in runs for line in run.question.remarks)
     grouping = runs[0].question.grouping
     seed = runs[0].question.settings.seed
     levels = [episode_tables(replans_of(run.question), run.question.grouping) for run in runs]

@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
     from vla_attention.analyze.measures.question import ask
 
     question = ask(stores_of(arguments), settings_of(arguments))
-    for line in question.skipped:
+    for line in question.remarks:
         print(line)
     folder = output_folder(arguments, "export")
     written: list[Path] = []

@@ -67,7 +67,6 @@ def _header(study: HeadStudy) -> str:
         f"{listing(chosen.head_numbers, 40)}",
         f"Grouping '{question.grouping.name}'; {_measure_name(study.heads, question.grouping)}",
         *([chosen.note] if chosen.note else []),
-        *question.notes,
         interval_note(DEFAULT_LEVEL),
     ]
     return "\n".join([*lines, *wrap_all(about)])

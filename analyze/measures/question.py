@@ -13,13 +13,20 @@ from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
 from vla_attention.analyze.show.headings import run_header
 from vla_attention.analyze.show.progress import progress_bar
-from vla_attention.analyze.stores.selection import Selection, check_combinable, choose_site, select, select_episodes
+from vla_attention.analyze.stores.selection import (
+    Selection,
+    check_combinable,
+    choose_site,
+    denoise_text,
+    select,
+    select_episodes,
+)
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.builtin_groupings import find_grouping
 from vla_attention.schemas.groupings.grouping import Grouping, parse_group_argument, parse_ratio_argument, with_groups
 from vla_attention.schemas.groupings.vocabulary import Vocabulary
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
-from vla_attention.schemas.stores.store_format import StoreError
+from vla_attention.schemas.stores.store_format import RootAttributes, StoreError
 from vla_attention.schemas.stores.verify import episode_faults
 
 DEFAULT_GROUPING = "default"
@@ -38,7 +45,7 @@ class Question:
         grouping: the groups of keys.
         vocabulary: the names that selectors may use over the episodes.
         skipped: one line for every episode that was left out because it is damaged or empty (`skip_corrupt`).
-        notes: further lines for every result, for instance which keys were taken out.
+        notes: further lines for every result, for instance which denoise steps it is of or which keys were taken out.
     """
 
     stores: tuple[Store, ...]
@@ -55,6 +62,11 @@ class Question:
     def episodes(self) -> list[tuple[Store, StoredEpisode]]:
         """The episodes, each with its store."""
         return [(item.store, item.episode) for item in self.selected]
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """The lines that every result with numbers has: what was left out, and the notes."""
+        return (*self.skipped, *self.notes)
 
     @property
     def num_tasks(self) -> int:
@@ -76,7 +88,7 @@ class Question:
             layer=layer_name(layer),
             num_episodes=len(self.selected),
             num_tasks=self.num_tasks,
-            notes=self.skipped,
+            notes=self.remarks,
         )
 
 
@@ -99,7 +111,8 @@ def ask(stores: Sequence[Store], settings: AnalysisSettings) -> Question:
     selected = tuple(load_tokens(chosen, site))
     vocabulary = vocabulary_of(selected)
     grouping = choose_grouping(settings, vocabulary)
-    return Question(tuple(stores), settings, selection, site, selected, grouping, vocabulary, tuple(skipped))
+    notes = _denoise_notes(root, selection, grouping)
+    return Question(tuple(stores), settings, selection, site, selected, grouping, vocabulary, tuple(skipped), notes)
 
 
 def choose_grouping(settings: AnalysisSettings, vocabulary: Vocabulary) -> Grouping:
@@ -112,6 +125,22 @@ def choose_grouping(settings: AnalysisSettings, vocabulary: Vocabulary) -> Group
         grouping = with_groups(base, [parse_group_argument(text) for text in settings.groups])
     assert grouping is not None
     return grouping if settings.ratio is None else replace(grouping, ratio=parse_ratio_argument(settings.ratio))
+
+
+def _denoise_notes(root: RootAttributes, selection: Selection, grouping: Grouping) -> tuple[str, ...]:
+    """Of which denoise steps the numbers are, where these are a choice or differ from the published ones."""
+    steps, num_steps = selection.denoise_steps, root.policy.num_denoise_steps
+    these = denoise_text(steps, num_steps)
+    if grouping.published_denoise is not None:
+        published = 0 if grouping.published_denoise == "first" else num_steps - 1
+        if steps == (published,):
+            return (f"These numbers are of {these} alone, as those of the published scripts.",)
+        return (
+            f"These numbers are means over {these}; those of the published scripts are of denoise step {published} "
+            f"alone: compare with --denoise {grouping.published_denoise}.",
+        )
+    chosen = len(steps) < len(root.recording.denoise_steps)
+    return (f"These numbers are of {these} only, as --denoise asks.",) if chosen else ()
 
 
 def _without_faulty(

@@ -35,7 +35,7 @@ def overlay_text(study: OverlayStudy) -> str:
         rows.append(cells)
     item = overlay.item
     lines = [
-        *study.question.skipped,
+        *study.question.remarks,
         f"{item.store.suite} {item.episode.name}: {item.episode.attributes.instruction}",
         text_table(header, rows),
         *wrap(_LEGEND),

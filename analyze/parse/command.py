@@ -137,12 +137,14 @@ def _draw_file(wanted: Sequence[str], folder: Path, label: str, table: ResultsTa
 
     about = f"results file '{label}'"
     end = f"_{label.replace('/', '_')}" if several else ""
-    note = "No uniform baseline: a results file does not hold the numbers of keys."
+    cells = table.replans.cells
+    unknown = cells["uniform_ratio"].is_null().all()
+    note = "No uniform baseline: this results file does not hold the numbers of keys." if unknown else ""
     written: list[Path] = []
     if "distribution" in wanted:
         stem = plot_ratio_distribution.STEM + end
         written += plot_ratio_distribution.plot_ratio_distribution(
-            table.replans.cells, table.grouping, folder, stem=stem, about=about, note=note
+            cells, table.grouping, folder, stem=stem, about=about, note=note
         )
     if "per_task" in wanted:
         stem = plot_ratio_per_task.STEM + end

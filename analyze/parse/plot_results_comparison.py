@@ -13,8 +13,8 @@ from vla_attention.analyze.measures.aggregate import FRACTION_COLUMNS, overall_l
 from vla_attention.analyze.measures.frames import LAYERS_AVG, layer_name
 from vla_attention.analyze.published.results_tables import ResultsTables
 from vla_attention.analyze.show.numbers import interval_name, plural
-from vla_attention.analyze.show.plot_axes import note_at_row, ratio_axis, scattered, share_ticks
-from vla_attention.analyze.show.plot_colours import FIXED_COLORS, NOTE_COLOR, SERIES_COLORS
+from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, note_at_row, ratio_axis, scattered, share_ticks
+from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, FIXED_COLORS, NOTE_COLOR, SERIES_COLORS
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import title, wrapped
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
@@ -32,10 +32,11 @@ def comparison_table(tables: Sequence[ResultsTables], labels: Sequence[str]) -> 
     """One row per results file, over all its episodes, in its overall layer ("layers_avg", else the first).
 
     Columns: file, kind, layer, num_tasks, num_episodes, episodes_without_ratio, num_replans, num_nonfinite,
-    success_rate, ratio_mean with ratio_mean_low and ratio_mean_high (two-level bootstrap), ratio_std (over episodes).
+    success_rate, ratio_mean with ratio_mean_low and ratio_mean_high (two-level bootstrap), ratio_std (over episodes),
+    uniform_ratio (null where the file has no numbers of keys).
     """
     columns = ["num_tasks", "num_episodes", "episodes_without_ratio", "num_replans", "num_nonfinite", "success_rate"]
-    columns += ["ratio_mean", "ratio_mean_low", "ratio_mean_high", "ratio_std"]
+    columns += ["ratio_mean", "ratio_mean_low", "ratio_mean_high", "ratio_std", "uniform_ratio"]
     rows = []
     for table, label in zip(tables, labels, strict=True):
         layer = overall_layer(table.tasks.cells)
@@ -67,8 +68,10 @@ def plot_results_comparison(tables: Sequence[ResultsTables], labels: Sequence[st
     figure = new_figure(10, 1.9 + (0.42 if few else 0.22) * (data.height + 0.5) + 0.16 * len(kinds))
     note = (
         f"n counts episodes. Means over episodes with {interval_name(DEFAULT_LEVEL)}s (two-level bootstrap over tasks "
-        "and episodes). No uniform baseline: results files do not hold the numbers of keys."
+        "and episodes)."
     )
+    if data["uniform_ratio"].null_count():
+        note += " No uniform baseline where a results file does not hold the numbers of keys."
     if len(kinds) > 1:
         note += " Files of different kinds measure different things: compare within a kind."
     layers = data["layer"].unique(maintain_order=True).to_list()
@@ -128,7 +131,8 @@ def _ratios(axes: Axes, data: pl.DataFrame, tables: Sequence[ResultsTables], kin
         for table, layer in zip(tables, data["layer"], strict=True)
     ]
     bounds = [data[f"ratio_mean{end}"].drop_nulls().to_numpy() for end in ("", "_low", "_high")]
-    ratio_axis(axes.xaxis, np.concatenate([*bounds, *dots]))
+    uniform = data["uniform_ratio"].drop_nulls().to_numpy()
+    ratio_axis(axes.xaxis, np.concatenate([*bounds, *dots, uniform]))
     low, high = axes.get_xlim()
     if low < 1 < high:
         axes.axvline(1.0, color=NOTE_COLOR, linewidth=0.9, zorder=1)
@@ -148,6 +152,9 @@ def _ratios(axes: Axes, data: pl.DataFrame, tables: Sequence[ResultsTables], kin
             axes.plot(
                 row["ratio_mean"], position, marker, color=color, markersize=6.5, markeredgecolor="white", zorder=4
             )
+        if row["uniform_ratio"]:
+            ends = [position - 0.42, position + 0.42]
+            axes.plot([row["uniform_ratio"]] * 2, ends, "--", color=BASELINE_COLOR, linewidth=1.2, zorder=1)
         text = f"n = {row['num_episodes']}"
         if row["episodes_without_ratio"]:
             text += f" ({row['episodes_without_ratio']} without)"
@@ -156,6 +163,8 @@ def _ratios(axes: Axes, data: pl.DataFrame, tables: Sequence[ResultsTables], kin
         color, marker = _KINDS[i % len(_KINDS)]
         axes.plot([], [], marker, color=color, markersize=6, label=wrapped(kind, 60, 2))
     axes.scatter([], [], s=10, color=NOTE_COLOR, alpha=0.5, linewidths=0, label="single episode")
+    if uniform.size:
+        axes.plot([], [], "--", color=BASELINE_COLOR, linewidth=1.2, label=BASELINE_LABEL)
     axes.grid(axis="x")
     axes.set_xlabel("ratio of masses, visual / linguistic (logarithmic)")
 

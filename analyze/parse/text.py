@@ -16,6 +16,7 @@ from vla_attention.analyze.published.results_tables import (
     disagreements,
     layers_of,
     spread_of,
+    uniform_ratios,
 )
 from vla_attention.analyze.ratios.verdict import LINGUISTIC_BELOW, VISUAL_ABOVE, verdict
 from vla_attention.analyze.show.headings import WIDTH, wrap
@@ -31,7 +32,7 @@ _VERDICTS = {
     "balanced": "Model shows BALANCED attention between visual and linguistic",
 }
 _CAVEAT = (
-    "Results files do not say how many keys are on each side, so there is no uniform baseline here. With hundreds of "
+    "The file does not say how many keys are on each side, so there is no uniform baseline here. With hundreds of "
     "image keys and a dozen words, uniform attention alone gives ratios of 35 to 50: the verdict (above "
     f"{VISUAL_ABOVE} visual, below {LINGUISTIC_BELOW} linguistic) means little without it. vla-analyze prints it "
     "beside every ratio."
@@ -55,17 +56,20 @@ def summary_of_files(title: str, files: Sequence[ResultsFile], tables: ResultsTa
         "",
         f"Visual/Linguistic Ratio ({_named(layer)}, {plural(spread.num_replans, 'replan')}):",
         *_ratio(spread, layer),
+        *_baseline(rows, spread),
     ]
     lines += _over_episodes(tables, layer)
     lines += ["", f"Attention Fractions ({_named(layer)}):", *_fractions(rows)]
     if len(_layers(files)) > 1:
         lines += ["", "Per layer", *_per_layer(files)]
     lines += ["", f"Per task ({_named(layer)})", *_per_task(episodes, files, layer)]
+    known = rows.select(uniform_ratios().is_not_null().all()).item()
     notes = [
-        _FRAMES_CAVEAT if files[0].kind.frames else _CAVEAT,
+        *([_FRAMES_CAVEAT] if files[0].kind.frames else [] if known else [_CAVEAT]),
         *(note for file in files for note in _notes(file, layer, named=len(files) > 1)),
     ]
-    lines += ["", "Notes", *(line for note in notes for line in wrap(note, first="  - ", rest="    "))]
+    if notes:
+        lines += ["", "Notes", *(line for note in notes for line in wrap(note, first="  - ", rest="    "))]
     return "\n".join(lines) + "\n"
 
 
@@ -114,8 +118,12 @@ def _rows_of(files: Sequence[ResultsFile], layer: str) -> list[pl.DataFrame]:
 
 
 def _origin(files: Sequence[ResultsFile]) -> list[str]:
+    kind = files[0].kind
     lines = [f"file:   {file.path}" for file in files]
-    return [*lines, *wrap(f"masses: {files[0].kind}", rest=" " * 8)]
+    lines += wrap(f"masses: {kind}", rest=" " * 8)
+    if kind.grouping is not None and kind.grouping[1]:
+        lines += wrap(kind.grouping[1], first=" " * 8, rest=" " * 8)
+    return lines
 
 
 def _dataset(episodes: pl.DataFrame) -> list[str]:
@@ -127,6 +135,9 @@ def _dataset(episodes: pl.DataFrame) -> list[str]:
         f"  Tasks: {episodes.select('file', 'task_id').n_unique()}",
         f"  Success Rate: {format_percent(solved / episodes.height)} ({solved} of {episodes.height})",
     ]
+    steps = _float(episodes["num_steps"].mean())
+    if steps is not None:
+        lines.append(f"  Steps: {format_number(steps)} (mean; the loop's counter at the end, waiting steps included)")
     if without.height:
         named = [f"task {row['task_id']} episode {row['episode_index']}" for row in without.iter_rows(named=True)]
         lines.append(f"  Without a single step, and so in no ratio: {listing(named, 6)}")
@@ -148,6 +159,25 @@ def _ratio(spread: Spread, layer: str) -> list[str]:
     if left_out:
         lines.append(f"  Left out of {spread.num_replans}: {left_out}")
     return [*lines, f"  → {_VERDICTS[verdict(spread.mean)]}"]
+
+
+def _baseline(rows: pl.DataFrame, spread: Spread) -> list[str]:
+    """The ratio of uniform attention, what the guide calls it, and the lift over it, where the files have them."""
+    known = rows.filter(pl.col("ratio").is_finite() & uniform_ratios().is_finite())
+    if spread.num_finite == 0 or known.height < spread.num_finite:
+        return []
+    uniform, lift = (
+        _float(known.select(values.mean()).item()) for values in (uniform_ratios(), pl.col("ratio") / uniform_ratios())
+    )
+    keys = " over ".join(format_number(_float(known[f"{side}_keys"].mean())) for side in ("visual", "linguistic"))
+    word, of_uniform = verdict(spread.mean), verdict(uniform)
+    same = "the same: here the word means nothing" if word == of_uniform else f"'{of_uniform}'"
+    return wrap(
+        f"Uniform attention: {format_number(uniform)} ({keys} keys), which the guide calls {same}. Ratio / uniform: "
+        f"{format_number(lift)}.",
+        first="    ",
+        rest="    ",
+    )
 
 
 def _over_episodes(tables: ResultsTables, layer: str) -> list[str]:
@@ -228,6 +258,12 @@ def _notes(file: ResultsFile, layer: str, named: bool) -> list[str]:
     if lacking:
         notes.append(
             f"{of}{plural(lacking, 'episode')} with steps, but without any in {_named(overall_layer(file.steps))}."
+        )
+    if file.counts_actions:
+        notes.append(
+            f"{of}num_steps is the number of executed actions in this file, which does not say so because it is an old "
+            "one of this tool; the waiting steps (the step of the first replan) are added here, and the action that "
+            "solves a task is not counted, as in the published scripts."
         )
     if file.zeros:
         notes.append(

@@ -7,6 +7,9 @@ points, and in no other:
     a ratio of 0 where no ratio exists               undefined: both masses 0, or "layers_avg" of layers without a
                                                      finite ratio
     no "layers_avg", no action fields, no summary    as they are; see `ResultsFile`
+    no numbers of keys, no total mass                unknown; ours from before lack them, too
+    no "num_steps_definition"                        the loop's counter in their files; in ours from before the number
+                                                     of executed actions, from which the counter is computed
     unknown fields                                   skipped, and named in `ResultsFile.unused`
     one episode that is not in a list                a list of one
 """
@@ -18,9 +21,9 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import polars as pl
 
@@ -29,9 +32,11 @@ from vla_attention.schemas.errors import listing
 from vla_attention.schemas.results import (
     RESULTS_PREFIX,
     EpisodeResult,
+    NumStepsDefinition,
     ResultsError,
     ResultsNotFound,
     StepRatio,
+    loop_counter,
     suite_of_results_file,
 )
 
@@ -42,6 +47,8 @@ NO_MASS = 1e-8
 FRAME_FIELDS = ("query_frame", "visual_frame", "text_frame")
 _MASSES = ("visual_mass", "linguistic_mass")
 _FRACTIONS = ("visual_fraction", "linguistic_fraction")
+#: Fields that only newer files of ours have, and their columns.
+_COUNTS = {"total_mass": "total_mass", "num_visual_tokens": "visual_keys", "num_text_tokens": "linguistic_keys"}
 #: The largest accepted fraction: fractions are quotients of sums in float32.
 _ONE = 1 + 1e-4
 
@@ -53,18 +60,23 @@ class ResultsKind:
     Attributes:
         frames: the latent frames of the queries, the visual and the text side (Cosmos scripts); None in other files.
         has_action: the file has an action mass, which is part of the sum in every fraction.
+        grouping: name and description of the grouping that visual and linguistic are from; None where the file does
+            not say.
+        denoise_steps: the denoise steps that masses are means over; None where the file does not say.
     """
 
     frames: tuple[str, str, str] | None
     has_action: bool
+    grouping: tuple[str, str] | None = None
+    denoise_steps: tuple[int, ...] | None = None
 
     def __str__(self) -> str:
-        if self.frames is None:
-            return "visual over linguistic keys, as the file's writer defined them" + (
-                "" if self.has_action else "; no action mass"
-            )
-        query, visual, text = self.frames
-        return f"latent frames, {visual} over {text}, queries {query}"
+        steps = "" if self.denoise_steps is None else f"; denoise steps {listing(self.denoise_steps, 40)}"
+        if self.frames is not None:
+            query, visual, text = self.frames
+            return f"latent frames, {visual} over {text}, queries {query}{steps}"
+        whose = "as the file's writer defined them" if self.grouping is None else f"grouping '{self.grouping[0]}'"
+        return f"visual over linguistic keys, {whose}{'' if self.has_action else '; no action mass'}{steps}"
 
 
 @dataclass(frozen=True)
@@ -87,13 +99,15 @@ class ResultsFile:
         suite: its suite, from the file name.
         kind: the definition of its masses.
         episodes: one row per episode, in the file's order: episode (position), task_id, instruction, episode_index,
-            success, num_steps, num_replans (0 for an episode without steps).
+            success, num_steps (the loop's counter, `results.loop_counter`; null where it cannot be known), num_replans
+            (0 for an episode without steps).
         steps: one row per (episode, replan, layer): episode (position), replan, env_step, layer (the number as a
             string, or "layers_avg"), layer_number, ratio (infinite; null where undefined), visual_mass,
-            linguistic_mass, visual_fraction, linguistic_fraction (null where undefined) and, with `kind.has_action`,
-            action_mass and action_fraction.
+            linguistic_mass, visual_fraction, linguistic_fraction (null where undefined), total_mass, visual_keys,
+            linguistic_keys (null where the file has none) and, with `kind.has_action`, action_mass and action_fraction.
         summary_numbers: the numbers of the file's own summaries.
         zeros: how many ratios of 0 stand for "no ratio" and were read as undefined.
+        counts_actions: `num_steps` of the file is the number of executed actions, as in our files from before.
         unused: names of unknown fields, which were skipped.
     """
 
@@ -104,6 +118,7 @@ class ResultsFile:
     steps: pl.DataFrame
     summary_numbers: tuple[SummaryNumber, ...]
     zeros: int
+    counts_actions: bool
     unused: tuple[str, ...]
 
 
@@ -185,6 +200,7 @@ class _Reading:
         self.unused: dict[str, None] = {}
         self.kinds: dict[ResultsKind, str] = {}
         self.zeros = 0
+        self.ours = False
 
     def read(self, document: object) -> ResultsFile:
         """The whole file."""
@@ -203,18 +219,26 @@ class _Reading:
             if identity in seen:
                 raise _Problem(f"episodes {seen[identity]} and {episode['episode']} are both {_of(*identity)}.")
             seen[identity] = episode["episode"]
+        counts_actions = self._counts_actions(document)
+        for episode in episodes:
+            first = episode.pop("first_step")
+            if counts_actions:
+                given = (episode["num_steps"], episode["success"])
+                episode["num_steps"] = None if first is None else loop_counter(first, *given)
         kind = next(iter(self.kinds))
-        schema = {"ratio": pl.Float64, "visual_fraction": pl.Float64, "linguistic_fraction": pl.Float64}
+        floats = ("ratio", "visual_fraction", "linguistic_fraction", *_COUNTS.values())
+        schema = dict.fromkeys(floats, pl.Float64)
         return ResultsFile(
             path=self.path,
             suite=suite_of_results_file(self.path),
             kind=kind,
-            episodes=pl.DataFrame(episodes),
+            episodes=pl.DataFrame(episodes, schema_overrides={"num_steps": pl.Int64}, infer_schema_length=None),
             steps=pl.DataFrame(
                 self.rows, schema_overrides={**schema, "layer_number": pl.Int64}, infer_schema_length=None
             ),
             summary_numbers=tuple(self.summary_numbers),
             zeros=self.zeros,
+            counts_actions=counts_actions,
             unused=tuple(self.unused),
         )
 
@@ -237,18 +261,43 @@ class _Reading:
             "num_steps": _whole(episode["num_steps"], f"{where}, num_steps"),
         }
         where = f"{where} ({_of(identity['task_id'], identity['episode_index'])})"
-        steps = self._steps(number, _expect(episode["per_step_ratios"], dict, f"{where}, per_step_ratios"), where)
+        about = self._about(episode, where)
+        layers = _expect(episode["per_step_ratios"], dict, f"{where}, per_step_ratios")
+        steps = self._steps(number, layers, about, where)
         self._read_summary(number, _expect(episode.get("summary", {}), dict, f"{where}, summary"), where)
-        return {**identity, "num_replans": len({row["env_step"] for row in steps})}
+        replans = {row["env_step"] for row in steps}
+        return {**identity, "num_replans": len(replans), "first_step": min(replans, default=None)}
 
-    def _steps(self, number: int, layers: Mapping[str, object], where: str) -> list[dict[str, Any]]:
+    def _about(self, episode: Mapping[str, Any], where: str) -> ResultsKind:
+        """The definitions that an episode states; the steps add the rest."""
+        stated = episode.get("num_steps_definition")
+        if stated not in (None, *get_args(NumStepsDefinition)):
+            known = listing(map(repr, get_args(NumStepsDefinition)))
+            raise _Problem(f"{where}, num_steps_definition is {stated!r}; expected {known}, or nothing.")
+        grouping, steps = None, None
+        if episode.get("grouping") is not None:
+            texts = (episode["grouping"], episode.get("grouping_description") or "")
+            grouping = tuple(_expect(text, str, f"{where}, grouping") for text in texts)
+        if episode.get("denoise_steps") is not None:
+            given = _expect(episode["denoise_steps"], list, f"{where}, denoise_steps")
+            steps = tuple(_whole(step, f"{where}, denoise_steps") for step in given)
+        return ResultsKind(None, False, grouping, steps)
+
+    def _counts_actions(self, document: Sequence[Mapping[str, Any]]) -> bool:
+        """Whether `num_steps` is the number of actions: in our files from before the field that says what it is.
+
+        Ours differ from the published scripts' in that every summary counts the ratios that are not finite.
+        """
+        return self.ours and all(episode.get("num_steps_definition") is None for episode in document)
+
+    def _steps(self, number: int, layers: Mapping[str, object], about: ResultsKind, where: str) -> list[dict[str, Any]]:
         rows: list[dict[str, Any]] = []
         for name, given in layers.items():
             label, layer_number = _layer_of(name, f"{where}, per_step_ratios")
             before = -1
             for position, step in enumerate(_expect(given, list, f"{where}, per_step_ratios.{name}")):
                 at = f"{where}, {name}[{position}]"
-                row = self._step(_expect(step, dict, at), at)
+                row = self._step(_expect(step, dict, at), about, at)
                 if step["visual_linguistic_ratio"] is None and label != LAYERS_AVG:
                     # Our files write null for infinite and for undefined ratios; the masses tell which it is.
                     row["ratio"] = math.inf if row["visual_mass"] > NO_MASS >= row["linguistic_mass"] else None
@@ -274,7 +323,7 @@ class _Reading:
         self.rows += rows
         return rows
 
-    def _step(self, step: Mapping[str, Any], where: str) -> dict[str, Any]:
+    def _step(self, step: Mapping[str, Any], about: ResultsKind, where: str) -> dict[str, Any]:
         has_action = "action_mass" in step
         masses, fractions = [*_MASSES], [*_FRACTIONS]
         if has_action:
@@ -285,7 +334,7 @@ class _Reading:
         if missing:
             raise _Problem(f"{where} lacks {listing(map(repr, missing))}.")
         self._note_unused(step, [*(field.name for field in fields(StepRatio)), *FRAME_FIELDS, "selected_call_S"])
-        self._note_kind(step, has_frames, has_action, where)
+        self._note_kind(step, replace(about, has_action=has_action), has_frames, where)
         row: dict[str, Any] = {"env_step": _whole(step["step"], f"{where}.step")}
         for name in masses:
             row[name] = _number(step[name], f"{where}.{name}", math.inf)
@@ -293,15 +342,15 @@ class _Reading:
                 raise _Problem(f"{where}.{name} is {step[name]!r}; expected a finite mass.")
         for name in fractions:
             row[name] = _number(step[name], f"{where}.{name}", _ONE)
+        for name, column in _COUNTS.items():
+            row[column] = _number(step.get(name), f"{where}.{name}", math.inf)
         row["ratio"] = _number(step["visual_linguistic_ratio"], f"{where}.visual_linguistic_ratio", math.inf)
         return row
 
-    def _note_kind(self, step: Mapping[str, Any], has_frames: bool, has_action: bool, where: str) -> None:
-        frames = None
+    def _note_kind(self, step: Mapping[str, Any], kind: ResultsKind, has_frames: bool, where: str) -> None:
         if has_frames:
             query, visual, text = (_expect(step[name], str, f"{where}.{name}") for name in FRAME_FIELDS)
-            frames = (query, visual, text)
-        kind = ResultsKind(frames, has_action)
+            kind = replace(kind, frames=(query, visual, text))
         if self.kinds and kind not in self.kinds:
             other, first = next(iter(self.kinds.items()))
             raise _Problem(f"{where} holds masses of another kind ({kind}) than {first} ({other}).")
@@ -315,7 +364,9 @@ class _Reading:
                     continue
                 at = f"{where}, summary.{name}.{measure}"
                 for statistic, value in _expect(statistics, dict, at).items():
-                    if statistic != "num_nonfinite":
+                    if statistic == "num_nonfinite":
+                        self.ours = True
+                    else:
                         stated = _number(value, f"{at}.{statistic}", math.inf)
                         self.summary_numbers.append(SummaryNumber(number, label, measure, statistic, stated))
 

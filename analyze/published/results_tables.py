@@ -1,7 +1,8 @@
 """Results files as the tables of `measures.aggregate`, so that pictures and intervals are those of stores.
 
-A results file holds masses and fractions, but no row sums and no numbers of keys. Those columns are null, and so are
-the uniform baseline and every lift.
+A results file holds masses and fractions, but no row sums, and only the numbers of keys of the two sides of the ratio.
+The other columns are null, and so are the lifts of groups. The uniform baseline is null where a file has no numbers of
+keys, as those of the published scripts.
 """
 
 from __future__ import annotations
@@ -118,6 +119,7 @@ def _replans(rows: pl.DataFrame, grouping: Grouping) -> Tables:
             for name in names
         )
         rows = rows.with_columns(rest.alias(f"{REST}_fraction"), (rest * total).alias(f"{REST}_mass"))
+    uniform = uniform_ratios()
     not_finite = ~pl.col("ratio").is_finite().fill_null(False)
     left_out = (
         pl.when(pl.col("layer") != LAYERS_AVG)
@@ -132,8 +134,8 @@ def _replans(rows: pl.DataFrame, grouping: Grouping) -> Tables:
         _UNKNOWN.alias("num_valid"),
         pl.col("visual_mass").alias("numerator_mass"),
         pl.col("linguistic_mass").alias("denominator_mass"),
-        _UNKNOWN.alias("uniform_ratio"),
-        _UNKNOWN.alias("ratio_lift"),
+        uniform.alias("uniform_ratio"),
+        (pl.col("ratio") / uniform).fill_nan(None).alias("ratio_lift"),
         pl.col("ratio").log(2.0).alias("log2_ratio"),
         pl.when(pl.col("layer") == LAYERS_AVG)
         .then(left_out)
@@ -148,12 +150,18 @@ def _replans(rows: pl.DataFrame, grouping: Grouping) -> Tables:
             pl.lit(name).alias("group"),
             pl.col(f"{name}_mass").cast(pl.Float64).alias("mass"),
             pl.col(f"{name}_fraction").cast(pl.Float64).alias("fraction"),
-            *(_UNKNOWN.alias(unknown) for unknown in ("keys", "density", "lift")),
+            (pl.col(f"{name}_keys") if f"{name}_keys" in table.columns else _UNKNOWN).alias("keys"),
+            *(_UNKNOWN.alias(unknown) for unknown in ("density", "lift")),
             pl.int_range(pl.len()).alias("_cell"),
         )
         for name in grouping.names
     ).sort("_cell", maintain_order=True)  # fmt: skip
-    return Tables(table.drop(measures), groups.drop("_cell"))
+    return Tables(table.drop(measures, "total_mass", "visual_keys", "linguistic_keys"), groups.drop("_cell"))
+
+
+def uniform_ratios() -> pl.Expr:
+    """The ratio that uniform attention gives at every step; null where the numbers of keys are unknown."""
+    return (pl.col("visual_keys") / pl.col("linguistic_keys")).fill_nan(None)
 
 
 def layers_of(file: ResultsFile) -> list[str]:

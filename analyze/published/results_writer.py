@@ -7,25 +7,33 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.frames import EPISODE_KEYS, LAYERS_AVG, Tables
+from vla_attention.analyze.measures.masses import sides
 from vla_attention.analyze.show.output_files import replacing
 from vla_attention.schemas.groupings.grouping import Grouping
-from vla_attention.schemas.results import FrameProxy, ResultsError, results_file_name
+from vla_attention.schemas.results import FrameProxy, ResultsError, loop_counter, results_file_name
 
 #: Fields that are absent, not null, when the grouping has no group of this name.
 _ACTION = "action"
 _SIDES = ("visual", "linguistic")
 _RATIO = "visual_linguistic_ratio"
+#: Fields of every step beside ratio, masses and fractions.
+_COUNTS = ("total_mass", "num_visual_tokens", "num_text_tokens")
 
 
-def episode_documents(replans: Tables, grouping: Grouping, proxy: FrameProxy | None = None) -> Iterator[dict[str, Any]]:
+def episode_documents(
+    replans: Tables, grouping: Grouping, denoise_steps: Sequence[int], proxy: FrameProxy | None = None
+) -> Iterator[dict[str, Any]]:
     """Episodes of one or more suites from `aggregate.replan_tables`, in their order, as JSON documents.
 
     visual is the sum of the ratio's numerator groups, linguistic that of its denominator groups; the fraction of either
-    is its mass / sum of all groups' masses. With a `proxy` the numbers are those of the published Cosmos scripts
-    instead: masses are sums over the queries (ours are means), and fractions are of visual + linguistic only.
+    is its mass / sum of all groups' masses. `denoise_steps` are those that the masses are means over. With a `proxy`
+    the numbers are those of the published Cosmos scripts instead: masses are sums over the queries (ours are means),
+    and fractions are of visual + linguistic only.
 
     The documents follow `vla_attention.schemas.results.EpisodeResult`. They are plain dictionaries, because a suite has
     a hundred thousand steps.
@@ -37,7 +45,8 @@ def episode_documents(replans: Tables, grouping: Grouping, proxy: FrameProxy | N
         )
     sides = [*_SIDES, _ACTION] if _ACTION in grouping.names and proxy is None else list(_SIDES)
     kinds = [f"{side}_{kind}" for side in sides for kind in ("mass", "fraction")]
-    table = _with_sides(replans, grouping, proxy).select(*EPISODE_KEYS, "layer", "replan", "step", _RATIO, *kinds)
+    columns = ("layer", "replan", "step", _RATIO, *kinds, *_COUNTS)
+    table = _with_sides(replans, grouping, proxy).select(*EPISODE_KEYS, *columns)
     extra = {} if proxy is None else proxy.fields()
     for part in table.partition_by("suite", "task_id", "episode_index", maintain_order=True):
         identity = part.select(EPISODE_KEYS).row(0, named=True)
@@ -50,7 +59,12 @@ def episode_documents(replans: Tables, grouping: Grouping, proxy: FrameProxy | N
             "episode_idx": identity["episode_index"],
             "task_description": identity["instruction"],
             "success": identity["success"],
-            "num_steps": identity["num_steps"],
+            # The first replan comes after the last waiting step.
+            "num_steps": loop_counter(int(part["step"].to_numpy().min()), identity["num_steps"], identity["success"]),
+            "num_steps_definition": "loop_counter",
+            "grouping": grouping.name,
+            "grouping_description": grouping.description,
+            "denoise_steps": list(denoise_steps),
             "summary": {_field_of_layer(layer): _summary_document(summaries[layer], kinds) for layer in steps},
             "per_step_ratios": {
                 _field_of_layer(layer): [step | extra for step in rows.to_dicts()] if extra else rows.to_dicts()
@@ -70,23 +84,29 @@ def write_results(path: Path, episodes: Iterable[dict[str, Any]]) -> None:
 
 
 def write_results_of_suites(
-    folder: Path, replans: Tables, grouping: Grouping, proxy: FrameProxy | None = None
+    folder: Path,
+    replans: Tables,
+    grouping: Grouping,
+    denoise_steps: Sequence[int],
+    proxy: FrameProxy | None = None,
 ) -> list[Path]:
     """Write `attention_ratio_results_<suite>.json` for every suite of the tables and return the paths."""
     paths = []
     for suite in replans.cells["suite"].unique(maintain_order=True):
         path = folder / results_file_name(suite)
-        write_results(path, episode_documents(replans.filter(pl.col("suite") == suite).kept(), grouping, proxy))
+        of_suite = replans.filter(pl.col("suite") == suite).kept()
+        write_results(path, episode_documents(of_suite, grouping, denoise_steps, proxy))
         paths.append(path)
     return paths
 
 
 def _with_sides(replans: Tables, grouping: Grouping, proxy: FrameProxy | None) -> pl.DataFrame:
-    """Add step, ratio (null where it is not finite), and the masses and fractions of the two sides."""
+    """Add step, ratio (null where it is not finite), masses, fractions and numbers of keys of the two sides."""
     cells = replans.cells
     visual, linguistic = cells["numerator_mass"], cells["denominator_mass"]
     queries = 1 if proxy is None else proxy.num_queries
     total = visual + linguistic if proxy else pl.Series(replans.values("mass").sum(axis=1))
+    above, below = sides(replans.values("keys"), grouping)
     table = cells.with_columns(
         pl.col("env_step").alias("step"),
         pl.when(pl.col("ratio").is_finite()).then(pl.col("ratio")).alias(_RATIO),
@@ -94,6 +114,9 @@ def _with_sides(replans: Tables, grouping: Grouping, proxy: FrameProxy | None) -
         (linguistic * queries).alias("linguistic_mass"),
         (visual / total).fill_nan(None).alias("visual_fraction"),
         (linguistic / total).fill_nan(None).alias("linguistic_fraction"),
+        (total * queries).alias("total_mass"),
+        _count("num_visual_tokens", above),
+        _count("num_text_tokens", below),
     )
     if _ACTION in grouping.names:
         of_action = replans.of_group(_ACTION)
@@ -101,6 +124,11 @@ def _with_sides(replans: Tables, grouping: Grouping, proxy: FrameProxy | None) -
             of_action["mass"].alias(f"{_ACTION}_mass"), of_action["fraction"].alias(f"{_ACTION}_fraction")
         )
     return table
+
+
+def _count(name: str, keys: NDArray[np.float64]) -> pl.Series:
+    """Numbers of keys; whole numbers unless objects cover parts of patches."""
+    return pl.Series(name, keys.astype(np.int64) if (keys == np.floor(keys)).all() else keys)
 
 
 def _summaries(episode: pl.DataFrame, kinds: Sequence[str]) -> pl.DataFrame:

@@ -30,7 +30,7 @@ from vla_attention.analyze.published.results_writer import write_results_of_suit
 from vla_attention.analyze.ratios.contribution_text import contributions_section, group_contributions_section
 from vla_attention.analyze.ratios.summary_text import AnalysedRun, summary_text
 from vla_attention.analyze.show.output_files import write_parquet, write_text, writing
-from vla_attention.analyze.stores.selection import Selection, heads_text
+from vla_attention.analyze.stores.selection import Selection, denoise_text, heads_text
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
@@ -73,6 +73,12 @@ class Analysis:
             for (layer, group), row in overall_rows(self.tasks).by_group("layer").items()
             if layer == self.overall["layer"]
         }
+
+    @property
+    def denoise(self) -> str:
+        """The denoise steps that the numbers are means over, in words."""
+        policy = self.question.stores[0].attributes.policy
+        return denoise_text(self.question.selection.denoise_steps, policy.num_denoise_steps)
 
     @property
     def present_groups(self) -> tuple[str, ...]:
@@ -137,7 +143,7 @@ def _described(question: Question) -> AnalysedRun:
         untrained=policy.untrained,
         denoise_steps=question.selection.denoise_steps,
         heads=describe_heads(question.selection, policy.num_heads),
-        notes=[*_notes(root, question.selection, question.site), *question.skipped, *question.notes],
+        notes=[*_notes(root, question.selection, question.site), *question.remarks],
     )
 
 
@@ -147,8 +153,11 @@ def write_tables(analysis: Analysis, folder: Path) -> list[Path]:
     Each file appears whole or not at all.
     """
     written: list[Path] = []
+    grouping = analysis.grouping
+    # A table that is passed on alone says what its numbers are.
+    about = {"grouping": grouping.name, "grouping_description": grouping.description, "mean_over": analysis.denoise}
     for name in ("steps", "episodes", "tasks"):
-        written += write_parquet(folder, **named_tables(name, getattr(analysis, name)))
+        written += write_parquet(folder, about, **named_tables(name, getattr(analysis, name)))
     recorded: dict[str, pl.DataFrame] = {}
     if analysis.contributions is not None:
         recorded["contributions"] = analysis.contributions
@@ -156,12 +165,13 @@ def write_tables(analysis: Analysis, folder: Path) -> list[Path]:
         recorded["group_contributions"] = analysis.group_contributions.groups
         if "contribution_ratio" in analysis.group_contributions.cells.columns:
             recorded["group_contribution_ratios"] = analysis.group_contributions.cells
-    written += write_parquet(folder, **recorded)
+    written += write_parquet(folder, about, **recorded)
     with writing("results", folder):
-        if analysis.grouping.ratio is not None:
+        if grouping.ratio is not None:
             question = analysis.question
-            proxy = frame_proxy(question.stores[0].attributes, question.selected[0].tokens.layout, analysis.grouping)
-            written += write_results_of_suites(folder, analysis.replans, analysis.grouping, proxy)
+            proxy = frame_proxy(question.stores[0].attributes, question.selected[0].tokens.layout, grouping)
+            steps = question.selection.denoise_steps
+            written += write_results_of_suites(folder, analysis.replans, grouping, steps, proxy)
         write_text(folder / "summary.txt", analysis.summary)
     written.append(folder / "summary.txt")
     if analysis.sinks is not None:

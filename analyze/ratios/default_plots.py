@@ -21,12 +21,12 @@ def write_plots(analysis: Analysis, folder: Path, every_episode: bool) -> list[P
 
     Pictures of ratios are drawn when the grouping has one; `every_episode` adds one per episode and layer.
     """
-    grouping = analysis.grouping
-    written = plot_attention_fractions(analysis.tasks, grouping, folder)
+    grouping, note = analysis.grouping, f"Mean over {analysis.denoise}."
+    written = plot_attention_fractions(analysis.tasks, grouping, folder, note=note)
     if grouping.ratio is not None:
-        written += plot_ratio_distribution(analysis.replans.cells, grouping, folder)
-        written += plot_ratio_per_task(analysis.episodes.cells, analysis.tasks.cells, grouping, folder)
-    written += plot_layer_profile(analysis.tasks, grouping, folder)
+        written += plot_ratio_distribution(analysis.replans.cells, grouping, folder, note=note)
+        written += plot_ratio_per_task(analysis.episodes.cells, analysis.tasks.cells, grouping, folder, note=note)
+    written += plot_layer_profile(analysis.tasks, grouping, folder, note=note)
     if every_episode:
         pictures = analysis.episodes.cells.height
         with progress_bar(pictures, "pictures") as advance:

@@ -19,15 +19,18 @@ STEM = "layer_profile"
 
 
 @drawn_in_our_style
-def plot_layer_profile(tasks: Tables, grouping: Grouping, folder: Path) -> list[Path]:
-    """Draw the rows of `aggregate.task_tables` over all tasks; returns the paths of pictures and data."""
+def plot_layer_profile(tasks: Tables, grouping: Grouping, folder: Path, *, note: str = "") -> list[Path]:
+    """Draw the rows of `aggregate.task_tables` over all tasks; returns the paths of pictures and data.
+
+    `note`: a sentence to add below the title.
+    """
     level = overall_rows(tasks).filter(pl.col("layer") != LAYERS_AVG)
     rows, layers = level.cells, layer_order(level.cells)
     figure = new_figure(max(6.6, 3.2 + 0.3 * min(len(layers), 28)), 3.1 if grouping.ratio is None else 5.0)
-    note = f"Means over {of_tasks(rows['num_episodes'][0], rows['num_tasks'][0])}."
+    about = f"Means over {of_tasks(rows['num_episodes'][0], rows['num_tasks'][0])}."
     if grouping.ratio is not None and rows["num_nonfinite"].sum():
-        note += f" {rows['num_nonfinite'].sum()} of {rows['num_replans'].sum()} ratios are not finite and in no mean."
-    title(figure, f"Layers, {named(grouping)}", note)
+        about += f" {rows['num_nonfinite'].sum()} of {rows['num_replans'].sum()} ratios are not finite and in no mean."
+    title(figure, f"Layers, {named(grouping)}", f"{about} {note}")
     draw_profile(figure, level, grouping, layers, "layer", DEFAULT_LEVEL)
     names = ["layer", "block", "num_episodes", "num_replans"]
     if grouping.ratio is not None:

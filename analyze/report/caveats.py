@@ -68,6 +68,7 @@ def caveats(analysis: Analysis, masses: Mapping[str, float], sinks: pl.DataFrame
         *_compute_type(question),
         *_rounding(question),
         *(Caveat("Left out", line, True) for line in question.skipped),
+        *(Caveat("Chosen part", line) for line in question.notes),
     ]
     return sorted(found, key=lambda caveat: not caveat.grave)
 
@@ -212,7 +213,7 @@ def _parts_of_the_model(question: Question) -> list[Caveat]:
             f"These numbers are of {blocks} of {policy.num_layers} layers and {heads} of {policy.num_heads} heads."
         )
         found.append(Caveat("Part of the model", sentence))
-    if len(steps) < policy.num_denoise_steps:
+    if len(steps) < policy.num_denoise_steps and not question.notes:
         which = "step" if len(steps) == 1 else "steps"
         sentence = f"Means over denoise {which} {listing(steps)} of {policy.num_denoise_steps}."
         found.append(Caveat("Denoise steps", sentence))

@@ -53,13 +53,15 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def write_parquet(folder: Path, **tables: pl.DataFrame) -> list[Path]:
+def write_parquet(folder: Path, about: Mapping[str, str] | None = None, /, **tables: pl.DataFrame) -> list[Path]:
     """Write each table as `NAME.parquet` into a folder, which is made if it is missing; returns the paths.
+
+    `about` is written into the metadata of each file (`polars.read_parquet_metadata`).
 
     Raises:
         BadArgument: the folder cannot be made or written to.
     """
-    return _write(folder, "parquet", tables, lambda table, path: table.write_parquet(path))
+    return _write(folder, "parquet", tables, lambda table, path: table.write_parquet(path, metadata=dict(about or {})))
 
 
 def write_csv(folder: Path, **tables: pl.DataFrame) -> list[Path]:

@@ -83,6 +83,14 @@ def heads_text(selection: Selection, num_heads: int) -> str:
     return "all heads" if len(selection.heads) == num_heads else f"heads {listing(selection.head_numbers, 40)}"
 
 
+def denoise_text(steps: Sequence[int], num_steps: int) -> str:
+    """Denoise steps in words; `num_steps` is how many the policy has."""
+    if len(steps) == 1:
+        which = {0: " (the first)", num_steps - 1: " (the last)"}.get(steps[0], "") if num_steps > 1 else ""
+        return f"denoise step {steps[0]}{which} of {num_steps}"
+    return f"denoise steps {listing(steps, 40)} of {num_steps}"
+
+
 def choose_site(root: RootAttributes, name: str | None) -> str:
     """The wanted site, or the first one. Sites are normalised separately: one analysis never mixes them."""
     names = [site.name for site in root.sites]

@@ -51,7 +51,7 @@ def _header(question: Question, courses: TimeCourses) -> str:
         f"{of_tasks(of.height, of.select('suite', 'task_id').n_unique())}, {int(of['success'].sum())} successful; "
         f"{layer}; grouping '{question.grouping.name}'. {interval_note(DEFAULT_LEVEL, 'pointwise')}"
     )
-    for line in question.skipped:
+    for line in question.remarks:
         lines += wrap(line)
     return "\n".join(lines)
 

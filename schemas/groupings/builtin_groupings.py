@@ -5,6 +5,7 @@ To add one, write its function and its entry in `BUILTIN_GROUPINGS`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,6 +19,9 @@ from vla_attention.schemas.groupings.grouping import (
 )
 from vla_attention.schemas.groupings.vocabulary import NO_COVERAGE, NO_WORDS, Vocabulary
 
+#: Keys that the published pi scripts call text: their prompt is padded to this length by default.
+PUBLISHED_TEXT_KEYS = 256
+_REFERENCE = re.compile(r"reference:(\d+)")
 _TEXT = "role:bos | role:template | role:instruction | role:text"
 
 
@@ -104,40 +108,55 @@ def objects(vocabulary: Vocabulary) -> Grouping:
     )
 
 
-def reference(vocabulary: Vocabulary) -> Grouping:
+def reference(vocabulary: Vocabulary, text_keys: int | None = None) -> Grouping:
     """The published scripts' key ranges on our rows, to compare with old numbers.
 
-    The groups are not what their names say. pi: "visual" is the first camera, "linguistic" the next keys, as many as
-    the prompt has slots (they are patches of the next camera), "action" all the rest. Cosmos: frame `curr_last` over
-    frame `frame0`, a blank picture. The scripts' queries differ too: theirs is one token of the prefix pass for pi, and
-    for Cosmos they sum over the queries, whereas our rows are means.
+    The groups are not what their names say. pi: "visual" is the first camera, "linguistic" the next `text_keys` keys
+    (those of the next camera, at 256 its patches exactly), "action" all the rest. A range that reaches beyond the last
+    key ends there, as the scripts' slices do. Cosmos: frame `curr_last` over frame `frame0`, a blank picture. The
+    scripts' queries differ too: docs/published-numbers.md.
+
+    Args:
+        vocabulary: the names in the stores.
+        text_keys: length of the scripts' prompt (their `--max-token-len`), for pi; None is their default, 256.
     """
+    name = "reference" if text_keys is None else f"reference-{text_keys}"
     spans = vocabulary.layout.spans if vocabulary.layout is not None else ()
     if any(span.kind == "latent" for span in spans):
+        if text_keys is not None:
+            raise GroupingError(
+                f"Cannot use the grouping 'reference:{text_keys}' here: a number of text keys belongs to the published "
+                "pi scripts, and the Cosmos scripts compare latent frames; expected 'reference'."
+            )
         groups = {"visual": ("frame:curr_last",), "linguistic": ("frame:frame0",)}
         return Grouping(
-            name="reference",
+            name=name,
             groups=groups,
             ratio=Ratio(("visual",), ("linguistic",)),
             description="the published Cosmos scripts' frames: 'linguistic' is a blank picture, and holds no language",
             proxy=True,
+            published_denoise="last",
         )
     images = [span.num_keys for span in spans if span.kind == "image"]
-    texts = [span.num_keys for span in spans if span.kind == "text"]
-    if not images or not texts:
+    if vocabulary.layout is None or not images or not any(span.kind == "text" for span in spans):
         raise GroupingError(
             "The grouping 'reference' is defined for the sites 'joint' (pi) and 'self' (Cosmos) only; "
             "choose with --site."
         )
-    first, last = images[0], images[0] + texts[0] - 1
+    first, wanted = images[0], PUBLISHED_TEXT_KEYS if text_keys is None else text_keys
+    last = min(first + wanted, vocabulary.layout.num_keys) - 1
+    if last < first:
+        raise GroupingError(f"Cannot use the grouping 'reference:{wanted}': expected at least one text key.")
+    cut = f" (of {wanted} keys; the site ends there)" if last - first + 1 < wanted else ""
     return Grouping(
-        name="reference",
+        name=name,
         groups={"visual": (f"keys:0-{first - 1}",), "linguistic": (f"keys:{first}-{last}",), "action": ("*",)},
         ratio=Ratio(("visual",), ("linguistic",)),
         allow_empty=("action",),
-        description=f"the published pi scripts' key ranges: 'linguistic' is keys {first} to {last}, "
+        description=f"the published pi scripts' key ranges: 'linguistic' is keys {first} to {last}{cut}, "
         "wherever the prompt really is",
         proxy=True,
+        published_denoise="first",
     )
 
 
@@ -151,7 +170,10 @@ BUILTIN_GROUPINGS: dict[str, Callable[[Vocabulary], Grouping]] = {
 
 
 def find_grouping(name_or_file: str, vocabulary: Vocabulary) -> Grouping:
-    """Find a built-in grouping by name, or read a TOML file."""
+    """Find a built-in grouping by name (`reference:N`: `reference` with N text keys), or read a TOML file."""
+    with_keys = _REFERENCE.fullmatch(name_or_file)
+    if with_keys is not None:
+        return reference(vocabulary, int(with_keys[1]))
     if name_or_file in BUILTIN_GROUPINGS:
         return BUILTIN_GROUPINGS[name_or_file](vocabulary)
     path = Path(name_or_file)

@@ -7,6 +7,7 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 from vla_attention.schemas.errors import UserError, did_you_mean, listing
 from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
@@ -57,6 +58,7 @@ class Grouping:
     `groups`: group name to selectors (their union). `overlap`: a key may belong to more than one group. `allow_empty`:
     groups that may have no keys in any selected episode; for any other group that is an error. `proxy`: groups are
     called visual and linguistic, as in the published scripts, although their keys are something else.
+    `published_denoise`: the denoise step whose rows the published numbers are of, for a grouping that repeats them.
     """
 
     name: str
@@ -66,6 +68,7 @@ class Grouping:
     allow_empty: tuple[str, ...] = ()
     description: str = ""
     proxy: bool = False
+    published_denoise: Literal["first", "last"] | None = None
 
     def __post_init__(self) -> None:
         """Check everything that can be checked without a layout."""

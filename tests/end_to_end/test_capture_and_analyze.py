@@ -96,7 +96,7 @@ def test_results_file_has_the_published_structure(captured_store, tmp_path):
     assert [(item["task_id"], item["episode_idx"]) for item in episodes] == [(0, 0), (0, 1), (1, 0), (1, 1)]
     first = episodes[0]
     assert first["task_description"] == "lift the red cube"
-    assert first["num_steps"] == 12
+    assert first["num_steps"] == 10 + 12  # waiting steps and actions
     assert first["success"] is False
     # 3 is the published scripts' number for block 0 of a model with three blocks.
     assert set(first["summary"]) == set(first["per_step_ratios"]) == {"layer_2", "layer_3", "layers_avg"}

@@ -76,7 +76,7 @@ def test_root_attributes_validate():
     )
     attributes = RootAttributes(
         format="vla-attention",
-        format_version=2,
+        format_version=1,
         policy=policy,
         protocol=Protocol("libero_10", seed=7, wait_steps=10, replan_steps=5, max_steps=520),
         recording=Recording((7,), (25,), (0, 9), tuple(range(8)), "mean", 10, 10),
@@ -135,7 +135,7 @@ def test_results_files_validate(grouping, tmp_path):
     keys = None if grouping.name == "default" else CUSTOM_KEYS
     steps = make_steps(grouping, keys, no_denominator=0.5)
     replans = replans_of(steps, grouping)
-    (path,) = write_results_of_suites(tmp_path, replans, grouping)
+    (path,) = write_results_of_suites(tmp_path, replans, grouping, (0, 9))
     document = json.loads(path.read_text(encoding="utf-8"))
     check("results.schema.json", document)
     document[0]["per_step_ratios"]["layers_avg"][0]["step"] = "ten"

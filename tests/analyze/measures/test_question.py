@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -85,3 +86,39 @@ def test_a_misspelt_command_is_no_store(capsys):
     said = capsys.readouterr().err
     assert "Did you mean 'heads'" in said
     assert "compare" in said
+
+
+def texts_of(folder: Path, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[str, str]:
+    """What is printed, and the line on denoise steps in the summary file."""
+    assert main([*words, "--output", str(folder)]) == 0
+    return " ".join(capsys.readouterr().out.split()), " ".join((folder / "summary.txt").read_text().split())
+
+
+def test_results_of_one_denoise_step_say_so_wherever_they_go(tmp_path, capsys):
+    path = str(write_store(tmp_path / "a.zarr"))
+    folder = tmp_path / "out"
+    only = "These numbers are of denoise step 0 (the first) of 10 only, as --denoise asks."
+    printed, summary = texts_of(folder, capsys, path, "--denoise", "first", "--no-plots")
+    assert only in printed
+    assert only in summary
+    results = json.loads((folder / "attention_ratio_results_made_up.json").read_text())
+    assert [episode["denoise_steps"] for episode in results] == [[0]] * 4
+    about = pl.read_parquet_metadata(folder / "tasks.parquet")
+    assert about["mean_over"] == "denoise step 0 (the first) of 10"
+    assert about["grouping"] == "default"
+    for command in ("heads", "words", "time"):
+        assert main([command, path, "--denoise", "first", "--no-plots", "--output", str(tmp_path / command)]) == 0
+        assert only in " ".join(capsys.readouterr().out.split()), command
+    printed, summary = texts_of(folder, capsys, path, "--no-plots")
+    assert "These numbers are of" not in printed + summary
+    assert json.loads((folder / "attention_ratio_results_made_up.json").read_text())[0]["denoise_steps"] == [0, 9]
+
+
+def test_the_grouping_reference_says_which_denoise_step_the_published_numbers_are_of(tmp_path, capsys):
+    path = str(write_store(tmp_path / "a.zarr"))
+    words = (path, "--grouping", "reference", "--no-plots")
+    printed, _ = texts_of(tmp_path / "out", capsys, *words)
+    assert "are means over denoise steps 0, 9 of 10; those of the published scripts are of denoise step 0" in printed
+    assert "compare with --denoise first" in printed
+    printed, _ = texts_of(tmp_path / "out", capsys, *words, "--denoise", "first")
+    assert "are of denoise step 0 (the first) of 10 alone, as those of the published scripts" in printed

@@ -16,6 +16,7 @@ from tests.analyze.published.test_results_reader import ours
 from tests.kit.published_results import cosmos_episodes, pi_episodes, write_published
 from vla_attention.analyze.parse.command import main
 from vla_attention.analyze.parse.plot_results_comparison import row_names
+from vla_attention.analyze.show.numbers import format_number
 
 
 def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
@@ -59,6 +60,22 @@ def test_the_published_parsers_numbers_are_printed(tmp_path, monkeypatch, capsys
     assert re.search(r"  Success Rate: 50\.0% ", out)
     assert max(map(len, out.splitlines())) <= 110
     assert list(tmp_path.iterdir()) == [path]  # without a flag nothing is written
+
+
+def test_the_published_verdict_stands_beside_what_uniform_attention_gives(tmp_path, capsys):
+    path, replans = ours(tmp_path)
+    _, out, _ = run(capsys, "--results", path)
+    cells = replans.cells.filter(layer="layers_avg")
+    lift = np.mean(cells["ratio"].to_numpy() / (512 / 14))
+    first, *more = out.split("→ Model is VISUAL-dominant (prefers visual features)\n")[1].splitlines()
+    said = " ".join([first, *more[:1]])
+    assert "Uniform attention: 36.57 (512 over 14 keys), which the guide calls the same" in " ".join(said.split())
+    assert f"Ratio / uniform: {format_number(lift)}." in " ".join(said.split())
+    assert "no uniform baseline" not in out
+    # A file of the published scripts has no numbers of keys.
+    _, out, _ = run(capsys, "--results", write_published(tmp_path, "theirs", pi_episodes()))
+    assert "Uniform attention:" not in out
+    assert "there is no uniform baseline here" in " ".join(out.split())
 
 
 def test_layers_and_tasks_have_their_own_means(tmp_path, capsys):

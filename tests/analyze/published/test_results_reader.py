@@ -36,11 +36,12 @@ from vla_attention.analyze.published.results_writer import write_results_of_suit
 from vla_attention.schemas.results import ResultsError, ResultsNotFound
 
 GROUPING = default_grouping()
+DENOISE_STEPS = (0, 9)
 
 
 def ours(folder, **changes):
     replans = replans_of(make_steps(**changes), GROUPING)
-    (path,) = write_results_of_suites(folder, replans, GROUPING)
+    (path,) = write_results_of_suites(folder, replans, GROUPING, DENOISE_STEPS)
     return path, replans
 
 
@@ -62,6 +63,61 @@ def test_our_own_files_read_back_as_the_table_they_were_written_from(tmp_path):
     assert back["ratio"].to_list() == expected["ratio"].to_list()
     assert expected["ratio"].is_infinite().any()
     assert disagreements(file) == []
+
+
+def as_before(path: Path, actions: dict[tuple[int, int], int]) -> None:
+    """Make a file of ours one from before: `num_steps` is the number of actions, and nothing says so."""
+    document = json.loads(path.read_text())
+    new = ("num_steps_definition", "grouping", "grouping_description", "denoise_steps")
+    for episode in document:
+        for name in new:
+            del episode[name]
+        episode["num_steps"] = actions[episode["task_id"], episode["episode_idx"]]
+        for steps in episode["per_step_ratios"].values():
+            for step in steps:
+                for name in ("total_mass", "num_visual_tokens", "num_text_tokens"):
+                    del step[name]
+    path.write_text(json.dumps(document))
+
+
+def test_num_steps_is_the_loops_counter_whoever_wrote_the_file_and_when(tmp_path):
+    path, replans = ours(tmp_path)
+    cells = replans.cells.unique(["task_id", "episode_index"]).sort("task_id", "episode_index")
+    actions = {(row["task_id"], row["episode_index"]): row["num_steps"] for row in cells.iter_rows(named=True)}
+    expected = [10 + row["num_steps"] - row["success"] for row in cells.iter_rows(named=True)]
+    new = read_results_file(path)
+    assert (new.episodes["num_steps"].to_list(), new.counts_actions) == (expected, False)
+    as_before(path, actions)
+    old = read_results_file(path)
+    assert (old.episodes["num_steps"].to_list(), old.counts_actions) == (expected, True)
+    assert old.steps["visual_keys"].is_null().all()
+    episodes = pi_episodes()
+    theirs = read_results_file(write_published(tmp_path, "theirs", episodes))
+    assert theirs.episodes["num_steps"].to_list() == [episode["num_steps"] for episode in episodes]
+    assert not theirs.counts_actions
+
+
+def test_files_that_say_how_many_keys_each_side_has_get_a_baseline_and_a_lift(tmp_path):
+    path, replans = ours(tmp_path, no_denominator=0.2)
+    tables = results_tables([read_results_file(path)], ["libero_10"])
+    for column in ("uniform_ratio", "ratio_lift"):
+        own, expected = (
+            part.cells.sort("task_id", "episode_index", "replan", "layer_number", nulls_last=True)[column]
+            for part in (tables.replans, replans)
+        )
+        np.testing.assert_allclose(own.to_numpy(), expected.to_numpy())
+    theirs = results_tables([read_results_file(write_published(tmp_path, "theirs", pi_episodes()))], ["theirs"])
+    assert theirs.replans.cells["uniform_ratio"].is_null().all()
+
+
+def test_files_of_different_groupings_or_denoise_steps_are_of_different_kinds(tmp_path):
+    path, _ = ours(tmp_path)
+    document = json.loads(path.read_text())
+    kinds = {read_results_file(path).kind}
+    for change in ({"grouping": "instruction"}, {"denoise_steps": [0]}):
+        path.write_text(json.dumps([{**episode, **change} for episode in document]))
+        kinds.add(read_results_file(path).kind)
+    assert len({str(kind) for kind in kinds}) == len(kinds) == 3
 
 
 def test_files_of_the_published_pi_script(tmp_path):
@@ -228,6 +284,7 @@ def with_step(**changes: Any) -> list[dict[str, Any]]:
         ([3], r"episode 0 is the number 3; expected an object"),
         ([one_episode(success="yes")], r"episode 0, success is a text; expected true or false"),
         ([one_episode(task_id=-1)], r"episode 0, task_id is the number -1; expected a whole number"),
+        ([one_episode(num_steps_definition="x")], r"num_steps_definition is 'x'; expected 'loop_counter', or nothing"),
         ([one_episode(), one_episode()], r"episodes 0 and 1 are both task 0, episode 0"),
         ([one_episode(per_step_ratios={}, summary={})], r"none of its 1 episodes has a single step"),
         ([one_episode(per_step_ratios={"level_3": []})], r"has 'level_3'; expected layer_N or layers_avg"),

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_attention.schemas.groupings.builtin_groupings import BUILTIN_GROUPINGS
+from vla_attention.schemas.groupings.builtin_groupings import BUILTIN_GROUPINGS, find_grouping
 from vla_attention.schemas.groupings.grouping import Grouping, GroupingError
 from vla_attention.schemas.groupings.resolve import OverlappingGroups, check_names, resolve
 from vla_attention.schemas.groupings.selectors import SelectorError
@@ -204,9 +204,30 @@ def test_union_and_difference_partition(data):
 def test_reference_takes_the_published_key_ranges(tokens):
     grouping = BUILTIN_GROUPINGS["reference"](collect_vocabulary([tokens]))
     resolved = resolve(grouping, tokens)
-    # One camera of 4 patches, then as many keys as the prompt has slots (12), whatever they are; the rest is "action".
-    assert resolved.num_keys.tolist() == [[4, 12, 6]]
-    assert resolved.weights[0, 4:16, 1].all()
+    # One camera of 4 patches, then 256 keys, which reach beyond the last one here, as the scripts' slices do.
+    assert resolved.num_keys.tolist() == [[4, 18, 0]]
+    assert "keys 4 to 21 (of 256 keys; the site ends there)" in grouping.description
+    for text_keys in (1, 12):
+        given = find_grouping(f"reference:{text_keys}", collect_vocabulary([tokens]))
+        assert given.name == f"reference-{text_keys}"
+        resolved = resolve(given, tokens)
+        assert resolved.num_keys.tolist() == [[4, text_keys, 18 - text_keys]]
+        assert resolved.weights[0, 4 : 4 + text_keys, 1].all()
+
+
+def test_reference_on_pi05_is_the_published_scripts_slices():
+    """Their default is a prompt of 256 slots, whatever the model's is: their text is the second camera."""
+    cameras = [Span(f"camera{i}", "image", 256 * i, 256 * (i + 1), camera=f"camera{i}") for i in range(3)]
+    spans = (*cameras, Span("prompt", "text", 768, 968), Span("actions", "action", 968, 978))
+    roles = np.repeat([Role.IMAGE, Role.PADDING, Role.ACTION], [768, 200, 10]).astype(np.uint8)[None]
+    tokens = EpisodeTokens(SiteLayout("joint", spans), roles)
+    row = np.random.default_rng(0).random(978)
+    for name, num_text in (("reference", 256), ("reference:200", 200), ("reference:5000", 5000)):
+        published = [row[:256].sum(), row[256 : 256 + num_text].sum(), row[256 + num_text :].sum()]
+        found = row @ resolve(find_grouping(name, collect_vocabulary([tokens])), tokens).weights[0]
+        np.testing.assert_allclose(found, published)
+    with pytest.raises(GroupingError, match="at least one text key"):
+        find_grouping("reference:0", collect_vocabulary([tokens]))
 
 
 def test_reference_on_latent_frames_and_where_it_makes_no_sense():
@@ -223,6 +244,8 @@ def test_reference_on_latent_frames_and_where_it_makes_no_sense():
     )
     with pytest.raises(GroupingError, match="choose with --site"):
         BUILTIN_GROUPINGS["reference"](collect_vocabulary([text]))
+    with pytest.raises(GroupingError, match="compare latent frames; expected 'reference'"):
+        find_grouping("reference:200", collect_vocabulary([latent]))
 
 
 def test_names_of_groups_and_ratios_are_checked():
