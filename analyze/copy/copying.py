@@ -1,10 +1,9 @@
 """Copies of stores without some of their arrays. A copy is a whole store: `verify` accepts it.
 
-An episode's attributes list its arrays, and its seal holds the digest of every piece of metadata. Deleting folders
-therefore gives a damaged store. A copy has attributes that list the arrays it has, a root that names the omitted parts
-and the run it was copied from, and a new seal. Arrays are copied byte by byte. Metadata is checked against its old seal
-before it is rewritten, so a damaged episode is refused. Values keep the digests that the capture wrote, so damage to
-them is found in the copy too.
+An episode's attributes list its arrays, and its seal lists its files. Deleting folders therefore gives a damaged store.
+A copy has attributes that list the arrays it has, a root that names the omitted parts and the run it was copied from,
+and a new seal that names the one under which the episode was captured. A copy without omissions is the same to the
+byte, its seals too. Every file is compared with the seal when it is copied, so a damaged episode is refused.
 """
 
 from __future__ import annotations
@@ -21,16 +20,16 @@ from typing import Any
 
 from vla_attention.schemas.errors import BadArgument, unknown_name
 from vla_attention.schemas.jsonable import to_json
-from vla_attention.schemas.stores.digest import document_digest
+from vla_attention.schemas.stores.digest import run_digest
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
-from vla_attention.schemas.stores.root import episode_folders
+from vla_attention.schemas.stores.root import episode_folders, group_attributes
+from vla_attention.schemas.stores.seal import seal_episode
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
     PARTIAL_SUFFIX,
     SEAL_GROUP,
     STORE_SUFFIX,
     CorruptEpisode,
-    EpisodeSeal,
     RootAttributes,
     RunMismatch,
 )
@@ -106,7 +105,7 @@ def copy_store(
 def _copy(store: Store, target: Path, without: tuple[str, ...], progress: Callable[[int], object] | None) -> Copied:
     building = target.with_name(target.name + PARTIAL_SUFFIX) / f"copy-{os.getpid()}"
     root = _root_document(store, without)
-    run = document_digest(root)
+    run = run_digest(group_attributes(root))
     building.mkdir(parents=True)
     try:
         _ensure_root(store, target, root, building)
@@ -144,36 +143,30 @@ def _ensure_root(store: Store, target: Path, root: bytes, building: Path) -> Non
 
 def _copy_episode(episode: StoredEpisode, folder: Path, without: tuple[str, ...], run: str) -> tuple[int, int]:
     """Write the copy of one episode; returns (bytes copied, bytes omitted)."""
-    if not episode.is_of_this_run:
-        raise CorruptEpisode(f"Episode {episode.name} was recorded under other attributes than its store has now.")
     attributes = episode.attributes
     kept = {name: record for name, record in attributes.arrays.items() if _part_of(name) not in without}
-    files = [file for file in _files(episode.folder) if _part_of(file) not in without]
-    digests: dict[str, str] = {}
-    copied = 0
-    for file in files:
-        if file == f"{SEAL_GROUP}/zarr.json":
+    for name in kept:
+        if f"{name}/zarr.json" not in episode.files.records:
+            raise CorruptEpisode(f"Episode {episode.name} lacks the array {name}: its files are gone.")
+    copied = left = 0
+    for file, record in episode.files.records.items():
+        if _part_of(file) in without:
+            left += record.size
             continue
+        content = episode.sealed(file)  # raises when it differs from what was written
+        if file == "zarr.json" and without:
+            content = _with_attributes(content, to_json(replace(attributes, arrays=kept)))
         place = folder / file
         place.parent.mkdir(parents=True, exist_ok=True)
-        if place.name != "zarr.json":
-            shutil.copyfile(episode.folder / file, place)
-        else:
-            content = episode.sealed(file)  # raises when it differs from what was written
-            if file == "zarr.json":
-                content = _with_attributes(content, to_json(replace(attributes, arrays=kept)))
-            place.write_bytes(content)
-            digests[file] = document_digest(content)
-        copied += place.stat().st_size
-    for name in kept:
-        if f"{name}/zarr.json" not in digests:
-            raise CorruptEpisode(f"Episode {episode.name} lacks the array {name}: its files are gone.")
-    seal = (episode.folder / SEAL_GROUP / "zarr.json").read_bytes()
-    (folder / SEAL_GROUP).mkdir()
-    sealed = _with_attributes(seal, to_json(EpisodeSeal(run=run, files=dict(sorted(digests.items())))))
-    (folder / SEAL_GROUP / "zarr.json").write_bytes(sealed)
-    left = sum((episode.folder / file).stat().st_size for file in _files(episode.folder) if _part_of(file) in without)
-    return copied + len(sealed), left
+        place.write_bytes(content)
+        copied += len(content)
+    seal = folder / SEAL_GROUP / "zarr.json"
+    if without:
+        seal_episode(folder, episode.name, run, copied_from=episode.seal.copied_from or episode.seal.digest)
+    else:
+        seal.parent.mkdir()
+        shutil.copyfile(episode.folder / SEAL_GROUP / "zarr.json", seal)
+    return copied + seal.stat().st_size, left
 
 
 def _root_document(store: Store, without: tuple[str, ...]) -> bytes:
@@ -191,7 +184,7 @@ def _root_document(store: Store, without: tuple[str, ...]) -> bytes:
     everything = [name for name in PARTS if name in without or name in before.split(", ")]
     provenance = dict(root.provenance) | {"copied_without": ", ".join(everything)}
     # A copy of a copy names the store that was captured, not the copy.
-    provenance.setdefault("copied_from", document_digest(content))
+    provenance.setdefault("copied_from", store.run)
     changed: RootAttributes = replace(root, recording=recording, provenance=provenance)
     return _with_attributes(content, to_json(changed))
 

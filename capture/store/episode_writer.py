@@ -19,15 +19,15 @@ from vla_attention.capture.store.store_root import check_same_run, read_existing
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import Prompt
-from vla_attention.schemas.stores.digest import ArrayDigest, document_digest
+from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.reader import StoredEpisode
+from vla_attention.schemas.stores.root import read_run
+from vla_attention.schemas.stores.seal import seal_episode
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
-    SEAL_GROUP,
     ArrayRecord,
     CorruptEpisode,
     EpisodeAttributes,
-    EpisodeSeal,
     RootAttributes,
     StoreError,
     StoreExists,
@@ -139,8 +139,9 @@ class EpisodeWriter:
                 self.digests[f"{name}/rows"] = site.finish()
             self._write_side_arrays()
             self.group.update_attributes(to_json(self._attributes(success, num_steps)))
-            self._write_seal()
-            self._read_back()
+            run = read_run(self.store)[1]
+            seal_episode(self.folder, self.name, run)
+            self._read_back(run)
             return self._publish()
 
     def _attributes(self, success: bool, num_steps: int) -> EpisodeAttributes:
@@ -194,14 +195,7 @@ class EpisodeWriter:
             coverage = np.stack([record.coverage[camera] for record in records])
             self.write(f"objects/{camera}", coverage, ("replan", "patch", "object"))
 
-    def _write_seal(self) -> None:
-        """Note the digest of every piece of metadata: chunks have checksums, and JSON has none of its own."""
-        files = sorted(self.folder.rglob("zarr.json"))
-        digests = {file.relative_to(self.folder).as_posix(): document_digest(file.read_bytes()) for file in files}
-        seal = EpisodeSeal(run=document_digest((self.store / "zarr.json").read_bytes()), files=digests)
-        self.group.create_group(SEAL_GROUP, attributes=to_json(seal))
-
-    def _read_back(self) -> None:
+    def _read_back(self, run: str) -> None:
         """Read everything back from disk, with the checks of `vla-analyze verify`."""
-        for problem in content_problems(self.run, StoredEpisode(self.folder)):
+        for problem in content_problems(self.run, StoredEpisode(self.folder, self.name, run)):
             raise CorruptEpisode(f"Episode {self.name}, read back from {self.folder}, is damaged: {problem}.")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import zarr
@@ -16,6 +15,7 @@ from vla_attention.capture.store.durable_files import (
     remove_if_empty,
 )
 from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.stores.digest import run_configuration
 from vla_attention.schemas.stores.root import read_root
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
@@ -27,25 +27,20 @@ from vla_attention.schemas.stores.store_format import (
 
 
 def check_same_run(path: Path, existing: RootAttributes, wanted: RootAttributes) -> None:
-    """Raise `RunMismatch` for the first field of the run's identity that differs.
-
-    Provenance may differ: it is kept per episode. So may the checkpoint's path: the digest identifies the weights.
-    """
-    moved = replace(wanted, policy=replace(wanted.policy, checkpoint=existing.policy.checkpoint))
-    for section in ("format_version", "policy", "protocol", "recording", "sites"):
-        difference = _first_difference(to_json(getattr(existing, section)), to_json(getattr(moved, section)), section)
-        if difference:
-            where, old, new = difference
-            raise RunMismatch(
-                f"Cannot resume {path}: its {where} is {old!r}, this run's is {new!r}; "
-                "use the same settings, or another --store."
-            )
+    """Raise `RunMismatch` for the first field of the run's configuration that differs."""
+    difference = _first_difference(run_configuration(to_json(existing)), run_configuration(to_json(wanted)), "")
+    if difference:
+        where, old, new = difference
+        raise RunMismatch(
+            f"Cannot resume {path}: its {where} is {old!r}, this run's is {new!r}; "
+            "use the same settings, or another --store."
+        )
 
 
 def _first_difference(old: object, new: object, where: str) -> tuple[str, object, object] | None:
     if isinstance(old, dict) and isinstance(new, dict):
         for key in [*old, *(key for key in new if key not in old)]:
-            found = _first_difference(old.get(key), new.get(key), f"{where}.{key}")
+            found = _first_difference(old.get(key), new.get(key), f"{where}.{key}".lstrip("."))
             if found:
                 return found
         return None

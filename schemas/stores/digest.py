@@ -1,15 +1,22 @@
-"""The digests in a store: of an array (sha256 over its values in C order, little endian), and of a `zarr.json`."""
+"""The digests in a store (sha256, in hexadecimal): of an array's values, a file, a run's configuration, a seal."""
 
 from __future__ import annotations
 
+import copy
 import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.stores.store_format import JOB_RECORDS, EpisodeSeal
+
 
 class ArrayDigest:
-    """Digest of an array that is given in consecutive blocks along its first axis."""
+    """Digest of an array (C order, little endian) that is given in consecutive blocks along its first axis."""
 
     def __init__(self) -> None:
         self._hash = hashlib.sha256()
@@ -24,6 +31,38 @@ class ArrayDigest:
         return self._hash.hexdigest()
 
 
-def document_digest(content: bytes) -> str:
-    """The digest of a `zarr.json`: sha256 of its bytes, in hexadecimal."""
+def bytes_digest(content: bytes) -> str:
+    """The digest of a file, or of a part of it."""
     return hashlib.sha256(content).hexdigest()
+
+
+def run_configuration(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """The root's attributes, as they stand in its `zarr.json`, without the job records (`JOB_RECORDS`)."""
+    configuration: dict[str, Any] = copy.deepcopy(dict(attributes))
+    for *parents, field in JOB_RECORDS:
+        holder = configuration
+        for parent in parents:
+            holder = holder[parent]
+        holder.pop(field, None)
+    return configuration
+
+
+def run_digest(attributes: Mapping[str, Any]) -> str:
+    """The digest of a run's configuration; `attributes` are those in the root's `zarr.json`.
+
+    It is over the attributes as they stand there, not over `RootAttributes`: a field that a later version adds with a
+    default does not change the digest of older stores.
+    """
+    return bytes_digest(_canonical(run_configuration(attributes)))
+
+
+def seal_digest(seal: EpisodeSeal) -> str:
+    """The digest of a seal over all its fields but `digest`."""
+    document = to_json(seal)
+    del document["digest"]
+    return bytes_digest(_canonical(document))
+
+
+def _canonical(document: object) -> bytes:
+    """JSON in one form: keys sorted, no white space, other characters than ASCII escaped."""
+    return json.dumps(document, sort_keys=True, separators=(",", ":")).encode()

@@ -6,7 +6,6 @@ is opened.
 
 from __future__ import annotations
 
-import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,15 +19,16 @@ from numpy.typing import NDArray
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.jsonable import from_json
-from vla_attention.schemas.stores.digest import document_digest
-from vla_attention.schemas.stores.root import episode_folders, group_attributes, read_root
+from vla_attention.schemas.stores.root import episode_folders, group_attributes, read_run
+from vla_attention.schemas.stores.seal import identity_problem, read_seal
+from vla_attention.schemas.stores.sealed_files import SealedFiles
 from vla_attention.schemas.stores.store_format import (
-    SEAL_GROUP,
     CorruptEpisode,
     EpisodeAttributes,
     EpisodeSeal,
     RootAttributes,
     StoreError,
+    episode_name,
     parse_episode_name,
 )
 
@@ -40,48 +40,55 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StoredEpisode:
-    """One episode in its folder. It is read when it is needed, and its metadata is then checked against the seal."""
+    """One episode in its folder. It is read when it is needed, and nothing is read that its seal does not bind.
+
+    Attributes:
+        folder: where it is.
+        name: the name of its group, which its seal must have.
+        run: digest of the configuration of the run that it must belong to, see `run_digest`.
+    """
 
     folder: Path
-
-    @property
-    def name(self) -> str:
-        """The episode's group name."""
-        return self.folder.name
+    name: str
+    run: str
 
     @cached_property
     def attributes(self) -> EpisodeAttributes:
         """The episode's attributes."""
         document = self.sealed("zarr.json")
         try:
-            return from_json(EpisodeAttributes, group_attributes(document))
+            attributes = from_json(EpisodeAttributes, group_attributes(document))
         except ValueError as error:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: its attributes are damaged ({error}).") from None
+        stated = episode_name(attributes.task_id, attributes.episode_index)
+        if stated != self.name:
+            raise CorruptEpisode(f"Episode {self.name} cannot be read: its attributes are those of {stated}.")
+        return attributes
 
     @cached_property
     def seal(self) -> EpisodeSeal:
-        """The digests of the episode's metadata."""
+        """What binds the episode's files to its name and run; `CorruptEpisode` when it is not that of this episode."""
         try:
-            document = (self.folder / SEAL_GROUP / "zarr.json").read_bytes()
-            return from_json(EpisodeSeal, group_attributes(document))
+            seal = read_seal(self.folder)
         except (OSError, ValueError) as error:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: its seal is damaged ({error}).") from None
+        problem = identity_problem(seal, self.name, self.run)
+        if problem is not None:
+            raise CorruptEpisode(f"Episode {self.name} cannot be read: {problem}.")
+        return seal
+
+    @cached_property
+    def files(self) -> SealedFiles:
+        """The episode's files, as the seal lists them."""
+        return SealedFiles(self.folder, self.seal.files)
 
     def sealed(self, file: str) -> bytes:
-        """Read one `zarr.json` of the episode; raises `CorruptEpisode` when its digest is not the one in the seal."""
+        """All bytes of one file of the episode; raises `CorruptEpisode` when they are not those that were sealed."""
+        files = self.files
         try:
-            content = (self.folder / file).read_bytes()
-        except OSError as error:
-            raise CorruptEpisode(f"Episode {self.name} lacks its {file} ({error.strerror}).") from None
-        if document_digest(content) != self.seal.files.get(file):
-            raise CorruptEpisode(f"Episode {self.name} is damaged: its {file} does not agree with its seal.")
-        return content
-
-    @property
-    def is_of_this_run(self) -> bool:
-        """Whether the `zarr.json` of the store is, to the byte, the one under which the episode was recorded."""
-        run = self.folder.parents[1] / "zarr.json"
-        return document_digest(run.read_bytes()) == self.seal.run
+            return files.whole(file)
+        except CorruptEpisode as error:
+            raise CorruptEpisode(f"Episode {self.name} is damaged: {error}.") from None
 
     @cached_property
     def _opened(self) -> dict[str, zarr.Array[Any]]:
@@ -92,31 +99,30 @@ class StoredEpisode:
         return {}
 
     def array(self, name: str) -> zarr.Array[Any]:
-        """Open one array; raises `CorruptEpisode` when it lacks a file or has another shape than in the attributes."""
+        """Open one array; raises `CorruptEpisode` when it has another shape than in the attributes."""
         if name not in self._opened:
             self._opened[name] = self._open(name)
         return self._opened[name]
 
     def _open(self, name: str) -> zarr.Array[Any]:
         import zarr
-        from zarr.storage import LocalStore, StorePath
+        from zarr.storage import StorePath
+
+        from vla_attention.schemas.stores.sealed_zarr import SealedArrayStore
 
         recorded = self.attributes.arrays.get(name)
         if recorded is None:
             raise CorruptEpisode(f"Episode {self.name} lacks the array {name}: its attributes do not list it.")
         document = self.sealed(f"{name}/zarr.json")
         try:
+            metadata = json.loads(document)
             # Opened from the bytes that were checked against the seal: zarr does not read the file a second time.
-            place = StorePath(LocalStore(self.folder / name, read_only=True))
-            array: zarr.Array[Any] = zarr.Array(zarr.AsyncArray(metadata=json.loads(document), store_path=place))
+            place = StorePath(SealedArrayStore(self.files, name, metadata))
+            array: zarr.Array[Any] = zarr.Array(zarr.AsyncArray(metadata=metadata, store_path=place))
         except (KeyError, TypeError, ValueError) as error:
             raise CorruptEpisode(f"Episode {self.name} lacks the array {name} ({error}).") from None
         if tuple(array.shape) != recorded.shape:
             raise CorruptEpisode(f"Array {name} of episode {self.name} has another shape than its attributes say.")
-        # zarr reads a missing file as the fill value, which is a valid number in a picture.
-        for file in _chunk_files(array):
-            if not (self.folder / name / file).is_file():
-                raise CorruptEpisode(f"Array {name} of episode {self.name} has lost its file {file}.")
         return array
 
     def read(self, name: str, index: Any = ...) -> NDArray[Any]:
@@ -138,14 +144,15 @@ class StoredEpisode:
         if name not in self._layers:
             from vla_attention.schemas.stores.shards import ShardedLayers
 
-            self._layers[name] = ShardedLayers.of(self.folder / name, dict(self.array(name).metadata.to_dict()))
+            metadata, files = dict(self.array(name).metadata.to_dict()), self.files
+            self._layers[name] = ShardedLayers.of(metadata, lambda file: files.shard(f"{name}/{file}"))
         layers = self._layers[name]
         if layers is None:
             return self.read(name, (slice(None), layer, denoise))
         try:
             values = layers.read(layer, denoise)
         except CorruptEpisode as error:
-            raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {error}") from None
+            raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {error}.") from None
         return self._without_missing(name, values)
 
     def _without_missing(self, name: str, values: NDArray[Any]) -> NDArray[Any]:
@@ -189,10 +196,14 @@ class _StoredCoverage(Mapping[str, NDArray[np.float32]]):
 
 @dataclass(frozen=True)
 class Store:
-    """A store opened for reading: its run, and the episodes that were committed when it was opened."""
+    """A store opened for reading: its run, and the episodes that were committed when it was opened.
+
+    `run` is the digest of the run's configuration.
+    """
 
     path: Path
     attributes: RootAttributes
+    run: str
     episodes: tuple[StoredEpisode, ...]
 
     @property
@@ -214,12 +225,12 @@ def open_store(path: Path) -> Store:
         StoreError: something else is there, or its attributes cannot be read.
         FormatTooNew: a later version wrote it.
     """
-    root = read_root(path)
+    root, run = read_run(path)
     try:
         folders = sorted(episode_folders(path), key=lambda folder: parse_episode_name(folder.name))
     except BadArgument as error:
         raise StoreError(f"The store {path} cannot be read: {error}") from None
-    return Store(path, root, tuple(StoredEpisode(folder) for folder in folders))
+    return Store(path, root, run, tuple(StoredEpisode(folder, folder.name, run) for folder in folders))
 
 
 def _lost_chunk(episode: StoredEpisode, name: str) -> CorruptEpisode:
@@ -233,10 +244,3 @@ def _holds_missing(values: NDArray[Any]) -> bool:
     if values.dtype.kind != "f" or not np.isnan(values.sum()):
         return False  # one pass without a temporary array: rows are large
     return bool(np.isnan(values).any())
-
-
-def _chunk_files(array: zarr.Array[Any]) -> Iterator[str]:
-    """Paths of the files that hold an array, relative to it."""
-    extents = zip(array.shape, array.shards or array.chunks, strict=True)
-    for coordinates in itertools.product(*(range(-(-size // extent)) for size, extent in extents)):
-        yield array.metadata.encode_chunk_key(coordinates)

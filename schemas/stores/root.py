@@ -8,6 +8,7 @@ from typing import Any
 
 from vla_attention.schemas.errors import did_you_mean, listing
 from vla_attention.schemas.jsonable import MalformedDocument, from_json
+from vla_attention.schemas.stores.digest import run_digest
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
     RootAttributes,
@@ -18,7 +19,12 @@ from vla_attention.schemas.stores.store_format import (
 
 
 def read_root(path: Path) -> RootAttributes:
-    """Read the attributes of the store at `path`.
+    """The attributes of the store at `path`; raises as `read_run` does."""
+    return read_run(path)[0]
+
+
+def read_run(path: Path) -> tuple[RootAttributes, str]:
+    """The attributes of the store at `path`, and the digest of its run's configuration; episodes are bound to it.
 
     Raises:
         StoreNotFound: nothing is there; the error lists the stores nearby.
@@ -39,7 +45,7 @@ def read_root(path: Path) -> RootAttributes:
         raise StoreError(f"The store {path} cannot be read: {error}.") from None
     check_format(attributes, path)
     try:
-        return from_json(RootAttributes, attributes)
+        return from_json(RootAttributes, attributes), run_digest(attributes)
     except (MalformedDocument, ValueError) as error:
         raise StoreError(f"The store {path} cannot be read: {error}") from None
 

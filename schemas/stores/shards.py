@@ -1,14 +1,21 @@
-"""Reading one layer and denoise step of a sharded array, straight from the shard's file.
+"""Reading chunks straight from a shard's file, and one layer and denoise step of an array.
 
 A shard is a file of compressed chunks, with an index of their positions at its end (Zarr's `sharding_indexed` codec).
 zarr-python reads it through an event loop, and passing the chunks between threads takes as long as decoding them; an
-analysis of words reads thousands of chunks. This reader handles the one layout that `capture/store/codecs.py` writes.
-An array of any other layout is read with zarr-python.
+analysis of words reads thousands of chunks. `ShardedLayers` handles the one layout that `capture/store/codecs.py`
+writes. An array of any other layout is read with zarr-python.
+
+Nothing that a file says about sizes is believed: the index, and the checksum at each chunk's end, are compared with the
+episode's seal, positions with the file's size, and the header of each compressed chunk with the size of the decoded
+one. A frame of Blosc that says it holds fewer bytes than the chunk would otherwise leave the rest of the buffer as it
+was: bytes of the process, which would pass for attention.
 """
 
 from __future__ import annotations
 
 import os
+import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,18 +26,137 @@ import numpy as np
 from numcodecs import blosc
 from numpy.typing import NDArray
 
-from vla_attention.schemas.stores.store_format import CorruptEpisode
+from vla_attention.schemas.stores.digest import bytes_digest
+from vla_attention.schemas.stores.store_format import CorruptEpisode, FileRecord
 
-_CHECKSUM_BYTES = 4
+CHECKSUM_BYTES = 4
 _ABSENT = np.uint64(2**64 - 1)
+#: The header of a Blosc frame: format, version of the codec, flags, typesize; decoded bytes, bytes of a block, bytes of
+#: the frame (c-blosc, README_CHUNK_FORMAT.rst).
+_BLOSC_HEADER = struct.Struct("<BBBBIII")
+
+
+def chunks_of_a_shard(metadata: dict[str, Any]) -> int | None:
+    """Number of chunks in each shard of an array, or None where single chunks of it cannot be bound to a seal.
+
+    They can when every chunk ends with its crc32c, and the file with its index. `metadata` is the array's `zarr.json`;
+    that of a group gives None, too.
+    """
+    codecs = metadata.get("codecs", [])
+    if [codec["name"] for codec in codecs] != ["sharding_indexed"]:
+        return None
+    inner = codecs[0]["configuration"]
+    shard = metadata["chunk_grid"]["configuration"]["chunk_shape"]
+    bound = (
+        inner["codecs"][-1]["name"] == "crc32c"
+        and inner.get("index_location", "end") == "end"
+        and [codec["name"] for codec in inner["index_codecs"]] == ["bytes", "crc32c"]
+        and inner["index_codecs"][0]["configuration"]["endian"] == "little"
+    )
+    counts = (extent // chunk for extent, chunk in zip(shard, inner["chunk_shape"], strict=True))
+    return int(np.prod(list(counts))) if bound else None
+
+
+def index_size(chunks: int) -> int:
+    """Bytes of a shard's index of that many chunks, with its checksum."""
+    return 16 * chunks + CHECKSUM_BYTES
+
+
+def read_index(stored: bytes, file_size: int) -> NDArray[np.uint64]:
+    """Offset and length of every chunk, shape (chunk, 2), from the bytes of the index; (0, 0): not written.
+
+    Raises:
+        CorruptEpisode: the checksum does not fit, or the chunks overlap or reach beyond the file's chunks.
+    """
+    content, checksum = stored[:-CHECKSUM_BYTES], stored[-CHECKSUM_BYTES:]
+    if google_crc32c.value(content) != int.from_bytes(checksum, "little"):
+        raise CorruptEpisode("the checksum of its index does not fit")
+    index = np.frombuffer(content, dtype="<u8").reshape(-1, 2).copy()
+    index[(index == _ABSENT).all(axis=1)] = 0
+    written = index[index[:, 1] > 0]
+    written = written[np.argsort(written[:, 0])]
+    end = np.uint64(file_size - len(stored))
+    # Compared without adding: a sum of large numbers would wrap around.
+    inside = (written[:, 0] <= end).all() and (written[:, 1] <= end - np.minimum(written[:, 0], end)).all()
+    if not inside or (written[:-1, 0] + written[:-1, 1] > written[1:, 0]).any():
+        raise CorruptEpisode("its index names chunks that overlap or lie outside of the file")
+    return index
 
 
 @dataclass(frozen=True)
-class _Shard:
-    """One shard's file; `index` (layer, denoise, 2) uint64 has the offset and the length of each chunk in bytes."""
+class SealedShard:
+    """One shard's file, whose size and index agree with the seal.
+
+    Attributes:
+        path: the file.
+        file: its path in the episode, for messages.
+        index_bytes: the index as it is stored, with its checksum.
+        index: offset and length of each chunk, shape (chunk, 2); (0, 0): not written.
+        checksums: the last `CHECKSUM_BYTES` of each chunk, from the seal.
+    """
 
     path: Path
+    file: str
+    index_bytes: bytes
     index: NDArray[np.uint64]
+    checksums: bytes
+
+    @classmethod
+    def open(cls, path: Path, file: str, record: FileRecord) -> SealedShard:
+        """Read the index; raises `CorruptEpisode` unless it is the one in the seal, and `OSError` without the file."""
+        checksums = bytes.fromhex(record.chunks)
+        size = index_size(len(checksums) // CHECKSUM_BYTES)
+        with path.open("rb", buffering=0) as opened:
+            handle = opened.fileno()
+            if os.fstat(handle).st_size != record.size:
+                raise CorruptEpisode(f"its {file} does not agree with its seal: it has another size")
+            stored = os.pread(handle, size, max(0, record.size - size))
+        if bytes_digest(stored) != record.index:
+            raise CorruptEpisode(f"its {file} does not agree with its seal: its index was changed")
+        try:
+            return cls(path, file, stored, read_index(stored, record.size), checksums)
+        except CorruptEpisode as error:
+            raise CorruptEpisode(f"its {file} cannot be read: {error}") from None
+
+    def chunk(self, number: int) -> bytes:
+        """The encoded bytes of one chunk, with the checksum at their end.
+
+        Raises:
+            CorruptEpisode: the chunk is missing, its checksum is not the one in the seal, or not that of its bytes.
+        """
+        offset, length = (int(value) for value in self.index[number])
+        if length <= CHECKSUM_BYTES:
+            raise CorruptEpisode(f"its {self.file} lacks chunk {number}: it is missing")
+        try:
+            with self.path.open("rb", buffering=0) as opened:
+                stored = os.pread(opened.fileno(), length, offset)
+        except OSError as error:
+            raise CorruptEpisode(f"its {self.file} cannot be read: {error.strerror or error}") from None
+        sealed = self.checksums[CHECKSUM_BYTES * number : CHECKSUM_BYTES * (number + 1)]
+        if len(stored) != length or stored[-CHECKSUM_BYTES:] != sealed:
+            raise CorruptEpisode(f"chunk {number} of its {self.file} does not agree with its seal")
+        if google_crc32c.value(stored[:-CHECKSUM_BYTES]) != int.from_bytes(sealed, "little"):
+            raise CorruptEpisode(f"the checksum of chunk {number} of its {self.file} does not fit")
+        return stored
+
+
+def check_blosc_frame(frame: bytes, decoded_bytes: int, typesize: int) -> None:
+    """Raise `CorruptEpisode` unless a Blosc frame says of itself what is known of it: its own size and the decoded one.
+
+    c-blosc trusts the header: it reads and writes as many bytes as that says.
+    """
+    if len(frame) < _BLOSC_HEADER.size:
+        raise CorruptEpisode("it is too short for a Blosc frame")
+    *_, stored_typesize, nbytes, blocksize, cbytes = _BLOSC_HEADER.unpack_from(frame)
+    for what, given, expected in (
+        ("decoded bytes", nbytes, decoded_bytes),
+        ("encoded bytes", cbytes, len(frame)),
+        ("bytes a number", stored_typesize, typesize),
+    ):
+        if given != expected:
+            raise CorruptEpisode(f"its header says {given} {what}; expected {expected}")
+    if not 0 < blocksize <= max(decoded_bytes, typesize):
+        raise CorruptEpisode(f"its header says blocks of {blocksize} bytes; expected 1 to {decoded_bytes}")
 
 
 @dataclass(frozen=True)
@@ -38,22 +164,22 @@ class ShardedLayers:
     """A float32 array (replan, layer, denoise, ...) whose chunks hold one layer and one denoise step each.
 
     Attributes:
-        folder: the array's folder.
         shape: shape of the array.
         replans_per_shard: extent of shards and chunks along the replans.
+        shard: gives the shard in a file of the array, by its path in the array; None when the seal lists no chunks.
     """
 
-    folder: Path
     shape: tuple[int, ...]
     replans_per_shard: int
+    shard: Callable[[str], SealedShard | None]
 
     @classmethod
-    def of(cls, folder: Path, metadata: dict[str, Any]) -> ShardedLayers | None:
+    def of(cls, metadata: dict[str, Any], shard_in: Callable[[str], SealedShard | None]) -> ShardedLayers | None:
         """The array's reader, or None when its metadata (its `zarr.json`) describe another layout."""
         shape = tuple(metadata["shape"])
         shard = tuple(metadata["chunk_grid"].get("configuration", {}).get("chunk_shape", ()))
         codecs = metadata["codecs"]
-        if len(shape) < 4 or len(codecs) != 1 or codecs[0]["name"] != "sharding_indexed":
+        if len(shape) < 4 or chunks_of_a_shard(metadata) is None:
             return None
         inner = codecs[0]["configuration"]
         known = (
@@ -63,61 +189,40 @@ class ShardedLayers:
             and shard[1:] == shape[1:]
             and tuple(inner["chunk_shape"]) == (shard[0], 1, 1, *shape[3:])
             and [codec["name"] for codec in inner["codecs"]] == ["bytes", "blosc", "crc32c"]
-            and [codec["name"] for codec in inner["index_codecs"]] == ["bytes", "crc32c"]
-            and inner["index_location"] == "end"
-            and all(
-                codec["configuration"]["endian"] == "little"
-                for codec in (*inner["codecs"], *inner["index_codecs"])
-                if codec["name"] == "bytes"
-            )
+            and inner["codecs"][0]["configuration"]["endian"] == "little"
         )
-        return cls(folder, shape, shard[0]) if known else None
+        return cls(shape, shard[0], shard_in) if known else None
 
     @cached_property
-    def _shards(self) -> tuple[_Shard, ...]:
+    def _shards(self) -> tuple[SealedShard, ...]:
         count = -(-self.shape[0] // self.replans_per_shard)
         rest = "/".join("0" for _ in self.shape[1:])
-        return tuple(self._open(self.folder / "c" / str(i) / rest) for i in range(count))
+        return tuple(self._open(f"c/{i}/{rest}") for i in range(count))
 
-    def _open(self, path: Path) -> _Shard:
-        size = self.shape[1] * self.shape[2] * 16
-        try:
-            with path.open("rb") as file:
-                file.seek(-(size + _CHECKSUM_BYTES), os.SEEK_END)
-                stored = file.read()
-        except OSError as error:
-            raise CorruptEpisode(f"{path} cannot be read: {error.strerror or error}.") from None
-        index = _checked(stored, f"the index of {path}")
-        return _Shard(path, np.frombuffer(index, dtype="<u8").reshape(*self.shape[1:3], 2))
+    def _open(self, file: str) -> SealedShard:
+        shard = self.shard(file)
+        if shard is None:
+            raise CorruptEpisode(f"the seal does not list the chunks of its {file}")
+        return shard
 
     def read(self, layer: int, denoise: int) -> NDArray[np.float32]:
         """Values (replan, ...) of one layer and denoise step, both positions along their axes.
 
         Raises:
-            CorruptEpisode: a chunk is missing, or its checksum does not fit.
+            CorruptEpisode: a chunk is missing, is not the one that was sealed, or decodes to another size.
         """
+        if not (0 <= layer < self.shape[1] and 0 <= denoise < self.shape[2]):
+            raise IndexError(f"layer {layer} and denoise {denoise} of an array of shape {self.shape}")
+        number = layer * self.shape[2] + denoise
         values = np.empty((self.shape[0], *self.shape[3:]), dtype=np.float32)
         chunk = np.empty((self.replans_per_shard, *self.shape[3:]), dtype="<f4")
         for i, shard in enumerate(self._shards):
-            offset, length = shard.index[layer, denoise]
-            what = f"chunk (layer {layer}, denoise {denoise}) of {shard.path}"
-            if offset == _ABSENT:
-                raise CorruptEpisode(f"The {what} is missing.")
-            with shard.path.open("rb", buffering=0) as file:
-                stored = os.pread(file.fileno(), int(length), int(offset))
-            encoded = _checked(stored, f"the {what}")
+            frame = shard.chunk(number)[:-CHECKSUM_BYTES]
             try:
-                blosc.decompress(encoded, chunk)
-            except (RuntimeError, ValueError) as error:
-                raise CorruptEpisode(f"The {what} cannot be decoded: {error}.") from None
+                check_blosc_frame(frame, chunk.nbytes, chunk.itemsize)
+                blosc.decompress(frame, chunk)
+            except (CorruptEpisode, RuntimeError, ValueError) as error:
+                raise CorruptEpisode(f"chunk {number} of its {shard.file} cannot be decoded: {error}") from None
             first = i * self.replans_per_shard
             values[first : first + self.replans_per_shard] = chunk[: self.shape[0] - first]
         return values
-
-
-def _checked(stored: bytes, what: str) -> bytes:
-    """The bytes without their checksum at the end, which must be right."""
-    content, checksum = stored[:-_CHECKSUM_BYTES], stored[-_CHECKSUM_BYTES:]
-    if len(stored) <= _CHECKSUM_BYTES or google_crc32c.value(content) != int.from_bytes(checksum, "little"):
-        raise CorruptEpisode(f"The checksum of {what} does not fit.")
-    return content

@@ -1,8 +1,8 @@
 """The store format: its version, the names, axes and attributes of `NAME.zarr`, and its errors. No I/O here.
 
 To raise the version, change `FORMAT_VERSION` and the dataclasses below; a new field with a default lets stores of lower
-versions be read. Then write the JSON Schema files again (`python -m vla_attention.schemas.json_files`) and describe the
-version in `docs/store.md`.
+versions be read, down to `OLDEST_VERSION`. Then write the JSON Schema files again (`python -m
+vla_attention.schemas.json_files`) and describe the version in `docs/store.md`.
 
 NAME.zarr/                            attributes: `RootAttributes`
   episodes/task003_episode007/        attributes: `EpisodeAttributes`; listed = complete
@@ -17,6 +17,7 @@ NAME.zarr/                            attributes: `RootAttributes`
     actions                           (replan, horizon, action_dim), as given to the environment
     frames/<camera>                   (replan, row, column, channel) uint8
     objects/<camera>                  (replan, patch, object) float32
+    seal/                             attributes: `EpisodeSeal`, which binds all of the above
 """
 
 from __future__ import annotations
@@ -31,8 +32,10 @@ from vla_attention.schemas.layout import Prompt, SiteLayout
 from vla_attention.schemas.segments import Segment
 
 FORMAT_NAME = "vla-attention"
-#: A whole number. A reader accepts its own version and lower ones.
-FORMAT_VERSION = 1
+#: A whole number. A reader accepts versions from `OLDEST_VERSION` to its own.
+FORMAT_VERSION = 2
+#: Seals of version 1 bind metadata only: files that were exchanged between episodes would be read without an error.
+OLDEST_VERSION = 2
 STORE_SUFFIX = ".zarr"
 EPISODES_GROUP = "episodes"
 #: Ending of the folder beside the store in which episodes are written. Readers of the store do not look there.
@@ -148,7 +151,10 @@ class PolicyIdentity:
 
 @dataclass(frozen=True)
 class RootAttributes:
-    """Attributes of the store's root group: the run's identity. The same for every process that adds episodes."""
+    """Attributes of the store's root group: the run's identity. The same for every process that adds episodes.
+
+    All of it is the run's configuration, except the fields in `JOB_RECORDS`.
+    """
 
     format: str
     format_version: int
@@ -157,6 +163,11 @@ class RootAttributes:
     recording: Recording
     sites: tuple[SiteLayout, ...]
     provenance: dict[str, str]
+
+
+#: Paths of the fields of `RootAttributes` that describe the job which made the store, not the run's configuration:
+#: another job, on another machine, may add episodes. The checkpoint's path is one; the digest of its weights is not.
+JOB_RECORDS = (("provenance",), ("policy", "checkpoint"))
 
 
 @dataclass(frozen=True)
@@ -168,11 +179,34 @@ class ArrayRecord:
 
 
 @dataclass(frozen=True)
-class EpisodeSeal:
-    """sha256 of every `zarr.json` of an episode by its path, and of that of the store (`run`)."""
+class FileRecord:
+    """Size in bytes and sha256 of a file of an episode.
 
+    A shard, from which parts are read, has two fields more. `index` is the sha256 of the index at its end (with the
+    index's checksum). `chunks` has the crc32c of every chunk, the 4 bytes at the chunk's end, in the index's order: 8
+    hexadecimal digits each, without a separator; `00000000` for a chunk that was not written.
+    """
+
+    size: int
+    sha256: str
+    index: str = ""
+    chunks: str = ""
+
+
+@dataclass(frozen=True)
+class EpisodeSeal:
+    """What binds every file of an episode to the episode's name and to its run.
+
+    `episode` is the name of the episode's group, `run` the digest of the run's configuration (`run_digest`), `files`
+    every file of the episode but the seal itself, by its path. `copied_from` is the digest of the captured episode's
+    seal, in a copy that leaves something out. `digest` is the sha256 of the other fields (`seal_digest`).
+    """
+
+    episode: str
     run: str
-    files: dict[str, str]
+    files: dict[str, FileRecord]
+    digest: str
+    copied_from: str = ""
 
 
 @dataclass(frozen=True)
@@ -219,9 +253,15 @@ def check_format(attributes: object, path: object) -> None:
             f"{path} is a Zarr group, but not a store of this tool: its attribute 'format' is not '{FORMAT_NAME}'."
         )
     version = given.get("format_version")
-    if not isinstance(version, int) or version < 1:
+    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
         raise StoreError(
-            f"{path} has the format version {version!r}; expected a whole number from 1 to {FORMAT_VERSION}."
+            f"{path} has the format version {version!r}; expected a whole number from {OLDEST_VERSION} to "
+            f"{FORMAT_VERSION}."
+        )
+    if version < OLDEST_VERSION:
+        raise StoreError(
+            f"{path} has format version {version}, whose seals do not bind the numbers to their episodes; this program "
+            f"reads versions from {OLDEST_VERSION} to {FORMAT_VERSION}: capture the episodes again."
         )
     if version > FORMAT_VERSION:
         raise FormatTooNew(

@@ -9,6 +9,7 @@ import pytest
 
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
+from vla_attention.schemas.stores.store_format import FORMAT_VERSION
 
 DUMMY = ["pi", "--checkpoint", "dummy", "--replan-steps", "4"]
 
@@ -117,9 +118,10 @@ def test_stores_that_cannot_be_read(captured_store, tmp_path, capsys):
     newer = tmp_path / "newer.zarr"
     shutil.copytree(captured_store, newer)
     document = json.loads((newer / "zarr.json").read_text())
-    document["attributes"]["format_version"] = 2
+    document["attributes"]["format_version"] = FORMAT_VERSION + 1
     (newer / "zarr.json").write_text(json.dumps(document))
-    assert "format version 2, and this program reads up to version 1" in run(analyze, [newer], capsys)
+    expected = f"format version {FORMAT_VERSION + 1}, and this program reads up to version {FORMAT_VERSION}"
+    assert expected in run(analyze, [newer], capsys)
 
     (newer / "zarr.json").write_text("{")
     assert "cannot be read" in run(analyze, [newer], capsys)

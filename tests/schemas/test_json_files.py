@@ -76,7 +76,7 @@ def test_root_attributes_validate():
     )
     attributes = RootAttributes(
         format="vla-attention",
-        format_version=1,
+        format_version=2,
         policy=policy,
         protocol=Protocol("libero_10", seed=7, wait_steps=10, replan_steps=5, max_steps=520),
         recording=Recording((7,), (25,), (0, 9), tuple(range(8)), "mean", 10, 10),

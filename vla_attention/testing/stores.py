@@ -23,6 +23,8 @@ from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.precision import round_mantissa
 from vla_attention.schemas.segments import segment_members, segments_of
+from vla_attention.schemas.stores.root import read_run
+from vla_attention.schemas.stores.seal import seal_episode
 from vla_attention.schemas.stores.store_format import (
     FORMAT_NAME,
     FORMAT_VERSION,
@@ -127,6 +129,11 @@ def commit(writer: EpisodeWriter, spec: StoreSpec, task: int, episode: int) -> P
     """Commit with the outcome of the episode: unless planted, episodes of odd numbers are solved."""
     success = spec.plant_success(task, episode) if spec.plant_success else episode % 2 == 1
     return writer.commit(success=success, num_steps=5 * spec.num_replans - episode % 2)
+
+
+def reseal(folder: Path) -> None:
+    """Seal a committed episode anew, after a test has changed its files: it then passes for what was captured."""
+    seal_episode(folder, folder.name, read_run(folder.parents[1])[1])
 
 
 def denoise_times(spec: StoreSpec) -> NDArray[np.float64]:

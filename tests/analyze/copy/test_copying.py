@@ -113,7 +113,7 @@ def test_a_changed_root_and_a_lost_array_are_refused(original, tmp_path):
     root = json.loads((path / "zarr.json").read_text())
     root["attributes"]["protocol"]["seed"] += 1
     (path / "zarr.json").write_text(json.dumps(root))
-    with pytest.raises(CorruptEpisode, match="other attributes"):
+    with pytest.raises(CorruptEpisode, match="a run of another configuration"):
         copy_store(open_store(path), tmp_path / "b.zarr", ("frames",))
     shutil.rmtree(path)
     shutil.copytree(original, path)
@@ -122,7 +122,8 @@ def test_a_changed_root_and_a_lost_array_are_refused(original, tmp_path):
         copy_store(open_store(path), tmp_path / "c.zarr", ("frames",))
 
 
-def test_damaged_values_are_found_in_the_copy_as_well(original, tmp_path):
+@pytest.mark.parametrize("without", [(), ("frames",)])
+def test_damaged_values_are_refused(original, tmp_path, without):
     path = tmp_path / "a.zarr"
     shutil.copytree(original, path)
     chunks = path.glob("episodes/task000_episode000/joint/rows/c/**/*")
@@ -130,8 +131,19 @@ def test_damaged_values_are_found_in_the_copy_as_well(original, tmp_path):
     content = bytearray(chunk.read_bytes())
     content[len(content) // 2] ^= 1
     chunk.write_bytes(bytes(content))
-    copy_store(open_store(path), tmp_path / "b.zarr", ("frames",))
-    assert {fault.episode for fault in verify_store(open_store(tmp_path / "b.zarr"))} == {"task000_episode000"}
+    with pytest.raises(CorruptEpisode, match="task000_episode000 is damaged: its joint/rows"):
+        copy_store(open_store(path), tmp_path / "b.zarr", without)
+    assert not list((tmp_path / "b.zarr/episodes").glob("task*"))
+
+
+def test_the_seal_of_a_changed_copy_names_the_captured_one(original, tmp_path):
+    copy_store(open_store(original), tmp_path / "b.zarr", ("frames",))
+    copy_store(open_store(tmp_path / "b.zarr"), tmp_path / "c.zarr", ("objects",))
+    stores = [open_store(path) for path in (original, tmp_path / "b.zarr", tmp_path / "c.zarr")]
+    for captured, first, second in zip(*(store.episodes for store in stores), strict=True):
+        assert captured.seal.copied_from == ""
+        assert first.seal.copied_from == second.seal.copied_from == captured.seal.digest
+        assert len({captured.seal.run, first.seal.run, second.seal.run}) == 2  # frames are part of the recording
 
 
 def test_command_line(original, tmp_path, capsys):

@@ -32,7 +32,14 @@ from vla_attention.capture.store.durable_files import StoreWriteFailed
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.schemas.stores.store_format import FormatTooNew, RunMismatch, StoreError, StoreExists, episode_name
+from vla_attention.schemas.stores.store_format import (
+    FORMAT_VERSION,
+    FormatTooNew,
+    RunMismatch,
+    StoreError,
+    StoreExists,
+    episode_name,
+)
 from vla_attention.schemas.stores.verify import verify_store
 from vla_attention.testing.stores import (
     StoreSpec,
@@ -399,7 +406,8 @@ def test_what_is_not_a_store_is_never_touched(tmp_path, kind, mode):
 def test_a_store_of_a_later_format_is_never_touched(tmp_path, mode):
     path = write_store(tmp_path / "a.zarr", spec=SPEC)
     root = path / "zarr.json"
-    root.write_text(root.read_text().replace('"format_version": 1', '"format_version": 2'))
+    versions = (f'"format_version": {version}' for version in (FORMAT_VERSION, FORMAT_VERSION + 1))
+    root.write_text(root.read_text().replace(*versions))
     before = store_bytes(path)
     with pytest.raises(FormatTooNew):
         write_store(path, mode=mode, spec=SPEC)

@@ -12,7 +12,9 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 
 from tests.kit.examples import examples
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.schemas.stores.shards import ShardedLayers
+from vla_attention.schemas.stores.seal import seal_episode
+from vla_attention.schemas.stores.sealed_files import SealedFiles
+from vla_attention.schemas.stores.shards import SealedShard, ShardedLayers
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 from vla_attention.testing.stores import write_store
 
@@ -36,7 +38,15 @@ def write_array(folder: Path, values: np.ndarray, block: int, **changes) -> zarr
 
 
 def reader_of(folder: Path) -> ShardedLayers | None:
-    return ShardedLayers.of(folder, json.loads((folder / "zarr.json").read_text()))
+    """The reader of the array `rows` in a folder, which is sealed here."""
+    files = SealedFiles(folder.parent, seal_episode(folder.parent, "made up", "a run").files)
+
+    def shard(file: str) -> SealedShard:
+        found = files.shard(f"rows/{file}")
+        assert found is not None
+        return found
+
+    return ShardedLayers.of(json.loads((folder / "zarr.json").read_text()), shard)
 
 
 @settings(max_examples=examples(8), deadline=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
@@ -75,12 +85,16 @@ def test_other_layouts_are_not_claimed(tmp_path, changes):
     assert reader_of(tmp_path / "rows") is None
 
 
+def fail(file: str) -> SealedShard:
+    raise AssertionError(file)
+
+
 def test_other_layouts_are_read_with_zarr_python(tmp_path, monkeypatch):
     episode = open_store(write_store(tmp_path / "a.zarr")).episodes[0]
     expected = episode.read("joint/rows")
     rows = episode.array("joint/rows")
-    assert isinstance(ShardedLayers.of(episode.folder / "joint/rows", rows.metadata.to_dict()), ShardedLayers)
-    monkeypatch.setattr(ShardedLayers, "of", classmethod(lambda cls, folder, metadata: None))
+    assert isinstance(ShardedLayers.of(rows.metadata.to_dict(), fail), ShardedLayers)
+    monkeypatch.setattr(ShardedLayers, "of", classmethod(lambda cls, metadata, shard_in: None))
     np.testing.assert_array_equal(episode.read_layer("joint/rows", 1, 0), expected[:, 1, 0])
 
 
@@ -106,7 +120,7 @@ def test_every_flipped_byte_of_a_chunk_or_the_index_is_noticed(tmp_path):
                 np.testing.assert_array_equal(read, whole[i, j])  # another chunk was hit
         assert noticed, place
     file.write_bytes(content[: len(content) // 2])
-    with pytest.raises(CorruptEpisode, match=r"task000_episode000.*checksum"):
+    with pytest.raises(CorruptEpisode, match=r"task000_episode000.*another size"):
         open_store(tmp_path / "a.zarr").episodes[0].read_layer("joint/rows", 0, 0)
 
 

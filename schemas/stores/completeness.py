@@ -1,0 +1,32 @@
+"""Whether an episode is there at all, looked at cheaply: its seal, its metadata, and the sizes of its files.
+
+`--resume`, `status` and `vla-capture repair` ask this of every episode. `verify.py` reads everything.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from vla_attention.schemas.stores.reader import StoredEpisode
+from vla_attention.schemas.stores.store_format import CorruptEpisode
+
+
+def check_presence(folder: Path, run: str) -> list[str]:
+    """What is wrong with the episode in a store's folder, one sentence each; an empty list means that it is present.
+
+    Looked at are the seal, the episode's name and run, every `zarr.json`, and the presence and size of every file; the
+    content of arrays is not read. `run` is the digest of the run's configuration: `run` of an open `Store`.
+    """
+    episode = StoredEpisode(folder, folder.name, run)
+    try:
+        _ = episode.attributes
+    except CorruptEpisode as error:
+        return [str(error)]
+    problems = [f"Episode {episode.name} is damaged: {problem}." for problem in episode.files.problems()]
+    for file in episode.files.records:
+        if file.endswith("zarr.json") and not any(file in problem for problem in problems):
+            try:
+                episode.sealed(file)
+            except CorruptEpisode as error:
+                problems.append(str(error))
+    return problems

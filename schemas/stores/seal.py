@@ -1,0 +1,86 @@
+"""Seals: a seal lists every file of an episode, and binds them to the episode's name and to its run.
+
+Capture seals an episode when all of it is written, `vla-analyze copy` when it has left something out. The reader
+(`reader.py`, `sealed_files.py`) compares what it reads with the seal. sha256 and crc32c find accidents: files that were
+damaged, exchanged, cut off or edited. They are no signature: who can compute them can make a new seal.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+from vla_attention.schemas.jsonable import from_json, to_json
+from vla_attention.schemas.stores.digest import bytes_digest, seal_digest
+from vla_attention.schemas.stores.root import group_attributes
+from vla_attention.schemas.stores.shards import CHECKSUM_BYTES, chunks_of_a_shard, index_size, read_index
+from vla_attention.schemas.stores.store_format import SEAL_GROUP, EpisodeSeal, FileRecord
+
+_FILE = f"{SEAL_GROUP}/zarr.json"
+
+
+def seal_episode(folder: Path, name: str, run: str, copied_from: str = "") -> EpisodeSeal:
+    """Seal an episode whose files are all in `folder`; returns what was written.
+
+    Args:
+        folder: where the episode is at the moment.
+        name: the name of its group in the store.
+        run: digest of the run's configuration, see `run_digest`.
+        copied_from: digest of the seal under which the episode was captured, if this is a changed copy.
+    """
+    (folder / _FILE).unlink(missing_ok=True)
+    files = sorted(file for file in folder.rglob("*") if file.is_file())
+    shards = {
+        document.parent: chunks
+        for document in files
+        if document.name == "zarr.json" and (chunks := chunks_of_a_shard(json.loads(document.read_bytes())))
+    }
+    records: dict[str, FileRecord] = {}
+    for file in files:
+        in_shards = (
+            None if file.name == "zarr.json" else next((shards[at] for at in file.parents if at in shards), None)
+        )
+        records[file.relative_to(folder).as_posix()] = _file_record(file.read_bytes(), in_shards)
+    seal = EpisodeSeal(name, run, records, digest="", copied_from=copied_from)
+    seal = replace(seal, digest=seal_digest(seal))
+    (folder / SEAL_GROUP).mkdir(exist_ok=True)
+    group = {"zarr_format": 3, "node_type": "group", "attributes": to_json(seal)}
+    (folder / _FILE).write_text(json.dumps(group, separators=(",", ":")), encoding="utf-8")
+    return seal
+
+
+def read_seal(folder: Path) -> EpisodeSeal:
+    """Read the seal of the episode in `folder`.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is no seal, or its own digest does not fit.
+    """
+    seal = from_json(EpisodeSeal, group_attributes((folder / _FILE).read_bytes()))
+    if seal.digest != seal_digest(seal):
+        raise ValueError("its own digest does not fit")
+    return seal
+
+
+def identity_problem(seal: EpisodeSeal, name: str, run: str) -> str | None:
+    """Why the sealed episode is not the one of that name in a store of that run, or None."""
+    if seal.episode != name:
+        return f"its seal is that of {seal.episode}: a folder was renamed, or copied under another name"
+    if seal.run != run:
+        return (
+            "its seal belongs to a run of another configuration than the zarr.json of the store states (policy, "
+            "protocol, recording, sites): one of them was changed, or the episode is of another store"
+        )
+    return None
+
+
+def _file_record(content: bytes, chunks: int | None) -> FileRecord:
+    record = FileRecord(len(content), bytes_digest(content))
+    if chunks is None:
+        return record
+    stored = content[-index_size(chunks) :]
+    index = read_index(stored, len(content))
+    ends = [int(offset + length) for offset, length in index]  # 0 for a chunk that was not written
+    checksums = [content[max(0, end - CHECKSUM_BYTES) : end].hex() or "00" * CHECKSUM_BYTES for end in ends]
+    return replace(record, index=bytes_digest(stored), chunks="".join(checksums))
