@@ -248,9 +248,13 @@ class OpenStores:
         return _frame(study_words(self.stores, settings_from_keywords(**settings)), table)
 
     def objects(
-        self, table: Literal["objects", "times", "pointing", "iou"] = "objects", **settings: Unpack[SettingKeywords]
+        self,
+        table: Literal["objects", "summary", "times", "pointing", "iou"] = "objects",
+        **settings: Unpack[SettingKeywords],
     ) -> pl.DataFrame:
-        """Attention on the objects: shares and lifts, shares over time, pointing game, or IoU with the objects' masks.
+        """Attention on the objects: shares and enrichment, shares over time, pointing game, or IoU with their masks.
+
+        "summary" has means over episodes with intervals, and the enrichment over the control.
 
         >>> objects = va.open(store).objects()
         >>> "akita_black_bowl_1" in objects["item"].to_list()
@@ -262,9 +266,10 @@ class OpenStores:
         from vla_attention.analyze.objects.object_settings import ObjectSettings
         from vla_attention.analyze.objects.object_study import study_objects
 
-        _check_name("table", table, ("objects", "times", "pointing", "iou"))
+        _check_name("table", table, ("objects", "summary", "times", "pointing", "iou"))
         options = ObjectSettings(spatial=table in ("pointing", "iou"))
-        return _frame(study_objects(self.stores, settings_from_keywords(**settings), options).tables, table)
+        study = study_objects(self.stores, settings_from_keywords(**settings), options)
+        return study.summary if table == "summary" else _frame(study.tables, table)
 
     def time(
         self,

@@ -23,8 +23,8 @@ _EXAMPLES = """examples:
   vla-analyze objects runs/libero_10.zarr --percentiles 75 90 --mask-coverage 0.3 --tolerance 0
   vla-analyze objects runs/libero_10.zarr --no-iou
 
-Shares and lifts of 50 episodes take seconds; pointing game and IoU several times as long, and with --per-head
-that times the number of heads.
+Shares, enrichment and control of 50 episodes take seconds; pointing game and IoU several times as long, and with
+--per-head that times the number of heads.
 """
 
 
@@ -32,7 +32,8 @@ def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-analyze objects STORE ...`."""
     parser = command_parser(
         "vla-analyze objects",
-        "Which objects are looked at: share of the image attention and lift over covered area per object and class (of "
+        "Which objects are looked at: share of the image attention, enrichment over covered area and over the object's "
+        "masks of other episodes (a control for attention that is fixed to a place), per object and class (of "
         "interest, other, robot, background); centre of attention, pointing game and IoU with the objects' masks, with "
         "chance levels.",
         _EXAMPLES,
@@ -58,7 +59,7 @@ def build_parser() -> argparse.ArgumentParser:
     maps.add_argument(
         "--tolerance", type=float, default=1.0, metavar="PATCHES", help="of the pointing game (default: 1 patch)"
     )
-    maps.add_argument("--no-iou", action="store_true", help="shares and lifts only: no centres, pointing game and IoU")
+    maps.add_argument("--no-iou", action="store_true", help="no centres, pointing game and IoU")
     maps.add_argument(
         "--save-steps", action="store_true", help="also a table per replan, layer, denoise step and head (large)"
     )
@@ -94,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
         from vla_attention.analyze.objects.plot_object_iou import plot_object_iou
         from vla_attention.analyze.objects.plot_object_shares import plot_object_shares
 
-        files += plot_object_shares(study.tables.times, study.example, folder, arguments.seed)
+        files += plot_object_shares(study, folder)
         if object_settings.spatial:
             files += plot_object_iou(study, folder)
     report_files(folder, files)

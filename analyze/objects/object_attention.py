@@ -1,9 +1,10 @@
-"""How much attention objects get: shares and lifts per object and class, and how well maps find the objects."""
+"""How much attention objects get: shares and enrichment per object and class, and how well maps find the objects."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import polars as pl
@@ -22,6 +23,8 @@ from vla_attention.analyze.measures.frames import (
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.objects.control_columns import ControlParts, control_columns, task_of
+from vla_attention.analyze.objects.control_masks import control_source
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_views import (
     ALL_CAMERAS,
@@ -39,7 +42,7 @@ from vla_attention.analyze.objects.pointing_and_iou import (
     otsu_regions,
     percentile_regions,
     pointing_hits,
-    random_iou,
+    shifted_iou,
 )
 from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.parallel import map_episodes
@@ -76,9 +79,13 @@ def object_tables(question: Question, settings: ObjectSettings | None = None, ke
             mass        sum over patches of row x covered area, mean over replans
             share       mass / mass of all patches of all cameras, mean over replans
             area_share  covered area / area of these cameras' pictures, mean over replans
-            lift        share of this camera's mass / area_share, of these means: 1 is what uniform attention gives. A
-                        mean of quotients would give a sliver that is in sight at one replan as much weight as all other
-                        replans.
+            enrichment  share of this camera's mass / area_share, of these means: 1 is what attention gives that is
+                        uniform over the picture. A mean of quotients would give a sliver that is in sight at one
+                        replan as much weight as all other replans.
+            control_enrichment  the same of these maps on the item's masks of other episodes of the task
+            control_balanced    stands for it when episodes are resampled
+            control_overlap     how much these masks overlap with the episode's own (see `control_masks` for all three;
+                        null where there is no control)
         times: one row per (episode, replan, camera, item) of the layers' and heads' mean: `share`, `area_share`,
             `env_step`.
         pointing: with `settings.spatial`, one row per (episode, layer or "layers_avg"[, head], camera, item): means
@@ -91,7 +98,7 @@ def object_tables(question: Question, settings: ObjectSettings | None = None, ke
             pointing, pointing_chance             pointing game, and the share of patches that would score
             In "layers_avg" each is the mean of the layers' values, not the value of the layers' mean map.
         iou: with `settings.spatial`, the same rows once for each `threshold` (`settings.thresholds`):
-            iou, iou_chance                       IoU with the mask, and of a random region of the same size
+            iou, iou_chance                       IoU with the mask, and mean IoU of the shifted region
         steps, iou_steps: with `keep_steps`, mass and the measures of `pointing` and of `iou` per (episode, replan,
             layer, denoise step, head, camera, item).
 
@@ -101,12 +108,20 @@ def object_tables(question: Question, settings: ObjectSettings | None = None, ke
     settings = settings or ObjectSettings()
     if not any(cameras_of(item) for item in question.selected):
         raise BadArgument(f"Site '{question.site}': {NO_COVERAGE}.")
-    with progress_bar(len(question.selected), "episodes") as advance:
+    showing = [item for item in question.selected if cameras_of(item)]
+    episodes_of = Counter(task_of(item) for item in showing)
+    with progress_bar(len(showing), "episodes") as advance:
 
-        def measure(item: SelectedEpisode) -> ObjectTables:
-            return _measure_episode(item, question.selection, question.site, settings, keep_steps)
+        def measure(item: SelectedEpisode) -> tuple[ObjectTables, ControlParts]:
+            others = episodes_of[task_of(item)] - 1
+            return _measure_episode(item, question.selection, question.site, settings, keep_steps, others)
 
-        parts = map_episodes(measure, [item for item in question.selected if cameras_of(item)], advance)
+        measured = map_episodes(measure, showing, advance)
+    columns = control_columns([of_control for _, of_control in measured])
+    parts = [
+        replace(part, objects=part.objects.hstack(control))
+        for (part, _), control in zip(measured, columns, strict=True)
+    ]
     tables = {}
     for one in fields(ObjectTables):
         frames: list[pl.DataFrame] = [frame for part in parts if (frame := getattr(part, one.name)) is not None]
@@ -145,20 +160,23 @@ class _Episode:
 
 
 def _measure_episode(
-    item: SelectedEpisode, selection: Selection, site: str, settings: ObjectSettings, keep_steps: bool
-) -> ObjectTables:
+    item: SelectedEpisode, selection: Selection, site: str, settings: ObjectSettings, keep_steps: bool, num_others: int
+) -> tuple[ObjectTables, ControlParts]:
     names, members = items_of(item)
     views = views_of(item, members, settings)
     measured = {view.camera: _Measured() for view in views}
     heads = len(selection.heads) if selection.per_head else 1
     cells = (item.tokens.num_replans, len(selection.layers), len(selection.denoise), heads)
+    maps = {view.camera: np.zeros((*cells[:2], heads, view.grid.num_patches)) for view in views}
     for part in layer_rows(item.episode, selection, site):
         rows = part.of_heads(selection)
         if item.without:
             rows = rows.copy()
             rows[:, :, list(item.without)] = 0.0
         for view in views:
-            values = _measure_maps(rows[:, :, view.span.start : view.span.stop], view, settings)
+            own = rows[:, :, view.span.start : view.span.stop]
+            maps[view.camera][:, part.layer] += own / len(selection.denoise)
+            values = _measure_maps(own, view, settings)
             of_camera = measured[view.camera]
             for one in fields(_Measured):
                 target = getattr(of_camera, one.name)
@@ -167,8 +185,9 @@ def _measure_episode(
                     whole[:, part.layer, part.denoise] = array
     items = {label: [name[i] for name in names] for i, label in enumerate(("kind", "item", "object_class"))}
     layers = LayerAxis.of(selection, average_one=False)
+    averaged = {camera: layers.with_average(values) for camera, values in maps.items()}
     episode = _Episode(item, selection, settings, views, measured, layers, items)
-    return ObjectTables(
+    tables = ObjectTables(
         objects=_objects_part(episode),
         times=_times_part(episode),
         pointing=_pointing_part(episode) if settings.spatial else None,
@@ -176,6 +195,17 @@ def _measure_episode(
         steps=_steps_part(episode) if keep_steps else None,
         iou_steps=_iou_steps_part(episode) if keep_steps and settings.spatial else None,
     )
+    pictures = {ALL_CAMERAS: views, **{view.camera: [view] for view in views}}
+    sources = {
+        name: control_source(
+            np.concatenate([averaged[view.camera] for view in seen], axis=-1),
+            np.concatenate([view.area for view in seen], axis=1),
+            num_others,
+        )
+        for name, seen in pictures.items()
+    }
+    axes = [layers.columns, head_axis(selection), items]
+    return tables, ControlParts(item, sources, axes, names)
 
 
 def _measure_maps(maps: NDArray[np.float32], view: View, settings: ObjectSettings) -> _Measured:
@@ -191,12 +221,9 @@ def _measure_maps(maps: NDArray[np.float32], view: View, settings: ObjectSetting
     by_item["distance"] = np.where(view.sizes[:, None, :] > 0, distance, np.nan)
     by_item["pointing"] = pointing_hits(maps, view.hit_masks)
     regions = [*(percentile_regions(maps, value) for value in settings.percentiles), otsu_regions(maps)]
-    chances = [
-        random_iou(region.sum(axis=-1)[..., None], view.sizes[:, None, :], view.grid.num_patches) for region in regions
-    ]
     by_threshold = {
         "iou": np.stack([intersection_over_union(region, view.masks) for region in regions], axis=2),
-        "iou_chance": np.stack(chances, axis=2),
+        "iou_chance": np.stack([shifted_iou(region, view.shifted_masks) for region in regions], axis=2),
     }
     return _Measured(by_map, by_item, by_threshold)
 
@@ -238,12 +265,12 @@ def _objects_part(episode: _Episode) -> pl.DataFrame:
     for camera, shares in _shares(episode).items():
         camera_share, area_share = finite_mean(shares.camera_share), shares.area_share.mean(axis=0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            lift = np.where(area_share > 0, camera_share / area_share, np.nan)
+            enrichment = np.where(area_share > 0, camera_share / area_share, np.nan)
         values = {
             "mass": shares.mass.mean(axis=0),
             "share": finite_mean(shares.share),
             "area_share": area_share,
-            "lift": lift,
+            "enrichment": enrichment,
         }
         parts.append(episode.table(camera, [episode.layers.columns, head_axis(episode.selection)], values))
     return pl.concat(parts)

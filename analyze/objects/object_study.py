@@ -13,6 +13,7 @@ from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, find_episode
+from vla_attention.analyze.objects.control_masks import STILL_OVERLAP
 from vla_attention.analyze.objects.object_attention import ObjectTables, object_tables
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_views import ALL_CAMERAS, CLASSES, site_of_pictures
@@ -20,9 +21,10 @@ from vla_attention.analyze.statistics.bootstrap import DEFAULT_SEED, POSITIVE, S
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
 from vla_attention.schemas.stores.reader import Store
 
-#: An item that covers less than this part of the pictures (one patch of 512) is not ranked by its lift.
+#: An item that covers less than this part of the pictures (one patch of 512) is not ranked by its enrichment.
 _LEAST_AREA = 0.002
 _ITEM = ("camera", "kind", "item")
+_OVER_CONTROL = "enrichment_over_control"
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class ObjectStudy:
 
     @cached_property
     def summary(self) -> pl.DataFrame:
-        """Shares and lifts; see `objects_summary`."""
+        """Shares, enrichment and control; see `objects_summary`."""
         return objects_summary(self.tables.objects, self.question.settings.seed)
 
     @cached_property
@@ -114,12 +116,19 @@ def study_objects(
 
 
 def objects_summary(objects: pl.DataFrame, seed: int = DEFAULT_SEED) -> pl.DataFrame:
-    """Mean share, area and lift of every item over the episodes that have it, with intervals, of the layers' mean.
+    """Means of every item over the episodes that have it, with intervals, of the layers' mean.
 
-    From `object_tables`, `objects`. Classes in their order, then objects by lift; per camera, all cameras first.
+    From `object_tables`, `objects`. Classes in their order, then objects by enrichment; per camera, all cameras first.
+    `enrichment_over_control` is mean enrichment / mean `control_enrichment` over the episodes with a control, and null
+    where the control cannot tell (`control_overlap`, of masks with control masks, from `STILL_OVERLAP` on).
     """
-    values = {"share": SHARE, "area_share": SHARE, "lift": POSITIVE}
-    return _ordered(_means(objects, _ITEM, values, seed), "lift")
+    values = {"share": SHARE, "area_share": SHARE, "enrichment": POSITIVE}
+    values |= {"control_enrichment": POSITIVE, "control_overlap": SHARE}
+    summary = _means(objects, _ITEM, values, seed, {_OVER_CONTROL: ("enrichment", "control_balanced")})
+    telling = pl.col("control_overlap") < STILL_OVERLAP
+    bounded = [_OVER_CONTROL, f"{_OVER_CONTROL}_low", f"{_OVER_CONTROL}_high"]
+    summary = summary.with_columns(pl.when(telling).then(pl.col(name)).alias(name) for name in bounded)
+    return _ordered(summary, "enrichment")
 
 
 def pointing_summary(pointing: pl.DataFrame, seed: int = DEFAULT_SEED) -> pl.DataFrame:
@@ -139,10 +148,11 @@ def iou_summary(iou: pl.DataFrame, seed: int = DEFAULT_SEED) -> pl.DataFrame:
 
 
 def strongest_followers(objects: pl.DataFrame, most: int = 5) -> pl.DataFrame:
-    """The layers (and heads, where they were kept apart) in which an object has its highest lift, mean over episodes.
+    """The layers (and heads, where they were kept apart) in which an object's enrichment exceeds its control the most.
 
-    One row per object: `item`, `object_class`, `layer`, `head`, `lift`, `num_episodes`; the background and items that
-    cover hardly anything are left out.
+    One row per object: `item`, `object_class`, `layer`, `head`, `enrichment` and `control_enrichment` (means over
+    episodes), `enrichment_over_control`, `num_episodes`. Left out are the background, items that cover hardly anything,
+    and those of which the control cannot tell.
     """
     single = _single_layers(objects).filter(
         (pl.col("kind") == "object")
@@ -150,12 +160,17 @@ def strongest_followers(objects: pl.DataFrame, most: int = 5) -> pl.DataFrame:
         & (pl.col("object_class") != CLASSES[3])
         & (pl.col("area_share") >= _LEAST_AREA)
     )
+    controlled = pl.col("control_enrichment").is_not_null()
     means = single.group_by("item", "layer", "head").agg(
         pl.col("object_class").mode().sort().first(),
-        pl.col("lift").mean(),
-        pl.len().cast(pl.Int64).alias("num_episodes"),
+        pl.col("enrichment").filter(controlled).mean(),
+        pl.col("control_enrichment").mean(),
+        pl.col("control_overlap").mean(),
+        controlled.sum().cast(pl.Int64).alias("num_episodes"),
     )
-    ranked = means.drop_nulls("lift").sort(["lift", "item", "layer"], descending=[True, False, False])
+    over = (pl.col("enrichment") / pl.col("control_enrichment")).alias(_OVER_CONTROL)
+    telling = means.with_columns(over).filter(pl.col("control_overlap") < STILL_OVERLAP).drop("control_overlap")
+    ranked = telling.drop_nulls(_OVER_CONTROL).sort([_OVER_CONTROL, "item", "layer"], descending=[True, False, False])
     return ranked.unique("item", keep="first", maintain_order=True).head(most)
 
 
@@ -177,10 +192,19 @@ def _single_layers(table: pl.DataFrame) -> pl.DataFrame:
     return table.filter((pl.col("layer") != LAYERS_AVG) | (overall_layer(table) != LAYERS_AVG))
 
 
-def _means(table: pl.DataFrame, item: Sequence[str], values: dict[str, tuple[float, float]], seed: int) -> pl.DataFrame:
+def _means(
+    table: pl.DataFrame,
+    item: Sequence[str],
+    values: dict[str, tuple[float, float]],
+    seed: int,
+    quotients: dict[str, tuple[str, str]] | None = None,
+) -> pl.DataFrame:
     chosen = table.filter(pl.col("layer") == overall_layer(table))
-    episodes = chosen.group_by(*EPISODE_ID, *item, maintain_order=True).agg(*(pl.col(name).mean() for name in values))
-    return means_with_intervals(episodes, item, values, seed)
+    names = {*values, *(name for sides in (quotients or {}).values() for name in sides)}
+    episodes = chosen.group_by(*EPISODE_ID, *item, maintain_order=True).agg(
+        *(pl.col(name).mean() for name in table.columns if name in names)
+    )
+    return means_with_intervals(episodes, item, values, seed, quotients=quotients)
 
 
 def _ordered(summary: pl.DataFrame, by: str) -> pl.DataFrame:

@@ -88,7 +88,7 @@ def _note(settings: ObjectSettings, cut: bool) -> str:
     note = (
         f"Mask: patches covered by at least {100 * settings.mask_coverage:g}%. Points: mean over episodes with "
         f"{interval_name(DEFAULT_LEVEL, 'bootstrap')}; n counts episodes in which the object has a mask. Black: chance "
-        "(a random region of the same size; the mask's share of the picture). Pointing game: within "
+        "(mean over shifts of the map about the picture). Pointing game: within "
         f"{settings.tolerance:g} patch of the mask. Lines at the right edge go on."
     )
     return note + (f" At most {_MOST} objects a camera, those with the highest IoU." if cut else "")

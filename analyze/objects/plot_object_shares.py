@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.frames import EPISODE_ID, rows_of_episode
-from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.objects.object_study import ObjectStudy
 from vla_attention.analyze.objects.object_views import ALL_CAMERAS, CLASSES
 from vla_attention.analyze.show.numbers import interval_name, of_tasks
 from vla_attention.analyze.show.plot_axes import legend_below, ratio_axis, uniform_line, whole_numbers
@@ -19,7 +20,6 @@ from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure
 from vla_attention.analyze.show.plot_text import shortened, title
 from vla_attention.analyze.statistics.bootstrap import (
     DEFAULT_LEVEL,
-    DEFAULT_SEED,
     SHARE,
     EpisodeStatistic,
     Resamples,
@@ -42,16 +42,16 @@ _OTHERS = "other objects"
 
 
 @drawn_in_our_style
-def plot_object_shares(
-    times: pl.DataFrame, example: SelectedEpisode, folder: Path, seed: int = DEFAULT_SEED
-) -> list[Path]:
-    """Draw `times` of `object_attention.object_tables`, all cameras together; returns the paths of png, pdf and csv.
+def plot_object_shares(study: ObjectStudy, folder: Path) -> list[Path]:
+    """Draw the study's `times` and controls, all cameras together; returns the paths of png, pdf and csv.
 
     Left: shares of the example episode's image attention, stacked by object. Middle: mean over episodes by class, over
     the episode's time from 0 to 1 (replans interpolated linearly), with pointwise intervals; dashed: covered area, what
-    uniform attention gives. Right: lift at each time, sum of the episodes' shares / sum of their covered areas.
+    uniform attention gives. Right: enrichment at each time, sum of the episodes' shares / sum of their covered areas;
+    dotted: the control, the enrichment of the same maps on masks of other episodes, where it can tell.
     """
-    whole = times.filter(pl.col("camera") == ALL_CAMERAS)
+    example = study.example
+    whole = study.tables.times.filter(pl.col("camera") == ALL_CAMERAS)
     attributes = example.episode.attributes
     own = rows_of_episode(whole, example)
     figure = new_figure(14.5, 4.7)
@@ -62,11 +62,12 @@ def plot_object_shares(
         "Share of the image attention by object, all cameras, mean over layers and heads",
         f"Left: {example.episode.name}, '{attributes.instruction}'. Middle and right: mean over "
         f"{of_tasks(num_episodes, num_tasks)} with {interval_name(DEFAULT_LEVEL, 'bootstrap')} at each time; "
-        "dashed: what uniform attention gives (in the middle: the covered area).",
+        "dashed: what uniform attention gives (in the middle: the covered area). Dotted: the control, the same maps on "
+        "the objects' masks of other episodes.",
     )
     left, middle, right = figure.subplots(1, 3)
     shown = _draw_example(left, own)
-    classes = _draw_classes(middle, right, whole, seed)
+    classes = _draw_classes(middle, right, whole, _controls(study.summary), study.question.settings.seed)
     return save_figure(figure, folder, STEM, pl.concat([shown, classes], how="diagonal"))
 
 
@@ -123,7 +124,15 @@ def _draw_example(axes: Axes, own: pl.DataFrame) -> pl.DataFrame:
     ).sort("name", "time")
 
 
-def _draw_classes(axes: Axes, lift_axes: Axes, whole: pl.DataFrame, seed: int) -> pl.DataFrame:
+def _controls(summary: pl.DataFrame) -> dict[str, float]:
+    """By class, all cameras together: its control, where that can tell."""
+    telling = summary.filter(camera=ALL_CAMERAS, kind="class").drop_nulls("enrichment_over_control")
+    return dict(telling.select("item", "control_enrichment").iter_rows())
+
+
+def _draw_classes(
+    axes: Axes, enrichment_axes: Axes, whole: pl.DataFrame, controls: Mapping[str, float], seed: int
+) -> pl.DataFrame:
     parts: list[pl.DataFrame] = []
     for name in CLASSES:
         part = whole.filter((pl.col("kind") == "class") & (pl.col("item") == name))
@@ -132,18 +141,21 @@ def _draw_classes(axes: Axes, lift_axes: Axes, whole: pl.DataFrame, seed: int) -
         share, area, tasks = _by_phase(part)
         resamples = resample_episodes(tasks, seed=seed)
         shares = _with_intervals([mean_over_episodes(column, SHARE) for column in share.T], resamples)
-        lifts = _with_intervals(
+        enrichments = _with_intervals(
             [ratio_of_means_over_episodes(*columns) for columns in zip(share.T, area.T, strict=True)], resamples
         )
         covered, color = area.mean(axis=0), CLASS_COLORS[name]
         label = name if len(tasks) == whole.select(EPISODE_ID).unique().height else f"{name} (n = {len(tasks)})"
         axes.plot(_PHASES, 100 * covered, color=color, linestyle="--", linewidth=1.0)
-        for target, factor, (value, low, high) in ((axes, 100, shares), (lift_axes, 1, lifts)):
+        for target, factor, (value, low, high) in ((axes, 100, shares), (enrichment_axes, 1, enrichments)):
             target.plot(_PHASES, factor * value, color=color, label=label)
             target.fill_between(_PHASES, factor * low, factor * high, color=color, alpha=0.2, linewidth=0)
         drawn: dict[str, NDArray[np.float64]] = {"time": _PHASES, "area_share": covered}
         drawn |= dict(zip(("share", "share_low", "share_high"), shares, strict=True))
-        drawn |= dict(zip(("lift", "lift_low", "lift_high"), lifts, strict=True))
+        drawn |= dict(zip(("enrichment", "enrichment_low", "enrichment_high"), enrichments, strict=True))
+        control = controls.get(name)
+        if control is not None:
+            enrichment_axes.axhline(control, color=color, linestyle=":", linewidth=1.2)
         parts.append(
             pl.DataFrame(drawn).select(
                 pl.lit("mean").alias("panel"),
@@ -151,6 +163,7 @@ def _draw_classes(axes: Axes, lift_axes: Axes, whole: pl.DataFrame, seed: int) -
                 "time",
                 "area_share",
                 pl.lit(len(tasks), dtype=pl.Int64).alias("num_episodes"),
+                pl.lit(control, dtype=pl.Float64).alias("control_enrichment"),
                 pl.exclude("time", "area_share"),
             )
         )
@@ -158,10 +171,11 @@ def _draw_classes(axes: Axes, lift_axes: Axes, whole: pl.DataFrame, seed: int) -
     top = 100 * max(data.select(pl.max_horizontal("share", "share_high", "area_share").max()).item() or 0.0, 0.01)
     axes.set_ylim(0, 1.05 * top)
     axes.set_ylabel("share of image attention (%)")
-    uniform_line(lift_axes)
-    ratio_axis(lift_axes.yaxis, np.append(data.select("lift", "lift_low", "lift_high").to_numpy().astype(float), 1.0))
-    lift_axes.set_ylabel("lift: share of attention / share of area (logarithmic)")
-    for target in (axes, lift_axes):
+    uniform_line(enrichment_axes)
+    drawn_values = data.select("enrichment", "enrichment_low", "enrichment_high", "control_enrichment")
+    ratio_axis(enrichment_axes.yaxis, np.append(drawn_values.to_numpy().astype(float), 1.0))
+    enrichment_axes.set_ylabel("enrichment (attention / area, logarithmic)")
+    for target in (axes, enrichment_axes):
         target.set_xlabel("time in the episode (0: first replan, 1: last)")
         target.set_xlim(0, 1)
         target.grid(axis="y")

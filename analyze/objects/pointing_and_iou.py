@@ -6,8 +6,6 @@ of patches. Axes are named in the docstrings; `...` stands for any axes in betwe
 
 from __future__ import annotations
 
-import functools
-import math
 from typing import Any
 
 import numpy as np
@@ -65,7 +63,7 @@ def pointing_hits(maps: NDArray[np.floating], masks: Masks | NDArray[np.float32]
     Zhang, Lin, Brandt, Shen & Sclaroff 2018, "Top-down neural attention by excitation backprop", IJCV 126, section 5.1,
     who accept a maximum within 15 pixels of the object: give masks that `grown` has widened by as much. Of several
     equally high patches each counts its part, so that a uniform map scores what chance does: the mask's share of the
-    picture.
+    picture, which is also what a map scores on average over all shifts.
 
     Args:
         maps: (replan, ..., patch).
@@ -136,36 +134,49 @@ def intersection_over_union(regions: Masks, masks: Masks | NDArray[np.float32]) 
         return np.where(sizes > 0, common / union, np.nan)
 
 
-def random_iou(region_sizes: NDArray[np.integer], mask_sizes: NDArray[np.integer], num_patches: int) -> Floats:
-    """Mean IoU of a mask with a region of the given size whose patches are drawn at random: what chance gives.
+#: Shifts along each side of the picture that `shifted_masks` takes at a replan. More need memory: 4 x 4 of 52 replans,
+#: 256 patches and 14 items are 12 MB.
+_SHIFTS_A_SIDE = 4
 
-    E[X / (k + m - X)], where X, the number of common patches of k drawn and m wanted ones, has the hypergeometric
-    distribution over `num_patches`. Sizes are broadcast; NaN where the mask is empty.
+
+def shifted_masks(masks: Masks | NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float32]:
+    """Masks (replan, patch, item) moved by many shifts that wrap around the picture: (replan, patch, shift, item).
+
+    All shifts of a picture of up to 4 x 4 patches. Of a larger one every replan has 4 x 4 evenly spaced ones, which
+    begin at another place at the next replan, so that 16 replans have all shifts of 16 x 16 patches.
     """
-    drawn, wanted = np.broadcast_arrays(region_sizes, mask_sizes)
-    pairs, place = np.unique(drawn.astype(np.int64) * (num_patches + 1) + wanted, return_inverse=True)
-    values = [_random_iou_of(*divmod(int(pair), num_patches + 1), num_patches) for pair in pairs]
-    return np.array(values)[place].reshape(drawn.shape)
+    replans, patches, items = masks.shape
+    pictures = masks.astype(np.float32, copy=False).reshape(replans, rows, columns, items)
+    row_shifts, column_shifts = (min(side, _SHIFTS_A_SIDE) for side in (rows, columns))
+    shifted = np.empty((replans, rows, columns, row_shifts, column_shifts, items), np.float32)
+    strides = -(-rows // row_shifts), -(-columns // column_shifts)
+    for replan in range(replans):
+        first = replan % strides[0], replan // strides[0] % strides[1]
+        for i in range(row_shifts):
+            for j in range(column_shifts):
+                by = (first[0] + i * rows // row_shifts, first[1] + j * columns // column_shifts)
+                shifted[replan, :, :, i, j] = np.roll(pictures[replan], by, axis=(0, 1))
+    return shifted.reshape(replans, patches, row_shifts * column_shifts, items)
 
 
-@functools.lru_cache(maxsize=1 << 16)
-def _random_iou_of(drawn: int, wanted: int, total: int) -> float:
-    if wanted == 0:
-        return math.nan
-    common = np.arange(max(0, drawn + wanted - total), min(drawn, wanted) + 1)
-    log = _log_binomial(wanted, common) + _log_binomial(total - wanted, drawn - common)
-    chance = np.exp(log - _log_binomial(total, np.array([drawn])))
-    return float((chance * common / (drawn + wanted - common)).sum())
+def shifted_iou(regions: Masks, shifted: NDArray[np.float32]) -> Floats:
+    """Mean IoU of regions (replan, ..., patch) with masks that were moved about the picture: what chance gives.
 
+    `shifted` is from `shifted_masks`; moving the mask is moving the map. Scattered patches overlap as much on average,
+    but the IoU rises faster than the overlap: a region in one piece, which overlaps much or not at all, has a higher
+    mean.
 
-def _log_binomial(total: int, chosen: NDArray[np.integer]) -> Floats:
-    log_factorial = _log_factorials(total)
-    return np.asarray(log_factorial[total] - log_factorial[chosen] - log_factorial[total - chosen])
-
-
-@functools.lru_cache(maxsize=64)
-def _log_factorials(last: int) -> Floats:
-    return np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, last + 1)))])
+    Returns:
+        (replan, ..., item); NaN where the item has no patch.
+    """
+    replans, patches, shifts, items = shifted.shape
+    flat = shifted.reshape(replans, patches, shifts * items)
+    common = _over_patches(regions.astype(np.float32), flat)
+    common = common.reshape(*common.shape[:-1], shifts, items)
+    sizes = _over_replans(mask_sizes(shifted[:, :, 0]), common.ndim)
+    union = regions.sum(axis=-1)[..., None, None] + sizes - common
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(sizes[..., 0, :] > 0, (common / union).mean(axis=-2), np.nan)
 
 
 def _over_patches(values: NDArray[np.float32], masks: Masks | NDArray[np.float32]) -> Floats:

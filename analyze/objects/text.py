@@ -1,4 +1,4 @@
-"""The objects as printed tables: shares and lifts, then how well attention maps find the objects."""
+"""The objects as printed tables: shares, enrichment and control, then how well attention maps find the objects."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Any
 
 import polars as pl
 
+from vla_attention.analyze.objects.control_masks import STILL_OVERLAP
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_study import ObjectStudy
 from vla_attention.analyze.objects.object_views import ALL_CAMERAS, item_name
@@ -17,13 +18,16 @@ from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 #: Rows of a printed table; the written ones have all.
 _MOST_ROWS = 28
 _SHARES_NOTE = (
-    "share: of the attention on all cameras' patches. area: covered part of the picture. lift: share of the picture's "
-    f"attention over area (1: uniform attention). {interval_note(DEFAULT_LEVEL)}"
+    "share: of the attention on all cameras' patches. area: covered part of the picture. enrichment: mean share of the "
+    "picture's attention / mean area (1: attention that is uniform over the picture). over control: mean enrichment / "
+    "mean enrichment of the same maps on the object's masks of other episodes of the task (1: attention that does not "
+    f"depend on where the object is). cannot tell: these masks overlap with the object's by {STILL_OVERLAP:.0%} or "
+    f"more, because it hardly moves; -: there are no other masks. {interval_note(DEFAULT_LEVEL)}"
 )
 
 
 def objects_text(study: ObjectStudy) -> str:
-    """Shares and lifts by camera; then, by camera, how well maps find the objects."""
+    """Shares and enrichment by camera; then, by camera, how well maps find the objects."""
     lines = [*study.question.header("OBJECTS: which objects are looked at", study.layer), *_shares(study)]
     if study.settings.spatial:
         lines += _finding(study)
@@ -42,8 +46,8 @@ def _shares(study: ObjectStudy) -> list[str]:
             lines += ["", f"camera {camera}", _shares_table(classes, several)]
     lines += ["", *wrap(_SHARES_NOTE)]
     followers = [
-        f"'{row['item']}' ({row['object_class']}) in layer {row['layer']}{_head(row)} (lift "
-        f"{format_number(row['lift'])})"
+        f"'{row['item']}' ({row['object_class']}) in layer {row['layer']}{_head(row)} "
+        f"({format_number(row['enrichment_over_control'])} x the control)"
         for row in study.followers.iter_rows(named=True)
     ]
     return [*lines, "", *wrap(f"Followed most, by layer: {'; '.join(followers)}.")] if followers else lines
@@ -76,8 +80,9 @@ def _finding_note(settings: ObjectSettings) -> str:
     return (
         f"An object's mask is the patches of which it covers at least {100 * settings.mask_coverage:g}%; replans "
         f"without any are left out; n counts episodes. IoU {settings.shown_threshold}: of the mask with the attended "
-        "region, the patches at or above that percentile of their map; otsu: above Otsu's threshold; chance: a random "
-        f"region of the same size. pointing: the highest patch is at most {settings.tolerance:g} patch from the mask. "
+        "region, the patches at or above that percentile of their map; otsu: above Otsu's threshold; chance: mean over "
+        "shifts of the map about the picture. "
+        f"pointing: the highest patch is at most {settings.tolerance:g} patch from the mask. "
         "distance: from the centre of attention to the object's, in picture sides; in brackets: from the middle of the "
         "picture."
     )
@@ -104,12 +109,22 @@ def _shares_table(part: pl.DataFrame, several_tasks: bool) -> str:
             format_number(row["share"]),
             format_interval(row["share_low"], row["share_high"]),
             format_number(row["area_share"]),
-            format_number(row["lift"]),
-            format_interval(row["lift_low"], row["lift_high"]),
+            format_number(row["enrichment"]),
+            format_interval(row["enrichment_low"], row["enrichment_high"]),
+            *_over_control(row),
         ]
         for row, count in zip(rows, counts, strict=True)
     ]
-    return text_table(["object", heading, "share", "interval", "area", "lift", "interval"], body, left=(0,))
+    header = ["object", heading, "share", "interval", "area", "enrichment", "interval", "over control", "interval"]
+    return text_table(header, body, left=(0,))
+
+
+def _over_control(row: dict[str, Any]) -> tuple[str, str]:
+    overlap = row["control_overlap"]
+    if overlap is not None and overlap >= STILL_OVERLAP:
+        return "cannot tell", "-"
+    name = "enrichment_over_control"
+    return format_number(row[name]), format_interval(row[f"{name}_low"], row[f"{name}_high"])
 
 
 def _finding_table(part: pl.DataFrame, otsu: pl.DataFrame, pointing: pl.DataFrame, shown: str) -> str:

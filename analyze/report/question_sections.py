@@ -101,7 +101,7 @@ def word_section(question: Question, folder: Path) -> Section:
     diagram = drawn(
         lambda where: plot_word_bars(study.summary, where, study.layer),
         folder,
-        f"Bars of the words' lifts, highest first: {_lifts(of_words.head(5)) or 'none'}.",
+        f"Bars of the words' lifts, highest first: {_named(of_words.head(5), 'lift') or 'none'}.",
         f"Words by lift, site {study.question.site}: mass per piece against the mean over valid keys; 1 is uniform "
         "attention.",
     )
@@ -134,12 +134,13 @@ def object_section(question: Question, folder: Path) -> Section | None:
     together = ALL_CAMERAS if ALL_CAMERAS in cameras else cameras[0]
     whole = study.summary.filter(pl.col("camera") == together)
     diagram = drawn(
-        lambda where: plot_object_shares(study.tables.times, study.example, where, question.settings.seed),
+        lambda where: plot_object_shares(study, where),
         folder,
         "Shares of image attention over time, by object and by class. "
-        f"Lifts of the classes: {_lifts(whole.filter(pl.col('kind') == 'class')) or 'none'}.",
+        f"Enrichment of the classes: {_named(whole.filter(pl.col('kind') == 'class'), 'enrichment') or 'none'}.",
         "Where image attention goes, by object in one episode and by class over all. Dashed: the area that is covered, "
-        "which is what uniform attention would give.",
+        "which is what uniform attention would give. Dotted: the control, the same maps on the objects' masks of other "
+        "episodes.",
     )
     rows = [
         [
@@ -149,18 +150,21 @@ def object_section(question: Question, folder: Path) -> Section | None:
             percent_cell(row["share"]),
             interval_cell(row["share_low"], row["share_high"], times=100),
             percent_cell(row["area_share"]),
-            number_cell(row["lift"]),
-            interval_cell(row["lift_low"], row["lift_high"]),
+            number_cell(row["enrichment"]),
+            interval_cell(row["enrichment_low"], row["enrichment_high"]),
+            number_cell(row["enrichment_over_control"]),
+            interval_cell(row["enrichment_over_control_low"], row["enrichment_over_control_high"]),
         ]
         for row in whole.head(_MOST_ROWS).iter_rows(named=True)
     ]
-    header = ["object", "kind", "episodes", "share %", _INTERVAL, "area %", "lift", _INTERVAL]
+    header = ["object", "kind", "episodes", "share %", _INTERVAL, "area %", "enrichment", _INTERVAL]
+    header += ["over control", _INTERVAL]
     more = f" (the first {_MOST_ROWS}; vla-analyze objects has all)" if whole.height > _MOST_ROWS else ""
     table = Table(f"Objects, all cameras together{more}", header, rows)
     return Section("objects", "Objects", [diagram, table])
 
 
-def _lifts(summary: pl.DataFrame) -> str:
-    """Names with their lifts, for people who do not see the diagram."""
-    rows = summary.filter(pl.col("lift").is_not_null()).iter_rows(named=True)
-    return ", ".join(f"{row['item']} {format_number(row['lift'])}" for row in rows)
+def _named(summary: pl.DataFrame, measure: str) -> str:
+    """Names with a measure, for people who do not see the diagram."""
+    rows = summary.filter(pl.col(measure).is_not_null()).iter_rows(named=True)
+    return ", ".join(f"{row['item']} {format_number(row[measure])}" for row in rows)

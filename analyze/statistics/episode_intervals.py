@@ -15,6 +15,7 @@ from vla_attention.analyze.statistics.bootstrap import (
     DEFAULT_RESAMPLES,
     DEFAULT_SEED,
     mean_over_episodes,
+    ratio_of_means_over_episodes,
     resample_episodes,
     values_with_intervals,
 )
@@ -29,6 +30,7 @@ def means_with_intervals(
     seed: int = DEFAULT_SEED,
     level: float = DEFAULT_LEVEL,
     num_resamples: int = DEFAULT_RESAMPLES,
+    quotients: Mapping[str, tuple[str, str]] | None = None,
 ) -> pl.DataFrame:
     """Mean over episodes of each value for every item, with its two-level interval (see `bootstrap`).
 
@@ -42,10 +44,11 @@ def means_with_intervals(
         seed: seed of the bootstrap.
         level: level of the intervals.
         num_resamples: number of resamples.
+        quotients: further columns, each the mean of one column / the mean of another over the episodes that have both.
 
     Returns:
-        One row per item in order of first appearance: `by`, `num_episodes`, `num_tasks`, and per value `V`, `V_low`,
-        `V_high` (null where there is none) and `V_episodes`, the number of episodes with a finite value.
+        One row per item in order of first appearance: `by`, `num_episodes`, `num_tasks`, and per value or quotient `V`,
+        `V_low`, `V_high` (null where there is none) and `V_episodes`, the number of episodes with a finite value.
     """
     # Tasks in the order of their names as text: the draws depend on it.
     task = pl.concat_str("suite", "task_id", separator="\t").rank("dense").cast(pl.Int64).alias(_TASK)
@@ -55,6 +58,9 @@ def means_with_intervals(
         statistics = {
             name: mean_over_episodes(part[name].cast(pl.Float64).to_numpy(), limits) for name, limits in values.items()
         }
+        for name, (above, below) in (quotients or {}).items():
+            pair = (part[column].cast(pl.Float64).to_numpy() for column in (above, below))
+            statistics[name] = ratio_of_means_over_episodes(*pair)
         row: dict[str, Any] = dict(zip(by, key, strict=True))
         row |= {"num_episodes": part.height, "num_tasks": part[_TASK].n_unique()}
         row |= values_with_intervals(statistics, resample_episodes(tasks, num_resamples, seed), level)
@@ -62,6 +68,6 @@ def means_with_intervals(
         rows.append(row)
     schema: dict[str, Any] = {name: table.schema[name] for name in by}
     schema |= {"num_episodes": pl.Int64, "num_tasks": pl.Int64}
-    for name in values:
+    for name in (*values, *(quotients or {})):
         schema |= dict.fromkeys((name, f"{name}_low", f"{name}_high"), pl.Float64) | {f"{name}_episodes": pl.Int64}
     return pl.DataFrame(rows, schema=schema)

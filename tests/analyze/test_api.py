@@ -179,6 +179,7 @@ def test_the_guide_names_every_column(run):
     tables = [ask(level) for level in levels for ask in (run.ratios, run.masses)]
     names = ("heads", "heads_groups", "dispersion", "depth", "denoise", "denoise_groups")
     tables += [*(run.heads(name) for name in names), run.row_metrics(), run.row_metrics("groups")]
+    tables += [run.objects(name) for name in ("objects", "summary", "times", "pointing", "iou")]
     ends = ("_low", "_high", "_episodes")
     missing = {
         name for table in tables for name in table.columns if f"`{name}`" not in guide and not name.endswith(ends)

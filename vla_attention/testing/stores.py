@@ -8,7 +8,7 @@ A `StoreSpec` decides every number in its store, so that what a reader must find
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -38,6 +38,8 @@ from vla_attention.testing.tokens import INSTRUCTIONS, random_rows, small_layout
 
 #: Task, episode, the episode's tokens and random rows (replan, layer, denoise, head, query, key) to the rows to store.
 PlantRows = Callable[[int, int, EpisodeTokens, NDArray[np.float32]], NDArray[np.floating]]
+#: Task, episode and the episode's tokens to covered areas by camera, (replan, patch, object).
+PlantCoverage = Callable[[int, int, EpisodeTokens], Mapping[str, NDArray[np.float32]]]
 #: Task, episode and number of replans to actions (replan, horizon, action_dim).
 PlantActions = Callable[[int, int, int], NDArray[np.float64]]
 #: Task and episode to the outcome.
@@ -51,8 +53,8 @@ class StoreSpec:
     Every episode has `replans` replans. `tokens`, when given, are the tokens of every episode (and decide the number
     of replans); otherwise each episode has those of `small_tokens`. `prompts`: "changing" (state digits, as in pi0.5)
     or "same". `seed` decides all random numbers. `layers` are blocks of `num_layers`; the other fields of the recording
-    are as in `Recording`. The three `plant_` functions replace rows, actions and outcomes; without them rows are random
-    and episodes of odd numbers are solved.
+    are as in `Recording`. The `plant_` functions replace rows, coverage, actions and outcomes; without them rows are
+    random and episodes of odd numbers are solved.
     """
 
     suite: str = "made_up"
@@ -75,6 +77,7 @@ class StoreSpec:
     policy: str = "made-up"
     tokens: EpisodeTokens | None = None
     plant_rows: PlantRows | None = None
+    plant_coverage: PlantCoverage | None = None
     plant_actions: PlantActions | None = None
     plant_success: PlantSuccess | None = None
 
@@ -183,6 +186,8 @@ def episode_records(spec: StoreSpec, task: int, episode: int) -> tuple[EpisodeSt
     """What the writer is given for one episode: its start and one record per replan."""
     seed = [spec.seed, task, episode]
     tokens = spec.tokens or small_tokens(spec.replans, task, seed, changing=spec.prompts == "changing")
+    if spec.plant_coverage is not None:
+        tokens = replace(tokens, coverage=spec.plant_coverage(task, episode, tokens))
     generator = np.random.default_rng(seed)
     rows = random_rows(tokens, spec.cells, int(generator.integers(2**31)))
     if spec.plant_rows is not None:

@@ -83,7 +83,7 @@ def raw_episode(path: Path, name: str) -> tuple[np.ndarray, dict[str, np.ndarray
     return episode["joint/rows"][:].astype(np.float64).mean(axis=4), coverage, spans
 
 
-def test_shares_and_lifts_equal_sums_over_raw_rows(follower_store):
+def test_shares_and_enrichment_equal_sums_over_raw_rows(follower_store):
     objects = measured(follower_store, ObjectSettings(spatial=False)).objects
     rows, coverage, spans = raw_episode(follower_store, "task001_episode000")
     own = objects.filter((pl.col("task_id") == 1) & (pl.col("episode_index") == 0) & (pl.col("layer") == "2"))
@@ -102,7 +102,21 @@ def test_shares_and_lifts_equal_sums_over_raw_rows(follower_store):
         assert row["mass"] == pytest.approx(masses.mean(), rel=1e-5)
         assert row["share"] == pytest.approx((masses / np.array(images)).mean(), rel=1e-5)
         assert row["area_share"] == pytest.approx(np.mean(areas), rel=1e-5)
-        assert row["lift"] == pytest.approx((masses / seen).mean() / np.mean(areas), rel=1e-5)
+        assert row["enrichment"] == pytest.approx((masses / seen).mean() / np.mean(areas), rel=1e-5)
+
+
+def moved_ious(values: np.ndarray, mask: set[int], percentile: float, replan: int, size: int) -> list[float]:
+    """IoU of a mask with the attended region of the map at the 16 places that this replan has, thresholded again."""
+    stride = math.ceil(size / 4)
+    first = (replan % stride, replan // stride % stride)
+    found = []
+    for i in range(4):
+        for j in range(4):
+            by = (-(first[0] + i * size // 4), -(first[1] + j * size // 4))
+            moved = np.roll(values.reshape(size, size), by, axis=(0, 1)).ravel()
+            region = set(np.flatnonzero(moved >= scipy.stats.scoreatpercentile(values, percentile)).tolist())
+            found.append(len(region & mask) / len(region | mask))
+    return found
 
 
 @QUICK
@@ -149,9 +163,8 @@ def test_spatial_metrics_equal_loops_over_raw_maps(data):
             continue
         region = set(np.flatnonzero(values >= scipy.stats.scoreatpercentile(values, percentile)).tolist())
         assert overlap["iou"] == pytest.approx(len(region & mask) / len(region | mask))
-        common = scipy.stats.hypergeom(size**2, len(mask), len(region))
-        chance = common.expect(lambda x: x / (len(region) + len(mask) - x))  # noqa: B023 - used at once
-        assert overlap["iou_chance"] == pytest.approx(chance)
+        moved = moved_ious(values, mask, percentile, row["replan"], size)
+        assert overlap["iou_chance"] == pytest.approx(np.mean(moved))
         # Stored rows are rounded, so two patches can be equally high.
         highest = centres[values == values.max()]
         near = [any(math.dist(place, centres[patch]) <= tolerance for patch in mask) for place in highest]
@@ -176,7 +189,7 @@ def test_uniform_attention_scores_exactly_what_chance_does(tmp_path):
     path = write_bowl_store(tmp_path / "uniform.zarr", plant_rows=attend_uniformly, tasks=(0,), episodes=1)
     tables = measured(path)
     assert tables.iou is not None
-    np.testing.assert_allclose(tables.objects["lift"].drop_nulls(), 1.0, rtol=1e-5)
+    np.testing.assert_allclose(tables.objects["enrichment"].drop_nulls(), 1.0, rtol=1e-5)
     np.testing.assert_allclose(
         tables.objects["share"], tables.objects["area_share"] * _of_all(tables.objects), rtol=1e-5
     )
@@ -201,7 +214,7 @@ def test_a_planted_follower_is_found_and_named(follower_store):
     best = strongest_followers(tables.objects).row(0, named=True)
     assert (best["item"], best["object_class"]) == ("akita_black_bowl_1", "of interest")
     assert (best["layer"], best["head"], best["num_episodes"]) == ("2", 1, 4)
-    assert best["lift"] > 10
+    assert best["enrichment"] > 10
     assert tables.pointing is not None
     finder = best_finders(tables.iou, tables.pointing, "p90").row(0, named=True)
     assert (finder["layer"], finder["head"]) == ("2", 1)
@@ -209,9 +222,9 @@ def test_a_planted_follower_is_found_and_named(follower_store):
     assert finder["pointing"] > 0.9 > finder["pointing_chance"] + 0.5
     summary = objects_summary(tables.objects)
     bowl = summary.filter((pl.col("camera") == "all") & (pl.col("item") == "akita_black_bowl_1")).row(0, named=True)
-    assert bowl["lift_low"] > 1.5
+    assert bowl["enrichment_low"] > 1.5
     cabinet = summary.filter((pl.col("camera") == "all") & (pl.col("item") == "wooden_cabinet_1")).row(0, named=True)
-    assert cabinet["lift_high"] < 1.1
+    assert cabinet["enrichment_high"] < 1.1
     found = iou_summary(tables.iou).filter(pl.col("threshold") == "p90")
     assert found.filter(pl.col("item") == "akita_black_bowl_1")["num_episodes"].to_list() == [4, 4]
 
@@ -229,7 +242,7 @@ def test_classes_follow_the_task_and_add_up(follower_store):
     assert classes == {**CLASS_OF, "robot": "robot", "background": "background"}
 
 
-def test_an_object_out_of_sight_has_no_lift_and_no_mask(tmp_path):
+def test_an_object_out_of_sight_has_no_enrichment_and_no_mask(tmp_path):
     tokens = bowl_tokens(replans=2)
     coverage = bowl_coverage(2, 16)
     coverage[CAMERAS[1]][:, :, 4] += coverage[CAMERAS[1]][:, :, 1]
@@ -237,7 +250,7 @@ def test_an_object_out_of_sight_has_no_lift_and_no_mask(tmp_path):
     hidden = EpisodeTokens(tokens.layout, tokens.key_role, tokens.prompts, tokens.prompt_index, OBJECTS, coverage)
     tables = measured(write_bowl_store(tmp_path / "hidden.zarr", tokens=hidden, tasks=(0,), episodes=1))
     plate = (pl.col("item") == "plate_1") & (pl.col("camera") == CAMERAS[1])
-    assert tables.objects.filter(plate)["lift"].is_null().all()
+    assert tables.objects.filter(plate)["enrichment"].is_null().all()
     assert tables.iou is not None
     assert tables.iou.filter(plate)["iou"].is_null().all()
     assert tables.pointing is not None
@@ -245,7 +258,9 @@ def test_an_object_out_of_sight_has_no_lift_and_no_mask(tmp_path):
     assert (unseen["mask_replans"] == 0).all()
     assert unseen.select("pointing", "distance", "pointing_chance").null_count().row(0) == (unseen.height,) * 3
     assert (
-        tables.objects.filter((pl.col("item") == "plate_1") & (pl.col("camera") == "all"))["lift"].is_not_null().all()
+        tables.objects.filter((pl.col("item") == "plate_1") & (pl.col("camera") == "all"))["enrichment"]
+        .is_not_null()
+        .all()
     )
 
 

@@ -24,7 +24,8 @@ from vla_attention.analyze.objects.pointing_and_iou import (
     patch_centres,
     percentile_regions,
     pointing_hits,
-    random_iou,
+    shifted_iou,
+    shifted_masks,
 )
 
 SIZES = st.tuples(st.integers(1, 6), st.integers(1, 6))
@@ -139,18 +140,49 @@ def test_otsu_separates_two_clusters_whatever_else_the_axes_hold():
     assert np.array_equal(otsu_regions(maps), np.broadcast_to(np.arange(26) >= 20, maps.shape))
 
 
-@settings(max_examples=examples(15), deadline=None)
-@given(st.integers(1, 9), st.data())
-def test_chance_iou_is_the_mean_over_all_regions_of_that_size(total, data):
-    from itertools import combinations
+@QUICK
+@given(maps_and_masks(), st.sampled_from([50.0, 80.0]))
+def test_chance_iou_is_the_mean_over_all_shifts_of_the_map(case, percentile):
+    """On pictures of up to 4 x 4 patches; larger ones take all shifts over several replans."""
+    rows, columns, maps, masks = case
+    if rows > 4 or columns > 4:
+        return
+    found = shifted_iou(percentile_regions(maps, percentile), shifted_masks(masks, rows, columns))
+    for replan, head, item in np.ndindex(*maps.shape[:2], masks.shape[2]):
+        mask = masks[replan, :, item]
+        picture = maps[replan, head].reshape(rows, columns)
+        moved = [np.roll(picture, by, (0, 1)).ravel() for by in np.ndindex(rows, columns)]
+        regions = [percentile_regions(one, percentile) for one in moved]
+        wanted = [(region & mask).sum() / (region | mask).sum() for region in regions] if mask.any() else [np.nan]
+        assert found[replan, head, item] == pytest.approx(np.mean(wanted), nan_ok=True)
 
-    drawn, wanted = data.draw(st.integers(0, total)), data.draw(st.integers(1, total))
-    mask = set(range(wanted))
-    all_regions = [set(region) for region in combinations(range(total), drawn)]
-    wanted_mean = np.mean([len(region & mask) / len(region | mask) for region in all_regions])
-    found = random_iou(np.array([[drawn]]), np.array([[wanted, 0]]), total)
-    assert found[0, 0] == pytest.approx(wanted_mean)
-    assert np.isnan(found[0, 1])
+
+@pytest.mark.parametrize(("rows", "columns", "replans"), [(8, 8, 4), (16, 16, 16), (8, 4, 2), (12, 8, 6)])
+def test_replans_take_all_shifts_of_a_large_picture_alike(rows, columns, replans):
+    generator = np.random.default_rng(rows + columns)
+    region = np.broadcast_to(generator.random(rows * columns) < 0.2, (replans, rows * columns))
+    mask = np.broadcast_to(generator.random((rows * columns, 1)) < 0.1, (replans, rows * columns, 1))
+    found = shifted_iou(region, shifted_masks(mask, rows, columns)).mean()
+    picture = region[0].reshape(rows, columns)
+    moved = [np.roll(picture, by, (0, 1)).ravel() for by in np.ndindex(rows, columns)]
+    assert found == pytest.approx(np.mean([(one & mask[0, :, 0]).sum() / (one | mask[0, :, 0]).sum() for one in moved]))
+
+
+def test_chance_is_higher_for_smooth_maps_than_for_scattered_patches():
+    """What a region in one piece scores by chance: a fixed blob against masks at random places."""
+    generator = np.random.default_rng(2)
+    row, column = np.divmod(np.arange(256), 16)
+    blob = np.exp(-((row - 7.5) ** 2 + (column - 7.5) ** 2) / 18)[None]
+    scores, shifted, scattered = [], [], []
+    for _ in range(400):
+        top, left = generator.integers(0, 13, 2)
+        mask = ((abs(row - top - 1.5) < 2) & (abs(column - left - 1.5) < 2))[None, :, None]
+        region, shuffled = (percentile_regions(one, 90) for one in (blob, generator.permutation(blob[0])[None]))
+        scores.append(intersection_over_union(np.roll(region, generator.integers(256)), mask)[0, 0])
+        shifted.append(shifted_iou(region, shifted_masks(mask, 16, 16))[0, 0])
+        scattered.append(intersection_over_union(shuffled, mask)[0, 0])
+    assert np.mean(shifted) == pytest.approx(np.mean(scores), rel=0.1)
+    assert np.mean(scattered) < 0.9 * np.mean(shifted)
 
 
 def test_masks_take_patches_from_the_stated_coverage_on():
