@@ -111,7 +111,9 @@ def write_checkpoint(folder: Path, checkpoint_format: str, dtype: str) -> None:
     (folder / STATS).parent.mkdir(parents=True)
     shutil.copy(GOLDEN / "pi0_batch2" / "checkpoint" / STATS, folder / STATS)
     if checkpoint_format == "openpi_torch":
-        (folder / "config.json").write_text(json.dumps({"action_dim": 32, "action_horizon": 10, "precision": dtype}))
+        variants = {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"}
+        config = {"action_dim": 32, "action_horizon": 10, "precision": dtype, **variants}
+        (folder / "config.json").write_text(json.dumps(config))
 
 
 def load_and_run(folder: Path, checkpoint_format: str, dtype: str) -> dict[str, float]:

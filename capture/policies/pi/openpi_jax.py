@@ -24,6 +24,7 @@ from vla_attention.capture.policies.pi.jax_lora import merge_lora
 from vla_attention.capture.policies.pi.jax_weights import plan_leaves
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.model_weights import build_model, expected_shapes, expected_tensors
+from vla_attention.capture.policies.pi.sizes import check_jax_heads
 from vla_attention.capture.policies.strict_loading import Shapes, check_shapes
 from vla_attention.schemas.errors import MissingDependency
 
@@ -149,6 +150,7 @@ def load_openpi_jax(
     for path, plan in plans.items():
         shapes |= _shapes_of(plan.shapes, stored[path])
     check_shapes(shapes, expected_shapes(config))
+    check_jax_heads({path: leaf.shape for path, leaf in stored.items()}, config)
 
     kept_as = expected_tensors(config, dtype)
     state: dict[str, Tensor] = {}

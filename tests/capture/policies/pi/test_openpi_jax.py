@@ -89,6 +89,27 @@ def test_other_sizes_and_ways_of_storing(tmp_path, sizes, options, pi05):
         assert torch.equal(loaded[name], tensor), name
 
 
+def test_other_heads_of_the_same_width_are_refused(tmp_path):
+    """One key head of 16 and two of 8 have the same rows; the leaves of a JAX checkpoint tell them apart."""
+    several, one = ({"num_heads": 8, "num_kv_heads": 2, "head_dim": 8}, {"num_heads": 4, "head_dim": 16})
+    stored, wrong = (
+        dataclasses.replace(
+            DUMMY_CONFIG,
+            **{
+                name: GemmaConfig(width=width, depth=2, mlp_dim=40, **heads)
+                for name, width in (("paligemma", 32), ("action_expert", 20))
+            },
+        )
+        for heads in (several, one)
+    )
+    write_leaves(tmp_path / "params", to_jax_leaves(random_weights(stored, 3), stored))
+    with pytest.raises(
+        CheckpointMismatch, match=r"_einsum.* has num\w* [28], and the configuration [14]; .*--config-name"
+    ):
+        load_openpi_jax(tmp_path, config=wrong)
+    assert load_openpi_jax(tmp_path, config=stored).config.paligemma.num_kv_heads == 2
+
+
 def lora_factors(leaves, generator, rank=3):
     """Factors for every weight that openpi adapts, by their names in its models."""
     factors = {}

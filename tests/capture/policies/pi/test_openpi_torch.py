@@ -13,6 +13,7 @@ from tests.kit.jax_state import from_jax_flat
 from tests.kit.pi_golden import GOLDEN, load_case, read_manifest
 from tests.kit.policy_inputs import KeepAll
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch, CheckpointNotFound, UnreadableCheckpoint
+from vla_attention.capture.policies.pi.case import read_config
 from vla_attention.capture.policies.pi.config import NAMED_CONFIGS, SiglipConfig, find_config, find_variant
 from vla_attention.capture.policies.pi.jax_weights import plan_leaves
 from vla_attention.capture.policies.pi.model import PiModel
@@ -91,6 +92,57 @@ def test_a_named_variant_of_other_sizes_is_refused():
     config_json = {"action_dim": 32, "action_horizon": 10, "paligemma_variant": "gemma_300m"}
     with pytest.raises(CheckpointMismatch, match="paligemma_variant 'gemma_300m'"):
         infer_config(expected_shapes(find_config("pi05_libero")), config_json)
+
+
+#: The rows of gemma_2b's projections (8 query heads and one key head of 256) as other heads.
+OTHER_HEADS = {"num_heads": 16, "num_kv_heads": 2, "head_dim": 128}
+
+
+def full_size(**heads):
+    plain = find_config("pi05_libero")
+    parts = {name: dataclasses.replace(getattr(plain, name), **heads) for name in ("paligemma", "action_expert")}
+    return dataclasses.replace(plain, **parts)
+
+
+def test_heads_that_nobody_states_are_asked_for():
+    """The tensors have the same shapes whether there are 8 heads of 256 or 16 of 128."""
+    shapes = expected_shapes(full_size(**OTHER_HEADS))
+    assert shapes == expected_shapes(find_config("pi05_libero"))
+    for variant in ({}, {"paligemma_variant": "gemma_3b", "action_expert_variant": None}):
+        with pytest.raises(CheckpointMismatch, match=r"2048 and 256 rows.*fit several.*--model-config PATH"):
+            infer_config(shapes, {"action_dim": 32, "action_horizon": 10, **variant})
+    # One named variant is enough, and a LoRA variant has the heads of the plain one.
+    for variant in ({"action_expert_variant": "gemma_300m"}, {"paligemma_variant": "gemma_2b_lora"}):
+        assert infer_config(shapes, {"action_dim": 32, "action_horizon": 10, **variant}) == find_config("pi05_libero")
+
+
+@pytest.mark.parametrize(
+    ("heads", "said"),
+    [
+        ({"num_kv_heads": 2}, r"paligemma_variant 'gemma_2b'.*num_kv_heads=2"),
+        ({"num_kv_heads": 1, "head_dim": 192}, r"1536 rows, which are no whole number|192 rows, which are no whole"),
+    ],
+)
+def test_more_key_heads_than_the_named_variant_has_are_noticed(heads, said):
+    named = {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"}
+    with pytest.raises(CheckpointMismatch, match=said):
+        infer_config(expected_shapes(full_size(**heads)), {"action_dim": 32, "action_horizon": 10, **named})
+
+
+def test_a_model_configuration_states_heads_that_the_tensors_do_not(checkpoint, pi05_case, tmp_path):
+    """A checkpoint without a named variant loads with the key heads of the file, and with no others."""
+    sizes = json.loads((GOLDEN / "pi05_batch2" / "case.json").read_text())
+    for part in ("paligemma", "action_expert"):
+        sizes["config"][part] |= {"num_heads": sizes["config"][part]["num_heads"] * 2, "num_kv_heads": 2}
+        sizes["config"][part]["head_dim"] //= 2
+    path = tmp_path / "sizes.json"
+    path.write_text(json.dumps(sizes))
+    config = read_config(path)
+    assert config.paligemma.num_kv_heads == 2
+    halves = load_openpi_torch(checkpoint, config=config)
+    assert halves.config.paligemma == config.paligemma
+    whole = load_openpi_torch(checkpoint, config=pi05_case.config)
+    assert all(torch.equal(a, b) for a, b in zip(halves.parameters(), whole.parameters(), strict=True))
 
 
 def test_an_image_encoder_of_unknown_heads_needs_a_configuration():
