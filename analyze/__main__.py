@@ -36,22 +36,22 @@ def _run(name: str, arguments: Sequence[str]) -> int:
         _refuse_misspelt_command(arguments)
     command = import_module(f"vla_attention.analyze.{name or DEFAULT_COMMAND}.command")
     parser = command.build_parser(prog=f"vla-analyze {name}") if name == DEFAULT_COMMAND else command.build_parser()
+    parsed = parser.parse_args(arguments)
     try:
-        code: int = command.run(parser.parse_args(arguments))
+        code: int = command.run(parsed)
         return code
     except UserError as error:
-        raise _with_way_out(error) from error.__cause__
+        raise _with_way_out(error, can_skip=hasattr(parsed, "skip_corrupt")) from error.__cause__
 
 
-def _with_way_out(error: UserError) -> UserError:
+def _with_way_out(error: UserError, can_skip: bool) -> UserError:
     """Add to the error of a damaged episode what the user can do."""
     from vla_attention.schemas.stores.store_format import CorruptEpisode
 
     if not isinstance(error, CorruptEpisode):
         return error
-    return CorruptEpisode(
-        f"{error} See all faults with vla-analyze verify; leave such episodes out with --skip-corrupt."
-    )
+    skip = "; leave such episodes out with --skip-corrupt" if can_skip else ""
+    return CorruptEpisode(f"{error} See all faults with vla-analyze verify{skip}.")
 
 
 def _refuse_misspelt_command(arguments: Sequence[str]) -> None:

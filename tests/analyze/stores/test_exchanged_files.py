@@ -1,0 +1,203 @@
+"""Files in the wrong place and edited roots: a question has its right answer, or an error that names the episode."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+import vla_attention as va
+from tests.kit.attacks import SECOND, arrays_of, attacks, edit_root, encode_again, exchange, first, root_leaves, two
+from tests.kit.slow import slow_except
+from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.api import OpenStores
+from vla_attention.analyze.copy.copying import copy_store
+from vla_attention.capture.store import codecs as store_codecs
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import CorruptEpisode
+from vla_attention.schemas.stores.verify import verify_store
+from vla_attention.testing.stores import StoreSpec, write_store
+
+#: Both episodes of a task have arrays of the same shapes; rows are in two shards.
+SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=9, contributions=True, prompts="same")
+ARRAYS = (
+    *(f"joint/{name}" for name in ("atoms", "contribution", "denoise", "head", "key_role", "layer", "row_sum", "rows")),
+    *(f"{kind}/{camera}" for kind in ("frames", "objects") for camera in ("base_0_rgb", "left_wrist_0_rgb")),
+    *("actions", "denoise_time", "env_step", "noise_seed", "prompt_index", "state"),
+)
+WORDS = {"groups": {"image": "role:image", "bowl": "word:bowl"}, "ratio": "image/bowl"}
+
+#: Every table of every command that answers a question, and every number that overlays and exports show.
+QUESTIONS: dict[str, Callable[[OpenStores, Path], pl.DataFrame | list[pl.DataFrame]]] = {
+    "ratios of spans": lambda run, other: [run.ratios("steps"), run.masses(), run.contributions()],
+    "ratios of words": lambda run, other: run.ratios("steps", **WORDS),
+    "episodes": lambda run, other: run.episodes,
+    "heads": lambda run, other: [run.heads(), run.heads("denoise"), run.row_metrics()],
+    "sinks": lambda run, other: run.sinks(),
+    "words": lambda run, other: [run.words(), run.words("episodes")],
+    "objects": lambda run, other: [run.objects(), run.objects("iou")],
+    "time": lambda run, other: [run.time("course"), run.time("closing")],
+    "compare": lambda run, other: run.compare(other, allow_mismatch=["seed"]),
+    "export": lambda run, other: pl.DataFrame(run.to_xarray(rows=True)["rows"].to_series().reset_index()),
+    "overlay": lambda run, other: run.overlay(replans=0),
+}
+
+
+@pytest.fixture(scope="module")
+def originals(tmp_path_factory) -> tuple[Path, Path]:
+    """Two stores of other seeds, with equal shapes."""
+    folder = tmp_path_factory.mktemp("originals")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store_codecs, "TARGET_CHUNK_BYTES", 1)
+        return write_store(folder / "a.zarr", spec=SPEC), write_store(folder / "b.zarr", spec=SPEC, seed=3)
+
+
+@pytest.fixture(scope="module")
+def answers(originals) -> dict[str, list[pl.DataFrame]]:
+    return {name: answer(name, *originals) for name in QUESTIONS}
+
+
+@pytest.fixture
+def stores(originals, tmp_path) -> tuple[Path, Path]:
+    for store in originals:
+        shutil.copytree(store, tmp_path / store.name)
+    return tmp_path / "a.zarr", tmp_path / "b.zarr"
+
+
+def answer(name: str, path: Path, other: Path) -> list[pl.DataFrame]:
+    found = QUESTIONS[name](va.open(path), other)
+    return found if isinstance(found, list) else [found]
+
+
+def check_answers(stores: tuple[Path, Path], answers: dict[str, list[pl.DataFrame]]) -> list[str]:
+    """Every question ends with its right answer, or names an episode; returns the questions that ended so."""
+    refused = []
+    for name, expected in answers.items():
+        try:
+            found = answer(name, *stores)
+        except CorruptEpisode as error:
+            assert re.search(r"task\d{3}_episode\d{3}", str(error)), error  # noqa: PT017
+            refused.append(name)
+        else:
+            drop = [frame.drop("store", strict=False) for frame in found]
+            assert all(a.equals(b.drop("store", strict=False)) for a, b in zip(drop, expected, strict=True)), name
+    return refused
+
+
+def test_the_attacks_are_on_every_array(originals):
+    assert sorted(arrays_of(first(originals[0]))) == sorted(ARRAYS)
+
+
+def all_bytes(store: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(store)): file.read_bytes() for file in store.rglob("*") if file.is_file()}
+
+
+FAST = (
+    "files of joint/atoms exchanged",
+    "files of joint/rows exchanged",
+    "joint/key_role of another store",
+    "objects/base_0_rgb encoded again",
+    "index of rows: layers exchanged",
+    "chunks of rows: denoise steps exchanged",
+    "an episode copied under another name",
+)
+
+
+@pytest.mark.parametrize("name", slow_except(FAST, attacks(list(ARRAYS))))
+def test_no_question_is_answered_with_bytes_of_something_else(stores, answers, tmp_path, name):
+    before = all_bytes(stores[0])
+    attacks(list(ARRAYS))[name](*stores)
+    refused = check_answers(stores, answers)
+    if all_bytes(stores[0]) == before:
+        return  # what was exchanged is the same in both, as the numbers of the layers are
+    unread = ("joint/denoise", "joint/head", "joint/layer", "noise_seed", "state")  # by none of the questions
+    if not any(array in name for array in unread):
+        assert refused, "no question noticed it"
+    assert verify_store(open_store(stores[0]))
+    with pytest.raises(CorruptEpisode, match=r"task\d{3}_episode\d{3}"):
+        copy_store(open_store(stores[0]), tmp_path / "copy.zarr", ())
+
+
+def test_an_edited_root_answers_nothing(stores):
+    """Every field of the run's configuration, one at a time."""
+    content = (stores[0] / "zarr.json").read_bytes()
+    by_name = 0
+    leaves = root_leaves(stores[0])
+    for place in leaves.values():
+        edit_root(stores[0], place)
+        with pytest.raises(va.UserError) as caught:  # for some the root itself says it: a gap in a layout, a head twice
+            va.open(stores[0]).summary()
+        by_name += "task000_episode000 cannot be read: its seal belongs to a run of another" in str(caught.value)
+        for question in (OpenStores.describe, lambda run: run.episodes, OpenStores.heads, OpenStores.overlay):
+            with pytest.raises(va.UserError):
+                question(va.open(stores[0]))
+        (stores[0] / "zarr.json").write_bytes(content)
+    assert by_name > 0.6 * len(leaves)
+
+
+COMMANDS = {
+    "ratios": (["--no-plots"], "joint/atoms"),
+    "heads": (["--no-plots"], "joint/rows"),
+    "words": (["--no-plots"], "joint/rows"),
+    "objects": (["--no-plots"], "objects/base_0_rgb"),
+    "time": (["--no-plots"], "actions"),
+    "groups": (["--no-plots"], "joint/key_role"),
+    "export": (["--csv"], "joint/row_sum"),
+    "overlay": (["--replans", "0"], "frames/base_0_rgb"),
+    "report": (["--quick"], "prompt_index"),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_ends_with_one_sentence_that_names_the_episode(stores, tmp_path, capsys, command):
+    words, array = COMMANDS[command]
+    encode_again(first(stores[0]), array)
+    output = tmp_path / ("out.html" if command == "report" else "out")
+    assert main([command, str(stores[0]), *words, "--output", str(output)]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "task000_episode000" in said
+    assert array in said
+    assert "\n" not in said
+    assert not output.exists()
+
+
+def test_compare_and_copy_end_so_too(stores, tmp_path, capsys):
+    exchange(*(episode / "joint/atoms" for episode in two(stores[1])))
+    assert main(["compare", *map(str, stores), "--allow-mismatch", "seed", "--output", str(tmp_path / "out")]) == 2
+    assert "joint/atoms of episode task000_episode000" in capsys.readouterr().err
+    assert main(["copy", str(stores[1]), str(tmp_path / "c.zarr")]) == 2
+    said = capsys.readouterr().err
+    assert "task000_episode000" in said
+    assert "--skip-corrupt" not in said  # copy has no such argument
+
+
+def test_exchanged_episodes_are_left_out_by_name_when_asked(stores, tmp_path, capsys):
+    exchange(*(episode / "joint/rows" for episode in two(stores[0])))
+    assert main([str(stores[0]), "--no-plots", "--skip-corrupt", "--output", str(tmp_path / "out")]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    for name in ("task000_episode000", SECOND):
+        assert re.search(f"{name} of .* is left out: Array joint/rows", printed)
+    assert set(pl.read_parquet(tmp_path / "out/episodes.parquet")["task_id"]) == {1}
+
+
+def test_the_records_of_a_job_may_differ(originals, stores, answers):
+    """Another job, on another machine, may have added the episodes; the weights may lie elsewhere."""
+    edit_root(stores[0], ("provenance", "numpy"))
+    edit_root(stores[0], ("policy", "checkpoint"))
+    assert check_answers(stores, {name: answers[name] for name in ("ratios of spans", "episodes", "words")}) == []
+    assert verify_store(open_store(stores[0])) == []
+
+
+def test_episodes_of_a_store_of_the_same_configuration_can_be_moved_here(tmp_path):
+    first_ = write_store(tmp_path / "a.zarr", spec=SPEC, tasks=(0,))
+    other = write_store(tmp_path / "b.zarr", spec=SPEC, tasks=(1,))
+    edit_root(other, ("provenance", "numpy"))
+    for folder in (other / "episodes").glob("task*"):
+        folder.rename(first_ / "episodes" / folder.name)
+    store = open_store(first_)
+    assert verify_store(store) == []
+    assert store.task_ids == (0, 1)

@@ -1,0 +1,178 @@
+"""Damage to a store that checksums and shapes cannot show: files in the wrong place, edited roots, renamed folders.
+
+Every attack leaves files that can be read by themselves. They use nothing of the package.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import google_crc32c
+import numpy as np
+import zarr
+
+#: The first two episodes of a task; arrays of both have the same shapes.
+FIRST, SECOND = "task000_episode000", "task000_episode001"
+
+#: Changes the store at the first path; the other one is of another seed, with equal shapes.
+Attack = Callable[[Path, Path], object]
+
+
+def exchange(one: Path, other: Path) -> None:
+    """Let two files or folders change places."""
+    aside = one.with_name(one.name + ".aside")
+    one.rename(aside)
+    other.rename(one)
+    aside.rename(other)
+
+
+def arrays_of(episode: Path) -> list[str]:
+    """Names of the arrays in an episode's folder."""
+    documents = sorted(episode.rglob("zarr.json"))
+    return [
+        file.parent.relative_to(episode).as_posix()
+        for file in documents
+        if json.loads(file.read_text())["node_type"] == "array"
+    ]
+
+
+def files_of(episode: Path, array: str) -> list[Path]:
+    """The files of an array's chunks."""
+    return sorted(file for file in (episode / array / "c").rglob("*") if file.is_file())
+
+
+def exchange_index_entries(shard: Path, one: int, other: int, chunks: int) -> None:
+    """Let two entries of a shard's index change places; the index gets its right checksum."""
+    content = shard.read_bytes()
+    size = 16 * chunks + 4
+    index = np.frombuffer(content[-size:-4], dtype="<u8").reshape(-1, 2).copy()
+    index[[one, other]] = index[[other, one]]
+    shard.write_bytes(content[:-size] + with_checksum(index.tobytes()))
+
+
+def permute_chunks(shard: Path, order: list[int]) -> None:
+    """Write a shard anew with its chunks in another order: a whole shard, as its writer might have written it."""
+    content = shard.read_bytes()
+    size = 16 * len(order) + 4
+    index = np.frombuffer(content[-size:-4], dtype="<u8").reshape(-1, 2)
+    chunks = [content[int(start) : int(start + length)] for start, length in index[order]]
+    starts = np.cumsum([0, *(len(chunk) for chunk in chunks[:-1])])
+    written = np.array([(start, len(chunk)) for start, chunk in zip(starts, chunks, strict=True)], dtype="<u8")
+    shard.write_bytes(b"".join(chunks) + with_checksum(written.tobytes()))
+
+
+def with_checksum(content: bytes) -> bytes:
+    """The bytes with their crc32c at the end, as in chunks and indices."""
+    return content + int(google_crc32c.value(content)).to_bytes(4, "little")
+
+
+def encode_again(episode: Path, array: str) -> None:
+    """Store other values of the same kind, with right checksums: the replans in reverse order, or numbers plus 1."""
+    stored = zarr.open_array(episode / array)
+    values = stored[...]
+    other = values[::-1] if values.shape[0] > 1 and not np.array_equal(values, values[::-1]) else values + 1
+    stored[...] = other
+
+
+def root_leaves(path: Path) -> dict[str, tuple[Any, ...]]:
+    """The fields of the root's attributes that are neither the format nor records of the job: name to path in JSON."""
+    attributes = json.loads((path / "zarr.json").read_text())["attributes"]
+    found = {}
+    for section in ("policy", "protocol", "recording", "sites"):
+        for place in _leaves(attributes[section]):
+            if (section, *place) != ("policy", "checkpoint"):
+                found[".".join(map(str, (section, *place)))] = (section, *place)
+    return found
+
+
+def _leaves(value: Any) -> Iterator[tuple[Any, ...]]:
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else None
+    if inner is None:
+        yield ()
+        return
+    for key, item in inner:
+        for rest in _leaves(item):
+            yield (key, *rest)
+
+
+def edit_root(path: Path, place: tuple[Any, ...]) -> None:
+    """Change one field of the root's attributes to another value of its kind."""
+    document = json.loads((path / "zarr.json").read_text())
+    holder = document["attributes"]
+    for key in place[:-1]:
+        holder = holder[key]
+    old = holder[place[-1]]
+    if isinstance(old, bool):
+        new: Any = not old
+    elif isinstance(old, (int, float)):
+        new = old + 1
+    else:
+        new = "base_0_rgb" if old is None else {"joint": "self", "mean": "all"}.get(old, f"{old}_x")
+    holder[place[-1]] = new
+    (path / "zarr.json").write_text(json.dumps(document))
+
+
+def attacks(arrays: list[str]) -> dict[str, Attack]:
+    """All attacks but those on the root, by name, on stores whose episodes have these arrays."""
+    found: dict[str, Attack] = {}
+    for array in arrays:
+        found[f"files of {array} exchanged"] = lambda path, other, array=array: [
+            exchange(*pair) for pair in zip(*(files_of(episode, array) for episode in two(path)), strict=True)
+        ]
+        found[f"{array} exchanged"] = lambda path, other, array=array: exchange(
+            *(episode / array for episode in two(path))
+        )
+        found[f"{array} of another store"] = lambda path, other, array=array: exchange(
+            *(store / "episodes" / FIRST / array for store in (path, other))
+        )
+        found[f"{array} encoded again"] = lambda path, other, array=array: encode_again(first(path), array)
+    for one, two_ in (("frames/base_0_rgb", "frames/left_wrist_0_rgb"), ("env_step", "prompt_index")):
+        found[f"{one} exchanged with {two_}"] = lambda path, other, pair=(one, two_): exchange(
+            *(files_of(first(path), array)[0] for array in pair)
+        )
+    rows = "joint/rows"
+    found["index of rows: layers exchanged"] = lambda path, other: exchange_index_entries(shard(path), 0, 2, 4)
+    found["index of rows: denoise steps exchanged"] = lambda path, other: exchange_index_entries(shard(path), 0, 1, 4)
+    found["chunks of rows: layers exchanged"] = lambda path, other: permute_chunks(shard(path), [2, 3, 0, 1])
+    found["chunks of rows: denoise steps exchanged"] = lambda path, other: permute_chunks(shard(path), [1, 0, 3, 2])
+    found["shards of rows exchanged"] = lambda path, other: exchange(*files_of(first(path), rows)[:2])
+    found["attributes exchanged"] = lambda path, other: exchange(*(episode / "zarr.json" for episode in two(path)))
+    found["seals exchanged"] = lambda path, other: exchange(*(episode / "seal" for episode in two(path)))
+    found["seals and attributes exchanged"] = lambda path, other: [
+        exchange(*(episode / name for episode in two(path))) for name in ("seal", "zarr.json")
+    ]
+    found["episodes exchanged"] = lambda path, other: exchange(*two(path))
+    found["an episode under another name"] = lambda path, other: first(path).rename(renamed(path))
+    found["an episode copied under another name"] = lambda path, other: shutil.copytree(first(path), renamed(path))
+    found["an episode of another run"] = lambda path, other: exchange(first(path), first(other))
+    found["the root of another run"] = lambda path, other: exchange(path / "zarr.json", other / "zarr.json")
+    return found
+
+
+def two(path: Path) -> tuple[Path, Path]:
+    """The folders of the two episodes."""
+    return path / "episodes" / FIRST, path / "episodes" / SECOND
+
+
+def first(path: Path) -> Path:
+    """The folder of the first episode."""
+    return two(path)[0]
+
+
+def renamed(path: Path) -> Path:
+    """A folder for an episode that the store does not hold."""
+    return path / "episodes" / "task000_episode007"
+
+
+def shard(path: Path) -> Path:
+    """The first shard of the first episode's rows: two layers of two denoise steps."""
+    file = files_of(first(path), "joint/rows")[0]
+    index = np.frombuffer(file.read_bytes()[-68:-4], dtype="<u8")
+    assert len(index) == 8
+    assert math.isclose(index[1::2].sum() + 68, file.stat().st_size)
+    return file
