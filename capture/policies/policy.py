@@ -12,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from vla_attention.capture.environments.base import Observation
 from vla_attention.capture.recording.attention import RowCollector
@@ -46,6 +46,10 @@ class Policy(Protocol):
     @property
     def family(self) -> str:
         """Kind of model, as the store names it; it decides which layer numbers are accepted."""
+
+    @property
+    def model(self) -> nn.Module:
+        """The network. Its modules are looked at when a policy call gives numbers that are not finite."""
 
     @property
     def sites(self) -> tuple[SiteLayout, ...]:

@@ -67,6 +67,10 @@ def attend(
 class RowCollector(Protocol):
     """Receives rows. A model asks it for a receiver at every block and denoise step."""
 
+    def begin_block(self, layer: int, denoise_step: int) -> None:
+        """Learn that the model begins this block; models call it before everything else of the block."""
+        return
+
     def sink(self, layer: int, denoise_step: int, action_queries: slice) -> RowSink | None:
         """Return the function that takes the rows of this call, or None if they are not wanted.
 

@@ -8,16 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import Environment, Observation, Task
 from vla_attention.capture.environments.coverage import patch_coverage
 from vla_attention.capture.environments.episode_protocol import WAIT_ACTION
-from vla_attention.capture.policies.policy import Policy, camera_grid
+from vla_attention.capture.policies.policy import Policy, PolicyInput, camera_frame, camera_grid
+from vla_attention.capture.recording.finite_numbers import NumbersNotFinite, all_finite, describe_origin
 from vla_attention.capture.recording.recorder import make_recorders
 from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
 from vla_attention.capture.store.store_writer import RunStore
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.stores.store_format import Protocol
 
 #: Called after the actions of each replan with (environment steps done, replans done).
@@ -136,9 +138,12 @@ def _replan(
     pools = policy.query_pools() if recording.queries == "steps" else None
     recorders = make_recorders(recording, policy.sites, policy_input.key_role, pools)
     actions = policy.act(policy_input, seed, recorders)
+    rows = {site: recorder.finish() for site, recorder in recorders.items()}
+    if not all_finite(actions, rows):
+        raise _not_finite(policy, policy_input, seed, store, writer, step)
     coverage = {
         camera.name: patch_coverage(
-            environment.segmentation(camera.source),
+            _segmentation(environment, camera.source, observation),
             len(environment.objects),
             grid.rows,
             grid.columns,
@@ -153,7 +158,7 @@ def _replan(
         ReplanRecord(
             env_step=protocol.wait_steps + step,
             noise_seed=seed,
-            rows={site: recorder.finish() for site, recorder in recorders.items()},
+            rows=rows,
             key_role=policy_input.key_role,
             prompt=policy_input.prompt,
             state=policy_input.state,
@@ -163,3 +168,36 @@ def _replan(
         )
     )
     return actions
+
+
+def _segmentation(environment: Environment, camera: str, observation: Observation) -> NDArray[np.integer]:
+    """Return the object of every pixel of a camera's picture (height, width)."""
+    segmentation, picture = environment.segmentation(camera), camera_frame(observation, camera)
+    if segmentation.shape != picture.shape[:2] or segmentation.dtype.kind not in "iu":
+        raise BadArgument(
+            f"The environment's segmentation of camera '{camera}' has the shape {segmentation.shape} and type "
+            f"{segmentation.dtype}; expected the picture's {picture.shape[:2]}, and whole numbers."
+        )
+    return segmentation
+
+
+def _not_finite(
+    policy: Policy, policy_input: PolicyInput, seed: int, store: RunStore, writer: EpisodeWriter, step: int
+) -> NumbersNotFinite:
+    """Return the error of a policy call whose results are not finite; it repeats the call to find where that began."""
+    wrong_inputs = [name for name, values in policy_input.tensors.items() if not torch.isfinite(values).all()]
+    if wrong_inputs:
+        origin = f"The policy's input is not finite already: {listing(wrong_inputs)}"
+    else:
+        origin = describe_origin(
+            policy.model,
+            lambda watch: policy.act(policy_input, seed, watch),
+            tuple(site.name for site in policy.sites),
+        )
+    dtype = store.attributes.policy.config.get("dtype")
+    remedy = "use another checkpoint" if dtype == "float32" else "use --dtype float32, or another checkpoint"
+    return NumbersNotFinite(
+        f"The policy's numbers turned NaN or infinite in {writer.what}, replan {len(writer.records)} (step {step}). "
+        f"{origin}. Nothing of this episode was kept, and the episodes before it are unharmed; {remedy}, and a new "
+        "--store."
+    )

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import zarr
@@ -16,9 +15,17 @@ from vla_attention.capture.store.durable_files import naming_the_failure, publis
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.site_writer import SiteWriter
 from vla_attention.capture.store.store_root import check_same_run, read_existing_root
+from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import Prompt
+from vla_attention.schemas.stores.content_rules import (
+    counter_problems,
+    coverage_problems,
+    picture_problems,
+    piece_role_problems,
+    prompt_problems,
+)
 from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.root import read_run
@@ -70,6 +77,10 @@ class EpisodeStart:
     provenance: dict[str, str]
 
 
+class ReplanRefused(StoreError):
+    """A replan whose numbers cannot be right; nothing of it is added to the episode."""
+
+
 class EpisodeWriter:
     """Collects replans; has at most one block of rows in memory and writes whole shards only."""
 
@@ -100,13 +111,17 @@ class EpisodeWriter:
         self.records: list[ReplanRecord] = []
 
     def append(self, record: ReplanRecord) -> None:
-        """Add the next replan.
+        """Add the next replan, or none of it.
 
         Raises:
-            ValueError: the record does not fit the run or the replans before it, or holds numbers that are not finite.
+            ReplanRefused: the record does not fit the run or the replans before it, or breaks a rule of `verify`.
             StoreWriteFailed: the disk is full, or refuses in another way.
         """
-        self._check(record)
+        for problem in self._problems(record):
+            raise ReplanRefused(
+                f"Cannot store replan {len(self.records)} (environment step {record.env_step}) of {self.what}: "
+                f"{problem}."
+            )
         with naming_the_failure(self.what):
             for name, site in self.sites.items():
                 site.append(record.rows[name], record.key_role[name])
@@ -114,16 +129,39 @@ class EpisodeWriter:
         # The site writers have the rows; the rest is small and is written at the end.
         self.records.append(replace(record, rows={}))
 
-    def _check(self, record: ReplanRecord) -> None:
+    def _problems(self, record: ReplanRecord) -> Iterator[str]:
+        """What forbids adding a replan."""
+        replan, sites = len(self.records), self.run.sites
+        for what, given in (("rows", record.rows), ("key roles", record.key_role)):
+            if set(given) != set(self.sites):
+                yield f"it has {what} of the sites {listing(given)}; expected {listing(self.sites)}"
+                return
+        yield from self._misfits(record)
+        for name, site in self.sites.items():
+            yield from site.problems(record.rows[name], record.key_role[name], replan)
+            yield from piece_role_problems(site.layout, record.key_role[name], record.prompt, replan)
+        if record.prompt not in self.prompts:
+            yield from prompt_problems(sites, record.prompt)
+        for camera, frame in record.frames.items():
+            yield from picture_problems(sites, camera, frame.shape, frame.dtype)
+        for camera, coverage in record.coverage.items():
+            yield from coverage_problems(sites, camera, coverage[None], len(self.start.objects), replan)
+        steps = [*(earlier.env_step for earlier in self.records[-1:]), record.env_step]
+        yield from counter_problems(np.array(steps), np.array([record.noise_seed]))
+
+    def _misfits(self, record: ReplanRecord) -> Iterator[str]:
+        """Where a replan differs in form from the first one, so that their arrays could not be stacked."""
         first = self.records[0] if self.records else record
         for what in ("frames", "coverage"):
             given, expected = list(getattr(record, what)), list(getattr(first, what))
             if given != expected:
-                raise ValueError(f"a replan has {what} of the cameras {given}, the first one of {expected}")
-        numbers: dict[str, NDArray[Any]] = {"state": record.state, "actions": record.actions, **record.coverage}
-        for what, values in numbers.items():
+                yield f"it has {what} of the cameras {listing(given)}, the first replan of {listing(expected)}"
+        for what in ("state", "actions"):
+            values, before = getattr(record, what), getattr(first, what)
+            if values.shape != before.shape:
+                yield f"its {what} have the shape {values.shape}, those of the first replan {before.shape}"
             if not np.isfinite(values).all():
-                raise ValueError(f"the {what} of a replan are not all finite numbers")
+                yield f"its {what} are not all finite numbers"
 
     def commit(self, success: bool, num_steps: int) -> Path:
         """Finish, verify and publish the episode; returns its folder in the store.

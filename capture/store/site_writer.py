@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import zarr
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from vla_attention.capture.store.codecs import create_blocked, replans_per_block
 from vla_attention.capture.store.recorded_rows import RecordedRows
-from vla_attention.schemas.layout import SiteLayout
-from vla_attention.schemas.precision import round_mantissa
+from vla_attention.schemas.layout import ROLE_DTYPE, SiteLayout
+from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, round_mantissa
 from vla_attention.schemas.segments import Segment, merge_segments, segment_masses, segment_members, segments_of
+from vla_attention.schemas.stores.content_rules import (
+    gram_problems,
+    role_problems,
+    row_problems,
+    row_sum_problems,
+)
 from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.store_format import ATOM_AXES, CONTRIBUTION_AXES, ROW_AXES, ArrayRecord, Recording
 
@@ -46,22 +52,38 @@ class SiteWriter:
         self.segments: tuple[Segment, ...] = ()
         group.create_group(layout.name)
 
+    def problems(self, recorded: RecordedRows, key_role: NDArray[np.uint8], replan: int) -> Iterator[str]:
+        """What forbids adding a replan (its number, for the sentences): shapes, types, and the rules of `verify`."""
+        name, recording = self.layout.name, self.recording
+        rows, gram = recorded.rows, recorded.contribution
+        wanted = (*self.shape, self.layout.num_keys)
+        faults = [
+            *_array_faults(f"{name}/rows", rows, wanted, np.float32),
+            *_array_faults(f"{name}/row_sum", recorded.row_sum, self.shape, np.float32),
+            *_array_faults(f"{name}/key_role", key_role, wanted[-1:], ROLE_DTYPE),
+        ] or list(role_problems(self.layout, key_role[None], replan))
+        if (gram is None) is recording.contributions:
+            faults.append(f"{name} has {'no' if gram is None else 'unplanned'} contributions")
+        elif gram is not None and not faults:
+            parts = len(segments_of(self.layout, key_role)) + 1
+            faults += _array_faults(f"{name}/contribution", gram, (*self.shape[:2], parts, parts), np.float32)
+        if faults:
+            yield from faults  # the numbers of wrong shapes have no places that could be named
+            return
+        # `recorded.rows` are as computed: no rounding yet.
+        yield from row_problems(
+            f"{name}/rows", rows[None], recorded.row_sum[None], recording, FLOAT32_MANTISSA_BITS, replan
+        )
+        yield from row_sum_problems(f"{name}/row_sum", recorded.row_sum[None], recording, replan)
+        if gram is not None:
+            yield from gram_problems(f"{name}/contribution", gram[None], recording, replan)
+
     def append(self, recorded: RecordedRows, key_role: NDArray[np.uint8]) -> None:
-        """Add the next replan's rows (layer, denoise, head, query, key) and roles (key,)."""
-        expected = (*self.shape, self.layout.num_keys)
-        shapes = (recorded.rows.shape, recorded.row_sum.shape, key_role.shape)
-        if shapes != (expected, self.shape, expected[-1:]):
-            raise ValueError(
-                f"site '{self.layout.name}' recorded rows, row sums and key roles of shapes {shapes}; "
-                f"expected {(expected, self.shape, expected[-1:])}"
-            )
-        if not np.isfinite(recorded.rows).all() or (recorded.rows < 0).any():
-            raise ValueError(
-                f"site '{self.layout.name}' recorded rows that are not probabilities: negative or not finite"
-            )
+        """Add the next replan, in which `problems` found nothing. Rows as in `RecordedRows`; roles (key,)."""
         segments = segments_of(self.layout, key_role)
         members = segment_members(self.layout, key_role[None], segments)[0]
-        self._take_contribution(recorded.contribution, len(segments))
+        if recorded.contribution is not None:
+            self.contributions.append(recorded.contribution)
         # Atoms and sums come from the rows as computed, so that the rounded rows can be compared with them.
         self.masses.append((segments, segment_masses(recorded.rows, members)))
         self.row_sums.append(recorded.row_sum)
@@ -69,19 +91,6 @@ class SiteWriter:
         self.pending.append(round_mantissa(recorded.rows, self.bits))
         if len(self.pending) == self.block:
             self._flush()
-
-    def _take_contribution(self, gram: NDArray[np.float32] | None, num_segments: int) -> None:
-        wanted = self.recording.contributions
-        expected = (*self.shape[:2], num_segments + 1, num_segments + 1) if wanted else None
-        if (None if gram is None else gram.shape) != expected:
-            raise ValueError(
-                f"site '{self.layout.name}' recorded contributions of shape {None if gram is None else gram.shape}; "
-                f"expected {expected}"
-            )
-        if gram is not None:
-            if not np.isfinite(gram).all():
-                raise ValueError(f"site '{self.layout.name}' recorded contributions that are not all finite")
-            self.contributions.append(gram)
 
     def _flush(self) -> None:
         rows = np.stack(self.pending)
@@ -131,3 +140,8 @@ class SiteWriter:
             at = [*(column[segment] for segment in segments), size - 1]
             grams[replan][..., np.ix_(at, at)[0], np.ix_(at, at)[1]] = gram
         self.write(f"{self.layout.name}/contribution", grams, CONTRIBUTION_AXES)
+
+
+def _array_faults(name: str, values: NDArray[Any], shape: tuple[int, ...], dtype: DTypeLike) -> Iterator[str]:
+    if (values.shape, values.dtype) != (shape, np.dtype(dtype)):
+        yield f"{name} has the shape {values.shape} and type {values.dtype}; expected {shape} and {np.dtype(dtype)}"

@@ -11,7 +11,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.schemas.precision import mass_error_bound
+from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
+from vla_attention.schemas.stores.content_rules import (
+    counter_problems,
+    coverage_problems,
+    gram_problems,
+    picture_problems,
+    piece_role_problems,
+    prompt_problems,
+    role_problems,
+    row_problems,
+    row_sum_problems,
+)
 from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import (
@@ -71,8 +82,9 @@ def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[s
         if record.shape[: len(expected)] != expected:
             yield f"the array {name} has the shape {record.shape}; expected {expected}"
             continue
-        yield from _guarded(_array_problems(episode, name, record.sha256, root.recording.mantissa_bits))
-    yield from _guarded(_prompt_problems(episode))
+        yield from _guarded(_array_problems(root, episode, name, record.sha256))
+    for check in (_token_problems, _camera_problems, _counter_problems):
+        yield from _guarded(check(root, episode))
 
 
 def _guarded(check: Iterator[str]) -> Iterator[str]:
@@ -108,29 +120,28 @@ def _metadata_problems(episode: StoredEpisode, file: str) -> Iterator[str]:
     yield from ()
 
 
-def _array_problems(episode: StoredEpisode, name: str, sha256: str, mantissa_bits: int) -> Iterator[str]:
-    """One pass over an array: its digest and, of rows and of segments' masses, that they add up to the row sums."""
+def _array_problems(root: RootAttributes, episode: StoredEpisode, name: str, sha256: str) -> Iterator[str]:
+    """One pass over an array: its digest, and the rules for the numbers of rows, segments' masses and contributions."""
     array = episode.array(name)
-    sums, bound = None, 1e-5 + (mass_error_bound(mantissa_bits) if name.endswith("/rows") else 0.0)
-    if name.endswith(("/rows", "/atoms")):
-        sums = _row_sums(episode, name, array.shape[:-1])
-    digest, negative, worst = ArrayDigest(), False, 0.0
+    recording, kind = root.recording, name.rpartition("/")[2]
+    sums = _row_sums(episode, name, array.shape[:-1]) if kind in ("rows", "atoms") else None
+    digest, problems = ArrayDigest(), list[str]()
     step = max(1, (array.shards or array.chunks)[0])
     for first in range(0, array.shape[0], step):
         values = episode.read(name, slice(first, first + step))
         digest.update(values)
+        if problems:
+            continue  # the first block with a fault names its place
         if sums is not None:
-            expected = sums[first : first + step]
-            error = np.abs(values.sum(axis=-1, dtype=np.float64) - expected) / np.maximum(expected, 1e-30)
-            negative, worst = negative or bool((values < 0).any()), max(worst, float(error.max(initial=0.0)))
+            bits = recording.mantissa_bits if kind == "rows" else FLOAT32_MANTISSA_BITS
+            problems += row_problems(name, values, sums[first : first + step], recording, bits, first)
+        elif kind == "row_sum":
+            problems += row_sum_problems(name, values, recording, first)
+        elif kind == "contribution":
+            problems += gram_problems(name, values, recording, first)
     if digest.hexdigest() != sha256:
         yield f"the values of {name} are not those that were written (digest differs)"
-    if negative:
-        yield f"{name} holds negative numbers"
-    if worst > bound:
-        yield (
-            f"{name} does not add up to the row sums: they differ by up to {worst:.2g} of them, allowed is {bound:.2g}"
-        )
+    yield from problems
 
 
 def _row_sums(episode: StoredEpisode, name: str, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
@@ -142,7 +153,30 @@ def _row_sums(episode: StoredEpisode, name: str, shape: tuple[int, ...]) -> NDAr
     return sums if sums.shape == shape else None
 
 
-def _prompt_problems(episode: StoredEpisode) -> Iterator[str]:
+def _token_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
+    prompts = episode.attributes.prompts
+    for prompt in prompts:
+        yield from prompt_problems(root.sites, prompt)
     index = episode.read("prompt_index")
-    if not np.isin(index, np.arange(len(episode.attributes.prompts))).all():
+    if not np.isin(index, np.arange(len(prompts))).all():
         yield "prompt_index names prompts that the attributes do not have"
+        return
+    for site in root.sites:
+        roles = episode.read(f"{site.name}/key_role")
+        yield from role_problems(site, roles)
+        for replan, number in enumerate(index):
+            yield from piece_role_problems(site, roles[replan], prompts[number], replan)
+
+
+def _camera_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
+    for name in episode.attributes.arrays:
+        group, _, camera = name.partition("/")
+        if group == "frames":
+            array = episode.array(name)
+            yield from picture_problems(root.sites, camera, array.shape[1:], array.dtype)
+        elif group == "objects":
+            yield from coverage_problems(root.sites, camera, episode.read(name), len(episode.attributes.objects))
+
+
+def _counter_problems(_root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
+    yield from counter_problems(episode.read("env_step"), episode.read("noise_seed"))

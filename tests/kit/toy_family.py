@@ -32,6 +32,7 @@ def make_toy_policy(checkpoint: str, size: int) -> Any:
 
     class ToyPolicy:
         name, family = "toy", "toy"
+        model = torch.nn.Identity()
         sites = (layout,)
         num_layers, num_heads, num_denoise_steps = 1, 2, 1
         action_horizon = num_action_queries = size

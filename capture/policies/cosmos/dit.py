@@ -23,10 +23,14 @@ NORM_EPS = 1e-6
 class BlockObserver(Protocol):
     """Observes the inside of a block. The model calls it for every block and, at `self`, for every frame of queries.
 
+    `begin_block`: is called before everything else of a block.
     `rows`: returns the function that takes the float32 probabilities (batch, head, query of the frame, key), or None.
     `updates`: takes the block's gated updates, name -> (batch, frame, token, width), after the block.
     `takes_updates`: whether `updates` is called.
     """
+
+    def begin_block(self, layer: int) -> None:
+        """Learn that this block begins."""
 
     def rows(self, site: str, layer: int, frame: int, attention: Attention, value: Tensor) -> RowSink | None:
         """Return the function that takes the rows of these queries; `value` is (batch, head, key, dim)."""
@@ -348,6 +352,8 @@ class Dit(nn.Module):
         rotary = self.pos_embedder(frames, rows, columns)
         text = text.to(self.dtype)
         for layer, block in enumerate(self.blocks):
+            if observer is not None:
+                observer.begin_block(layer)
             x = block(x, time, shared_modulation, text, rotary, layer, observer)
         features = self.final_layer(x, time, shared_modulation)
         size = self.config.patch_size

@@ -44,6 +44,11 @@ class CallObserver:
         }
         return {site: sink for site, sink in found.items() if sink is not None}
 
+    def begin_block(self, layer: int) -> None:
+        """Tell the recorders that this block begins."""
+        for recorder in self.recorders.values():
+            recorder.begin_block(layer, self.denoise_step)
+
     def rows(self, site: str, layer: int, frame: int, attention: Attention, value: Tensor) -> RowSink | None:
         """Return the function that takes the rows of these queries, or None if they are not recorded."""
         recorder = self.recorders.get(site)

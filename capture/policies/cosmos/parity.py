@@ -122,6 +122,9 @@ class EverythingObserver:
     residual_norms: dict[int, Tensor] = field(default_factory=dict)
     contribution_norms: dict[int, Tensor] = field(default_factory=dict)
 
+    def begin_block(self, layer: int) -> None:
+        """Nothing is kept of a block's begin."""
+
     def rows(self, site: str, layer: int, frame: int, attention: Attention, value: Tensor) -> RowSink:
         """Return the function that takes the rows of these queries."""
 

@@ -237,6 +237,8 @@ class PiModel(nn.Module):
             tokens_now, condition = self._embed_suffix(state, x, waves)
             hidden = tokens_now.to(self.dtype)
             for layer, block in enumerate(self._expert.blocks):
+                if recorder is not None:
+                    recorder.begin_block(layer, step)
                 hidden, _ = block(
                     hidden,
                     mask,

@@ -20,7 +20,7 @@ from vla_attention.capture.store.disk_estimate import (
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import PatchGrid, SiteLayout, Span
 from vla_attention.testing.stores import StoreSpec, root_attributes, write_store
-from vla_attention.testing.tokens import small_prompt
+from vla_attention.testing.tokens import OBJECTS, small_prompt
 
 
 def large_tokens(replans: int, pixels: int = 56) -> EpisodeTokens:
@@ -44,7 +44,7 @@ def large_tokens(replans: int, pixels: int = 56) -> EpisodeTokens:
         prompts.append(prompt)
     edges = np.zeros((replans, 340, 5), dtype=np.float32)
     edges[:, np.arange(340), np.arange(340) // 70] = 1
-    return EpisodeTokens(layout, roles, tuple(prompts), np.arange(replans), (), {"base": edges, "wrist": edges})
+    return EpisodeTokens(layout, roles, tuple(prompts), np.arange(replans), OBJECTS, {"base": edges, "wrist": edges})
 
 
 def size_of(path: Path) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
@@ -21,7 +20,6 @@ from tests.kit.examples import examples
 from tests.kit.slow import slow_except
 from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.capture.store.codecs import replans_per_block, write_whole
-from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.json_files import FOLDER
 from vla_attention.schemas.layout import Role
@@ -309,44 +307,6 @@ def test_a_store_has_no_code_and_no_objects(written):
     files = {file.name for file in written[0].rglob("*") if file.is_file()}
     assert "zarr.json" in files
     assert all(name == "zarr.json" or name.isdigit() for name in files)
-
-
-def wrong(spec: StoreSpec, **changes: object):
-    start, (first, second, *_) = episode_records(spec, 0, 0)
-    return start, first, replace(second, **changes)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"state": np.array([np.nan] * 8)}, "state"),
-        ({"actions": np.full((5, 7), np.inf)}, "actions"),
-        ({"frames": {}}, "frames of the cameras"),
-        ({"coverage": {"base_0_rgb": np.zeros((12, 5), dtype=np.float32)}}, "coverage of the cameras"),
-        ({"key_role": {"joint": np.zeros(40, dtype=np.uint8)}}, "shapes"),
-        ({"key_role": {"joint": np.zeros(39, dtype=np.uint8)}}, "Role"),
-    ],
-)
-def test_a_replan_that_does_not_fit_is_refused_at_once(tmp_path, changes, message):
-    spec = StoreSpec()
-    store = open_run(tmp_path / "a.zarr", root_attributes(spec), "new")
-    start, first, second = wrong(spec, **changes)
-    with store.episode(start, denoise_times(spec), 3) as writer:
-        writer.append(first)
-        with pytest.raises(ValueError, match=message):
-            writer.append(second)
-    assert store.committed() == set()
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -0.1])
-def test_rows_that_are_no_probabilities_are_refused(tmp_path, value):
-    spec = StoreSpec()
-    store = open_run(tmp_path / "a.zarr", root_attributes(spec), "new")
-    start, (first, *_) = episode_records(spec, 0, 0)
-    rows = first.rows["joint"].rows.copy()
-    rows[1, 1, 0, 0, 7] = value
-    with store.episode(start, denoise_times(spec), 3) as writer, pytest.raises(ValueError, match="not probabilities"):
-        writer.append(replace(first, rows={"joint": RecordedRows(rows, first.rows["joint"].row_sum)}))
 
 
 def test_an_episode_without_replans_is_refused(tmp_path):
