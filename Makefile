@@ -35,9 +35,8 @@ SOURCES := vla_attention schemas capture analyze tests benchmarks scripts docs
 
 # Processes that share the tests; WORKERS=0 runs them in one, which a debugger needs.
 WORKERS ?= 2
-# One thread for each: threads of two processes on two cores wait for each other.
 # An empty PYTHONDONTWRITEBYTECODE: where it is set, both processes compile all tests anew at every run.
-PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/pytest -n $(WORKERS) --dist worksteal
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 
 .PHONY: capture analyze test test-slurm test-thorough check unit package setup setup-analyze schemas clean
 

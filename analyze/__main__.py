@@ -12,9 +12,10 @@ from pathlib import Path
 from vla_attention.analyze.commands import COMMANDS, DEFAULT_COMMAND
 from vla_attention.schemas.command_line import run_command
 from vla_attention.schemas.errors import UnknownName, UserError, did_you_mean, listing
+from vla_attention.schemas.threads import use_threads
 
 #: Episodes are measured in threads (`stores.parallel`); matrix products that start threads too make them slower.
-_ONE_THREAD_EACH = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
+_ONE_THREAD_EACH = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 #: Objects made between two runs of the garbage collector. Token pieces and steps are tens of thousands, without cycles;
 #: Python's default of 700 would search them again and again.
 _OBJECTS_BETWEEN_COLLECTIONS = 5_000_000
@@ -22,8 +23,6 @@ _OBJECTS_BETWEEN_COLLECTIONS = 5_000_000
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code (2: an argument or a store is wrong, and one sentence says how)."""
-    for name in _ONE_THREAD_EACH:  # read when numpy is imported, which is later
-        os.environ.setdefault(name, "1")
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
     given = sys.argv[1:] if argv is None else list(argv)
     name = given[0] if given[:1] and given[0] in COMMANDS else ""
@@ -36,7 +35,16 @@ def _run(name: str, arguments: Sequence[str]) -> int:
         _refuse_misspelt_command(arguments)
     command = import_module(f"vla_attention.analyze.{name or DEFAULT_COMMAND}.command")
     parser = command.build_parser(prog=f"vla-analyze {name}") if name == DEFAULT_COMMAND else command.build_parser()
+    parser.add_argument(
+        "--threads",
+        type=int,
+        metavar="N",
+        help="threads that measure episodes, at most 4 (default: OMP_NUM_THREADS, else the cores of this process)",
+    )
     parsed = parser.parse_args(arguments)
+    # The libraries read the numbers when they are imported, which the command does.
+    use_threads(parsed.threads)
+    os.environ.update(dict.fromkeys(_ONE_THREAD_EACH, "1"))
     try:
         code: int = command.run(parsed)
         return code

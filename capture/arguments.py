@@ -11,6 +11,7 @@ from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.parity_command import run_parity_command
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
+from vla_attention.capture.policies.model_arguments import add_threads
 from vla_attention.capture.tasks_command import run_tasks_command
 from vla_attention.schemas.command_line import OneSentenceParser
 from vla_attention.schemas.errors import listing
@@ -215,6 +216,7 @@ def _add_parity_arguments(parser: argparse.ArgumentParser, families: tuple[Polic
         help=f"largest difference that passes (default: {limit})",
     )
     parser.add_argument("--device", default="cpu", help="auto, cpu (default), cuda, cuda:1 ...")
+    add_threads(parser)
     parser.set_defaults(command=run_parity_command)
 
 

@@ -8,10 +8,13 @@ from vla_attention.capture.analysis_process import run_analysis
 from vla_attention.capture.command_line import check_writable
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.family import PolicyFamily
+from vla_attention.schemas.threads import use_threads
 
 
 def run_capture_of_family(arguments: argparse.Namespace, termination: Termination) -> int:
     """Run `vla-capture FAMILY` on parsed arguments; returns the exit code."""
+    threads = use_threads(arguments.threads)
+
     from vla_attention.capture.run_settings import run_settings
     from vla_attention.capture.store.store_writer import refuse_existing
 
@@ -24,10 +27,11 @@ def run_capture_of_family(arguments: argparse.Namespace, termination: Terminatio
         check_writable(arguments.output_dir, "--output-dir")
 
     from vla_attention.capture.capture_run import run_capture
-    from vla_attention.capture.device import choose_device
+    from vla_attention.capture.device import load_torch
     from vla_attention.capture.rollout.progress import say
 
-    device = choose_device(arguments.device)
+    say(threads.describe())
+    device = load_torch(arguments.device, threads.number)
     family: PolicyFamily = arguments.family
     policy = family.build(arguments, device)
     run_capture(settings, policy, device, termination)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal, cast
 
+import torch
+
 from vla_attention.capture.environments.base import check_initial_state_index
 from vla_attention.capture.environments.episode_protocol import WAIT_STEPS
 from vla_attention.capture.environments.suites import list_tasks
@@ -143,7 +145,7 @@ def _record_missing(
     if not todo and all(task.task_id in known and known[task.task_id].episodes >= task.episodes for task in plan):
         return []
     worker = this_worker()
-    record = RecordWriter(store.path, worker, plan)
+    record = RecordWriter(store.path, worker, plan, torch.get_num_threads())
     loop = EpisodeLoop(
         suite=settings.suite,
         environment_settings=settings.environment,

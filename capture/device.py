@@ -1,14 +1,19 @@
-"""The device that a model runs on."""
+"""torch, with the device and the number of threads that a model runs on."""
 
 from __future__ import annotations
 
 from vla_attention.schemas.errors import BadArgument
 
 
-def choose_device(name: str) -> str:
-    """Return the torch device of `--device`, which exists; `auto` takes a GPU if there is one."""
+def load_torch(name: str, threads: int) -> str:
+    """Load torch with a number of threads; return the device of `--device`, which exists (`auto`: a GPU if there is
+    one).
+
+    Call `schemas.threads.use_threads` before: how threads wait is read from the environment when torch is loaded.
+    """
     import torch
 
+    torch.set_num_threads(threads)  # from OMP_NUM_THREADS alone, MKL takes at most what it finds right
     if name == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     try:

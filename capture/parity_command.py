@@ -8,13 +8,14 @@ from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.policies.family import ParityCases
 from vla_attention.schemas.errors import listing
+from vla_attention.schemas.threads import use_threads
 
 
 def run_parity_command(arguments: argparse.Namespace, termination: Termination) -> int:
     """Run a case with the family that recognises it; returns 0 within the limits, 1 beyond them."""
-    from vla_attention.capture.device import choose_device
+    from vla_attention.capture.device import load_torch
 
-    device = choose_device(arguments.device)
+    device = load_torch(arguments.device, use_threads(arguments.threads).number)
     return _cases_of(arguments).run(arguments, device)
 
 

@@ -1,4 +1,4 @@
-"""What all tests share: which of them run, how many random examples they try, zarr without threads, LIBERO's assets."""
+"""What all tests share: one thread, which of them run, how many random examples they try, zarr, LIBERO's assets."""
 
 from __future__ import annotations
 
@@ -12,6 +12,11 @@ import pytest
 from hypothesis import settings
 
 from tests.kit.examples import PROFILES
+from vla_attention.schemas.threads import use_threads
+
+# Before a test module imports torch or numpy: several threads make small models slower. OMP_NUM_THREADS overrides.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+use_threads()
 
 for _name, _count in PROFILES.items():
     settings.register_profile(_name, max_examples=_count, deadline=None)

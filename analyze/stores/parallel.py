@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
+
+from vla_attention.analyze.stores.blas import one_blas_thread
+from vla_attention.schemas.threads import threads_of_this_process
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -21,14 +23,14 @@ def map_episodes(
 
     `progress` is called with 1 after each, in the caller's thread.
     """
-    workers = max(1, min(_MOST_AT_ONCE, os.cpu_count() or 1))
     results: list[Result] = []
-    executor = ThreadPoolExecutor(workers)
-    try:
-        for result in executor.map(function, items):
-            results.append(result)
-            if progress is not None:
-                progress(1)
-    finally:
-        executor.shutdown(wait=True, cancel_futures=True)
+    executor = ThreadPoolExecutor(min(_MOST_AT_ONCE, threads_of_this_process().number))
+    with one_blas_thread():
+        try:
+            for result in executor.map(function, items):
+                results.append(result)
+                if progress is not None:
+                    progress(1)
+        finally:
+            executor.shutdown(wait=True, cancel_futures=True)
     return results

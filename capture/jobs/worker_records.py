@@ -43,6 +43,7 @@ class WorkerRecord:
     """The record of one worker.
 
     store: `store_identity` of its store, which differs from that of a later store with the same name.
+    threads: number of processor threads that its policy computes with; 0 in a record that does not state it.
     """
 
     store: str
@@ -51,14 +52,15 @@ class WorkerRecord:
     began: str
     state: Literal["running", "finished", "stopped", "failed"]
     committed: tuple[Commit, ...] = ()
+    threads: int = 0
 
 
 class RecordWriter:
     """Writes the record of this worker after every change."""
 
-    def __init__(self, store: Path, worker: Worker, plan: tuple[PlannedTask, ...]) -> None:
+    def __init__(self, store: Path, worker: Worker, plan: tuple[PlannedTask, ...], threads: int = 0) -> None:
         self.file = records_folder(store) / f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{worker.tag}.json"
-        self.record = WorkerRecord(store_identity(store), worker, plan, now(), "running")
+        self.record = WorkerRecord(store_identity(store), worker, plan, now(), "running", threads=threads)
         self._write()
 
     def add_commit(self, episode: str) -> None:

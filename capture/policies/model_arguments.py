@@ -34,4 +34,15 @@ def add_model_arguments(
     group.add_argument("--config-name", metavar="NAME", help=config_name)
     group.add_argument("--dtype", metavar="NAME", help=f"float32 or bfloat16 (default: {dtype_default})")
     group.add_argument("--device", default="auto", help="auto (default: a GPU if there is one), cpu, cuda, cuda:1 ...")
+    add_threads(group)
     return group
+
+
+def add_threads(group: argparse._ActionsContainer) -> None:
+    """Add `--threads`; `schemas.threads.use_threads` takes its value."""
+    group.add_argument(
+        "--threads",
+        type=int,
+        metavar="N",
+        help="processor threads of the policy (default: OMP_NUM_THREADS, else the cores that this process may use)",
+    )

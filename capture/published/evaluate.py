@@ -25,6 +25,7 @@ from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
 from vla_attention.schemas.errors import BadArgument, unknown_name
 from vla_attention.schemas.layers import select_layers
+from vla_attention.schemas.threads import Threads, use_threads
 
 if TYPE_CHECKING:
     from vla_attention.capture.run_settings import RunSettings
@@ -88,13 +89,14 @@ class _Job:
 
 
 def _evaluate(arguments: argparse.Namespace, script: PublishedScript, termination: Termination) -> int:
+    threads = use_threads(arguments.threads)
     jobs = _jobs(arguments)
     stage = arguments.stage or ("both" if arguments.array_index is None else "capture")
     if stage != "capture":
         for job in jobs:
             check_writable(job.output, "--output-dir")
     if stage != "analyze":
-        _capture(arguments, jobs, termination)
+        _capture(arguments, jobs, threads, termination)
     if stage == "capture":
         return 0
     codes = [_analyze(job, script) for job in jobs]
@@ -172,15 +174,16 @@ def _place(index: int, suites: Sequence[str]) -> tuple[str, int] | None:
     return None
 
 
-def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], termination: Termination) -> None:
+def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], threads: Threads, termination: Termination) -> None:
     for job in jobs:
         check_writable(job.settings.store.parent, "--output-dir" if arguments.store is None else "--store")
 
     from vla_attention.capture.capture_run import run_capture
-    from vla_attention.capture.device import choose_device
+    from vla_attention.capture.device import load_torch
     from vla_attention.capture.rollout.progress import say
 
-    device = choose_device(arguments.device)
+    say(threads.describe())
+    device = load_torch(arguments.device, threads.number)
     policy = arguments.family.build(arguments, device)
     # A layer that does not exist is an error before the capture, not after it.
     select_layers(arguments.layers, policy.num_layers, policy.family)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -11,12 +12,14 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+import torch
 import xarray as xr
 import zarr
 
 from tests.kit.written_tables import written_steps
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
+from vla_attention.capture.jobs.worker_records import read_records
 
 pytestmark = pytest.mark.simulator
 
@@ -45,6 +48,18 @@ def test_two_runs_give_the_same_bytes_whatever_ran_before(captured_store, run_ca
         assert files == sorted(path.relative_to(second) for path in second.rglob("*") if path.is_file())
         for file in files:
             assert (first / file).read_bytes() == (second / file).read_bytes(), file
+
+
+def test_the_number_of_threads_is_printed_and_recorded(run_capture, tmp_path, monkeypatch, capsys):
+    before = torch.get_num_threads()
+    monkeypatch.setattr(os, "environ", dict(os.environ))
+    store = tmp_path / "a.zarr"
+    run_capture("--task-id", 0, "--num-episodes", 1, "--store", store, "--threads", 2)
+    assert torch.get_num_threads() == 2
+    torch.set_num_threads(before)
+    assert capsys.readouterr().out.startswith("Threads: 2 (--threads).\n")
+    assert [record.threads for record in read_records(store)] == [2]
+    assert "threads" not in (store / "zarr.json").read_text()
 
 
 def test_episodes_hold_the_inputs_of_the_policy(captured_store):

@@ -44,13 +44,11 @@ SHORT = ["--task-id", "1", "--num-episodes", "1", "--max-steps", "4", "--device"
 
 @pytest.fixture(scope="module", autouse=True)
 def alone() -> Iterator[None]:
-    """One thread, because several slow small models down, and no files of this machine's hub cache."""
+    """No files of this machine's hub cache."""
     pytest.importorskip("diffusers")
-    before, cache = torch.get_num_threads(), os.environ.get("HF_HUB_CACHE")
-    torch.set_num_threads(1)
+    cache = os.environ.get("HF_HUB_CACHE")
     os.environ["HF_HUB_CACHE"] = os.devnull
     yield
-    torch.set_num_threads(before)
     if cache is None:
         del os.environ["HF_HUB_CACHE"]
     else:

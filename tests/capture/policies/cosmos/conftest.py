@@ -11,15 +11,6 @@ from tests.kit.policy_inputs import make_observation
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, random_policy
 
 
-@pytest.fixture(scope="package", autouse=True)
-def one_thread():
-    """Several threads make these small models ten times slower on busy cores."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture(scope="session")
 def dummy():
     pytest.importorskip("diffusers")

@@ -3,21 +3,11 @@
 from __future__ import annotations
 
 import pytest
-import torch
 
 from tests.kit.pi_golden import GOLDEN, LARGE_GOLDEN, GoldenCase, load_case
 from tests.kit.policy_inputs import make_observation
 from vla_attention.capture.environments.base import Observation
 from vla_attention.capture.policies.pi.embedded import dummy_policy, embedded_policy
-
-
-@pytest.fixture(scope="package", autouse=True)
-def one_thread():
-    """Several threads make these small models ten times slower on busy cores, and timings random."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session", params=["pi05_batch2", "pi0_batch2", "pi05_full_layout"])

@@ -1,0 +1,184 @@
+"""How many threads this process computes with, and that threads without work sleep.
+
+torch takes a thread per processor that it sees, and an OpenMP thread that waits for the others keeps its core busy:
+where other work has the cores, or several workers share a node, a policy call takes ten times as long or more
+(benchmarks/threads.py). Here one number is chosen, and waiting threads sleep. OpenMP, MKL, OpenBLAS, polars and Mesa
+read their environment variables once, when they are loaded, so `use_threads` comes before them.
+
+Order of precedence: `--threads`, OMP_NUM_THREADS, then the smallest of the cores that this process may run on, the
+CPU quota of its control groups, and what SLURM gave to the task.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from vla_attention.schemas.errors import BadArgument
+
+_OPENMP = "OMP_NUM_THREADS"
+_SLURM = ("SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE")
+#: Set to the same number, unless the user has set them. LP_: Mesa's renderer, which draws on nodes without a GPU.
+_OTHER_LIBRARIES = ("MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "POLARS_MAX_THREADS", "LP_NUM_THREADS")
+#: Let threads that wait sleep: the standard's variable, and those of the GNU (torch's own) and the Intel runtime.
+_SLEEP = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "KMP_BLOCKTIME": "0"}
+
+
+@dataclass(frozen=True)
+class Threads:
+    """A number of threads, and what it was taken from."""
+
+    number: int
+    source: str
+
+    def describe(self) -> str:
+        """Return a line for the terminal."""
+        how = "" if self.source == "--threads" else "; --threads N changes it"
+        return f"Threads: {self.number} ({self.source}{how})."
+
+
+def choose_threads(given: int | None, environment: Mapping[str, str], cores: int, quota: float | None) -> Threads:
+    """Choose the number of threads.
+
+    Args:
+        given: the value of `--threads`; None without one.
+        environment: environment variables.
+        cores: number of cores that the process may run on.
+        quota: processor seconds per second that its control groups allow; None without a limit.
+
+    Raises:
+        BadArgument: `given` or OMP_NUM_THREADS is no number of threads.
+    """
+    if given is not None:
+        if given < 1:
+            raise BadArgument(f"Cannot use --threads {given}; expected at least 1.")
+        return Threads(given, "--threads")
+    by_user = environment.get(_OPENMP, "").strip()
+    if by_user:
+        first = by_user.split(",")[0].strip()  # the others are for nested parallel regions
+        if not first.isdecimal() or int(first) < 1:
+            raise BadArgument(f"{_OPENMP} is '{by_user}'; expected a number of threads, at least 1, or unset it.")
+        return Threads(int(first), _OPENMP)
+    limits = [Threads(cores, "the cores that this process may use")]
+    if quota is not None:
+        limits.append(Threads(max(1, int(quota)), "the CPU quota of its control group"))
+    limits += _slurm_limits(environment)
+    return min(limits, key=lambda limit: limit.number)
+
+
+def _slurm_limits(environment: Mapping[str, str]) -> list[Threads]:
+    """Return what SLURM gave: to the task if the job says how much, else its share of the node's part of the job."""
+    values = {name: int(text) for name, text in environment.items() if name in _SLURM and text.isdecimal()}
+    task, node = (values.get(name, 0) for name in _SLURM)
+    if task:
+        return [Threads(task, _SLURM[0])]
+    # Tasks per node of this step, as in 2(x3),1: two on each of three nodes, one on the fourth.
+    tasks = max(map(int, re.findall(r"(?<![x\d])\d+", environment.get("SLURM_STEP_TASKS_PER_NODE", ""))), default=1)
+    return [Threads(max(1, node // max(1, tasks)), _SLURM[1])] if node else []
+
+
+def use_threads(given: int | None = None) -> Threads:
+    """Choose the number of threads of this process, and set the variables from which libraries take it.
+
+    Call it before torch, numpy and polars are imported. Processes that this one starts inherit the number.
+
+    Raises:
+        BadArgument: as `choose_threads`.
+    """
+    threads = threads_of_this_process(given)
+    number = str(threads.number)
+    os.environ[_OPENMP] = number
+    for name in _OTHER_LIBRARIES:
+        if given is not None or name not in os.environ:
+            os.environ[name] = number
+    if not any(name in os.environ for name in _SLEEP):
+        os.environ.update(_SLEEP)
+    return threads
+
+
+def threads_of_this_process(given: int | None = None) -> Threads:
+    """Return the number that `use_threads` would set; after it, the number that it has set."""
+    return choose_threads(given, os.environ, _cores(), cpu_quota())
+
+
+def _cores() -> int:
+    """Return the number of physical cores that this process may run on."""
+    try:
+        processors = os.sched_getaffinity(0)
+    except AttributeError:  # macOS and Windows bind no process to processors
+        return os.cpu_count() or 1
+    return count_cores(processors)
+
+
+def count_cores(processors: Iterable[int], root: Path = Path("/")) -> int:
+    """Return the number of physical cores of processors: two that share a core multiply no faster than one.
+
+    Args:
+        processors: numbers of processors.
+        root: folder in place of /, for tests.
+    """
+    topology = "sys/devices/system/cpu/cpu{}/topology/thread_siblings_list"
+    return len({_text(root / topology.format(number)) or str(number) for number in processors})
+
+
+def cpu_quota(root: Path = Path("/")) -> float | None:
+    """Return the processor seconds per second that control groups allow this process; None without a limit.
+
+    A group is limited by its parents too, so the smallest quota on the way up counts. Both versions of control groups
+    are read, and where a container sees only a part of the tree, that part.
+
+    Args:
+        root: folder in place of /, for tests.
+    """
+    quotas = []
+    for mount, group, version in _cpu_groups(root):
+        for folder in (group, *group.parents):
+            quota = _quota_of(mount / folder, version)
+            if quota is not None:
+                quotas.append(quota)
+    return min(quotas, default=None)
+
+
+def _cpu_groups(root: Path) -> list[tuple[Path, Path, int]]:
+    """Return (where the tree is mounted, this process's group below it, version) of each tree that limits the CPU."""
+    own = {}
+    for line in _text(root / "proc/self/cgroup").splitlines():
+        number, controllers, path = line.split(":", 2)
+        if number == "0" and not controllers:
+            own[2] = path
+        elif "cpu" in controllers.split(","):
+            own[1] = path
+    found = []
+    for line in _text(root / "proc/self/mountinfo").splitlines():
+        before, _, after = line.partition(" - ")
+        tree, mount = before.split()[3:5]
+        kind, _, options = after.split(maxsplit=2)
+        version = {"cgroup2": 2, "cgroup": 1}.get(kind)
+        if version not in own or (version == 1 and "cpu" not in options.split(",")):
+            continue
+        # A container without a namespace of its own sees its group's path on the host, and that group as the mount.
+        group = Path(own[version])
+        below = group.relative_to(tree) if group.is_relative_to(tree) else group.relative_to("/")
+        found.append((root / mount.lstrip("/"), below, version))
+    return found
+
+
+def _quota_of(folder: Path, version: int) -> float | None:
+    if version == 2:
+        words = _text(folder / "cpu.max").split()
+    else:
+        words = [_text(folder / f"cpu.cfs_{name}_us").strip() for name in ("quota", "period")]
+    # `max` and -1 stand for no limit; a group that is not visible from here has no file.
+    if len(words) != 2 or not all(word.isdecimal() for word in words) or int(words[1]) == 0:
+        return None
+    return int(words[0]) / int(words[1])
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError:
+        return ""
