@@ -6,14 +6,14 @@
 #   make test-slurm  an array job on the SLURM that sbatch reaches from here (opt-in; installs nothing)
 #   make setup       the whole environment        make setup-analyze   the laptop's part of it
 #
-# Options, as in: make capture SUITE=libero_10 TASK_ID=0 CHECKPOINT=~/pi05_libero, or make capture POLICY=cosmos
+# Options, as in: make capture SUITE=libero_10 TASK_ID="0 3" CHECKPOINT=~/pi05_libero, or make capture POLICY=cosmos
 POLICY     ?= pi
 CHECKPOINT ?= embedded
 SUITE      ?= robosuite
 TASK_ID    ?=
 EPISODES   ?=
 LAYERS     ?=
-SEED       ?= 7
+SEED       ?=
 STORE      ?= runs/$(if $(filter-out pi,$(POLICY)),$(POLICY)_)$(SUITE).zarr
 GROUPING   ?= default
 OUTPUT     ?= results/$(basename $(notdir $(STORE)))/$(basename $(notdir $(GROUPING)))
@@ -41,8 +41,8 @@ PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 .PHONY: capture analyze test test-slurm test-thorough check unit package setup setup-analyze schemas clean
 
 capture: .venv/capture-installed
-	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --seed $(SEED) --store $(STORE) \
-	  $(CAPTURE_ARGS) $(if $(TASK_ID),--task-id $(TASK_ID)) $(if $(LAYERS),--layers $(LAYERS)) $(ARGS)
+	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --store $(STORE) \
+	  $(CAPTURE_ARGS) $(if $(SEED),--seed $(SEED)) $(if $(TASK_ID),--task-id $(TASK_ID)) $(if $(LAYERS),--layers $(LAYERS)) $(ARGS)
 
 analyze: .venv/analyze-installed
 	$(BIN)/vla-analyze $(STORE) --grouping $(GROUPING) --output $(OUTPUT) $(if $(LAYERS),--layers $(LAYERS)) $(ARGS)

@@ -122,9 +122,19 @@ def _add_evaluation_arguments(
     if script:
         which = f"one of {names}, or {ALL_SUITES} for {listing(STANDARD_SUITES)} (default: libero_10)"
     group.add_argument("--task-suite", default="robosuite", metavar="SUITE", help=which)
-    group.add_argument("--task-id", type=int, metavar="N", help="a single task (default: all tasks of the suite)")
+    group.add_argument(
+        "--task-id", type=int, nargs="+", metavar="N", help="one or several tasks (default: all tasks of the suite)"
+    )
     group.add_argument("--num-episodes", type=int, default=5, metavar="N", help="episodes per task (default: 5)")
-    group.add_argument("--seed", type=int, default=7, help="seed of the simulator and of all noise (default: 7)")
+    if len(family.protocols) > 1:
+        group.add_argument(
+            "--protocol",
+            choices=[protocol.name for protocol in family.protocols],
+            help="the published evaluation to follow: picture size, steps and seeding, see docs/protocol.md (default: "
+            "that of the checkpoint's format)",
+        )
+    seeds = ", ".join(f"{protocol.default_seed} for {protocol.name}" for protocol in family.protocols)
+    group.add_argument("--seed", type=int, help=f"seed of the simulator and of all noise (default: {seeds})")
     group.add_argument(
         "--replan-steps",
         type=int,
@@ -132,7 +142,10 @@ def _add_evaluation_arguments(
         help=f"actions executed per policy call (default: {family.replan_default})",
     )
     group.add_argument(
-        "--max-steps", type=int, metavar="N", help="steps after waiting (default: the suite's published number)"
+        "--max-steps",
+        type=int,
+        metavar="N",
+        help="steps after waiting (default: the published number of suite and protocol)",
     )
     group.add_argument(
         "--libero-assets", type=Path, metavar="PATH", help="LIBERO asset folder (or set VLA_LIBERO_ASSETS)"

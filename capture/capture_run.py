@@ -7,8 +7,8 @@ from typing import Literal, cast
 
 import torch
 
-from vla_attention.capture.environments.base import check_initial_state_index
-from vla_attention.capture.environments.episode_protocol import WAIT_STEPS
+from vla_attention.capture.environments.base import EnvironmentSettings, check_initial_state_index
+from vla_attention.capture.environments.episode_protocol import WAIT_STEPS, EvaluationProtocol
 from vla_attention.capture.environments.suites import list_tasks
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.jobs.worker import this_worker
@@ -68,6 +68,27 @@ def plan_recording(settings: RecordingSettings, policy: Policy) -> tuple[Recordi
     return recording, layers.note
 
 
+def plan_protocol(settings: RunSettings, evaluation: EvaluationProtocol, policy: Policy) -> Protocol:
+    """Return the protocol of a run: what the settings leave open is as in the published evaluation.
+
+    The number of executed actions is the policy's own, unless the evaluation is another ecosystem's and has a number.
+    """
+    replan_steps = policy.default_replan_steps
+    if evaluation != policy.default_protocol and evaluation.replan_steps is not None:
+        replan_steps = evaluation.replan_steps
+    suite = settings.suite
+    published_steps = evaluation.max_steps.get(suite.name, suite.max_steps)
+    return Protocol(
+        suite=suite.name,
+        seed=evaluation.default_seed if settings.seed is None else settings.seed,
+        wait_steps=WAIT_STEPS,
+        replan_steps=replan_steps if settings.replan_steps is None else settings.replan_steps,
+        max_steps=published_steps if settings.max_steps is None else settings.max_steps,
+        name=evaluation.name,
+        image_size=evaluation.image_size,
+    )
+
+
 def _denoise_steps(words: Sequence[str], count: int) -> tuple[int, ...]:
     named = {"first": (0,), "last": (count - 1,), "all": tuple(range(count))}
     steps: set[int] = set()
@@ -99,17 +120,12 @@ def run_capture(
 def _record_missing(
     settings: RunSettings, policy: Policy, device: str, termination: Termination
 ) -> list[EpisodeResult]:
-    protocol = Protocol(
-        suite=settings.suite.name,
-        seed=settings.seed,
-        wait_steps=WAIT_STEPS,
-        replan_steps=policy.default_replan_steps if settings.replan_steps is None else settings.replan_steps,
-        max_steps=settings.max_steps,
-    )
+    evaluation = settings.protocol or policy.default_protocol
+    protocol = plan_protocol(settings, evaluation, policy)
     check_protocol(protocol, policy)
     recording, note = plan_recording(settings.recording, policy)
     tasks = list_tasks(settings.suite)
-    wanted = tasks if settings.task_id is None else (tasks[settings.task_id],)
+    wanted = tasks if settings.task_ids is None else tuple(tasks[number] for number in settings.task_ids)
     for task in wanted:
         check_initial_state_index(task, settings.num_episodes - 1)
     machine = describe_machine(device)
@@ -148,7 +164,7 @@ def _record_missing(
     record = RecordWriter(store.path, worker, plan, torch.get_num_threads())
     loop = EpisodeLoop(
         suite=settings.suite,
-        environment_settings=settings.environment,
+        environment_settings=EnvironmentSettings(evaluation, settings.libero_assets),
         policy=policy,
         store=store,
         worker=worker,
@@ -184,6 +200,10 @@ def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int) -
         )
     else:
         say(_checkpoint_line(identity))
+    say(
+        f"Protocol: {protocol.name} (docs/protocol.md), seed {protocol.seed}, pictures of {protocol.image_size} "
+        f"pixels, {protocol.wait_steps} waiting steps, at most {protocol.max_steps} steps after them."
+    )
     say(f"A policy call gives {identity.action_horizon} actions, of which {protocol.replan_steps} are executed.")
     grids = [camera_grid(policy.sites, camera.name) for camera in policy.cameras]
     pictures = [grid.image_height * grid.image_width * 3 for grid in grids]

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vla_attention.capture.environments.base import EnvironmentSettings, Suite, check_task_id
+from vla_attention.capture.environments.base import Suite, check_task_id
+from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
 from vla_attention.capture.environments.suites import find_suite
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.schemas.errors import BadArgument
@@ -38,20 +39,21 @@ class RecordingSettings:
 class RunSettings:
     """Which episodes are run, and into which store.
 
-    task_id: None runs all tasks of the suite. replan_steps: None takes the number of the policy's own published
-    evaluation. array_task_ids: tasks that other processes of the same array job run; the store is expected to hold
-    these too.
+    task_ids: None runs all tasks of the suite. protocol: the published evaluation that is followed; None takes that of
+    the policy. seed, replan_steps, max_steps: None takes the protocol's number. array_task_ids: tasks that
+    other processes of the same array job run; the store is expected to hold these too.
     """
 
     suite: Suite
-    task_id: int | None
+    task_ids: tuple[int, ...] | None
     num_episodes: int
-    seed: int
+    protocol: EvaluationProtocol | None
+    seed: int | None
     replan_steps: int | None
-    max_steps: int
+    max_steps: int | None
     store: Path
     mode: WriteMode
-    environment: EnvironmentSettings
+    libero_assets: Path | None
     recording: RecordingSettings
     array_task_ids: tuple[int, ...] = ()
 
@@ -59,22 +61,23 @@ class RunSettings:
 def run_settings(arguments: argparse.Namespace) -> RunSettings:
     """Return the settings of parsed arguments; checks everything that needs no policy."""
     suite = find_suite(arguments.task_suite)
-    if arguments.task_id is not None:
-        check_task_id(suite, arguments.task_id)
+    for task_id in arguments.task_id or ():
+        check_task_id(suite, task_id)
     if arguments.num_episodes < 1:
         raise BadArgument(f"Cannot use --num-episodes {arguments.num_episodes}; expected at least 1.")
-    if arguments.seed < 0:
+    if arguments.seed is not None and arguments.seed < 0:
         raise BadArgument(f"Cannot use --seed {arguments.seed}; expected 0 or more.")
     return RunSettings(
         suite=suite,
-        task_id=arguments.task_id,
+        task_ids=None if arguments.task_id is None else tuple(sorted(set(arguments.task_id))),
         num_episodes=arguments.num_episodes,
+        protocol=_protocol(arguments),
         seed=arguments.seed,
         replan_steps=arguments.replan_steps,
-        max_steps=suite.max_steps if arguments.max_steps is None else arguments.max_steps,
+        max_steps=arguments.max_steps,
         store=store_path(arguments),
         mode="overwrite" if arguments.overwrite else "resume" if arguments.resume else "new",
-        environment=EnvironmentSettings(libero_assets=arguments.libero_assets),
+        libero_assets=arguments.libero_assets,
         recording=RecordingSettings(
             layers=None if arguments.layers is None else tuple(arguments.layers),
             denoise_steps=tuple(arguments.denoise_steps),
@@ -85,6 +88,11 @@ def run_settings(arguments: argparse.Namespace) -> RunSettings:
             contributions=arguments.contributions,
         ),
     )
+
+
+def _protocol(arguments: argparse.Namespace) -> EvaluationProtocol | None:
+    name = getattr(arguments, "protocol", None)  # a family with a single protocol has no such option
+    return next((protocol for protocol in arguments.family.protocols if protocol.name == name), None)
 
 
 def store_path(arguments: argparse.Namespace) -> Path:

@@ -19,9 +19,10 @@
 #   CONFIG_NAME    openpi's name for the checkpoint's configuration (default: pi05_libero or what the checkpoint says)
 #   TASK_SUITE     libero_spatial, libero_object, libero_goal, libero_10, libero_90, robosuite, or 'all' for the four
 #                  standard suites: libero_spatial, libero_object, libero_goal, libero_10 (default: libero_10)
-#   TASK_ID        one task of the suite (default: all tasks; in an array the index is the task)
+#   TASK_ID        one task of the suite, or several: TASK_ID="0 3" (default: all; in an array the index is the task)
 #   NUM_EPISODES   episodes per task (default: 5)
-#   SEED           seed of the simulator and of all noise (default: 7)
+#   PROTOCOL       openpi or lerobot, the published evaluation to follow (default: that of the checkpoint's format)
+#   SEED           seed of the simulator and of all noise (default: 7 for openpi, 1000 for lerobot)
 #   REPLAN_STEPS   actions executed per policy call (default: 5 for openpi, n_action_steps for LeRobot)
 # What is analysed (all layers are recorded, independently of LAYERS, so that other layers need no second capture)
 #   LAYERS         block numbers 0 to 17, or the published call numbers 18 to 35 (default: 25 26 27)

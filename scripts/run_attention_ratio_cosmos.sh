@@ -19,7 +19,7 @@
 #   CONFIG_NAME    the reference's name for the configuration (default: its LIBERO one)
 #   TASK_SUITE     libero_spatial, libero_object, libero_goal, libero_10, libero_90, robosuite, or 'all' for the four
 #                  standard suites: libero_spatial, libero_object, libero_goal, libero_10 (default: libero_10)
-#   TASK_ID        one task of the suite (default: all tasks; in an array the index is the task)
+#   TASK_ID        one task of the suite, or several: TASK_ID="0 3" (default: all; in an array the index is the task)
 #   NUM_EPISODES   episodes per task (default: 5)
 #   SEED           seed of the simulator and of all noise (default: 7)
 #   REPLAN_STEPS   actions executed per policy call (default: the whole chunk of 16)

@@ -16,7 +16,7 @@ _EXAMPLES = """examples:
   vla-analyze compare runs/libero_spatial.zarr runs/libero_goal.zarr --allow-mismatch suite
 
 Episodes pair when suite, task, initial state and seed are equal. Everything but the weights and their
-names must agree, or be allowed by name: family, suite, seed, wait_steps, replan_steps, max_steps,
+names must agree, or be allowed by name: family, suite, seed, protocol, image_size, wait_steps, replan_steps, max_steps,
 layers, denoise_steps, heads, queries, depth, layout, cameras, processing, simulator.
 """
 

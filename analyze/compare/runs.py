@@ -140,6 +140,8 @@ _FIELDS: dict[str, tuple[Callable[[Run], Any], str]] = {
     "family": (lambda run: run.stores[0].attributes.policy.family, "policies of other families attend over other keys"),
     "suite": (lambda run: run.suites, "other suites have other tasks"),
     "seed": (lambda run: _protocol(run, "seed"), "it seeds environment and noise"),
+    "protocol": (lambda run: _protocol(run, "name"), "resets are seeded in other ways"),
+    "image_size": (lambda run: _protocol(run, "image_size"), "the simulator drew other pictures"),
     "wait_steps": (lambda run: _protocol(run, "wait_steps"), "episodes begin elsewhere"),
     "replan_steps": (lambda run: _protocol(run, "replan_steps"), "replans are taken at other moments"),
     "max_steps": (lambda run: _protocol(run, "max_steps"), "failed episodes have other lengths"),

@@ -34,8 +34,8 @@ def _store_items(store: Store) -> list[Item]:
     untrained = ", untrained weights" if policy.untrained else ""
     libraries = [f"{name} {version}" for name, version in root.provenance.items() if name != "code"]
     steps = (
-        f"seed {protocol.seed}, {protocol.wait_steps} waiting steps, a replan every {protocol.replan_steps} steps, at "
-        f"most {protocol.max_steps} steps"
+        f"{protocol.name}, seed {protocol.seed}, pictures of {protocol.image_size} pixels, {protocol.wait_steps} "
+        f"waiting steps, a replan every {protocol.replan_steps} steps, at most {protocol.max_steps} steps"
     )
     return [
         Item("store", store.path, code=True),

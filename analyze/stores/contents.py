@@ -79,8 +79,9 @@ def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
     yield f"  weights    {policy.digest[:16]}{'  UNTRAINED random weights' if policy.untrained else ''}"
     protocol = root.protocol
     yield (
-        f"  run        suite {protocol.suite}, seed {protocol.seed}, replan every {protocol.replan_steps} steps, "
-        f"at most {protocol.max_steps} steps after {protocol.wait_steps} waiting steps"
+        f"  run        suite {protocol.suite}, protocol {protocol.name}, seed {protocol.seed}, pictures of "
+        f"{protocol.image_size} pixels, replan every {protocol.replan_steps} steps, at most {protocol.max_steps} steps "
+        f"after {protocol.wait_steps} waiting steps"
     )
     solved = sum(episode.attributes.success for episode in episodes)
     yield f"  episodes   {len(episodes)} ({solved} solved), tasks {listing(store.task_ids, 100)}"

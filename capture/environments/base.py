@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol
 
-from vla_attention.capture.environments.episode_protocol import IMAGE_SIZE
+from vla_attention.capture.environments.episode_protocol import OPENPI, EvaluationProtocol
 from vla_attention.schemas.errors import BadArgument
 
 # Command lines read suites and settings from here, and print their help without waiting for a library.
@@ -32,7 +32,8 @@ class Suite:
     """A set of tasks and the limits of their evaluation. `suites.py` lists all suites.
 
     kind: the simulator. "libero" needs the LIBERO package and its assets; "robosuite" needs no download.
-    max_steps: policy steps after which an episode counts as failed, as in the published evaluations.
+    max_steps: policy steps after which an episode counts as failed, as in openpi's evaluation. Other protocols may have
+        other numbers (`episode_protocol.py`).
     """
 
     name: str
@@ -61,11 +62,12 @@ class Task:
 class EnvironmentSettings:
     """The choices of a user about an environment.
 
-    image_size: height and width of every camera picture in pixels.
+    protocol: the evaluation whose picture size and, in LIBERO, whose resets are used. The built-in suite has seeds of
+        its own.
     libero_assets: the folder of LIBERO's assets; None searches the places that `libero_installation.find_assets` lists.
     """
 
-    image_size: int = IMAGE_SIZE
+    protocol: EvaluationProtocol = OPENPI
     libero_assets: Path | None = None
 
 
@@ -109,7 +111,14 @@ class Environment(Protocol):
     objects: tuple[SceneObject, ...]
 
     def reset(self, initial_state_index: int, seed: int) -> None:
-        """Begin an episode from a stored initial state. Earlier episodes have no influence on it."""
+        """Begin an episode from a stored initial state. It is the same whatever ran before.
+
+        An episode's index is that of its initial state. Where the published evaluation seeds once per task, the resets
+        of the lower indices are part of the episode; those that this environment has not made yet are made first.
+        """
+
+    def missing_resets(self, initial_state_index: int, seed: int) -> int:
+        """Return the number of other resets that `reset` with these arguments would make first."""
 
     @property
     def initial_state_digest(self) -> str:

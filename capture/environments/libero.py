@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -46,15 +48,28 @@ def parent_of_region(name: str, known: Sequence[str]) -> str | None:
     return max(owners, key=len, default=None)
 
 
-class LiberoEnvironment(SimulatedEnvironment):
-    """One LIBERO task. An initial state is one of the 50 that are stored with the task; the protocol's `seed` is 7.
+@dataclass(frozen=True)
+class ResetStart:
+    """With what a reset begins: the state of numpy's global generator, and the number of samplers of joints."""
 
-    Effect of the seed: a stored state holds joint positions and velocities, but cabinets, stoves and racks have no
-    joint. Every reset places them at random in small regions of the table (measured: up to 15 mm and 3 degrees apart).
-    The protocol seeds once per task, so there the places differ between episodes and depend on the number of earlier
-    episodes in the process. Here every reset is seeded. The furniture always stands as in the first episode of the
-    protocol, and an episode is the same alone, in a job array, or after other episodes. The first episode of a task
-    equals the protocol's bit for bit; a later one equals the episode that the protocol gives after new seeding.
+    random_state: Any
+    num_joint_samplers: int
+
+
+class LiberoEnvironment(SimulatedEnvironment):
+    """One LIBERO task. An initial state is one of the 50 that are stored with the task.
+
+    What a reset draws: a stored state holds joint positions and velocities, but cabinets, stoves and racks have no
+    joint. Every reset places them at random in small regions of the table (measured: up to 15 mm and 3 degrees apart),
+    with numbers of numpy's global generator; no step draws any. Two things decide these numbers:
+
+    - The state of the generator. The published loop of openpi seeds it once per task, so the furniture of episode i
+      depends on the i resets before it. This class keeps the state that each reset begins with. Episodes in order cost
+      nothing; one that is further ahead needs the resets in between once, without drawing.
+    - The number of earlier resets. Each one appends further samplers of the joints that the task begins with open or
+      switched on (28 of the 130 tasks) to a list of the environment, and every reset draws from all of them.
+
+    So every episode is the published one, alone, in a job array, or after others (`Seeding` has the evaluations).
     """
 
     def __init__(self, task: Task, settings: EnvironmentSettings) -> None:
@@ -66,7 +81,12 @@ class LiberoEnvironment(SimulatedEnvironment):
                 f"The installed LIBERO stores {len(self._initial_states)} initial states for '{task.name}' "
                 f"instead of {task.num_initial_states}; run 'make setup'."
             )
+        self._protocol = settings.protocol
         super().__init__(task, settings)
+        #: The samplers that one reset appends; the environment's construction has appended the first ones.
+        self._joint_samplers = tuple(self._simulator.object_property_initializers)
+        #: By the run's seed, with what the resets of episodes 0, 1, ... begin, as far as known.
+        self._reset_starts: dict[int, list[ResetStart]] = {}
 
     def _build(self, options: dict[str, Any]) -> Any:
         classes = load_libero(self._assets)
@@ -78,7 +98,36 @@ class LiberoEnvironment(SimulatedEnvironment):
         return self._construct(classes[problem], task_file, initialization_noise=None, **options)
 
     def _reset_seed(self, initial_state_index: int, seed: int) -> int:
-        return seed
+        return {"once per task": seed, "per episode": seed + initial_state_index, "always 0": 0}[self._protocol.seeding]
+
+    def missing_resets(self, initial_state_index: int, seed: int) -> int:
+        """Return how many resets the episode needs before its own; see `Environment.missing_resets`."""
+        if self._protocol.seeding != "once per task":
+            return 0
+        known = len(self._reset_starts.get(seed, ())) or 1
+        return max(0, initial_state_index - (known - 1))
+
+    def _reset_simulator(self, initial_state_index: int, seed: int) -> None:
+        if self._protocol.seeding != "once per task":
+            resets = self._protocol.earlier_resets + initial_state_index
+            self._reset_from(ResetStart(np.random.get_state(), (1 + resets) * len(self._joint_samplers)))  # noqa: NPY002
+            return
+        starts = self._reset_starts.setdefault(seed, [])
+        if not starts:
+            starts.append(ResetStart(np.random.get_state(), len(self._joint_samplers)))  # noqa: NPY002
+        while len(starts) <= initial_state_index:
+            starts.append(self._reset_from(starts[-1], can_draw=False))
+        following = self._reset_from(starts[initial_state_index])
+        if len(starts) == initial_state_index + 1:
+            starts.append(following)
+
+    def _reset_from(self, start: ResetStart, can_draw: bool = True) -> ResetStart:
+        """Reset with the random numbers of `start`; return with what the next reset begins."""
+        samplers = self._simulator.object_property_initializers
+        samplers[:] = itertools.islice(itertools.cycle(self._joint_samplers), start.num_joint_samplers)
+        np.random.set_state(start.random_state)  # noqa: NPY002
+        self._reset_once(can_draw)
+        return ResetStart(np.random.get_state(), len(samplers))  # noqa: NPY002
 
     def _set_initial_state(self, initial_state_index: int) -> None:
         simulation = self._simulator.sim

@@ -92,29 +92,28 @@ class CameraGate:
 class SimulatedEnvironment:
     """Base class of the environments; implements `Environment` except for the beginning of an episode.
 
-    A subclass builds the simulator, chooses the seed of a reset, sets the initial state after it, and lists the scene
-    objects.
+    A subclass builds the simulator, chooses the random numbers of a reset, sets the initial state after it, and lists
+    the scene objects.
     """
 
     def __init__(self, task: Task, settings: EnvironmentSettings) -> None:
         import_robosuite()
         self.task = task
-        self._image_size = settings.image_size
-        self._gate = CameraGate(settings.image_size, before_drawing=self._keep_moment)
+        self._image_size = settings.protocol.image_size
+        self._gate = CameraGate(self._image_size, before_drawing=self._keep_moment)
         self._digest: str | None = None
         self._moment: Any = None  # copy of the simulation data at the moment of the last pictures
         self._moment_is_kept = False
         self._closed = False
         with readable_device_choice(), seeded(0):
-            self._simulator = self._build(self._simulator_options(settings))
+            self._simulator = self._build(self._simulator_options())
         # Freeing an EGL context after EGL's own end prints errors at interpreter exit. atexit calls the functions in
         # reverse order, and `_build` made robosuite register EGL's end, so `close` runs before it.
         atexit.register(self.close)
         self.objects, self._roots = self._describe_objects()
 
-    @staticmethod
-    def _simulator_options(settings: EnvironmentSettings) -> dict[str, Any]:
-        """Options of the published LIBERO evaluation: a Panda arm, pose deltas of its gripper, two cameras."""
+    def _simulator_options(self) -> dict[str, Any]:
+        """Options of the published LIBERO evaluations: a Panda arm, pose deltas of its gripper, two cameras."""
         from robosuite.controllers import load_controller_config
 
         return {
@@ -126,8 +125,8 @@ class SimulatedEnvironment:
             "control_freq": CONTROL_FREQUENCY_HZ,
             "ignore_done": True,  # the rollout counts the steps
             "camera_names": list(CAMERAS),
-            "camera_heights": settings.image_size,
-            "camera_widths": settings.image_size,
+            "camera_heights": self._image_size,
+            "camera_widths": self._image_size,
         }
 
     def _construct(self, environment_class: Any, *arguments: Any, **options: Any) -> Any:
@@ -142,8 +141,12 @@ class SimulatedEnvironment:
         raise NotImplementedError
 
     def _reset_seed(self, initial_state_index: int, seed: int) -> int:
-        """Return the seed of the global generators during a reset."""
+        """Return the seed of the global generators at the beginning of `_reset_simulator`."""
         raise NotImplementedError
+
+    def _reset_simulator(self, initial_state_index: int, seed: int) -> None:
+        """Make the simulator's own reset; called with seeded generators, which `_reset_seed` chooses."""
+        self._reset_once()
 
     def _set_initial_state(self, initial_state_index: int) -> None:
         """Set the state with which the episode begins; called after the simulator's own reset."""
@@ -155,19 +158,9 @@ class SimulatedEnvironment:
 
     def reset(self, initial_state_index: int, seed: int) -> None:
         """Begin an episode; see `Environment.reset`. The subclass determines the use of `seed`."""
-        from robosuite.utils.errors import RandomizationError
-
         check_initial_state_index(self.task, initial_state_index)
         with seeded(self._reset_seed(initial_state_index, seed)):
-            while True:
-                # A reset frees the old drawing context, and OpenGL frees names in the current context. If the current
-                # context were another environment's, the pictures of that environment would break.
-                self._make_context_current()
-                try:
-                    self._simulator.reset()
-                    break
-                except RandomizationError:  # the objects did not fit; like the protocol, try again with further draws
-                    continue
+            self._reset_simulator(initial_state_index, seed)
             self._set_initial_state(initial_state_index)
         import mujoco
 
@@ -181,6 +174,25 @@ class SimulatedEnvironment:
         roots = {model.body_name2id(body): index_of[name] for name, bodies in self._roots.items() for body in bodies}
         self._background = index_of[BACKGROUND]
         self._owners = owners_of_bodies(model.body_parentid, roots, self._background)
+
+    def missing_resets(self, initial_state_index: int, seed: int) -> int:
+        """Return 0: no episode depends on another; see `Environment.missing_resets`."""
+        return 0
+
+    def _reset_once(self, can_draw: bool = True) -> None:
+        """Reset the simulator. Without `can_draw`, it gets no drawing context, whose making takes most of the time."""
+        from robosuite.utils.errors import RandomizationError
+
+        self._simulator.has_offscreen_renderer = can_draw
+        while True:
+            # A reset frees the old drawing context, and OpenGL frees names in the current context. If the current
+            # context were another environment's, the pictures of that environment would break.
+            self._make_context_current()
+            try:
+                self._simulator.reset()
+                return
+            except RandomizationError:  # the objects did not fit; like the protocol, try again with further draws
+                continue
 
     def _flat_state(self) -> NDArray[np.float64]:
         return np.asarray(self._simulator.sim.get_state().flatten(), dtype=np.float64)

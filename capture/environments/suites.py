@@ -9,7 +9,7 @@ from __future__ import annotations
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Suite, Task, check_task_id
 from vla_attention.schemas.errors import BadArgument, unknown_name
 
-#: Every suite. The numbers of steps are those of the published evaluations (see `episode_protocol.py`).
+#: Every suite. The numbers of steps are openpi's (see `episode_protocol.py`).
 SUITES: tuple[Suite, ...] = (
     Suite("libero_spatial", "libero", num_tasks=10, max_steps=220, initial_states_per_task=50),
     Suite("libero_object", "libero", num_tasks=10, max_steps=280, initial_states_per_task=50),
@@ -50,8 +50,8 @@ def make_environment(suite: Suite, task_id: int, settings: EnvironmentSettings) 
         MissingDependency: the simulator is not installed.
     """
     check_task_id(suite, task_id)
-    if settings.image_size < 1:
-        raise BadArgument(f"The image size is {settings.image_size}; it must be at least 1 pixel (published: 256).")
+    if settings.protocol.image_size < 1:
+        raise BadArgument(f"The image size is {settings.protocol.image_size}; it must be at least 1 pixel.")
     task = list_tasks(suite)[task_id]
     if suite.kind == "libero":
         from vla_attention.capture.environments.libero import LiberoEnvironment

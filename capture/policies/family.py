@@ -11,6 +11,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from vla_attention.capture.environments.episode_protocol import OPENPI, EvaluationProtocol
+
 if TYPE_CHECKING:
     from vla_attention.capture.policies.policy import Policy
 
@@ -70,6 +72,8 @@ class PolicyFamily:
     store_prefix: str
     #: the default of `--replan-steps`, for its help text
     replan_default: str
+    #: the evaluations that `--protocol` offers; each policy has one of them as its default
+    protocols: tuple[EvaluationProtocol, ...] = (OPENPI,)
     #: a note on further layer numbers, for the help text of `--layers`
     layers_note: str = ""
     #: checkpoints that come with the program and run without a GPU

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from vla_attention.capture.environments.base import Observation
+from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
 from vla_attention.capture.recording.attention import RowCollector
 from vla_attention.schemas.errors import unknown_name
 from vla_attention.schemas.layout import PatchGrid, Prompt, SiteLayout
@@ -70,6 +71,10 @@ class Policy(Protocol):
     @property
     def action_horizon(self) -> int:
         """Actions of one chunk."""
+
+    @property
+    def default_protocol(self) -> EvaluationProtocol:
+        """The published evaluation of policies of this kind."""
 
     @property
     def default_replan_steps(self) -> int:

@@ -22,12 +22,16 @@ _OPTIONS = {
     "STAGE": "--stage",
 }
 _WHOLE_NUMBERS = {
-    "TASK_ID": "--task-id",
     "NUM_EPISODES": "--num-episodes",
     "SEED": "--seed",
     "REPLAN_STEPS": "--replan-steps",
     "MAX_REQUEUES": "--max-requeues",
 }
+#: Variable, option, and what is expected.
+_SEVERAL_NUMBERS = (
+    ("TASK_ID", "--task-id", "a whole number, or several separated by spaces"),
+    ("LAYERS", "--layers", 'layer numbers separated by spaces, as in LAYERS="25 26 27"'),
+)
 _SWITCH = {"1": True, "true": True, "yes": True, "": False, "0": False, "false": False, "no": False}
 
 
@@ -48,13 +52,12 @@ def arguments_from_environment(environment: Mapping[str, str], family: PolicyFam
             if not given[name].isdecimal():
                 raise BadArgument(f"{name} is '{given[name]}'; expected a whole number.")
             arguments += [option, given[name]]
-    if get("LAYERS"):
-        layers = given["LAYERS"].split()
-        if not all(layer.isdecimal() for layer in layers):
-            raise BadArgument(
-                f"LAYERS is '{given['LAYERS']}'; expected layer numbers separated by spaces, as in LAYERS=\"25 26 27\"."
-            )
-        arguments += ["--layers", *layers]
+    for name, option, described in _SEVERAL_NUMBERS:
+        numbers = given.get(name, "").split()
+        if not all(number.isdecimal() for number in numbers):
+            raise BadArgument(f"{name} is '{given[name]}'; expected {described}.")
+        if numbers:
+            arguments += [option, *numbers]
     arguments += _family_arguments(given, family)
     save_viz = _SWITCH.get(get("SAVE_VIZ", "").lower())
     if save_viz is None:

@@ -23,7 +23,7 @@ from vla_attention.capture.command_line import check_writable, run_capture_comma
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
-from vla_attention.schemas.errors import BadArgument, unknown_name
+from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.layers import select_layers
 from vla_attention.schemas.threads import Threads, use_threads
 
@@ -118,16 +118,17 @@ def _jobs(arguments: argparse.Namespace) -> list[_Job]:
             f"Cannot put the suites of '{ALL_SUITES}' into one store, {arguments.store}: a store holds one suite; "
             "leave --store out (each suite gets its own in --output-dir)."
         )
-    task_id: int | None = arguments.task_id
+    task_ids: list[int] | None = arguments.task_id
     of_array: list[tuple[str, int]] = []
     if arguments.array_index is not None:
         suite, task_id = _task_of_array_index(arguments, suites)
+        task_ids = [task_id]
         of_array = [place for index in array_task_ids() if (place := _place(index, suites)) is not None]
         suites = (suite,)
     jobs = []
     for suite in suites:
         one = copy.copy(arguments)
-        one.task_suite, one.task_id = suite, task_id
+        one.task_suite, one.task_id = suite, task_ids
         given = arguments.output_dir
         if given is None:
             one.output_dir = Path("results") / f"attention_ratio_{arguments.family.store_prefix}{suite}"
@@ -149,8 +150,8 @@ def _task_of_array_index(arguments: argparse.Namespace, suites: Sequence[str]) -
 
     if arguments.task_id is not None:
         raise BadArgument(
-            f"Cannot run task {arguments.task_id} and array index {arguments.array_index}: in an array the index is "
-            "the task; give --task-id (TASK_ID) or --array, not both."
+            f"Cannot run task {listing(arguments.task_id)} and array index {arguments.array_index}: in an array the "
+            "index is the task; give --task-id (TASK_ID) or --array, not both."
         )
     place = _place(arguments.array_index, suites)
     if place is not None:
@@ -205,7 +206,7 @@ def _analyze(job: _Job, script: PublishedScript) -> int:
     layers, typed = _layers(arguments.layers, script.layers, root.policy.num_layers, root.policy.family)
     more = [] if layers is None else ["--layers", *map(str, layers)]
     if arguments.task_id is not None:
-        more += ["--tasks", str(arguments.task_id)]
+        more += ["--tasks", *map(str, arguments.task_id)]
     if not (typed and job.default_output):
         return run_analysis(arguments, store, job.output, more)
     # In the published default folder, each group of layers keeps its results in a folder of its own. The default folder

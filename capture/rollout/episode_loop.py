@@ -115,6 +115,11 @@ class EpisodeLoop:
             self._position = f"{name} at step {step}"
             self._progress.update(step, replans)
 
+        missing = environment.missing_resets(episode, self.store.attributes.protocol.seed)
+        if missing:
+            self._progress.say(
+                f"{name}: the published furniture depends on the resets of earlier episodes; making {missing} first."
+            )
         self._position = f"{name} at step 0"
         with self.termination.only_at_checks():
             result = record_episode(

@@ -106,13 +106,19 @@ class Recording:
 
 @dataclass(frozen=True)
 class Protocol:
-    """How episodes are run. It is the same for all episodes of a run."""
+    """How episodes are run. It is the same for all episodes of a run.
 
+    `name` is the published evaluation that is followed (openpi, lerobot or cosmos): it decides how resets are seeded.
+    `image_size` is the height and width of the simulator's pictures in pixels. `docs/protocol.md` has the details.
+    """
+
+    name: str
     suite: str
     seed: int
     wait_steps: int
     replan_steps: int
     max_steps: int
+    image_size: int
 
 
 @dataclass(frozen=True)

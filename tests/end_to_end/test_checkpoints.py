@@ -68,7 +68,12 @@ def test_a_checkpoint_drives_the_simulator_and_its_store_is_analysed(name, small
     assert facts["configuration"] == "case.json beside the checkpoint"
     assert facts["dtype"] == "float32"
     assert facts["config"]["siglip"]["image_size"] == 56
-    assert attributes["protocol"]["replan_steps"] == 5
+    protocol = attributes["protocol"]
+    # A checkpoint is evaluated as in its own ecosystem; the number of executed actions is that of the checkpoint.
+    expected = ("lerobot", 1000, 360) if checkpoint_format == "lerobot" else ("openpi", 7, 256)
+    assert (protocol["name"], protocol["seed"], protocol["image_size"]) == expected
+    assert protocol["replan_steps"] == 5
+    assert f"Protocol: {expected[0]} (docs/protocol.md), seed {expected[1]}, pictures of {expected[2]} pix" in said.out
 
     episode = zarr.open_group(store / "episodes/task000_episode000", mode="r")
     camera = policy["cameras"][0]["name"]
@@ -80,6 +85,17 @@ def test_a_checkpoint_drives_the_simulator_and_its_store_is_analysed(name, small
         assert prompt_read["pieces"][-1]["stop"] < len(prompt_read["text"])
     assert analyze([str(store), "--output", str(tmp_path / "results"), "--no-plots"]) == 0
     assert analyze(["verify", str(store)]) == 0
+    covered = episode[f"objects/{camera}"][:]
+    np.testing.assert_allclose(covered.sum(axis=-1), 1, atol=1e-5)
+
+    capsys.readouterr()
+    assert analyze([str(store), "--list"]) == 0
+    assert f"protocol {expected[0]}, seed {expected[1]}, pictures of {expected[2]} pixels" in capsys.readouterr().out
+    other = "openpi" if expected[0] == "lerobot" else "lerobot"
+    resumed = ["--resume", "--protocol", other, "--seed", expected[1]]
+    assert f"its protocol.name is '{expected[0]}', this run's is '{other}'" in refused(
+        ["--checkpoint", GOLDEN / name, *arguments, *resumed], capsys
+    )
 
 
 def test_the_three_formats_of_one_model_have_one_digest(small_tokenizer):

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Mapping
 from typing import Any
 
+from vla_attention.capture.environments.episode_protocol import OPENPI
 from vla_attention.capture.policies.family import ParityCases, PolicyFamily
 
 
@@ -36,6 +37,7 @@ def make_toy_policy(checkpoint: str, size: int) -> Any:
         sites = (layout,)
         num_layers, num_heads, num_denoise_steps = 1, 2, 1
         action_horizon = num_action_queries = size
+        default_protocol = OPENPI
         default_replan_steps = 2
         cameras = (PolicyCameraView("view", source="agentview", upright=True, mirrored=False),)
 

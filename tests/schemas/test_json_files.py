@@ -78,7 +78,9 @@ def test_root_attributes_validate():
         format="vla-attention",
         format_version=2,
         policy=policy,
-        protocol=Protocol("libero_10", seed=7, wait_steps=10, replan_steps=5, max_steps=520),
+        protocol=Protocol(
+            suite="libero_10", seed=7, wait_steps=10, replan_steps=5, max_steps=520, name="openpi", image_size=256
+        ),
         recording=Recording((7,), (25,), (0, 9), tuple(range(8)), "mean", 10, 10),
         sites=(layout,),
         provenance={"python": "3.11"},

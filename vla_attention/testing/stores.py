@@ -164,7 +164,13 @@ def root_attributes(spec: StoreSpec) -> RootAttributes:
             config={"width": 8, "scale": 0.5},
         ),
         protocol=Protocol(
-            suite=spec.suite, seed=spec.seed, wait_steps=10, replan_steps=5, max_steps=5 * spec.num_replans
+            suite=spec.suite,
+            seed=spec.seed,
+            wait_steps=10,
+            replan_steps=5,
+            max_steps=5 * spec.num_replans,
+            name="openpi",
+            image_size=256,
         ),
         recording=Recording(
             layers=spec.layers,

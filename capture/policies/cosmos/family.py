@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from vla_attention.capture.policies.cosmos.protocol import COSMOS
 from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedScript
 from vla_attention.capture.policies.model_arguments import UNTRAINED, add_model_arguments
 from vla_attention.schemas.errors import BadArgument
@@ -116,6 +117,7 @@ FAMILY = PolicyFamily(
     build=_build,
     store_prefix="cosmos_",
     replan_default="--num-open-loop-steps",
+    protocols=(COSMOS,),
     untrained=UNTRAINED,
     analysis_arguments=_analysis_arguments,
     parity=ParityCases(recognises=_is_cosmos_case, run=_run_parity),

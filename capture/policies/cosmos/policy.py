@@ -16,6 +16,7 @@ from vla_attention.capture.policies.cosmos.latents import action_shares, query_p
 from vla_attention.capture.policies.cosmos.layout import CROSS, SELF, cameras, self_roles
 from vla_attention.capture.policies.cosmos.model import CosmosModel, Recorders
 from vla_attention.capture.policies.cosmos.preprocess import Statistics, model_picture, proprio_of, upright
+from vla_attention.capture.policies.cosmos.protocol import COSMOS
 from vla_attention.capture.policies.cosmos.sampler import flow_time
 from vla_attention.capture.policies.cosmos.text import TextSource
 from vla_attention.capture.policies.identity import PolicySource, describe_policy
@@ -72,6 +73,7 @@ class CosmosPolicy:
         self.num_heads = config.dit.num_heads
         self.num_denoise_steps = len(model.levels)
         self.action_horizon = config.chunk_size
+        self.default_protocol = COSMOS
         self.default_replan_steps = open_loop_steps
         self.num_action_queries = config.tokens_per_frame
         self.cameras = cameras(config)

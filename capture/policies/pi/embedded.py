@@ -10,13 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vla_attention.capture.environments.episode_protocol import OPENPI_REPLAN_STEPS
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.pi.config import GemmaConfig, PiConfig, SiglipConfig, find_variant
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.model_weights import expected_shapes, model_from_state
 from vla_attention.capture.policies.pi.policy import PiPolicy
 from vla_attention.capture.policies.pi.preprocess import NormStats, Statistics
-from vla_attention.capture.policies.pi.processing import OPENPI_REPLAN_STEPS, OpenpiProcessing
+from vla_attention.capture.policies.pi.processing import OpenpiProcessing
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
 from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.capture.policies.strict_loading import Shapes

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vla_attention.capture.environments.episode_protocol import LEROBOT, OPENPI
 from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedScript
 from vla_attention.capture.policies.model_arguments import UNTRAINED, add_model_arguments
 
@@ -89,6 +90,7 @@ FAMILY = PolicyFamily(
     build=_build,
     store_prefix="",
     replan_default="5 for openpi, n_action_steps for LeRobot",
+    protocols=(OPENPI, LEROBOT),
     layers_note="; also the published scripts' numbers 18..35 (25 = block 7)",
     untrained=UNTRAINED,
     parity=ParityCases(
@@ -101,5 +103,6 @@ FAMILY = PolicyFamily(
         program="evaluate-attention-ratio",
         checkpoint="~/.cache/openpi/openpi-assets/checkpoints/pi05_libero",
         layers=(25, 26, 27),
+        variables={"PROTOCOL": "--protocol"},
     ),
 )

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from vla_attention.capture.environments.episode_protocol import LEROBOT
 from vla_attention.capture.policies.pi.lerobot_config import IMAGES, LerobotConfig, UnsupportedLerobotFeature
 from vla_attention.capture.policies.pi.lerobot_pipeline import LerobotPipeline
 from vla_attention.capture.policies.pi.preprocess import ENVIRONMENT_ACTION_DIM
@@ -74,6 +75,7 @@ class LerobotProcessing:
                     "made for another robot."
                 )
         self.pipeline = pipeline
+        self.protocol = LEROBOT
         self.default_replan_steps = config.n_action_steps
         self.cut_long_prompts = pipeline.cut_long_prompts
         self.environment_cameras: Mapping[str, str] = {

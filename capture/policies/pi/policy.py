@@ -76,6 +76,7 @@ class PiPolicy:
         self.num_denoise_steps = config.num_denoise_steps
         self.action_horizon = config.action_horizon
         self.num_action_queries = config.action_horizon
+        self.default_protocol = processing.protocol
         self.default_replan_steps = processing.default_replan_steps
         self.cameras = tuple(
             PolicyCameraView(name, source=processing.environment_cameras[name], upright=True, mirrored=True)

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from vla_attention.capture.environments.episode_protocol import OPENPI, OPENPI_REPLAN_STEPS, EvaluationProtocol
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.preprocess import NormalisationMode, NormStats, environment_actions, model_image
 from vla_attention.capture.policies.pi.tokenizer import PromptFormat
@@ -23,9 +24,6 @@ CAMERA_OF_SLOT = {"base_0_rgb": "agentview", "left_wrist_0_rgb": "robot0_eye_in_
 
 #: Numbers of the state in both ecosystems: position, axis-angle, two finger joints.
 STATE_DIM = 8
-
-#: Actions that openpi's LIBERO client executes of each chunk.
-OPENPI_REPLAN_STEPS = 5
 
 
 class Processing(Protocol):
@@ -42,6 +40,10 @@ class Processing(Protocol):
     @property
     def environment_cameras(self) -> Mapping[str, str]:
         """Slot of the model -> camera of the environment; other slots are black and masked."""
+
+    @property
+    def protocol(self) -> EvaluationProtocol:
+        """The ecosystem's own evaluation."""
 
     @property
     def default_replan_steps(self) -> int:
@@ -78,6 +80,7 @@ class OpenpiProcessing:
         replan_steps: int = OPENPI_REPLAN_STEPS,
     ):
         norm_stats.check(normalisation, STATE_DIM, config.action_dim)
+        self.protocol = OPENPI
         self.norm_stats = norm_stats
         self.normalisation = normalisation
         self.relative_actions = relative_actions

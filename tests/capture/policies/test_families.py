@@ -33,6 +33,9 @@ class StubEnvironment:
     def reset(self, initial_state_index: int, seed: int) -> None:
         self.steps = 100 * initial_state_index
 
+    def missing_resets(self, initial_state_index: int, seed: int) -> int:
+        return initial_state_index
+
     def step(self, action: np.ndarray, observe: bool) -> StepResult:
         self.steps += 1
         if not observe:
@@ -62,6 +65,9 @@ def test_a_third_family_captures_and_is_analysed(tmp_path, capfd):
     printed = capfd.readouterr().out
     assert "Checkpoint: toy in format toy, configuration: built in; cameras view = agentview." in printed
     assert "A policy call gives 3 actions, of which 2 are executed." in printed
+    assert "Protocol: openpi (docs/protocol.md), seed 7, pictures of 256 pixels, 10 waiting steps, at most 6" in printed
+    furniture = "task000_episode001: the published furniture depends on the resets of earlier episodes; making 1 first."
+    assert furniture in printed
     store = tmp_path / "toy_robosuite.zarr"
     policy = dict(zarr.open_group(store, mode="r").attrs)["policy"]
     assert (policy["family"], policy["checkpoint"], policy["config"]["size"]) == ("toy", "toy-weights", 3)
@@ -73,6 +79,23 @@ def test_a_third_family_captures_and_is_analysed(tmp_path, capfd):
     assert steps.height == 6
     assert (tmp_path / "attention_ratio_results_robosuite.json").is_file()
     assert "seen / read" in printed
+
+
+@pytest.mark.usefixtures("toy_is_registered")
+def test_several_tasks_fill_one_store_and_their_status_is_theirs(tmp_path, capfd):
+    """`--task-id 2 0` runs both, `status` expects both, and a task more joins with --resume."""
+    store = tmp_path / "toy.zarr"
+    arguments = ["toy", "--num-episodes", "1", "--max-steps", "2", "--no-contributions", "--store", str(store)]
+    assert main([*arguments, "--task-id", "2", "0"]) == 0
+    assert sorted(path.name for path in (store / "episodes").glob("task*")) == [
+        "task000_episode000",
+        "task002_episode000",
+    ]
+    assert main([*arguments, "--task-id", "2", "3", "0", "--resume"]) == 0
+    assert "2 of 3 episodes are complete already; 1 to run." in capfd.readouterr().out
+    assert main(["status", str(store), "--check", "--json"]) == 0
+    tasks = json.loads(capfd.readouterr().out)[0]["tasks"]
+    assert [task["task_id"] for task in tasks if task["committed"] == task["expected"] == 1] == [0, 2, 3]
 
 
 @pytest.mark.usefixtures("toy_is_registered")

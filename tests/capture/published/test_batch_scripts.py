@@ -122,6 +122,7 @@ def test_variables_become_the_options_that_they_name():
         "--save-viz",
         *("--max-steps", "10"),
     ]
+    assert arguments(TASK_ID="0 3", PROTOCOL="lerobot") == ["--task-id", "0", "3", "--protocol", "lerobot"]
     assert arguments(CKPT_PATH="a b") == ["--checkpoint", "a b"]
     assert arguments(COSMOS, TEXT_FRAME="frame0") == ["--text-frame", "frame0"]
 
@@ -139,6 +140,7 @@ def test_a_job_with_a_real_checkpoint_needs_a_gpu():
     [
         {"SAVE_VIZ": "maybe"},
         {"TASK_ID": "-1"},
+        {"TASK_ID": "0,3"},
         {"NUM_EPISODES": "five"},
         {"QUERY_FRAME": "action"},
         {"CHECKPOINT": "a", "CKPT_PATH": "b"},
@@ -164,6 +166,7 @@ def test_the_log_begins_with_the_job():
         (["--task-suite", "all", "--array-index", "40"], "--array=0-39"),
         (["--array-index", "1", "--task-id", "1"], "in an array the index is the task"),
         (["--task-id", "11"], "its tasks are 0 to 9"),
+        (["--task-id", "3", "11"], "Task 11 does not exist"),
         (["--layers", "3.5"], "invalid int value"),
         (["--stage", "analyze"], "There is no store at"),
         (["--stage", "plot"], "invalid choice"),

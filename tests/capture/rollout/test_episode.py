@@ -47,6 +47,9 @@ class FakeEnvironment:
     def reset(self, initial_state_index: int, seed: int) -> None:
         self.start = (initial_state_index, seed)
 
+    def missing_resets(self, initial_state_index: int, seed: int) -> int:
+        return 0
+
     def step(self, action: np.ndarray, observe: bool) -> StepResult:
         self.actions.append(np.asarray(action))
         number = len(self.actions)
@@ -96,7 +99,14 @@ class FakeStore:
     """Keeps the replans of its one episode."""
 
     def __init__(self, **changes: int) -> None:
-        values = {"seed": 7, "wait_steps": WAIT_STEPS, "replan_steps": 3, "max_steps": 8} | changes
+        values = {
+            "seed": 7,
+            "wait_steps": WAIT_STEPS,
+            "replan_steps": 3,
+            "max_steps": 8,
+            "name": "openpi",
+            "image_size": 4,
+        } | changes
         self.attributes = SimpleNamespace(
             protocol=Protocol(suite="made_up", **values),
             recording=Recording((0,), (0,), (1,), (0, 1), "mean", 1, 10, frames=False),
@@ -182,11 +192,21 @@ def test_an_error_of_the_check_drops_the_episode() -> None:
 
 @pytest.mark.parametrize(("replan_steps", "max_steps", "message"), [(5, 8, "expected 1 to 4"), (4, 0, "at least 1")])
 def test_a_policy_must_be_able_to_follow_the_protocol(replan_steps: int, max_steps: int, message: str) -> None:
-    protocol = Protocol("made_up", seed=7, wait_steps=10, replan_steps=replan_steps, max_steps=max_steps)
+    protocol = Protocol(
+        suite="made_up",
+        seed=7,
+        wait_steps=10,
+        replan_steps=replan_steps,
+        max_steps=max_steps,
+        name="openpi",
+        image_size=4,
+    )
     with pytest.raises(BadArgument, match=message):
         check_protocol(protocol, FakePolicy())
 
 
 def test_the_largest_number_of_replans() -> None:
-    protocol = Protocol("made_up", seed=7, wait_steps=10, replan_steps=5, max_steps=520)
+    protocol = Protocol(
+        suite="made_up", seed=7, wait_steps=10, replan_steps=5, max_steps=520, name="openpi", image_size=256
+    )
     assert max_replans(protocol) == 104

@@ -129,7 +129,7 @@ def test_a_later_format(path):
         ({"format_version": 1}, "format version 1, whose seals do not bind .*capture the episodes again"),
         ({"format_version": "1"}, "expected a whole number from 2"),
         ({"policy": "pi0.5"}, r"\$\.policy is str; expected dict"),
-        ({"protocol": {}}, r"\$\.protocol lacks the field 'suite'"),
+        ({"protocol": {}}, r"\$\.protocol lacks the field 'name'"),
         (
             {"sites": [{"name": "joint", "spans": [{"name": "a", "kind": "image", "start": 3, "stop": 5}]}]},
             "gap or overlap",
