@@ -9,7 +9,7 @@ from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.layers import LayerSelection, block_of_labels, select_layers
 from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
-from vla_attention.schemas.stores.store_format import RootAttributes, StoreError, parse_episode_name
+from vla_attention.schemas.stores.store_format import CorruptEpisode, RootAttributes, StoreError, parse_episode_name
 
 
 @dataclass(frozen=True)
@@ -147,6 +147,8 @@ def select_episodes(store: Store, tasks: Sequence[int] | None) -> tuple[StoredEp
 
 def check_combinable(stores: Sequence[Store]) -> None:
     """Raise unless several stores can be analysed as one: same policy and recording, and no episode twice."""
+    for store in stores:
+        _check_root(store)
     first = stores[0]
     seen: dict[tuple[str, str], Store] = {}
     for store in stores:
@@ -166,3 +168,17 @@ def check_combinable(stores: Sequence[Store]) -> None:
                     f"Stores {other.path} and {store.path} both hold {episode.name} of {store.suite}; analyse them one "
                     "at a time."
                 )
+
+
+def _check_root(store: Store) -> None:
+    """Raise `CorruptEpisode` unless an episode is of the run that the store's root describes; one seal is enough."""
+    problems = []
+    for episode in store.episodes:
+        try:
+            _ = episode.seal
+        except CorruptEpisode as error:
+            problems.append(error)
+        else:
+            return
+    if problems:
+        raise problems[0]

@@ -52,11 +52,11 @@ class SealedArrayStore(Store):
                 return part
         content = self._files.whole(file)
         if shard is None:
-            self._check_frame(content, file)
+            self._check_frame(content[:-CHECKSUM_BYTES], file)
         else:
             for offset, length in shard.index.tolist():
                 if length:
-                    self._check_frame(content[offset : offset + length], file)
+                    self._check_frame(content[offset : offset + length - CHECKSUM_BYTES], file)
         return _cut(content, byte_range)
 
     def _part(self, shard: SealedShard, wanted: ByteRequest) -> bytes | None:
@@ -67,17 +67,17 @@ class SealedArrayStore(Store):
             at = np.flatnonzero(shard.index[:, 0] == wanted.start)
             for number in at.tolist():
                 if shard.index[number].sum() == wanted.end:
-                    content = shard.chunk(number)
-                    self._check_frame(content, shard.file)
-                    return content
+                    frame = shard.chunk(number)
+                    self._check_frame(frame, shard.file)
+                    return frame + shard.checksum(number)
         return None
 
-    def _check_frame(self, content: bytes, file: str) -> None:
-        """Compare the sizes in the header of an encoded chunk, which has its checksum at the end, with the array's."""
+    def _check_frame(self, frame: bytes, file: str) -> None:
+        """Compare the sizes in the header of an encoded chunk, without its checksum, with those of the array."""
         if self._expected is None:
             return
         try:
-            check_blosc_frame(content[:-CHECKSUM_BYTES], *self._expected)
+            check_blosc_frame(frame, *self._expected)
         except CorruptEpisode as error:
             raise CorruptEpisode(f"a chunk of its {file} cannot be decoded: {error}") from None
 

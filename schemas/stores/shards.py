@@ -119,7 +119,7 @@ class SealedShard:
             raise CorruptEpisode(f"its {file} cannot be read: {error}") from None
 
     def chunk(self, number: int) -> bytes:
-        """The encoded bytes of one chunk, with the checksum at their end.
+        """The encoded bytes of one chunk, without the checksum that follows them in the file.
 
         Raises:
             CorruptEpisode: the chunk is missing, its checksum is not the one in the seal, or not that of its bytes.
@@ -127,17 +127,23 @@ class SealedShard:
         offset, length = (int(value) for value in self.index[number])
         if length <= CHECKSUM_BYTES:
             raise CorruptEpisode(f"its {self.file} lacks chunk {number}: it is missing")
+        length -= CHECKSUM_BYTES
         try:
             with self.path.open("rb", buffering=0) as opened:
-                stored = os.pread(opened.fileno(), length, offset)
+                # Two reads: taking the checksum off the end of one would copy the chunk.
+                encoded = os.pread(opened.fileno(), length, offset)
+                checksum = os.pread(opened.fileno(), CHECKSUM_BYTES, offset + length)
         except OSError as error:
             raise CorruptEpisode(f"its {self.file} cannot be read: {error.strerror or error}") from None
-        sealed = self.checksums[CHECKSUM_BYTES * number : CHECKSUM_BYTES * (number + 1)]
-        if len(stored) != length or stored[-CHECKSUM_BYTES:] != sealed:
+        if len(encoded) != length or checksum != self.checksum(number):
             raise CorruptEpisode(f"chunk {number} of its {self.file} does not agree with its seal")
-        if google_crc32c.value(stored[:-CHECKSUM_BYTES]) != int.from_bytes(sealed, "little"):
+        if google_crc32c.value(encoded) != int.from_bytes(checksum, "little"):
             raise CorruptEpisode(f"the checksum of chunk {number} of its {self.file} does not fit")
-        return stored
+        return encoded
+
+    def checksum(self, number: int) -> bytes:
+        """The checksum of one chunk, from the seal."""
+        return self.checksums[CHECKSUM_BYTES * number : CHECKSUM_BYTES * (number + 1)]
 
 
 def check_blosc_frame(frame: bytes, decoded_bytes: int, typesize: int) -> None:
@@ -217,7 +223,7 @@ class ShardedLayers:
         values = np.empty((self.shape[0], *self.shape[3:]), dtype=np.float32)
         chunk = np.empty((self.replans_per_shard, *self.shape[3:]), dtype="<f4")
         for i, shard in enumerate(self._shards):
-            frame = shard.chunk(number)[:-CHECKSUM_BYTES]
+            frame = shard.chunk(number)
             try:
                 check_blosc_frame(frame, chunk.nbytes, chunk.itemsize)
                 blosc.decompress(frame, chunk)
