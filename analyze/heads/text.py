@@ -100,8 +100,8 @@ def _ranking(study: HeadStudy, top: int) -> str:
     )
     if grouping.ratio is not None:
         note = (
-            "ratio: geometric mean over replans and episodes. lift: ratio / uniform ratio, 1 = uniform attention. "
-            + note
+            "ratio: geometric mean over replans and episodes. lift: the same of ratio / uniform ratio, 1 = uniform "
+            "attention. " + note
         )
         left_out = int(study.heads.cells.unique(["block", "head"])["num_nonfinite"].sum())
         if left_out:
@@ -167,7 +167,10 @@ def _layers(study: HeadStudy) -> str:
     grouping = study.question.grouping
     level = overall_rows(study.tasks).filter(pl.col("layer") != LAYERS_AVG)
     labels = [str(layer) for layer in level.cells["layer"]]
-    return "\n".join([heading("LAYERS  mean over heads"), _profile(level, "layer", "layer", labels, grouping)])
+    lines = [heading("LAYERS  mean over heads"), _profile(level, "layer", "layer", labels, grouping)]
+    if grouping.ratio is not None:
+        lines += wrap("ratio, uniform, lift: means over replans and episodes, the last of ratio / uniform.")
+    return "\n".join(lines)
 
 
 def _profile(level: Tables, along: str, label: str, labels: Sequence[str], grouping: Grouping) -> str:

@@ -14,10 +14,15 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.contributions import joint_norm, selected_gram
+from vla_attention.analyze.measures.contribution_ratios import (
+    contribution_rows,
+    episode_means,
+    joint_norm,
+    ratio_columns,
+    selected_gram,
+    uniform_weights,
+)
 from vla_attention.analyze.measures.frames import (
-    EPISODE_ID,
-    LAYERS_AVG,
     Tables,
     concat_tables,
     denoise_axis,
@@ -25,11 +30,8 @@ from vla_attention.analyze.measures.frames import (
     long_table,
     replan_axis,
 )
-from vla_attention.analyze.measures.masses import ratio
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.statistics.bootstrap import POSITIVE
-from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
 from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 from vla_attention.schemas.segments import segment_members, weights_on_segments
@@ -63,7 +65,7 @@ def group_contribution_tables(question: Question, resolved: Sequence[ResolvedGro
     Returns:
         cells: suite, task_id, episode_index, replan, env_step, layer, block, denoise_step; when the grouping has a
             ratio of groups that can be measured, numerator_norm, denominator_norm (of the vector sum of a side's
-            groups) and contribution_ratio, their quotient.
+            groups), contribution_ratio, their quotient, uniform_ratio and ratio_lift (see `contribution_ratios`).
         groups: the same names, group, norm; of every group that is made of whole segments in all episodes.
     """
     if not all(store.attributes.recording.contributions for store in question.stores):
@@ -85,15 +87,17 @@ def group_contribution_tables(question: Question, resolved: Sequence[ResolvedGro
 
 def _episode_norms(item: SelectedEpisode, parts: Mapping[str, NDArray[np.bool_]], question: Question) -> Tables:
     selection, grouping = question.selection, question.grouping
-    gram = selected_gram(item.episode, question.site, selection)
+    gram = selected_gram(item, question.site, selection)
     norms = np.stack([joint_norm(gram, taken) for taken in parts.values()], axis=-1)
     sides: dict[str, NDArray[np.float64]] = {}
     if grouping.ratio is not None and {*grouping.ratio.numerator, *grouping.ratio.denominator} <= parts.keys():
+        uniform = uniform_weights(item, question.site, selection)
         above, below = (
-            joint_norm(gram, np.any([parts[name] for name in side], axis=0))
+            (joint_norm(gram, taken), joint_norm(gram, taken, uniform))
             for side in (grouping.ratio.numerator, grouping.ratio.denominator)
+            for taken in [np.any([parts[name] for name in side], axis=0)]
         )
-        sides = {"numerator_norm": above, "denominator_norm": below, "contribution_ratio": ratio(above, below)}
+        sides = {"numerator_norm": above[0], "denominator_norm": below[0], **ratio_columns(above, below)}
     axes = [replan_axis(item), layer_axis(selection), denoise_axis(selection)]
     return Tables(
         long_table(item, axes, sides),
@@ -101,34 +105,16 @@ def _episode_norms(item: SelectedEpisode, parts: Mapping[str, NDArray[np.bool_]]
     )
 
 
-def _episode_means(table: pl.DataFrame, measure: pl.Expr, *by: str) -> pl.DataFrame:
-    """Means over replans and denoise steps, one row per (episode, layer or "layers_avg", `by`); `layer` is a string.
-
-    A block that was named by two layer numbers counts once in "layers_avg".
-    """
-    once = table.select("layer", "block").unique(maintain_order=True).unique("block", keep="first")["layer"]
-    layers = table.group_by(*EPISODE_ID, "layer", *by, maintain_order=True).agg(measure)
-    average = table.filter(pl.col("layer").is_in(once.implode())).group_by(*EPISODE_ID, *by, maintain_order=True)
-    return pl.concat(
-        [
-            layers.with_columns(pl.col("layer").cast(pl.String)),
-            average.agg(measure).with_columns(pl.lit(LAYERS_AVG).alias("layer")).select(layers.columns),
-        ]
-    )
-
-
 def norms_by_layer(tables: Tables) -> dict[tuple[str, str], float]:
     """By (layer, group): mean over episodes of the mean norm."""
-    episodes = pl.concat([_episode_means(part.groups, pl.col("norm").mean(), "group") for part in tables.parts])
+    episodes = pl.concat([episode_means(part.groups, pl.col("norm").mean(), by=("group",)) for part in tables.parts])
     means = episodes.group_by("layer", "group", maintain_order=True).agg(pl.col("norm").mean())
     return {(layer, group): norm for layer, group, norm in means.iter_rows()}
 
 
 def ratios_by_layer(cells: pl.DataFrame, seed: int) -> dict[str, dict[str, Any]]:
-    """By layer: mean over episodes of the mean ratio of norms, with its interval; empty without a ratio."""
+    """By layer the rows of `contribution_ratios.contribution_rows`; empty without a ratio."""
     if "contribution_ratio" not in cells.columns:
         return {}
-    finite = pl.col("contribution_ratio").filter(pl.col("contribution_ratio").is_finite())
-    episodes = _episode_means(cells, finite.mean())
-    means = means_with_intervals(episodes, ["layer"], {"contribution_ratio": POSITIVE}, seed)
-    return {row["layer"]: row for row in means.iter_rows(named=True)}
+    rows = contribution_rows(cells, "numerator_norm", "denominator_norm", seed)
+    return {row["layer"]: row for row in rows.iter_rows(named=True)}

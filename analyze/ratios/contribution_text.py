@@ -2,36 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import polars as pl
 
-from vla_attention.analyze.measures.contributions import contribution_rows
+from vla_attention.analyze.measures.contribution_ratios import contribution_rows
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables
 from vla_attention.analyze.measures.group_contributions import norms_by_layer, ratios_by_layer
 from vla_attention.analyze.show.headings import heading, wrap
-from vla_attention.analyze.show.numbers import format_interval, format_number, interval_name
+from vla_attention.analyze.show.numbers import format_number, interval_name, row_interval
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
 
+_RATIO_HEADER = ("mean", interval_name(DEFAULT_LEVEL), "of means", "geom.", "uniform", "lift", "interval")
+_RATIO_NOTE = (
+    "mean: over episodes, of the mean ratio of norms, with its interval. of means: mean norm / mean norm. geom.: "
+    "geometric mean of the ratios. uniform: the ratio that the same values would give if attention were shared out "
+    "between the segments as uniform attention is. lift: mean of ratio / uniform, with its interval."
+)
+
 
 def contributions_section(table: pl.DataFrame, seed: int) -> str:
-    """The summary's section: `contribution_rows` as text."""
+    """The summary's section: `contribution_rows` of both sides as text."""
     rows = [
-        [
-            row["layer"],
-            *(format_number(row[column]) for column in ("visual_norm", "linguistic_norm", "ratio")),
-            format_interval(row["ratio_low"], row["ratio_high"]),
-        ]
-        for row in contribution_rows(table, seed).iter_rows(named=True)
+        [row["layer"], format_number(row["visual_norm"]), format_number(row["linguistic_norm"]), *_ratio_cells(row)]
+        for row in contribution_rows(table, "visual_norm", "linguistic_norm", seed).iter_rows(named=True)
     ]
     title = "CONTRIBUTIONS  |visual| / |linguistic|, norms of what the keys add to the residual stream"
     note = (
         "Value-weighted, through output projection and gate; root mean square over action queries, mean over replans "
-        "and denoise steps. ratio: mean over episodes of the mean ratio of norms. Norms of different sites may be "
-        "divided; masses may not."
+        f"and denoise steps. Norms of different sites may be divided; masses may not. {_RATIO_NOTE}"
     )
-    header = ["layer", "|visual|", "|linguistic|", "ratio", interval_name(DEFAULT_LEVEL)]
+    header = ["layer", "|visual|", "|linguistic|", *_RATIO_HEADER]
     return "\n".join([heading(title), text_table(header, rows, left=(0,)), "", *wrap(note), ""])
 
 
@@ -59,10 +64,14 @@ def group_contributions_section(tables: Tables | None, grouping: Grouping, site:
     for layer in (*tables.cells["layer"].unique(maintain_order=True).cast(pl.String), LAYERS_AVG):
         cells = [layer, *(format_number(norms[layer, name]) for name in shown)]
         if layer in ratios:
-            row = ratios[layer]
-            bounds = format_interval(row["contribution_ratio_low"], row["contribution_ratio_high"])
-            cells += [format_number(row["contribution_ratio"]), bounds]
+            cells += _ratio_cells(ratios[layer])
         rows.append(cells)
-    header = ["layer", *(f"|{name}|" for name in shown), *(["ratio", interval_name(DEFAULT_LEVEL)] if ratios else [])]
+    header = ["layer", *(f"|{name}|" for name in shown), *(_RATIO_HEADER if ratios else [])]
+    note = f"{_RATIO_NOTE if ratios else ''} {note}".strip()
     lines = [heading(title), text_table(header, rows, left=(0,))]
     return "\n".join([*lines, *(["", *wrap(note)] if note else []), ""])
+
+
+def _ratio_cells(row: Mapping[str, Any]) -> list[str]:
+    plain = (format_number(row[name]) for name in ("ratio_of_means", "geometric_mean", "uniform_ratio", "ratio_lift"))
+    return [format_number(row["ratio_mean"]), row_interval(row, "ratio_mean"), *plain, row_interval(row, "ratio_lift")]

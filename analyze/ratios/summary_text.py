@@ -10,7 +10,7 @@ import polars as pl
 
 from vla_attention.analyze.measures.aggregate import layer_order, overall_layer, overall_rows
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables, layer_name
-from vla_attention.analyze.ratios.verdict import LINGUISTIC_BELOW, VISUAL_ABOVE, verdict
+from vla_attention.analyze.ratios.verdict import LINGUISTIC_BELOW, VISUAL_ABOVE, meanings, reading, verdict
 from vla_attention.analyze.show.headings import WIDTH, heading, title, untrained_warning, wrap
 from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent, interval_name, plural
 from vla_attention.analyze.show.plot_text import shortened
@@ -106,15 +106,17 @@ def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: Tables) -> str:
             format_interval(row["ratio_mean_low"], row["ratio_mean_high"]),
             format_number(row["uniform_ratio"]),
             format_number(row["ratio_lift"]),
-            *[verdict(row["ratio_mean"])] * grouping.compares_modalities,
+            *[reading(row, run.untrained)] * grouping.compares_modalities,
         ]
         for row in _by_layer(rows)
     ]
     overall = rows.filter(pl.col("layer") == overall_layer(rows)).row(0, named=True)
+    words = meanings([reading(row, run.untrained) for row in _by_layer(rows)]) if grouping.compares_modalities else ""
     legend = (
         f"mean, std, median: of the episodes' mean ratios (n = {overall['num_episodes']}). of means: mean numerator "
-        "mass / mean denominator mass. geom.: geometric mean of the ratios. lift: ratio / uniform ratio, 1 = what "
-        f"uniform attention gives. {_interval_note(run, overall)}"
+        "mass / mean denominator mass. geom.: geometric mean of the ratios. uniform: mean of the ratios that uniform "
+        "attention gives. lift: mean of ratio / uniform ratio over replans and episodes (not mean ratio / mean uniform "
+        f"ratio), 1 = uniform attention. {_interval_note(run, overall)} {words}".strip()
     )
     return "\n".join(
         [
@@ -211,7 +213,7 @@ def _groups_section(grouping: Grouping, tasks: Tables, kind: str) -> str:
         note = ""
     else:
         of_groups = "LIFT  mass per key, against the mean over valid keys"
-        note = "\n1 = what uniform attention gives."
+        note = "\nMean over replans of mass per key / mass per valid key; 1 = what uniform attention gives."
     return "\n".join([heading(of_groups), "\n\n".join(tables)]) + note
 
 

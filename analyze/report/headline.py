@@ -52,7 +52,7 @@ def headline_section(analysis: Analysis, notes: Sequence[Caveat]) -> Section:
     boxes.append(Box("episodes", str(row["num_episodes"]), note + plural(row["num_replans"], "replan")))
     parts: list[Part] = [Headline([caveat for caveat in notes if caveat.grave], boxes)]
     if ratio is not None:
-        sentence = verdict_sentence(analysis.grouping, row["ratio_mean"], row["uniform_ratio"])
+        sentence = verdict_sentence(analysis.grouping, row, analysis.question.untrained)
         parts += [Paragraph(sentence)] if sentence else []
         other = [
             f"{name} {format_number(row[column])} {format_interval(row[f'{column}_low'], row[f'{column}_high'])}"
@@ -71,7 +71,7 @@ def _ratio_boxes(row: Mapping[str, Any], numerator: Sequence[str], denominator: 
     else:
         ratio = Box(f"ratio {name}", format_number(row["ratio_mean"]), f"{_interval(row, 'ratio_mean')}; {over}")
     uniform = format_number(row["uniform_ratio"])
-    lift = f"{_interval(row, 'ratio_lift')}; 1 is uniform attention"
+    lift = f"{_interval(row, 'ratio_lift')}; mean of ratio / uniform ratio"
     return [
         ratio,
         Box("with uniform attention", uniform, "what the numbers of keys alone give"),

@@ -10,7 +10,7 @@ import polars as pl
 from vla_attention.analyze.heads.layer_time import layer_time_table
 from vla_attention.analyze.heads.plot_layer_time import plot_layer_time
 from vla_attention.analyze.measures.aggregate import layer_order, overall_rows
-from vla_attention.analyze.measures.contributions import contribution_rows
+from vla_attention.analyze.measures.contribution_ratios import contribution_rows
 from vla_attention.analyze.measures.frames import layer_name
 from vla_attention.analyze.ratios.analysis import Analysis
 from vla_attention.analyze.ratios.plot_attention_fractions import plot_attention_fractions
@@ -186,11 +186,20 @@ def contribution_section(analysis: Analysis) -> Section | None:
             Cell(row["layer"], row["layer_number"]),
             number_cell(row["visual_norm"]),
             number_cell(row["linguistic_norm"]),
-            number_cell(row["ratio"]),
-            interval_cell(row["ratio_low"], row["ratio_high"]),
+            number_cell(row["ratio_mean"]),
+            interval_cell(row["ratio_mean_low"], row["ratio_mean_high"]),
+            *(number_cell(row[name]) for name in ("ratio_of_means", "geometric_mean", "uniform_ratio", "ratio_lift")),
+            interval_cell(row["ratio_lift_low"], row["ratio_lift_high"]),
         ]
-        for row in contribution_rows(analysis.contributions, analysis.question.settings.seed).iter_rows(named=True)
+        for row in contribution_rows(
+            analysis.contributions, "visual_norm", "linguistic_norm", analysis.question.settings.seed
+        ).iter_rows(named=True)
     ]
-    caption = "Norms of contributions; ratio: mean over episodes of the mean ratio of norms"
-    table = Table(caption, ["layer", "visual norm", "linguistic norm", "ratio", _INTERVAL], rows)
+    caption = (
+        "Norms of contributions. Mean ratio: mean over episodes of the mean ratio of norms. Uniform: the ratio that "
+        "the same values would give if attention were shared out between the segments as uniform attention is; lift: "
+        "mean of ratio / uniform"
+    )
+    header = ["layer", "visual norm", "linguistic norm", "mean ratio", _INTERVAL, "of means", "geom."]
+    table = Table(caption, [*header, "uniform", "lift", _INTERVAL], rows)
     return Section("contributions", "Contributions", [Paragraph(note), table])

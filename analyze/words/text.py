@@ -13,8 +13,8 @@ from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
 from vla_attention.analyze.words.word_study import WordStudy
 
 _NOTE = (
-    "lift: mass per piece over that of the average valid key (1: uniform attention). share: of all linguistic mass "
-    f"(bos, template, instruction). {interval_note(DEFAULT_LEVEL)}"
+    "lift: mean over replans of mass per piece / mass per valid key (1: uniform attention). share: of all "
+    f"linguistic mass (bos, template, instruction). {interval_note(DEFAULT_LEVEL)}"
 )
 
 

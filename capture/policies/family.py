@@ -64,7 +64,7 @@ class PolicyFamily:
     description: str
     #: lines of examples for the help text, each ending with a newline
     examples: str
-    #: Adds the options of the model, among them `checkpoint` and `device` (see `model_arguments.py`).
+    #: Adds the options of the model, among them `checkpoint`, `device` and `threads` (see `model_arguments.py`).
     add_arguments: Callable[[argparse.ArgumentParser], None]
     #: (parsed arguments, device) -> the policy
     build: Callable[[argparse.Namespace, str], Policy]

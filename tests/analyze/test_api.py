@@ -173,12 +173,14 @@ def test_an_empty_store_can_be_opened_and_says_that_it_is_empty(tmp_path):
         run.ratios()
 
 
-def test_the_guide_names_every_column(run):
+def test_the_guide_names_every_column(run, tmp_path):
     guide = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
     levels = ("steps", "replans", "episodes", "tasks")
     tables = [ask(level) for level in levels for ask in (run.ratios, run.masses)]
     names = ("heads", "heads_groups", "dispersion", "depth", "denoise", "denoise_groups")
     tables += [*(run.heads(name) for name in names), run.row_metrics(), run.row_metrics("groups")]
+    run_with_norms = va.open(write_store(tmp_path / "a.zarr", contributions=True))
+    tables.append(run_with_norms.contributions())
     tables += [run.objects(name) for name in ("objects", "summary", "times", "pointing", "iou")]
     ends = ("_low", "_high", "_episodes")
     missing = {

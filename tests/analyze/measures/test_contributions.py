@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_attention.analyze.measures.contributions import LINGUISTIC_ROLES, VISUAL_ROLES, contribution_table, joint_norm
+from vla_attention.analyze.measures.contribution_ratios import contribution_rows, joint_norm
+from vla_attention.analyze.measures.contributions import LINGUISTIC_ROLES, VISUAL_ROLES, contribution_table
 from vla_attention.analyze.measures.selected import load_tokens
 from vla_attention.analyze.stores.selection import select
-from vla_attention.schemas.segments import segments_of
+from vla_attention.schemas.segments import segment_members, segments_of
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import StoreSpec, contribution_vectors, write_store
+from vla_attention.testing.stores import StoreSpec, contribution_vectors, expected_arrays, write_store
 from vla_attention.testing.tokens import small_tokens
 
 SPEC = StoreSpec(contributions=True, replans=3, tasks=(0, 1), episodes=2)
@@ -47,6 +51,71 @@ def test_both_sides_and_their_ratio_equal_a_direct_computation(tmp_path):
             expected = np.sqrt((vectors[:, mask].sum(axis=1) ** 2).sum(axis=1).mean())
             assert row[f"{side}_norm"] == pytest.approx(expected, rel=1e-4)
         assert row["contribution_ratio"] == pytest.approx(row["visual_norm"] / row["linguistic_norm"])
+        sums = {}
+        rows = expected_arrays(SPEC, row["task_id"], row["episode_index"])["joint/rows"]
+        mean = rows[row["replan"], 1, SPEC.denoise_steps.index(row["denoise_step"])].mean(axis=(0, 1))
+        members = segment_members(tokens.layout, tokens.key_role, segments)[row["replan"]]
+        num_valid = np.broadcast_to(tokens.valid, tokens.key_role.shape)[row["replan"]].sum()
+        for side, names in (("above", VISUAL_ROLES), ("below", LINGUISTIC_ROLES)):
+            chosen = [i for i, segment in enumerate(segments) if segment.role in names]
+            weights = [members[:, i].sum() / num_valid / mean[members[:, i]].sum() for i in chosen]
+            summed = sum(weight * vectors[:, i] for weight, i in zip(weights, chosen, strict=True))
+            sums[side] = np.sqrt((summed**2).sum(axis=1).mean())
+        assert row["uniform_ratio"] == pytest.approx(sums["above"] / sums["below"], rel=1e-3)
+        assert row["ratio_lift"] == pytest.approx(row["contribution_ratio"] / row["uniform_ratio"])
+
+
+def uniform_over_valid(task, episode, tokens, rows):
+    even = np.broadcast_to(tokens.valid[:, None, None, None, None], rows.shape)
+    return even / even.sum(axis=-1, keepdims=True)
+
+
+def test_uniform_attention_has_a_lift_of_one_whatever_the_values_are(tmp_path):
+    spec = replace(SPEC, plant_rows=uniform_over_valid)
+    store = open_store(write_store(tmp_path / "a.zarr", spec=spec))
+    table = contribution_table(
+        load_tokens([(store, episode) for episode in store.episodes], "joint"), select(store.attributes)
+    )
+    assert table is not None
+    assert table["contribution_ratio"].std() > 0.1
+    np.testing.assert_allclose(table["ratio_lift"], 1.0, rtol=1e-3)
+
+
+def test_the_baseline_needs_all_heads(tmp_path):
+    store = open_store(write_store(tmp_path / "a.zarr", spec=replace(SPEC, heads=(1,))))
+    table = contribution_table(
+        load_tokens([(store, episode) for episode in store.episodes], "joint"), select(store.attributes)
+    )
+    assert table is not None
+    assert table["contribution_ratio"].is_not_null().all()
+    assert table["uniform_ratio"].is_null().all()
+
+
+def test_rows_over_episodes_have_the_three_means_and_what_each_is_of(tmp_path):
+    store = open_store(write_store(tmp_path / "a.zarr", spec=SPEC))
+    selected = load_tokens([(store, episode) for episode in store.episodes], "joint")
+    table = contribution_table(selected, select(store.attributes))
+    assert table is not None
+    rows = contribution_rows(table, "visual_norm", "linguistic_norm", seed=0)
+    assert rows["layer"].to_list() == ["0", "2", "layers_avg"]
+    wanted = (pl.col("layer") == 0, pl.col("layer") == 2, pl.lit(True))
+    for layer, row in zip(wanted, rows.iter_rows(named=True), strict=True):
+        means = (
+            table.filter(layer)
+            .group_by("task_id", "episode_index")
+            .agg(
+                pl.col("visual_norm", "linguistic_norm", "ratio_lift", "uniform_ratio").mean(),
+                pl.col("contribution_ratio").mean().alias("mean"),
+                pl.col("contribution_ratio").log().mean().alias("log"),
+            )
+        )
+        assert row["ratio_mean"] == pytest.approx(means["mean"].mean())
+        assert row["geometric_mean"] == pytest.approx(np.exp(means["log"].mean()))
+        assert row["ratio_of_means"] == pytest.approx(means["visual_norm"].mean() / means["linguistic_norm"].mean())
+        for name in ("ratio_lift", "uniform_ratio"):
+            assert row[name] == pytest.approx(means[name].mean())
+        for name in ("ratio_mean", "geometric_mean", "ratio_of_means", "ratio_lift"):
+            assert row[f"{name}_low"] <= row[name] <= row[f"{name}_high"]
 
 
 def test_a_store_without_contributions_has_no_norms(tmp_path):

@@ -42,6 +42,8 @@ def test_the_summary_has_a_line_per_layer_and_an_interval(store):
     assert [line[0] for line in lines if line and line[0] in ("0", "2", "layers_avg")] == ["0", "2", "layers_avg"]
     assert all("[" in " ".join(line) for line in lines if line and line[0] in ("0", "2", "layers_avg"))
     assert max(map(len, section.splitlines())) <= 100
+    for name in ("of means", "geom.", "uniform", "lift"):
+        assert name in section
 
 
 def test_a_store_without_contributions_has_no_section(tmp_path):

@@ -1,0 +1,140 @@
+"""Ratios of contribution norms over episodes, beside what uniform attention would give.
+
+The baseline. A part i of the keys (a segment) adds the vector c_i, which attention has weighted; its mass is m_i, the
+mean over heads and queries. Its n_i keys would get the mass n_i / N from attention that is uniform over the N valid
+keys of the site, and would then add about
+
+    (n_i / N) / m_i * c_i
+
+so that the norm of a side is sqrt(uᵀ G u) with u_i = (n_i / N) / m_i for its parts. For uniform attention this is the
+norm itself, and lift = ratio / uniform ratio is 1. Between parts it is exact where attention is even inside each of
+them. Otherwise the mean value of a part as attention weights it stands for the plain mean of its values, and the mean
+over heads for each head: the store has no values of single keys. So the lift tells how attention is shared out between
+parts, as that of masses does, while the uniform ratio tells what the values alone make of a ratio: how long and how
+much of one direction they are. Unlike masses, both may be given for sides at different sites.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
+from vla_attention.analyze.measures.masses import ratio
+from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL, NO_LIMITS, POSITIVE
+from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
+from vla_attention.analyze.stores.selection import Selection
+from vla_attention.schemas.layout import INVALID_ROLES
+from vla_attention.schemas.segments import segment_members
+
+Array = NDArray[np.float64]
+
+
+def selected_gram(item: SelectedEpisode, site: str, selection: Selection) -> NDArray[np.float32]:
+    """The Gram matrices (replan, layer, denoise, part, part) of the selected layers and denoise steps."""
+    gram: NDArray[np.float32] = item.episode.read(f"{site}/contribution")
+    return gram[:, list(selection.layers)][:, :, list(selection.denoise)]
+
+
+def joint_norm(gram: NDArray[np.floating], chosen: NDArray[np.bool_], weights: Array | None = None) -> Array:
+    """Norm of the chosen parts' summed contribution (root mean square over the queries): sqrt(wᵀ G w).
+
+    gram: (..., part, part); chosen: (part,) bool; weights: (..., part) of the parts, 1 without. Returns (...). Rounding
+    may leave tiny negative squares: they are 0.
+    """
+    part = np.flatnonzero(chosen)
+    inner = gram[..., part[:, None], part]
+    if weights is not None:
+        inner = inner * weights[..., part, None] * weights[..., None, part]
+    norm: Array = np.sqrt(np.clip(inner.sum(axis=(-2, -1), dtype=np.float64), 0.0, None))
+    return norm
+
+
+def uniform_weights(item: SelectedEpisode, site: str, selection: Selection) -> Array:
+    """u_i of every part (replan, layer, denoise, part): its mass under uniform attention / its mass.
+
+    0 for keys that are not valid, NaN for a valid part without mass, and NaN everywhere where not all heads were
+    recorded, because contributions are of all heads. The block's whole update, the last part, is in no side: NaN.
+    """
+    root = item.store.attributes
+    layout = next(layout for layout in root.sites if layout.name == site)
+    segments = item.episode.attributes.segments[site]
+    roles = item.episode.tokens(root, site).static_roles
+    members = segment_members(layout, roles, segments) & ~np.isin(roles, INVALID_ROLES)[:, :, None]
+    keys = members.sum(axis=1, dtype=np.float64)  # (replan or 1, segment)
+    share = (keys / keys.sum(axis=1, keepdims=True))[:, None, None]
+    atoms = item.episode.read(f"{site}/atoms")[:, list(selection.layers)][:, :, list(selection.denoise)]
+    mass = atoms.mean(axis=(3, 4), dtype=np.float64)
+    if len(root.recording.heads) < root.policy.num_heads:
+        mass = np.full_like(mass, np.nan)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weights = np.where(share > 0, np.where(mass > 0, share / mass, np.nan), 0.0)
+    return np.concatenate([weights, np.full((*weights.shape[:-1], 1), np.nan)], axis=-1)
+
+
+def ratio_columns(above: tuple[Array, Array], below: tuple[Array, Array]) -> dict[str, Array]:
+    """`contribution_ratio`, `uniform_ratio`, `ratio_lift`; each side is its norm and its norm of uniform attention."""
+    value, uniform = ratio(above[0], below[0]), ratio(above[1], below[1])
+    return {"contribution_ratio": value, "uniform_ratio": uniform, "ratio_lift": ratio(value, uniform)}
+
+
+def episode_means(table: pl.DataFrame, *measures: pl.Expr, by: tuple[str, ...] = ()) -> pl.DataFrame:
+    """Means over replans and denoise steps, one row per (episode, layer or "layers_avg", `by`); `layer` is a string.
+
+    A block that was named by two layer numbers counts once in "layers_avg".
+    """
+    once = table.select("layer", "block").unique(maintain_order=True).unique("block", keep="first")["layer"]
+    layers = table.group_by(*EPISODE_ID, "layer", *by, maintain_order=True).agg(*measures)
+    average = table.filter(pl.col("layer").is_in(once.implode())).group_by(*EPISODE_ID, *by, maintain_order=True)
+    return pl.concat(
+        [
+            layers.with_columns(pl.col("layer").cast(pl.String)),
+            average.agg(*measures).with_columns(pl.lit(LAYERS_AVG).alias("layer")).select(layers.columns),
+        ]
+    )
+
+
+def contribution_rows(
+    table: pl.DataFrame, above: str, below: str, seed: int, level: float = DEFAULT_LEVEL
+) -> pl.DataFrame:
+    """Norms and their ratio of every layer and over all of them ("layers_avg"), over episodes, with intervals.
+
+    Args:
+        table: one row per (episode, replan, layer, denoise step), with the norms and `ratio_columns`.
+        above: the column of the numerator's norm.
+        below: the column of the denominator's norm.
+        seed: of the bootstrap.
+        level: of the intervals.
+
+    Returns:
+        layer, layer_number (null for the average); means of `above`, `below` and uniform_ratio; and with `_low` and
+        `_high`
+            ratio_mean        mean over episodes of the mean ratio of norms
+            ratio_of_means    mean `above` / mean `below`
+            geometric_mean    exp of the mean log ratio
+            ratio_lift        mean over episodes of the mean of ratio / uniform ratio
+        Ratios that are infinite or undefined are in no mean but `ratio_of_means`.
+    """
+    log_ratio = pl.col("contribution_ratio").log()
+    episodes = episode_means(
+        table,
+        pl.col(above, below).mean(),
+        pl.col("contribution_ratio").filter(pl.col("contribution_ratio").is_finite()).mean().alias("ratio_mean"),
+        log_ratio.filter(log_ratio.is_finite()).mean().alias("geometric_mean"),
+        *(pl.col(name).filter(pl.col(name).is_finite()).mean() for name in ("uniform_ratio", "ratio_lift")),
+    )
+    values = dict.fromkeys((above, below, "ratio_mean", "uniform_ratio", "ratio_lift"), POSITIVE)
+    values |= {"geometric_mean": NO_LIMITS}
+    quotients = {"ratio_of_means": (above, below)}
+    rows = means_with_intervals(episodes, ["layer"], values, seed, level, quotients=quotients)
+    bounded = ("ratio_mean", "ratio_of_means", "geometric_mean", "ratio_lift")
+    return rows.with_columns(pl.col("^geometric_mean(_low|_high)?$").exp()).select(
+        "layer",
+        pl.col("layer").cast(pl.Int64, strict=False).alias("layer_number"),
+        above,
+        below,
+        "uniform_ratio",
+        *(f"{name}{end}" for name in bounded for end in ("", "_low", "_high")),
+    )
