@@ -366,20 +366,22 @@ class OpenStores:
     ) -> Path:
         """Write the self-contained HTML page of `vla-analyze report`; returns its path.
 
+        `path`: a folder, in which `report.html` is written, or a file that ends with .html.
         `episodes`: how many are shown with pictures; `replans`: how many of each.
 
         >>> page = va.open(store).report(folder / "report.html", episodes=1, replans=2)
         >>> page.read_text(encoding="utf-8")[:15].lower()
         '<!doctype html>'
         """
-        from vla_attention.analyze.report.page import write_report
+        from vla_attention.analyze.report.page import report_file, write_report
         from vla_attention.analyze.report.report_settings import ReportSettings
 
         shown: dict[str, Any] = {
             name: count for name, count in (("episodes", episodes), ("replans", replans)) if count is not None
         }
-        write_report(self.ask(**settings), Path(path), ReportSettings(**shown))
-        return Path(path)
+        file = report_file(Path(path))
+        write_report(self.ask(**settings), file, ReportSettings(**shown))
+        return file
 
     def __str__(self) -> str:
         return f"OpenStores of {one_line(self.stores)}"

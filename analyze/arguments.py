@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vla_attention.schemas.safe_text import file_part
+
 if TYPE_CHECKING:
     from vla_attention.analyze.measures.question_settings import AnalysisSettings
     from vla_attention.analyze.measures.sinks import SinkRule
@@ -118,4 +120,4 @@ def settings_of(arguments: argparse.Namespace) -> AnalysisSettings:
 def output_folder(arguments: argparse.Namespace, name: str) -> Path:
     """The folder of results: `--output`, else results/STORE/NAME."""
     given: Path | None = arguments.output
-    return given or Path("results") / arguments.stores[0].stem / name
+    return given or Path("results") / arguments.stores[0].stem / file_part(name)

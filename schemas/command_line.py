@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import NoReturn
 
 from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.safe_text import visible_output
 
 #: Columns of a help text's description.
 _HELP_WIDTH = 100
@@ -44,7 +45,15 @@ def format_bytes(count: float) -> str:
 
 
 def run_command(program: str, command: Callable[[], int], if_stopped: str) -> int:
-    """Run a command and return its exit code; a `UserError` becomes one sentence and 2, Ctrl-C a sentence and 130."""
+    """Run a command and return its exit code; a `UserError` becomes one sentence and 2, Ctrl-C a sentence and 130.
+
+    Control characters in what it prints are made visible (`safe_text.visible_output`).
+    """
+    with visible_output():
+        return _run(program, command, if_stopped)
+
+
+def _run(program: str, command: Callable[[], int], if_stopped: str) -> int:
     try:
         return command()
     except UserError as error:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.schemas.errors import BadArgument, unknown_name
+from vla_attention.schemas.safe_text import check_name
 
 SiteName = Literal["joint", "self", "cross"]
 SpanKind = Literal["image", "text", "state", "action", "latent"]
@@ -82,6 +83,12 @@ class Span:
     stop: int
     camera: str | None = None
     grid: PatchGrid | None = None
+
+    def __post_init__(self) -> None:
+        """Check the names; they are parts of paths in a store."""
+        check_name("span", self.name)
+        if self.camera is not None:
+            check_name("camera", self.camera)
 
     @property
     def num_keys(self) -> int:

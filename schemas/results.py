@@ -12,8 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
+from urllib.parse import unquote
 
 from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.safe_text import file_part
 
 RESULTS_PREFIX = "attention_ratio_results_"
 #: What `EpisodeResult.num_steps` counts: see `loop_counter`.
@@ -148,10 +150,10 @@ def loop_counter(wait_steps: int, num_actions: int, success: bool) -> int:
 
 
 def results_file_name(suite: str) -> str:
-    """File name of a suite's results."""
-    return f"{RESULTS_PREFIX}{suite}.json"
+    """File name of a suite's results; see `safe_text.file_part`."""
+    return f"{RESULTS_PREFIX}{file_part(suite)}.json"
 
 
 def suite_of_results_file(path: Path) -> str:
     """The suite of a results file: its name without prefix and ending."""
-    return path.stem.removeprefix(RESULTS_PREFIX)
+    return unquote(path.stem.removeprefix(RESULTS_PREFIX))

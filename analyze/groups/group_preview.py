@@ -16,6 +16,7 @@ from vla_attention.schemas.groupings.grouping import REST, Grouping
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping, resolve, shared_keys
 from vla_attention.schemas.groupings.words import Word
 from vla_attention.schemas.layout import Prompt
+from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.segments import merge_segments, segment_members, segments_of
 
 #: Name under which tables list what no group takes.
@@ -68,7 +69,7 @@ def preview_groups(question: Question) -> GroupPreview:
 
 def pieces_of(word: Word, prompt: Prompt) -> tuple[str, ...]:
     """The text of a word's tokens, without the space before them."""
-    texts = {piece.key: prompt.text[piece.start : piece.stop].strip() for piece in prompt.pieces}
+    texts = {piece.key: visible(prompt.text[piece.start : piece.stop].strip()) for piece in prompt.pieces}
     return tuple(texts[key] for key in word.keys)
 
 

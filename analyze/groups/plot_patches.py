@@ -20,6 +20,7 @@ from vla_attention.analyze.show.plot_text import explain, shortened, title
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import resolve
 from vla_attention.schemas.layout import PatchGrid, Piece
+from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.store_format import PolicyCameraView
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def plot_group_patches(item: SelectedEpisode, grouping: Grouping, replan: int, f
     figure = new_figure(9, 1.1 + sum(heights) + 0.25 * len(layers))
     note = (
         f"{item.episode.name} of {item.store.suite}, replan {replan} of {item.tokens.num_replans}: "
-        f"'{item.episode.attributes.instruction}'"
+        f"'{visible(item.episode.attributes.instruction)}'"
     )
     if hidden:
         note += f"; {hidden} more groups with patches have no picture here"
@@ -166,7 +167,7 @@ def _pieces(item: SelectedEpisode, replan: int) -> list[tuple[Piece, str]]:
         return []
     prompt = tokens.prompts[int(tokens.prompt_index[replan])]
     return [
-        (piece, prompt.text[piece.start : piece.stop].replace("\n", "\u21b5").strip() or "\u2423")
+        (piece, visible(prompt.text[piece.start : piece.stop].replace("\n", "\u21b5").strip()) or "\u2423")
         for piece in prompt.pieces
     ]
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.stores.selection import Selection
+from vla_attention.schemas.safe_text import visible
 
 #: The columns that name an episode.
 EPISODE_ID = ("suite", "task_id", "episode_index")
@@ -62,7 +63,8 @@ def long_table(
 
 def _constant(name: str, item: SelectedEpisode, height: int) -> pl.Series:
     value = item.store.suite if name == "suite" else getattr(item.episode.attributes, name)
-    return _labels(name, [value]).new_from_index(0, height)
+    # Instructions are any text, and tables are printed and drawn.
+    return _labels(name, [visible(value) if isinstance(value, str) else value]).new_from_index(0, height)
 
 
 def _labels(name: str, labels: Sequence[Any] | NDArray[Any] | pl.Series) -> pl.Series:

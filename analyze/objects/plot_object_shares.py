@@ -28,6 +28,7 @@ from vla_attention.analyze.statistics.bootstrap import (
     ratio_of_means_over_episodes,
     resample_episodes,
 )
+from vla_attention.schemas.safe_text import visible
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,7 +61,7 @@ def plot_object_shares(study: ObjectStudy, folder: Path) -> list[Path]:
     title(
         figure,
         "Share of the image attention by object, all cameras, mean over layers and heads",
-        f"Left: {example.episode.name}, '{attributes.instruction}'. Middle and right: mean over "
+        f"Left: {example.episode.name}, '{visible(attributes.instruction)}'. Middle and right: mean over "
         f"{of_tasks(num_episodes, num_tasks)} with {interval_name(DEFAULT_LEVEL, 'bootstrap')} at each time; "
         "dashed: what uniform attention gives (in the middle: the covered area). Dotted: the control, the same maps on "
         "the objects' masks of other episodes.",

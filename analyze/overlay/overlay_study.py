@@ -22,6 +22,7 @@ from vla_attention.analyze.overlay.overlay_data import (
 )
 from vla_attention.analyze.stores.selection import heads_text
 from vla_attention.schemas.errors import listing
+from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.reader import Store
 
 
@@ -63,7 +64,7 @@ class OverlayStudy:
     def stem(self) -> str:
         """Name of the files, without an ending; with the suite where there are several stores."""
         item = self.overlay.item
-        suite = f"{item.store.suite}_" if len(self.question.stores) > 1 else ""
+        suite = f"{file_part(item.store.suite)}_" if len(self.question.stores) > 1 else ""
         return f"overlay_{suite}{item.episode.name}"
 
 

@@ -8,6 +8,7 @@ from vla_attention.analyze.show.headings import wrap
 from vla_attention.analyze.show.numbers import format_number
 from vla_attention.analyze.show.patch_pictures import upright
 from vla_attention.analyze.show.text_table import text_table
+from vla_attention.schemas.safe_text import visible
 
 _LEGEND = (
     "%: camera's share of all image attention. most, at: highest lift of a patch, and its row,column in the picture as "
@@ -36,7 +37,7 @@ def overlay_text(study: OverlayStudy) -> str:
     item = overlay.item
     lines = [
         *study.question.remarks,
-        f"{item.store.suite} {item.episode.name}: {item.episode.attributes.instruction}",
+        f"{item.store.suite} {item.episode.name}: {visible(item.episode.attributes.instruction)}",
         text_table(header, rows),
         *wrap(_LEGEND),
         "",

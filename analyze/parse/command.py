@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vla_attention.schemas.command_line import command_parser, run_command
+from vla_attention.schemas.safe_text import file_part
 
 if TYPE_CHECKING:
     from vla_attention.analyze.published.results_reader import ResultsFile
@@ -136,7 +137,7 @@ def _draw_file(wanted: Sequence[str], folder: Path, label: str, table: ResultsTa
     from vla_attention.analyze.ratios import plot_attention_fractions, plot_ratio_distribution, plot_ratio_per_task
 
     about = f"results file '{label}'"
-    end = f"_{label.replace('/', '_')}" if several else ""
+    end = f"_{file_part(label.replace('/', '_'))}" if several else ""
     cells = table.replans.cells
     unknown = cells["uniform_ratio"].is_null().all()
     note = "No uniform baseline: this results file does not hold the numbers of keys." if unknown else ""

@@ -39,6 +39,7 @@ from vla_attention.schemas.results import (
     loop_counter,
     suite_of_results_file,
 )
+from vla_attention.schemas.safe_text import visible
 
 _LAYER = re.compile(r"layer_(\d+)$")
 #: The published scripts treat a mass of up to this as zero, and write a ratio of 0 where both masses are zero.
@@ -255,7 +256,7 @@ class _Reading:
         identity = {
             "episode": number,
             "task_id": _whole(episode["task_id"], f"{where}, task_id"),
-            "instruction": _expect(episode["task_description"], str, f"{where}, task_description"),
+            "instruction": visible(_expect(episode["task_description"], str, f"{where}, task_description")),
             "episode_index": _whole(episode["episode_idx"], f"{where}, episode_idx"),
             "success": _expect(episode["success"], bool, f"{where}, success"),
             "num_steps": _whole(episode["num_steps"], f"{where}, num_steps"),

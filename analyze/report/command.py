@@ -11,7 +11,7 @@ from vla_attention.schemas.command_line import command_parser
 _EXAMPLES = """examples:
   vla-analyze report runs/libero_10.zarr
   vla-analyze report runs/libero_10.zarr --grouping instruction --layers 9 13 17 --output paper/report.html
-  vla-analyze report runs/a.zarr runs/b.zarr --episodes 8 --replans 10
+  vla-analyze report runs/a.zarr runs/b.zarr --episodes 8 --replans 10 --output results/both
   vla-analyze report runs/cosmos.zarr --site self
 
 The file needs no network and nothing beside it: open it with a double click, mail it, print it.
@@ -48,7 +48,12 @@ def build_parser() -> argparse.ArgumentParser:
     )
     content.add_argument("--quick", action="store_true", help="leave out what reads every row: sinks, words, objects")
     output = parser.add_argument_group("output")
-    output.add_argument("--output", type=Path, metavar="FILE", help="HTML file (default: results/STORE/report.html)")
+    output.add_argument(
+        "--output",
+        type=Path,
+        metavar="PATH",
+        help="folder, in which report.html is written, or a file FILE.html (default: results/STORE)",
+    )
     output.add_argument("--seed", type=int, default=0, help="seed of the bootstrap (default: 0)")
     return parser
 
@@ -58,15 +63,12 @@ def run(arguments: argparse.Namespace) -> int:
     from pathlib import Path
 
     from vla_attention.analyze.measures.question import ask
-    from vla_attention.analyze.report.page import write_report
+    from vla_attention.analyze.report.page import report_file, write_report
     from vla_attention.analyze.show.numbers import plural
-    from vla_attention.schemas.errors import BadArgument
     from vla_attention.schemas.stores.reader import open_store
 
     settings = ReportSettings(arguments.episodes, arguments.replans, rows=not arguments.quick)
-    path = arguments.output or Path("results") / arguments.stores[0].stem / "report.html"
-    if path.is_dir() or path.suffix.lower() not in (".html", ".htm"):
-        raise BadArgument(f"Cannot write the report to {path}; expected --output FILE.html.")
+    path = report_file(arguments.output or Path("results") / arguments.stores[0].stem)
     question = ask([open_store(store) for store in arguments.stores], settings_of(arguments))
     write_report(question, path, settings)
     for line in question.skipped:

@@ -26,6 +26,22 @@ from vla_attention.analyze.report.section_parts import Section
 from vla_attention.analyze.show.numbers import of_tasks
 from vla_attention.analyze.show.output_files import write_text, writing
 from vla_attention.analyze.show.progress import progress_bar
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.safe_text import visible
+
+#: Endings of a file's name that make it a page.
+_ENDINGS = (".html", ".htm")
+
+
+def report_file(path: Path) -> Path:
+    """The file of a report: `path` if it ends with .html or .htm, else `report.html` in the folder `path`.
+
+    Raises:
+        BadArgument: `path` is a file of another kind.
+    """
+    if path.is_file() and path.suffix.lower() not in _ENDINGS:
+        raise BadArgument(f"Cannot write the report to the file {path}; expected a folder, or a file FILE.html.")
+    return path if path.suffix.lower() in _ENDINGS and not path.is_dir() else path / "report.html"
 
 
 def write_report(question: Question, path: Path, settings: ReportSettings) -> None:
@@ -107,11 +123,12 @@ def render(analysis: Analysis, sections: Sequence[Section]) -> str:
 
 
 def templates() -> jinja2.Environment:
-    """The folder `templates/`. Every text is escaped; an unknown name in a template is an error."""
+    """The folder `templates/`. Every text is escaped and `visible`; an unknown name in a template is an error."""
     return jinja2.Environment(
         loader=jinja2.PackageLoader("vla_attention.analyze.report"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
+        finalize=lambda value: visible(value, keep="\n") if type(value) is str else value,
         trim_blocks=True,
         lstrip_blocks=True,
     )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from vla_attention.analyze.show.plot_axes import hide_frame
 from vla_attention.analyze.show.plot_colours import NOTE_COLOR
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
+from vla_attention.schemas.safe_text import visible
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,7 +21,7 @@ _CHARACTERS_PER_INCH = 11
 
 def wrapped(text: str, width: int, lines: int) -> str:
     """Text in at most so many lines of at most so many characters, with … where it was cut."""
-    return "\n".join(textwrap.wrap(" ".join(text.split()), width, max_lines=lines, placeholder=" …"))
+    return "\n".join(textwrap.wrap(visible(" ".join(text.split())), width, max_lines=lines, placeholder=" …"))
 
 
 def shortened(name: str, width: int) -> str:

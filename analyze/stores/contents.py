@@ -14,6 +14,7 @@ from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vo
 from vla_attention.schemas.layers import block_of_labels
 from vla_attention.schemas.layout import Role, Span
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, mass_error_bound
+from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 
 #: Attributes of an episode that are columns of `episodes_table`.
@@ -34,6 +35,7 @@ def episodes_table(stores: Sequence[Store]) -> pl.DataFrame:
     rows = [
         {"store": str(store.path), "suite": store.suite}
         | {name: getattr(episode.attributes, name) for name in _EPISODE_COLUMNS}
+        | {"instruction": visible(episode.attributes.instruction)}
         for store in stores
         for episode in store.episodes
     ]
@@ -115,7 +117,7 @@ def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
             count = sum(other.attributes.task_id == attributes.task_id for other in episodes)
             interest = listing([thing.name for thing in attributes.objects if thing.of_interest])
             held = f"({count} episodes; objects of interest: {interest})"
-            yield f"  {attributes.task_id:>3}  {attributes.instruction}  {held}"
+            yield f"  {attributes.task_id:>3}  {visible(attributes.instruction)}  {held}"
     yield "Selectors"
     for name, kind in SELECTOR_KINDS.items():
         yield f"  {name + ':':<9} {kind.takes}"

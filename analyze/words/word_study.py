@@ -18,6 +18,7 @@ from vla_attention.analyze.stores.selection import site_that
 from vla_attention.analyze.words.word_reading import words_table
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import NO_WORDS
+from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store
 from vla_attention.schemas.stores.store_format import RootAttributes
 
@@ -68,7 +69,7 @@ def study_words(stores: Sequence[Store], settings: AnalysisSettings, task: int |
     tasks = settings.tasks if task is None else (task,)
     site = site_of_words(stores[0].attributes, settings.site)
     question = ask(stores, replace(settings, site=site, tasks=tasks))
-    instructions = {item.episode.attributes.instruction for item in question.selected}
+    instructions = {visible(item.episode.attributes.instruction) for item in question.selected}
     one = instructions.pop() if task is not None and len(instructions) == 1 else None
     return WordStudy(question, one, words_table(question))
 

@@ -14,6 +14,7 @@ from vla_attention.capture.jobs.worker_records import planned_tasks, read_record
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode, EpisodeAttributes, parse_episode_name
 
@@ -174,8 +175,8 @@ def _cells(task: TaskStatus) -> tuple[str, ...]:
         str(task.success) if task.committed else "-",
         format_bytes(task.bytes) if task.committed else "-",
         task.last_at.removesuffix("+00:00").replace("T", " ") or "-",
-        task.last_by or ("unknown" if task.committed else "-"),
-        task.instruction,
+        visible(task.last_by) or ("unknown" if task.committed else "-"),
+        visible(task.instruction),
     )
 
 

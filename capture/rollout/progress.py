@@ -7,6 +7,8 @@ import time
 
 from tqdm import tqdm
 
+from vla_attention.schemas.safe_text import plain_stderr
+
 #: Seconds between two lines about one episode in a log file. A GPU completes several replans a second.
 _LOG_EVERY_S = 30.0
 
@@ -30,7 +32,8 @@ class Progress:
         self._episode = ""
         self._begun_at = self._last_line_at = time.monotonic()
         self._steps_before = 0
-        self._bar = tqdm(total=num_episodes * max_steps, unit="step", disable=not sys.stderr.isatty())
+        hidden = not sys.stderr.isatty()
+        self._bar = tqdm(total=num_episodes * max_steps, unit="step", file=plain_stderr(), disable=hidden)
 
     def begin(self, task_id: int, episode: int) -> None:
         """Begin an episode."""

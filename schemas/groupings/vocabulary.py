@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vla_attention.schemas.groupings.words import Word, words_of
 from vla_attention.schemas.layout import INVALID_ROLES, Prompt, Role, SiteLayout
+from vla_attention.schemas.safe_text import check_name
 
 ObjectKind = Literal["object", "fixture", "robot", "background"]
 
@@ -36,6 +37,10 @@ class SceneObject:
     name: str
     kind: ObjectKind
     of_interest: bool
+
+    def __post_init__(self) -> None:
+        """Check the name."""
+        check_name("object", self.name)
 
 
 @dataclass(frozen=True)

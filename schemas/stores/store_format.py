@@ -29,6 +29,7 @@ from typing import Any, Literal
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.layout import Prompt, SiteLayout
+from vla_attention.schemas.safe_text import check_inner_path, check_name, check_text
 from vla_attention.schemas.segments import Segment
 
 FORMAT_NAME = "vla-attention"
@@ -120,6 +121,10 @@ class Protocol:
     max_steps: int
     image_size: int
 
+    def __post_init__(self) -> None:
+        """Check the suite's name."""
+        check_name("suite", self.suite)
+
 
 @dataclass(frozen=True)
 class PolicyCameraView:
@@ -135,6 +140,11 @@ class PolicyCameraView:
     upright: bool
     mirrored: bool
     visible: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the names."""
+        check_name("camera", self.name)
+        check_name("camera", self.source)
 
 
 @dataclass(frozen=True)
@@ -153,6 +163,11 @@ class PolicyIdentity:
     action_horizon: int
     cameras: tuple[PolicyCameraView, ...]
     config: dict[str, Any]
+
+    def __post_init__(self) -> None:
+        """Check that names and addresses are text of one line."""
+        for field in ("name", "family", "checkpoint", "checkpoint_format", "digest"):
+            check_text(f"policy's {field}", getattr(self, field))
 
 
 @dataclass(frozen=True)
@@ -214,12 +229,18 @@ class EpisodeSeal:
     digest: str
     copied_from: str = ""
 
+    def __post_init__(self) -> None:
+        """Check the paths: a seal lists files inside of its episode's folder."""
+        for path in self.files:
+            check_inner_path(path)
+
 
 @dataclass(frozen=True)
 class EpisodeAttributes:
     """Attributes of one episode's group.
 
-    `num_steps` is the number of actions executed after the waiting steps, with the one that solved the task.
+    `num_steps` is the number of actions executed after the waiting steps, with the one that solved the task. The
+    instruction and the prompts are any text; what is shown of them is made `safe_text.visible`.
     """
 
     task_id: int
@@ -236,6 +257,12 @@ class EpisodeAttributes:
     objects: tuple[SceneObject, ...]
     provenance: dict[str, str]
     arrays: dict[str, ArrayRecord]
+
+    def __post_init__(self) -> None:
+        """Check the task's name, and the names of arrays, which are paths."""
+        check_name("task", self.task_name)
+        for path in self.arrays:
+            check_inner_path(path)
 
 
 def episode_name(task_id: int, episode_index: int) -> str:

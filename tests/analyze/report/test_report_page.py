@@ -206,7 +206,7 @@ def test_a_single_episode_of_a_single_layer_and_a_grouping_without_ratio(tmp_pat
 @pytest.mark.parametrize(
     ("extra", "message"),
     [
-        (["--output", "folder"], "FILE.html"),
+        (["--output", __file__], "expected a folder, or a file FILE.html"),
         (["--episodes", "-1"], "--episodes from 0"),
         (["--replans", "0"], "--replans from 1"),
         (["--grouping", "defalt"], "Did you mean 'default'"),
@@ -219,6 +219,21 @@ def test_bad_input_is_one_sentence(
     captured = capsys.readouterr()
     assert message in captured.err
     assert "Traceback" not in captured.err
+
+
+def test_the_output_is_a_folder_or_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    store = kit.write_store(tmp_path / "a.zarr", tasks=(0,), episodes=1, replans=1, layers=(0,), frames=False)
+    existing = tmp_path / "v1.html"
+    existing.mkdir()
+    for given, file in (
+        (tmp_path / "new", tmp_path / "new" / "report.html"),
+        (tmp_path / "v1.2", tmp_path / "v1.2" / "report.html"),
+        (existing, existing / "report.html"),
+        (tmp_path / "page.HTML", tmp_path / "page.HTML"),
+    ):
+        assert main(["report", str(store), "--quick", "--episodes", "0", "--output", str(given)]) == 0
+        assert f"{file}: " in capsys.readouterr().out
+        assert file.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
 
 
 def test_episodes_are_chosen_over_tasks_and_outcomes(tmp_path: Path) -> None:

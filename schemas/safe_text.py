@@ -1,0 +1,104 @@
+"""Text that comes from stores and other files: refused as a name, safe as part of a path, visible when it is shown.
+
+A store may come from anybody. Its names (suite, tasks, cameras, objects ...) become parts of paths, and all of its text
+is printed. Control characters in it could change what a terminal shows, and characters that reverse the direction of
+writing, what a reader takes it for.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import IO, Any
+from urllib.parse import quote
+
+from vla_attention.schemas.errors import BadArgument
+
+#: Beside letters and digits, what stays as it is in `file_part`.
+_PLAIN = re.compile(r"[\w ._+=,@-]")
+_LINE_END = "\n"
+
+
+def visible(text: str, keep: str = "") -> str:
+    r"""Text with its unprintable characters as escapes, for instance \x1b, \n or \u202e.
+
+    Unprintable are control and format characters, line and paragraph separators, spaces other than the plain one, and
+    code points without a character (`str.isprintable`). Characters in `keep` stay as they are.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in keep else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def check_name(what: str, name: str) -> None:
+    """Raise `BadArgument` unless a name is printable and one part of a path.
+
+    `what` says whose name it is, for instance "suite".
+    """
+    _check_printable(what, name)
+    if not name.strip() or name in (".", "..") or "/" in name or "\\" in name:
+        raise BadArgument(f"'{name}' cannot be the name of a {what}: expected text without / and \\ that is no '..'.")
+
+
+def check_text(what: str, text: str) -> None:
+    """Raise `BadArgument` unless a text of one line that is in no path (a policy, an address) is printable."""
+    _check_printable(what, text)
+
+
+def check_inner_path(path: str) -> None:
+    """Raise `BadArgument` unless a path of a file or array stays inside the folder that it is relative to."""
+    _check_printable("path", path)
+    if any(part in ("", ".", "..") or "\\" in part for part in path.split("/")):
+        raise BadArgument(f"'{path}' cannot be the path of a file or array: expected names joined by /, without '..'.")
+
+
+def _check_printable(what: str, text: str) -> None:
+    if not text.isprintable():
+        raise BadArgument(f"The {what} '{visible(text)}' has control characters: expected printable text.")
+
+
+def file_part(name: str) -> str:
+    """A name as a part of a file's name. Names that differ stay different.
+
+    Letters, digits, space and ``._-+=,@`` stay; every other character, and a dot at the beginning, becomes % and the
+    codes of its UTF-8 bytes.
+    """
+    plain = "".join(c if _PLAIN.fullmatch(c) and c.isprintable() else quote(c, safe="", errors="replace") for c in name)
+    return f"%2E{plain[1:]}" if plain.startswith(".") else plain
+
+
+class _VisibleStream:
+    """An output stream that writes text `visible`, line ends apart. Everything else is the wrapped stream's."""
+
+    def __init__(self, stream: IO[str]) -> None:
+        self._wrapped = stream  # under this name tqdm recognises the stream of its bar
+
+    def write(self, text: str) -> int:
+        self._wrapped.write(visible(text, keep=_LINE_END))
+        return len(text)
+
+    def writelines(self, lines: Any) -> None:
+        for line in lines:
+            self.write(line)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._wrapped, name)
+
+
+@contextmanager
+def visible_output() -> Iterator[None]:
+    """Whatever the block prints on stdout and stderr is `visible`, line ends apart."""
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = (_VisibleStream(stream) for stream in before)
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = before
+
+
+def plain_stderr() -> IO[str]:
+    """stderr itself, also inside of `visible_output`: progress bars move the cursor."""
+    stream: IO[str] = getattr(sys.stderr, "_wrapped", sys.stderr)
+    return stream

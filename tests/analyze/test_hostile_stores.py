@@ -1,0 +1,257 @@
+"""A store may come from anybody: its names and texts stay text, whatever command shows them."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import shutil
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.kit.slow import slow_except
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.analyze.commands import COMMANDS
+from vla_attention.analyze.parse.command import main as parse
+from vla_attention.capture.__main__ import main as capture
+from vla_attention.schemas.jsonable import from_json
+from vla_attention.schemas.stores import store_format
+from vla_attention.schemas.stores.digest import bytes_digest, seal_digest
+from vla_attention.testing.stores import StoreSpec, reseal, write_store
+
+SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, contributions=True)
+#: Clears a screen, moves the cursor, reverses the direction of writing, begins a line, is markup, and is a formula.
+INSTRUCTION = "put\x1b[2J the\u202e bowl\r\non the plate\x9b31m\u2028 <script>alert('bowl')</script> $x^{$ & \"it\""
+MARKUP = "<img src=x onerror=alert(1)>"
+FORMULA = "$x^{$ <b>%2E"
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory) -> Path:
+    return write_store(tmp_path_factory.mktemp("original") / "a.zarr", spec=SPEC)
+
+
+@pytest.fixture
+def store(original, tmp_path) -> Path:
+    path = tmp_path / "stores" / "a.zarr"
+    shutil.copytree(original, path)
+    return path
+
+
+def change(document: Path, make: Callable[[dict[str, Any]], object]) -> None:
+    """Change the attributes in a zarr.json."""
+    content = json.loads(document.read_text())
+    make(content["attributes"])
+    document.write_text(json.dumps(content))
+
+
+def change_episodes(store: Path, make: Callable[[dict[str, Any]], object]) -> None:
+    for folder in sorted((store / "episodes").glob("task*")):
+        change(folder / "zarr.json", make)
+        reseal(folder)
+
+
+def hostile_texts(store: Path) -> None:
+    """Texts of every kind that a store may hold, with names that are refused nowhere."""
+
+    def root(attributes: dict[str, Any]) -> None:
+        attributes["protocol"]["suite"] = FORMULA
+        attributes["policy"] |= {"name": MARKUP, "checkpoint": f"https://x/{MARKUP}"}
+        attributes["provenance"] = {"code": f"\x1b[2J{MARKUP}\n\u202e", f"numpy\x1b{MARKUP}": "1\x07"}
+
+    def episode(attributes: dict[str, Any]) -> None:
+        attributes["instruction"] = INSTRUCTION
+        attributes["provenance"] = {"host": "\x1b[2J"}
+        for prompt in attributes["prompts"]:
+            prompt["text"] = prompt["text"].replace("the", "t\x1b\u202e")
+        attributes["objects"][0]["name"] = MARKUP
+        attributes["objects"][1]["name"] = FORMULA
+
+    change(store / "zarr.json", root)
+    change_episodes(store, episode)
+
+
+def files_under(folder: Path) -> set[Path]:
+    return {path for path in folder.rglob("*") if path.is_file()}
+
+
+def check_output(capsys: pytest.CaptureFixture[str]) -> str:
+    """Everything printed since the last call; all of it is printable."""
+    captured = capsys.readouterr()
+    for line in (captured.out + captured.err).split("\n"):
+        assert line.isprintable(), repr(line)
+    return captured.out + captured.err
+
+
+class Tags(HTMLParser):
+    """The tags and attributes of a page."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, list[str]]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, [name for name, _ in attrs]))
+
+
+#: Further arguments of each command; OUT is its folder of output.
+WORDS: dict[str, tuple[str, ...]] = {
+    "ratios": ("STORE", "--output", "OUT", "--save-viz", "--layers", "0"),
+    "groups": ("STORE", "--output", "OUT"),
+    "heads": ("STORE", "--output", "OUT", "--no-plots"),
+    "words": ("STORE", "--output", "OUT", "--task", "0"),
+    "objects": ("STORE", "--output", "OUT"),
+    "time": ("STORE", "--output", "OUT", "--no-plots"),
+    "compare": ("STORE", "OTHER", "--output", "OUT", "--no-plots"),
+    "overlay": ("STORE", "OTHER", "--output", "OUT"),
+    "report": ("STORE", "--output", "OUT", "--episodes", "1", "--tasks", "0", "--layers", "0"),
+    "export": ("STORE", "--csv", "--output", "OUT"),
+    "copy": ("STORE", "OUT/copy.zarr", "--without", "frames"),
+    "verify": ("STORE",),
+}
+
+
+def test_every_command_is_tried():
+    assert set(WORDS) == set(COMMANDS)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("command", slow_except(("ratios", "groups", "compare", "report", "copy", "verify"), WORDS))
+def test_hostile_texts_are_printed_visibly_and_nothing_is_written_elsewhere(
+    store, tmp_path, monkeypatch, capsys, command
+):
+    hostile_texts(store)
+    other = write_store(tmp_path / "stores" / "b.zarr", spec=SPEC, suite="other")
+    if command == "compare":
+        shutil.rmtree(other)
+        shutil.copytree(store, other)
+    out = tmp_path / "out"
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    if command == "overlay":  # of stores of one run
+        change(other / "zarr.json", lambda root: root["policy"].update(name=MARKUP))
+        for folder in (other / "episodes").glob("task*"):
+            reseal(folder)
+    before = files_under(tmp_path)
+    given = [
+        word.replace("STORE", str(store)).replace("OTHER", str(other)).replace("OUT", str(out))
+        for word in WORDS[command]
+    ]
+    code = analyze([command, *given])
+    printed = check_output(capsys)
+    assert code == 0, printed
+    assert all(out in path.parents for path in files_under(tmp_path) - before)
+    for path in files_under(out):
+        assert path.relative_to(out).as_posix().isprintable()
+        if path.suffix in (".txt", ".csv", ".html"):
+            for line in path.read_text(encoding="utf-8").split("\n"):
+                assert line.isprintable(), (path.name, line)
+    if command == "ratios":
+        text = (out / "summary.txt").read_text()
+        assert r"put\x1b[2J the\u202e" in text
+        assert text in printed
+        assert (out / "attention_ratio_results_%24x%5E%7B%24 %3Cb%3E%252E.json").is_file()
+        assert parse(["--results", str(out), "--output", str(out / "parsed.txt")]) == 0
+        assert r"put\x1b[2J the\u202e" in check_output(capsys)
+    if command == "report":
+        page = (out / "report.html").read_text(encoding="utf-8")
+        tags = Tags()
+        tags.feed(page)
+        assert not [tag for tag in tags.tags if any(name.startswith("on") for name in tag[1])]
+        assert sum(tag == "script" for tag, _ in tags.tags) == 1
+        assert MARKUP not in page
+        assert "&lt;img src=x onerror=alert(1)&gt;" in page
+
+
+def test_the_list_of_a_store_and_its_status_are_visible(store, capsys):
+    hostile_texts(store)
+    assert analyze([str(store), "--list"]) == 0
+    assert r"put\x1b[2J the\u202e bowl\r\non the plate\x9b31m\u2028" in check_output(capsys)
+    assert capture(["status", str(store)]) == 0
+    assert r"put\x1b[2J the\u202e bowl\r\non" in check_output(capsys)
+
+
+def set_suite(root: dict[str, Any], name: str) -> None:
+    root["protocol"]["suite"] = name
+
+
+def set_camera(root: dict[str, Any], name: str) -> None:
+    root["sites"][0]["spans"][0]["camera"] = name
+
+
+def set_view(root: dict[str, Any], name: str) -> None:
+    root["policy"]["cameras"][0]["name"] = name
+
+
+def set_span(root: dict[str, Any], name: str) -> None:
+    root["sites"][0]["spans"][0]["name"] = name
+
+
+def set_policy(root: dict[str, Any], name: str) -> None:
+    root["policy"]["name"] = name
+
+
+def set_object(episode: dict[str, Any], name: str) -> None:
+    episode["objects"][0]["name"] = name
+
+
+def set_array(episode: dict[str, Any], name: str) -> None:
+    episode["arrays"][name] = episode["arrays"].pop("frames/base_0_rgb")
+
+
+def set_task(episode: dict[str, Any], name: str) -> None:
+    episode["task_name"] = name
+
+
+CONTROL, PATH = "a\x1b[2J\u202e", "../../../x"
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [*itertools.product([set_suite, set_camera, set_view, set_span], [PATH, CONTROL]), (set_policy, CONTROL)],
+)
+def test_a_run_whose_names_are_paths_or_control_a_terminal_is_refused(store, tmp_path, capsys, make, name):
+    change(store / "zarr.json", lambda attributes: make(attributes, name))
+    before = files_under(tmp_path)
+    for command in ((), ("verify",), ("heads",), ("report",)):
+        more = () if command == ("verify",) else ("--output", str(tmp_path / "out" / "report.html"))
+        assert analyze([*command, str(store), *more]) == 2
+        assert "cannot be read" in check_output(capsys)
+    assert capture(["status", str(store)]) == 2
+    check_output(capsys)
+    assert files_under(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", [PATH, CONTROL])
+@pytest.mark.parametrize("make", [set_object, set_array, set_task])
+def test_an_episode_whose_names_are_paths_or_control_a_terminal_is_refused(store, tmp_path, capsys, make, name):
+    change_episodes(store, lambda attributes: make(attributes, name))
+    before = files_under(tmp_path)
+    assert analyze([str(store), "--output", str(tmp_path / "out")]) == 2
+    assert "its attributes are damaged" in check_output(capsys)
+    assert analyze(["copy", str(store), str(tmp_path / "copy.zarr")]) == 2
+    check_output(capsys)
+    assert analyze(["verify", str(store)]) == 1
+    check_output(capsys)
+    assert not {path for path in files_under(tmp_path) - before if path.name != "zarr.json"}
+
+
+def test_a_seal_that_lists_files_outside_of_its_episode_copies_none(store, tmp_path, capsys):
+    (tmp_path / "secret").write_text("secret")
+    folder = store / "episodes" / "task000_episode000"
+    outside = "../../../../secret"
+
+    def list_outside(seal: dict[str, Any]) -> None:
+        seal["files"][outside] = {"size": 6, "sha256": bytes_digest(b"secret"), "index": "", "chunks": ""}
+        # The digest that such a seal would have, computed without the check of its paths.
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(store_format, "check_inner_path", lambda path: None)
+            seal["digest"] = seal_digest(from_json(store_format.EpisodeSeal, seal))
+
+    change(folder / "seal" / "zarr.json", list_outside)
+    assert analyze(["copy", str(store), str(tmp_path / "deep" / "er" / "copy.zarr")]) == 2
+    assert "its seal is damaged" in check_output(capsys)
+    assert list(tmp_path.rglob("secret")) == [tmp_path / "secret"]
