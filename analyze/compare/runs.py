@@ -219,7 +219,7 @@ def noted_differences(runs: Sequence[Run]) -> list[str]:
     """A line per run whose software or machine differs from the first one's, which is no reason to refuse it."""
     first, notes = runs[0], []
     for run in runs[1:]:
-        mine, theirs = (item.stores[0].attributes.provenance for item in (first, run))
+        mine, theirs = _provenance(first), _provenance(run)
         names = [name for name in {**mine, **theirs} if name not in _SIMULATOR and mine.get(name) != theirs.get(name)]
         if names:
             pairs = [f"{name} {mine.get(name, 'unknown')} and {theirs.get(name, 'unknown')}" for name in names]
@@ -298,5 +298,14 @@ def _processing(run: Run) -> dict[str, Any]:
 
 
 def _versions(run: Run, names: Sequence[str]) -> dict[str, str]:
-    provenance = run.stores[0].attributes.provenance
+    provenance = _provenance(run)
     return {name: provenance[name] for name in names if name in provenance}
+
+
+def _provenance(run: Run) -> dict[str, str]:
+    """Software and machine of the run's episodes, which several jobs may have captured; the root has the first's."""
+    found: dict[str, dict[str, None]] = {}
+    for item in run.question.selected:
+        for name, value in item.episode.attributes.provenance.items():
+            found.setdefault(name, {})[value] = None
+    return {name: listing(values) for name, values in found.items()}

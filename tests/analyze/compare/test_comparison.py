@@ -196,7 +196,7 @@ CHANGES = {
     "queries": lambda root: replace(root, recording=replace(root.recording, num_action_queries=4)),
     "processing": lambda root: replace(root, policy=replace(root.policy, config={"normalisation": "other"})),
     "cameras": lambda root: replace(root, policy=replace(root.policy, cameras=root.policy.cameras[:1])),
-    "simulator": lambda root: replace(root, provenance={**root.provenance, "mujoco": "1.2"}),
+    "simulator": lambda root: replace(root, provenance={"mujoco": "1.2"}),
 }
 
 
@@ -209,7 +209,13 @@ def changed(stores, monkeypatch):
 
         def changed_store(path):
             store = plain(path)
-            return replace(store, attributes=change(store.attributes)) if path == stores["higher"] else store
+            if path != stores["higher"]:
+                return store
+            root = change(store.attributes)
+            if root.provenance != store.attributes.provenance:  # as episodes of another job have it
+                for episode in store.episodes:
+                    episode.__dict__["attributes"] = replace(episode.attributes, provenance=root.provenance)
+            return replace(store, attributes=root)
 
         with monkeypatch.context() as patch:
             patch.setattr(runs_module, "open_store", changed_store)
