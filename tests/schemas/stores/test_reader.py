@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import zarr
+from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
 
+from tests.kit.attacks import exchange, files_of
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import (
     FORMAT_VERSION,
@@ -17,7 +21,7 @@ from vla_attention.schemas.stores.store_format import (
     StoreError,
     StoreNotFound,
 )
-from vla_attention.testing.stores import StoreSpec, episode_records, root_attributes, write_store
+from vla_attention.testing.stores import StoreSpec, episode_records, reseal, root_attributes, write_store
 
 SPEC = StoreSpec(tasks=(1, 12), episodes=2, replans=2)
 
@@ -78,6 +82,57 @@ def test_one_layer_does_not_need_the_others(path):
     np.testing.assert_allclose(episode.read("joint/rows", (slice(None), 1)), rows[:, 1], rtol=2**-11)
     with pytest.raises(CorruptEpisode, match="joint/rows of episode task001_episode000"):
         episode.read("joint/rows", (slice(None), 0, 0))
+
+
+LAYOUTS: dict[str, dict[str, Any]] = {
+    "one file": {},
+    "a file for each replan and layer": {"chunks": (1, 1, 2, 2, 1, 39)},
+    "names with dots": {"chunks": (1, 2, 2, 2, 1, 39), "chunk_key_encoding": {"name": "v2", "separator": "."}},
+    "shards of a layer a chunk": {"shards": (2, 2, 2, 2, 1, 39), "chunks": (2, 1, 2, 2, 1, 39)},
+    "a shard for each replan": {"shards": (1, 2, 2, 2, 1, 39), "chunks": (1, 1, 1, 2, 1, 39)},
+    "shards without checksums": {"shards": (2, 2, 2, 2, 1, 39), "chunks": (1, 1, 1, 2, 1, 39), "compressors": ()},
+    "zstd": {"compressors": (ZstdCodec(),)},
+    "plain": {"compressors": None},
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_an_array_of_any_layout_is_bound_to_its_episode(path, layout):
+    """Rows that somebody else stored, in a way that capture does not, and sealed."""
+    settings = {"compressors": (BloscCodec(typesize=4), Crc32cCodec())} | LAYOUTS[layout]
+    folders = [path / "episodes" / name for name in ("task001_episode000", "task001_episode001")]
+    written = []
+    for folder in folders:
+        values = zarr.open_array(folder / "joint/rows")[...]
+        written.append(values)
+        shutil.rmtree(folder / "joint/rows")
+        array = zarr.create_array(folder / "joint/rows", shape=values.shape, dtype="float32", **settings)
+        array[...] = values
+        reseal(folder)
+    for episode, values in zip(open_store(path).episodes, written, strict=False):
+        np.testing.assert_array_equal(episode.read("joint/rows"), values)
+        np.testing.assert_array_equal(episode.read_layer("joint/rows", 1, 0), values[:, 1, 0])
+        np.testing.assert_array_equal(episode.read("joint/rows", (1, 1)), values[1, 1])
+        np.testing.assert_array_equal(episode.read("joint/rows", (slice(None), slice(None), 1)), values[:, :, 1])
+    files = (
+        files_of(folders[0], "joint/rows")
+        if "dots" not in layout
+        else sorted((folders[0] / "joint/rows").glob("[0-9]*"))
+    )
+    assert files
+    for file in files:
+        exchange(file, folders[1] / file.relative_to(folders[0]))
+    for episode in open_store(path).episodes[:2]:
+        for read in (
+            lambda episode=episode: episode.read("joint/rows"),
+            lambda episode=episode: episode.read("joint/rows", (1, 1)),
+            lambda episode=episode: episode.read_layer("joint/rows", 1, 0),
+        ):
+            with pytest.raises(CorruptEpisode, match=f"joint/rows of episode {episode.name}.*not agree with its seal"):
+                read()
+    files[0].unlink()
+    with pytest.raises(CorruptEpisode, match="lost its joint/rows"):
+        open_store(path).episodes[0].read("joint/rows")
 
 
 def test_an_index_that_does_not_exist_is_the_callers_mistake(original):
