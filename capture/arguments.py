@@ -19,8 +19,10 @@ from vla_attention.schemas.precision import DEFAULT_MANTISSA_BITS
 
 _FURTHER_EXAMPLES = """\
   vla-capture status runs/libero_10.zarr                     what is there, what is missing, who is writing
+  vla-capture repair runs/libero_10.zarr                     move damaged episodes aside; --resume records them again
   vla-capture parity CASE                                    our numbers against a reference's, on your own checkpoint
 """
+_VERIFY_HELP = "read every byte, instead of only seals, presence and sizes of files"
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -51,11 +53,20 @@ def build_parser() -> argparse.ArgumentParser:
         "differences. Exit code 0: all within the limit, 1: beyond it, 2: the case cannot be used.",
     )
     _add_parity_arguments(parity, families)
+    repair = commands.add_parser(
+        "repair",
+        help="move damaged episodes of a store aside, so that --resume records them again",
+        description="Look for damaged episodes and move each into NAME.zarr.quarantine, beside the store, with the "
+        "reason. Nothing is deleted, and episodes that another process is writing are left alone. Exit code 1 when a "
+        "damaged episode is left in a store.",
+    )
+    _add_repair_arguments(repair)
     status = commands.add_parser(
         "status",
         help="what a store holds, what is missing, and who is writing",
         description="Episodes committed and expected per task, success, size, last writer, what is missing and what "
-        "is being written. Reads only; works while captures run, and needs neither torch nor a GPU.",
+        "is being written; which episodes are damaged and why. Reads only; works while captures run, and needs neither "
+        "torch nor a GPU.",
     )
     _add_status_arguments(status)
     tasks = commands.add_parser("tasks", help="the tasks of a suite", description="The tasks of a suite by their ids.")
@@ -242,11 +253,33 @@ def _add_status_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="episodes expected per task (default: what the runs that filled the store planned)",
     )
-    parser.add_argument("--check", action="store_true", help="exit code 1 when an expected episode is missing")
+    parser.add_argument(
+        "--check", action="store_true", help="exit code 1 when an expected episode is missing, or one is damaged"
+    )
+    parser.add_argument("--verify", action="store_true", help=_VERIFY_HELP)
     parser.set_defaults(command=_run_status)
 
 
 def _run_status(arguments: argparse.Namespace, termination: Termination) -> int:
     from vla_attention.capture.jobs.status import print_status
 
-    return print_status(arguments.stores, arguments.expected, as_json=arguments.json, check=arguments.check)
+    return print_status(
+        arguments.stores,
+        arguments.expected,
+        as_json=arguments.json,
+        check=arguments.check,
+        verify=arguments.verify,
+    )
+
+
+def _add_repair_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("stores", nargs="+", type=Path, metavar="STORE", help="one or several NAME.zarr")
+    parser.add_argument("--verify", action="store_true", help=_VERIFY_HELP)
+    parser.add_argument("--dry-run", action="store_true", help="list the damaged episodes, and move nothing")
+    parser.set_defaults(command=_run_repair)
+
+
+def _run_repair(arguments: argparse.Namespace, termination: Termination) -> int:
+    from vla_attention.capture.jobs.repair import print_repair
+
+    return print_repair(arguments.stores, verify=arguments.verify, dry_run=arguments.dry_run)

@@ -10,6 +10,7 @@ import torch
 from vla_attention.capture.environments.base import EnvironmentSettings, check_initial_state_index
 from vla_attention.capture.environments.episode_protocol import WAIT_STEPS, EvaluationProtocol
 from vla_attention.capture.environments.suites import list_tasks
+from vla_attention.capture.jobs.damaged_episodes import DamagedEpisodesLeft, find_damaged, what_to_do
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.jobs.worker import this_worker
 from vla_attention.capture.jobs.worker_records import (
@@ -36,6 +37,7 @@ from vla_attention.schemas.stores.store_format import (
     Protocol,
     Recording,
     RootAttributes,
+    episode_name,
 )
 
 _QUERIES = {"mean": "the mean over", "steps": "the action steps' means over", "all": "each of"}
@@ -111,15 +113,20 @@ def run_capture(
 
     Raises:
         Terminated: SIGTERM was received; the episode in progress was dropped.
+        DamagedEpisodesLeft: all missing episodes were recorded, but the store holds damaged ones, which stay.
     """
-    results = _record_missing(settings, policy, device, termination or Termination())
+    results, damaged = _record_missing(settings, policy, device, termination or Termination())
     say(f"{len(results)} episodes added, {sum(result.success for result in results)} solved. Store: {settings.store}")
+    left = find_damaged(settings.store, damaged) if damaged else []
+    if left:
+        raise DamagedEpisodesLeft(what_to_do(settings.store, left))
     return results
 
 
 def _record_missing(
     settings: RunSettings, policy: Policy, device: str, termination: Termination
-) -> list[EpisodeResult]:
+) -> tuple[list[EpisodeResult], list[str]]:
+    """Record what is missing; also returns the names of the episodes that are in the store, but damaged."""
     evaluation = settings.protocol or policy.default_protocol
     protocol = plan_protocol(settings, evaluation, policy)
     check_protocol(protocol, policy)
@@ -151,7 +158,12 @@ def _record_missing(
         if (task.task_id, episode) not in done
     ]
     todo.sort(key=lambda item: item[0].task_id)
-    _announce(policy, store, len(wanted) * settings.num_episodes, len(todo))
+    names = {episode_name(task.task_id, episode) for task in wanted for episode in range(settings.num_episodes)}
+    damaged = find_damaged(store.path, names) if done else []
+    _announce(policy, store, len(names), len(todo), len(damaged))
+    for fault in damaged:
+        say(f"Not recorded again without vla-capture repair: {fault.describe()}")
+    damaged_names = [fault.name for fault in damaged]
     expected = {task.task_id: task for task in (*wanted, *(tasks[index] for index in settings.array_task_ids))}
     plan = tuple(
         PlannedTask(task.task_id, task.name, task.instruction, settings.num_episodes)
@@ -159,7 +171,7 @@ def _record_missing(
     )
     known = planned_tasks(read_records(store.path))
     if not todo and all(task.task_id in known and known[task.task_id].episodes >= task.episodes for task in plan):
-        return []
+        return [], damaged_names
     worker = this_worker()
     record = RecordWriter(store.path, worker, plan, torch.get_num_threads())
     loop = EpisodeLoop(
@@ -172,7 +184,7 @@ def _record_missing(
         machine=machine,
         termination=termination,
     )
-    return loop.record_all(todo)
+    return loop.record_all(todo), damaged_names
 
 
 def _checkpoint_line(identity: PolicyIdentity) -> str:
@@ -187,7 +199,7 @@ def _checkpoint_line(identity: PolicyIdentity) -> str:
     )
 
 
-def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int) -> None:
+def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int, num_damaged: int) -> None:
     identity, recording, protocol = store.attributes.policy, store.attributes.recording, store.attributes.protocol
     say(
         f"Policy: {identity.name} ({identity.checkpoint_format}: {identity.checkpoint}), weights "
@@ -215,4 +227,6 @@ def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int) -
     estimate = estimate_disk(recording, store.attributes.sites, pictures, max_replans(protocol), num_todo)
     say(describe(estimate, store.path))
     if num_todo < num_wanted:
-        say(f"{num_wanted - num_todo} of {num_wanted} episodes are complete already; {num_todo} to run.")
+        complete = num_wanted - num_todo - num_damaged
+        damaged = f" and {num_damaged} damaged" if num_damaged else ""
+        say(f"{complete} of {num_wanted} episodes are complete already{damaged}; {num_todo} to run.")

@@ -10,27 +10,27 @@ from pathlib import Path
 
 from vla_attention.capture.environments.suites import SUITES
 from vla_attention.capture.jobs.claims import Holder, holders
+from vla_attention.capture.jobs.damaged_episodes import DamagedEpisode, look_at
 from vla_attention.capture.jobs.worker_records import planned_tasks, read_records
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.safe_text import visible
-from vla_attention.schemas.stores.reader import StoredEpisode, open_store
-from vla_attention.schemas.stores.store_format import CorruptEpisode, EpisodeAttributes, parse_episode_name
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import parse_episode_name
 
 
 @dataclass(frozen=True)
 class EpisodeStatus:
-    """One committed episode.
+    """One committed episode that is whole, as far as was looked.
 
-    success: None if the attributes cannot be read.
     at: time of the commit (ISO 8601, UTC).
     by: the worker; empty if no record names it.
     """
 
     task_id: int
     episode: int
-    success: bool | None
+    success: bool
     bytes: int
     at: str
     by: str
@@ -41,8 +41,9 @@ class TaskStatus:
     """One task.
 
     expected: number of episodes; None if neither the user nor a record gives it.
+    committed, success, bytes: of the episodes that are not damaged.
     missing: indices of the expected episodes that the store lacks.
-    unreadable: number of episodes whose attributes cannot be read.
+    damaged: episodes that are in the store, but cannot be used.
     """
 
     task_id: int
@@ -50,11 +51,11 @@ class TaskStatus:
     committed: int
     expected: int | None
     success: int
-    unreadable: int
     bytes: int
     last_at: str
     last_by: str
     missing: tuple[int, ...]
+    damaged: tuple[DamagedEpisode, ...]
 
 
 @dataclass(frozen=True)
@@ -69,24 +70,27 @@ class StoreStatus:
 
     @property
     def complete(self) -> bool | None:
-        """Whether the store has all expected episodes; None if their number is unknown for a task."""
-        if any(task.missing for task in self.tasks):
+        """Whether the store has all expected episodes, undamaged; None if their number is unknown for a task."""
+        if any(task.missing or task.damaged for task in self.tasks):
             return False
         return None if any(task.expected is None for task in self.tasks) or not self.tasks else True
 
-    def missing_lines(self) -> list[str]:
-        """Return a line for every task with missing episodes."""
-        return [
-            f"task {task.task_id} lacks {len(task.missing)} of {task.expected} episodes: {listing(task.missing, 20)}"
+    def lacking_lines(self) -> list[str]:
+        """Return a line for every task with missing episodes, and for every damaged episode."""
+        missing = [
+            f"missing: task {task.task_id} lacks {len(task.missing)} of {task.expected} episodes: "
+            f"{listing(task.missing, 20)}"
             for task in self.tasks
             if task.missing
         ]
+        return missing + [f"damaged: {episode.describe()}" for task in self.tasks for episode in task.damaged]
 
 
-def store_status(path: Path, expected: int | None = None) -> StoreStatus:
+def store_status(path: Path, expected: int | None = None, verify: bool = False) -> StoreStatus:
     """Return the status of a store.
 
     expected: episodes per task; None takes the numbers that the workers planned.
+    verify: read every byte to find damaged episodes, instead of seals, presence and sizes only.
 
     Raises:
         BadArgument: `expected` is below 1.
@@ -101,30 +105,35 @@ def store_status(path: Path, expected: int | None = None) -> StoreStatus:
     plan = planned_tasks(records)
     writers = {commit.episode: (commit.at, record.worker) for record in records for commit in record.committed}
     episodes: dict[int, list[EpisodeStatus]] = {}
+    damaged: dict[int, list[DamagedEpisode]] = {}
     instructions: dict[int, str] = {task.task_id: task.instruction for task in plan.values()}
     for stored in store.episodes:
         task_id, index = parse_episode_name(stored.name)
+        fault = look_at(store, stored, verify)
+        if fault is not None:
+            damaged.setdefault(task_id, []).append(fault)
+            continue
         at, worker = writers.get(stored.name, ("", None))
-        attributes = _attributes(stored)
-        if attributes is not None:
-            instructions[task_id] = attributes.instruction
+        instructions[task_id] = stored.attributes.instruction
         episodes.setdefault(task_id, []).append(
             EpisodeStatus(
                 task_id=task_id,
                 episode=index,
-                success=None if attributes is None else attributes.success,
+                success=stored.attributes.success,
                 bytes=sum(file.stat().st_size for file in stored.folder.rglob("*") if file.is_file()),
                 at=at or _time_of(stored.folder),
                 by=worker.describe() if worker else "",
             )
         )
-    ids = set(plan) | set(episodes)
+    ids = set(plan) | set(episodes) | set(damaged)
     if expected is not None and not plan:
         ids |= set(range(next((suite.num_tasks for suite in SUITES if suite.name == root.protocol.suite), 0)))
     tasks = []
     for task_id in sorted(ids):
         found = episodes.get(task_id, [])
         wanted = expected if expected is not None else plan[task_id].episodes if task_id in plan else None
+        faulty = damaged.get(task_id, [])
+        present = {parse_episode_name(episode.name)[1] for episode in faulty} | {episode.episode for episode in found}
         last = max(found, key=lambda episode: episode.at, default=None)
         tasks.append(
             TaskStatus(
@@ -132,36 +141,29 @@ def store_status(path: Path, expected: int | None = None) -> StoreStatus:
                 instruction=instructions.get(task_id, ""),
                 committed=len(found),
                 expected=wanted,
-                success=sum(episode.success is True for episode in found),
-                unreadable=sum(episode.success is None for episode in found),
+                success=sum(episode.success for episode in found),
                 bytes=sum(episode.bytes for episode in found),
                 last_at=last.at if last else "",
                 last_by=last.by if last else "",
-                missing=tuple(sorted(set(range(wanted or 0)) - {episode.episode for episode in found})),
+                missing=tuple(sorted(set(range(wanted or 0)) - present)),
+                damaged=tuple(faulty),
             )
         )
     return StoreStatus(str(path), root.protocol.suite, root.policy.name, tuple(tasks), tuple(holders(path)))
 
 
-def print_status(stores: Sequence[Path], expected: int | None, as_json: bool, check: bool) -> int:
+def print_status(stores: Sequence[Path], expected: int | None, as_json: bool, check: bool, verify: bool = False) -> int:
     """Print the status of stores, as text or as JSON.
 
     Returns:
-        The exit code: 1 if `check` is set and an expected episode is missing, else 0.
+        The exit code: 1 if `check` is set and an expected episode is missing or one is damaged, else 0.
     """
-    found = [store_status(store, expected) for store in stores]
+    found = [store_status(store, expected, verify) for store in stores]
     if as_json:
         print(json.dumps([to_json(status) | {"complete": status.complete} for status in found], indent=1))
     else:
         print("\n\n".join(_text(status) for status in found))
     return 1 if check and any(status.complete is False for status in found) else 0
-
-
-def _attributes(stored: StoredEpisode) -> EpisodeAttributes | None:
-    try:
-        return stored.attributes
-    except CorruptEpisode:
-        return None
 
 
 def _time_of(folder: Path) -> str:
@@ -190,12 +192,9 @@ def _text(status: StoreStatus) -> str:
     rows = [("task", "episodes", "solved", "size", "last written (UTC)", "by", "instruction"), *map(_cells, tasks)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines += ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    unreadable = [task for task in tasks if task.unreadable]
-    lines += [
-        f"task {task.task_id}: the attributes of {task.unreadable} episodes cannot be read; see vla-analyze verify."
-        for task in unreadable
-    ]
-    lines += [f"missing: {line}" for line in status.missing_lines()]
+    lines += status.lacking_lines()
+    if any(task.damaged for task in tasks):
+        lines.append(f"Damaged episodes are moved aside by: vla-capture repair {status.store}")
     if status.complete is None:
         lines.append("The expected number of episodes is unknown; give it with --expected N.")
     elif status.complete:

@@ -181,6 +181,7 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], threads: Threa
 
     from vla_attention.capture.capture_run import run_capture
     from vla_attention.capture.device import load_torch
+    from vla_attention.capture.jobs.damaged_episodes import DamagedEpisodesLeft
     from vla_attention.capture.rollout.progress import say
 
     say(threads.describe())
@@ -188,10 +189,16 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], threads: Threa
     policy = arguments.family.build(arguments, device)
     # A layer that does not exist is an error before the capture, not after it.
     select_layers(arguments.layers, policy.num_layers, policy.family)
+    damaged = []
     for job in jobs:
         if len(jobs) > 1:
             say(f"Suite {job.settings.suite.name}:")
-        run_capture(job.settings, policy, device, termination)
+        try:
+            run_capture(job.settings, policy, device, termination)
+        except DamagedEpisodesLeft as error:
+            damaged.append(str(error))  # the other suites do not wait for a repair
+    if damaged:
+        raise DamagedEpisodesLeft(" ".join(damaged))
 
 
 def _analyze(job: _Job, script: PublishedScript) -> int:
@@ -200,7 +207,7 @@ def _analyze(job: _Job, script: PublishedScript) -> int:
     from vla_attention.schemas.stores.root import read_root
 
     arguments, store = job.arguments, job.settings.store
-    for line in store_status(store).missing_lines():
+    for line in store_status(store).lacking_lines():
         say(f"{store}: {line}")
     root = read_root(store)
     layers, typed = _layers(arguments.layers, script.layers, root.policy.num_layers, root.policy.family)

@@ -70,7 +70,10 @@ class StoredEpisode:
         """What binds the episode's files to its name and run; `CorruptEpisode` when it is not that of this episode."""
         try:
             seal = read_seal(self.folder)
-        except (OSError, ValueError) as error:
+        except OSError as error:
+            lost = error.strerror or error
+            raise CorruptEpisode(f"Episode {self.name} cannot be read: it has lost its seal ({lost}).") from None
+        except ValueError as error:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: its seal is damaged ({error}).") from None
         problem = identity_problem(seal, self.name, self.run)
         if problem is not None:

@@ -21,6 +21,9 @@ class StillScene:
         self._observation = make_observation(initial_state_index)
         self.initial_state_digest = hashlib.sha256(bytes([initial_state_index])).hexdigest()
 
+    def missing_resets(self, initial_state_index: int, seed: int) -> int:
+        return 0
+
     def step(self, action: np.ndarray, observe: bool) -> StepResult:
         return StepResult(False, self._observation if observe else None)
 

@@ -50,9 +50,9 @@ def test_every_file_is_missed(episode):
 
 def test_an_emptied_folder_and_one_that_is_gone(episode):
     shutil.rmtree(episode)
-    assert "its seal is damaged" in " ".join(problems(episode))
+    assert "it has lost its seal" in " ".join(problems(episode))
     episode.mkdir()
-    assert "its seal is damaged" in " ".join(problems(episode))
+    assert "it has lost its seal" in " ".join(problems(episode))
 
 
 def test_cut_off_grown_and_edited_files(episode):
