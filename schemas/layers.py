@@ -54,8 +54,8 @@ def _translation_note(numbers: Sequence[int], num_layers: int) -> str | None:
         return None
     translated = ", ".join(f"{number} = block {number - num_layers}" for number in calls)
     note = (
-        f"Layers {translated}: numbers from {num_layers} on are read as the published scripts' recorded-call numbers "
-        "(first denoise step there; here the block at every selected denoise step)."
+        f"Layers {translated}: numbers from {num_layers} on are read as the published scripts' recorded-call numbers, "
+        "which are of the first denoise step."
     )
     twice = [number for number in calls if number - num_layers in numbers]
     if twice:

@@ -33,6 +33,7 @@ from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, MissingDependency
 from vla_attention.schemas.layout import Role, SiteLayout
 from vla_attention.schemas.precision import mass_error_bound
+from vla_attention.schemas.safe_text import visible
 
 if TYPE_CHECKING:
     import xarray
@@ -200,10 +201,8 @@ def _sample_coordinates(question: Question) -> dict[str, tuple[str, NDArray[Any]
         constant = {
             "suite": item.store.suite,
             "store": item.store.path.name,
-            **{
-                name: getattr(attributes, name)
-                for name in ("task_id", "instruction", "episode_index", "success", "num_steps")
-            },
+            **{name: getattr(attributes, name) for name in ("task_id", "episode_index", "success", "num_steps")},
+            "instruction": visible(attributes.instruction),
         }
         for name, value in constant.items():
             columns[name] += [value] * attributes.num_replans

@@ -131,13 +131,16 @@ def _denoise_notes(root: RootAttributes, selection: Selection, grouping: Groupin
     """Of which denoise steps the numbers are, where these are a choice or differ from the published ones."""
     steps, num_steps = selection.denoise_steps, root.policy.num_denoise_steps
     these = denoise_text(steps, num_steps)
-    if grouping.published_denoise is not None:
-        published = 0 if grouping.published_denoise == "first" else num_steps - 1
+    # Layers that are numbered as recorded calls are those of the first denoise step in the published scripts.
+    calls = any(label >= root.policy.num_layers for label in selection.layer_labels)
+    named = grouping.published_denoise or ("first" if calls else None)
+    if named is not None:
+        published = 0 if named == "first" else num_steps - 1
         if steps == (published,):
             return (f"These numbers are of {these} alone, as those of the published scripts.",)
         return (
             f"These numbers are means over {these}; those of the published scripts are of denoise step {published} "
-            f"alone: compare with --denoise {grouping.published_denoise}.",
+            f"alone: compare with --denoise {named}.",
         )
     chosen = len(steps) < len(root.recording.denoise_steps)
     return (f"These numbers are of {these} only, as --denoise asks.",) if chosen else ()

@@ -51,7 +51,7 @@ def explain(axes: Axes, text: str) -> None:
 def title(figure: Figure, text: str, note: str = "") -> None:
     """The title of a figure, and below it a note (n, what was left out), wrapped to the figure's width."""
     width = int(figure.get_figwidth() * _CHARACTERS_PER_INCH)
-    lines = textwrap.wrap(note, width) if note else []
+    lines = textwrap.wrap(visible(" ".join(note.split())), width)
     figure.suptitle("\n".join([wrapped(text, width, 2), *lines]), x=0.01, ha="left", size=9, linespacing=1.35)
 
 

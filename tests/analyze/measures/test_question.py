@@ -14,7 +14,7 @@ from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.store_format import StoreError
-from vla_attention.testing.stores import write_store
+from vla_attention.testing.stores import reseal, write_store
 
 
 def damage_rows(store: Path, episode: str) -> None:
@@ -120,5 +120,22 @@ def test_the_grouping_reference_says_which_denoise_step_the_published_numbers_ar
     printed, _ = texts_of(tmp_path / "out", capsys, *words)
     assert "are means over denoise steps 0, 9 of 10; those of the published scripts are of denoise step 0" in printed
     assert "compare with --denoise first" in printed
+    alone = "are of denoise step 0 (the first) of 10 alone, as those of the published scripts"
+    printed, _ = texts_of(tmp_path / "out", capsys, *words, "--denoise", "first")
+    assert alone in printed
+
+
+def test_layers_numbered_as_recorded_calls_say_which_denoise_step_the_published_ones_are_of(tmp_path, capsys):
+    path = write_store(tmp_path / "a.zarr")  # 4 layers
+    content = json.loads((path / "zarr.json").read_text())
+    content["attributes"]["policy"]["family"] = "pi05"
+    (path / "zarr.json").write_text(json.dumps(content))
+    for folder in (path / "episodes").glob("task*"):
+        reseal(folder)
+    words = (str(path), "--layers", "4", "6", "--no-plots")
+    printed, _ = texts_of(tmp_path / "out", capsys, *words)
+    assert "those of the published scripts are of denoise step 0 alone: compare with --denoise first" in printed
     printed, _ = texts_of(tmp_path / "out", capsys, *words, "--denoise", "first")
     assert "are of denoise step 0 (the first) of 10 alone, as those of the published scripts" in printed
+    printed, _ = texts_of(tmp_path / "out", capsys, str(path), "--layers", "0", "2", "--no-plots")
+    assert "published scripts are of" not in printed
