@@ -38,10 +38,8 @@ def seal_episode(folder: Path, name: str, run: str, copied_from: str = "") -> Ep
     }
     records: dict[str, FileRecord] = {}
     for file in files:
-        in_shards = (
-            None if file.name == "zarr.json" else next((shards[at] for at in file.parents if at in shards), None)
-        )
-        records[file.relative_to(folder).as_posix()] = _file_record(file.read_bytes(), in_shards)
+        chunks = None if file.name == "zarr.json" else next((shards[at] for at in file.parents if at in shards), None)
+        records[file.relative_to(folder).as_posix()] = _file_record(file.read_bytes(), chunks)
     seal = EpisodeSeal(name, run, records, digest="", copied_from=copied_from)
     seal = replace(seal, digest=seal_digest(seal))
     (folder / SEAL_GROUP).mkdir(exist_ok=True)

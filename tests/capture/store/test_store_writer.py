@@ -292,7 +292,9 @@ def test_the_examples_of_the_documentation_run(written, tmp_path, monkeypatch, c
     (tmp_path / "run.zarr").symlink_to(written[0])
     monkeypatch.chdir(tmp_path)
     exec(compile(example, str(DOCUMENT), "exec"), {})
-    assert len(capsys.readouterr().out) > 10
+    printed = capsys.readouterr().out
+    assert len(printed) > 10
+    assert "False" not in printed
 
 
 def test_the_documentation_lists_every_array_and_role(written):
