@@ -139,21 +139,9 @@ def _replan(
     recorders = make_recorders(recording, policy.sites, policy_input.key_role, pools)
     actions = policy.act(policy_input, seed, recorders)
     rows = {site: recorder.finish() for site, recorder in recorders.items()}
+    where = f"replan {len(writer.records)} (environment step {protocol.wait_steps + step}) of {writer.what}"
     if not all_finite(actions, rows):
-        raise _not_finite(policy, policy_input, seed, store, writer, step)
-    coverage = {
-        camera.name: patch_coverage(
-            _segmentation(environment, camera.source, observation),
-            len(environment.objects),
-            grid.rows,
-            grid.columns,
-            flip_rows=camera.upright,
-            flip_columns=camera.mirrored,
-            visible=camera.visible,
-        )
-        for camera in policy.cameras
-        for grid in [camera_grid(policy.sites, camera.name)]
-    }
+        raise _not_finite(policy, policy_input, seed, store, where)
     writer.append(
         ReplanRecord(
             env_step=protocol.wait_steps + step,
@@ -164,26 +152,41 @@ def _replan(
             state=policy_input.state,
             actions=actions,
             frames=policy_input.frames if recording.frames else {},
-            coverage=coverage,
+            coverage=_coverage(environment, policy, observation, where),
         )
     )
     return actions
 
 
-def _segmentation(environment: Environment, camera: str, observation: Observation) -> NDArray[np.integer]:
-    """Return the object of every pixel of a camera's picture (height, width)."""
-    segmentation, picture = environment.segmentation(camera), camera_frame(observation, camera)
-    if segmentation.shape != picture.shape[:2] or segmentation.dtype.kind not in "iu":
-        raise BadArgument(
-            f"The environment's segmentation of camera '{camera}' has the shape {segmentation.shape} and type "
-            f"{segmentation.dtype}; expected the picture's {picture.shape[:2]}, and whole numbers."
-        )
-    return segmentation
+def _coverage(
+    environment: Environment, policy: Policy, observation: Observation, where: str
+) -> dict[str, NDArray[np.float32]]:
+    """Return how much of each patch each object covers, (patch, object) by policy camera."""
+    coverage = {}
+    for camera in policy.cameras:
+        segmentation, grid = environment.segmentation(camera.source), camera_grid(policy.sites, camera.name)
+        expected = camera_frame(observation, camera.source).shape[:2]
+        try:
+            if segmentation.shape != expected or segmentation.dtype.kind not in "iu":
+                raise BadArgument(
+                    f"The segmentation has the shape {segmentation.shape} and type {segmentation.dtype}; expected "
+                    f"whole numbers for the picture's {expected} pixels."
+                )
+            coverage[camera.name] = patch_coverage(
+                segmentation,
+                len(environment.objects),
+                grid.rows,
+                grid.columns,
+                flip_rows=camera.upright,
+                flip_columns=camera.mirrored,
+                visible=camera.visible,
+            )
+        except BadArgument as error:
+            raise BadArgument(f"Cannot store {where}, camera '{camera.source}': {error}") from None
+    return coverage
 
 
-def _not_finite(
-    policy: Policy, policy_input: PolicyInput, seed: int, store: RunStore, writer: EpisodeWriter, step: int
-) -> NumbersNotFinite:
+def _not_finite(policy: Policy, policy_input: PolicyInput, seed: int, store: RunStore, where: str) -> NumbersNotFinite:
     """Return the error of a policy call whose results are not finite; it repeats the call to find where that began."""
     wrong_inputs = [name for name, values in policy_input.tensors.items() if not torch.isfinite(values).all()]
     if wrong_inputs:
@@ -197,7 +200,6 @@ def _not_finite(
     dtype = store.attributes.policy.config.get("dtype")
     remedy = "use another checkpoint" if dtype == "float32" else "use --dtype float32, or another checkpoint"
     return NumbersNotFinite(
-        f"The policy's numbers turned NaN or infinite in {writer.what}, replan {len(writer.records)} (step {step}). "
-        f"{origin}. Nothing of this episode was kept, and the episodes before it are unharmed; {remedy}, and a new "
-        "--store."
+        f"The policy's numbers turned NaN or infinite at {where}. {origin}. Nothing of this episode was kept, and the "
+        f"episodes before it are unharmed; {remedy}, and a new --store."
     )

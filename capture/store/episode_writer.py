@@ -159,9 +159,9 @@ class EpisodeWriter:
         for what in ("state", "actions"):
             values, before = getattr(record, what), getattr(first, what)
             if values.shape != before.shape:
-                yield f"its {what} have the shape {values.shape}, those of the first replan {before.shape}"
+                yield f"{what} has the shape {values.shape}; that of the first replan is {before.shape}"
             if not np.isfinite(values).all():
-                yield f"its {what} are not all finite numbers"
+                yield f"{what} holds numbers that are NaN or infinite"
 
     def commit(self, success: bool, num_steps: int) -> Path:
         """Finish, verify and publish the episode; returns its folder in the store.

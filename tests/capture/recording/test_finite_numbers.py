@@ -82,7 +82,11 @@ def test_a_policy_that_overflows_is_reported_with_its_first_layer(
     said = capsys.readouterr()
     assert "Traceback" not in said.err
     assert said.err.count("\n") == 1
-    assert f"turned NaN or infinite in episode task000_episode001 of {store}, replan {replan} " in said.err
+    step = 4 * replan  # actions of a chunk that are executed
+    assert (
+        f"turned NaN or infinite at replan {replan} (environment step {10 + step}) of episode task000_episode001"
+        in said.err
+    )
     assert f"They begin {where}, in the output of {'dit.' * (family == 'cosmos')}{module}. " in said.err
     (episode,) = open_store(store).episodes
     assert episode.name == "task000_episode000"

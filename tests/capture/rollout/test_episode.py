@@ -112,6 +112,7 @@ class FakeStore:
             recording=Recording((0,), (0,), (1,), (0, 1), "mean", 1, 10, frames=False),
         )
         self.records: list[ReplanRecord] = []
+        self.what = "episode task003_episode002"
         self.ending: tuple[bool, int] | None = None
         self.dropped = False
 
@@ -175,6 +176,26 @@ def test_a_replan_is_stored_with_its_rows_and_coverage() -> None:
     assert record.coverage["base"].tolist() == [[0, 1], [1, 0]]
     assert record.frames == {}
     assert record.actions.shape == (4, 7)
+
+
+@pytest.mark.parametrize(
+    ("segmentation", "message"),
+    [
+        (np.zeros((2, 4), dtype=np.int32), r"shape \(2, 4\) and type int32; expected whole numbers .* \(4, 2\) pixels"),
+        (np.zeros((4, 2)), "type float64; expected whole numbers"),
+        (np.full((4, 2), 2, dtype=np.int32), "holds indices 2 to 2; with 2 objects, 0 to 1 are valid"),
+        (np.full((4, 2), -1, dtype=np.int32), "holds indices -1 to -1"),
+    ],
+)
+def test_a_segmentation_that_does_not_fit_its_picture_is_refused(segmentation, message) -> None:
+    environment, store = FakeEnvironment(), FakeStore()
+    environment.segmentation = lambda camera: segmentation
+    with pytest.raises(BadArgument, match=message) as caught:
+        record_episode(environment, FakePolicy(), store, TASK, 2, {})
+    assert str(caught.value).startswith(
+        "Cannot store replan 0 (environment step 10) of episode task003_episode002, camera 'agentview': "
+    )
+    assert store.dropped
 
 
 def test_an_error_of_the_check_drops_the_episode() -> None:
