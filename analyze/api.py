@@ -223,15 +223,18 @@ class OpenStores:
         level = row_metrics(self.ask(**settings))
         return level.cells if table == "rows" else level.groups
 
-    def sinks(self, **settings: Unpack[SettingKeywords]) -> pl.DataFrame:
-        """Keys of each task that take far more than their share in most rows (`measures.sinks`). Reads all rows.
+    def sinks(self, table: Literal["sinks", "heads"] = "sinks", **settings: Unpack[SettingKeywords]) -> pl.DataFrame:
+        """Keys of each task that take far more than their share in a head (`measures.sinks`). Reads all rows.
+
+        "heads" has a row for every head of a layer in which a key is a sink.
 
         >>> va.open(store).sinks().columns[:3]
         ['suite', 'task_id', 'num_episodes']
         """
-        from vla_attention.analyze.measures.sinks import sinks_table
+        from vla_attention.analyze.measures.sinks import search_sinks
 
-        return sinks_table(self.ask(**settings))
+        _check_name("table", table, ("sinks", "heads"))
+        return _frame(search_sinks(self.ask(**settings)), table)
 
     def words(
         self, table: Literal["summary", "episodes"] = "summary", **settings: Unpack[SettingKeywords]

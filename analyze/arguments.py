@@ -84,20 +84,32 @@ def add_output(parser: argparse.ArgumentParser, default: str = "results/STORE/GR
 
 
 def add_sink_rule(parser: argparse._ArgumentGroup) -> None:
-    """--sink-factor and --sink-share; their defaults are those of `measures.sinks.SinkRule`."""
+    """--sink-factor, --sink-share, --sink-mass, --sink-heads; their defaults are those of `measures.sinks.SinkRule`."""
     parser.add_argument(
         "--sink-factor", type=float, metavar="X", help="a sink takes more than X times its uniform share (default: 10)"
     )
     parser.add_argument(
-        "--sink-share", type=float, metavar="F", help="in at least this share of the rows (default: 0.5)"
+        "--sink-share", type=float, metavar="F", help="in at least this share of a head's rows (default: 0.5)"
+    )
+    parser.add_argument(
+        "--sink-mass",
+        type=float,
+        metavar="M",
+        help="or on average more than this part of a row (default: 0.3)",
+    )
+    parser.add_argument(
+        "--sink-heads",
+        type=float,
+        metavar="H",
+        help="--without-sinks takes out sinks of at least this share of the layers' heads (default: 0.25)",
     )
 
 
 def sink_rule(arguments: argparse.Namespace) -> SinkRule:
-    """The rule that --sink-factor and --sink-share give."""
+    """The rule that the four arguments give."""
     from vla_attention.analyze.measures.sinks import SinkRule
 
-    given = {"factor": arguments.sink_factor, "share": arguments.sink_share}
+    given = {name: getattr(arguments, f"sink_{name}") for name in ("factor", "share", "mass", "heads")}
     return SinkRule(**{name: value for name, value in given.items() if value is not None})
 
 

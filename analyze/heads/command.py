@@ -25,7 +25,8 @@ _EXAMPLES = """examples:
   vla-analyze heads runs/libero_10.zarr --sink-factor 20 --sink-share 0.25
   vla-analyze heads runs/libero_10.zarr --no-rows     (masses only: a moment, also for large stores)
 
-A sink is a key that takes more than --sink-factor times its uniform share in at least --sink-share of a task's rows.
+A sink of a head is a key that takes more than --sink-factor times its uniform share in at least --sink-share of the
+head's rows, or more than --sink-mass of a row on average; sinks are found task by task.
 """
 
 

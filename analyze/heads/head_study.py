@@ -15,7 +15,7 @@ from vla_attention.analyze.measures.aggregate import episode_tables, replan_tabl
 from vla_attention.analyze.measures.frames import Tables, concat_tables, named_tables
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import resolve_all
-from vla_attention.analyze.measures.sinks import key_shares_table, sinks_of
+from vla_attention.analyze.measures.sinks import SinkSearch, search_of
 from vla_attention.analyze.measures.steps import (
     MeasuredEpisode,
     measure_episode,
@@ -42,8 +42,7 @@ class HeadStudy:
         depth: `depth.depth_table`.
         denoise: `denoise.denoise_tables`.
         rows: `row_metrics.row_tables`, or None.
-        key_shares: `sinks.key_shares_table`, or None.
-        sinks: `sinks.sinks_of`, or None.
+        search: the sinks, or None.
     """
 
     question: Question
@@ -55,15 +54,15 @@ class HeadStudy:
     depth: pl.DataFrame
     denoise: Tables
     rows: Tables | None
-    key_shares: pl.DataFrame | None
-    sinks: pl.DataFrame | None
+    search: SinkSearch | None
 
     def tables(self) -> dict[str, pl.DataFrame]:
         """The tables that are written to files, by the files' names."""
         tables = named_tables("heads", self.heads) | {"dispersion": self.dispersion, "depth": self.depth}
         tables |= named_tables("denoise", self.denoise)
-        if self.rows is not None and self.sinks is not None:
-            tables |= {**named_tables("row_metrics", self.rows), "sinks": self.sinks}
+        if self.rows is not None and self.search is not None:
+            tables |= named_tables("row_metrics", self.rows)
+            tables |= {"sinks": self.search.sinks, "sink_heads": self.search.heads}
         return tables
 
 
@@ -98,11 +97,10 @@ def study_heads(question: Question, options: RowOptions | None = None) -> HeadSt
     over_heads = [episode.over_heads() for episode in measured]
     replans = replan_tables(over_heads, grouping)
     episodes = episode_tables(replans, grouping)
-    rows = key_shares = sinks = None
+    rows = search = None
     if options is not None and measures is not None:
         rows = row_tables(question.selected, measures, shown, selection, options)
-        key_shares = key_shares_table(question, [of_episode.shares for of_episode in measures])
-        sinks = sinks_of(key_shares, options.rule)
+        search = search_of(question, [of_episode.shares for of_episode in measures], options.rule)
     return HeadStudy(
         question=question,
         options=options,
@@ -113,6 +111,5 @@ def study_heads(question: Question, options: RowOptions | None = None) -> HeadSt
         depth=depth_table(episodes, contribution_norms(question, resolved), seed),
         denoise=denoise_tables(over_heads, grouping, seed),
         rows=rows,
-        key_shares=key_shares,
-        sinks=sinks,
+        search=search,
     )

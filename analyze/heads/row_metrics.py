@@ -14,7 +14,7 @@ from vla_attention.analyze.measures.frames import EPISODE_ID, Tables, denoise_ax
 from vla_attention.analyze.measures.masses import masses
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
-from vla_attention.analyze.measures.sinks import KeyShares, SinkRule, key_sums
+from vla_attention.analyze.measures.sinks import KeyShares, SinkRule
 from vla_attention.analyze.measures.steps import with_valid
 from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.parallel import map_episodes
@@ -79,10 +79,10 @@ def empty_measures(
     entropy = np.empty((ends[-1], *cells, num_entropies), dtype=np.float32)
     top = np.empty((ends[-1], *cells, len(options.top)), dtype=np.float32)
     mass = None if num_masses is None else np.empty((ends[-1], *cells, num_masses), dtype=np.float32)
-    shares = np.zeros((len(items), 2, items[0].tokens.layout.num_keys))
+    shares = [KeyShares.empty(selection, item.tokens.layout.num_keys) for item in items]
     parts = [slice(end - item.tokens.num_replans, end) for item, end in zip(items, ends, strict=True)]
     return [
-        RowMeasures(entropy[part], top[part], None if mass is None else mass[part], KeyShares(*share))
+        RowMeasures(entropy[part], top[part], None if mass is None else mass[part], share)
         for part, share in zip(parts, shares, strict=True)
     ]
 
@@ -112,17 +112,13 @@ def measure_rows(
     inside = valid[:, used]
     columns = [*(resolved.names.index(name) for name in shown), weights.shape[2] - 1]
     within = np.ascontiguousarray(weights[:, used][:, :, columns] * inside[:, :, None])
-    above, held, count = np.zeros(len(used), np.int64), np.zeros(len(used)), 0
     for part in layer_rows(item.episode, selection, question.site):
         rows = part.rows if len(used) == part.rows.shape[2] else part.rows[:, :, used]
         out.entropy[:, part.layer, part.denoise] = entropies(rows, within)
         out.top[:, part.layer, part.denoise] = top_mass(rows, inside, options.top)
         if out.mass is not None:
             out.mass[:, part.layer, part.denoise] = masses(part.rows, weights)
-        if selection.is_first_of_block(part.layer):
-            more, sums = key_sums(rows, inside, options.rule.factor)
-            above, held, count = above + more, held + sums, count + rows.shape[0] * rows.shape[1]
-    out.shares.above[used], out.shares.held[used] = above / count, held / count
+        out.shares.add(part.layer, rows, inside, options.rule.factor, selection, used)
 
 
 def row_tables(

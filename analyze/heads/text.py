@@ -12,7 +12,8 @@ from vla_attention.analyze.heads.head_study import HeadStudy
 from vla_attention.analyze.heads.row_metrics import episode_layer_means
 from vla_attention.analyze.measures.aggregate import overall_rows
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
-from vla_attention.analyze.measures.sinks import SinkRule, merged_sinks
+from vla_attention.analyze.measures.sink_kinds import SMALL_VALUES, kind_name
+from vla_attention.analyze.measures.sinks import SinkRule, SinkSearch, cannot_fire, merged_sinks
 from vla_attention.analyze.show.headings import WIDTH, heading, interval_note, wrap, wrap_all
 from vla_attention.analyze.show.numbers import (
     format_interval,
@@ -275,44 +276,54 @@ def _rows_by_layer(study: HeadStudy) -> str:
 
 def _sinks(study: HeadStudy) -> str:
     assert study.options is not None
-    assert study.sinks is not None
-    assert study.key_shares is not None
+    assert study.search is not None
     rule = study.options.rule
-    return "\n".join([heading(f"SINKS  keys that take {rule}"), sinks_text(study.sinks, study.key_shares, rule)])
+    lines = [heading("SINKS  keys that take far more than their share in a head"), sinks_text(study.search, rule)]
+    return "\n".join(lines)
 
 
-def sinks_text(sinks: pl.DataFrame, key_shares: pl.DataFrame, rule: SinkRule) -> str:
+def sinks_text(search: SinkSearch, rule: SinkRule) -> str:
     """The sinks as a table over tasks, or the key that comes nearest to being one."""
-    num_tasks = key_shares.select("suite", "task_id").n_unique()
+    keys, sinks = search.keys, search.sinks
+    num_tasks, num_heads = keys.select("suite", "task_id").n_unique(), int(keys["num_heads"][0])
+    beyond = cannot_fire(float(keys["num_valid"].max()), rule)  # type: ignore[arg-type]
     if sinks.is_empty():
-        nearest = key_shares.sort("share_of_rows", "mean_mass", descending=True).row(0, named=True)
+        nearest = keys.sort("largest_mass", descending=True).row(0, named=True)
         text = (
-            f"None. The key that comes nearest, {nearest['description']} ({nearest['role']}), takes that much in "
-            f"{nearest['share_of_rows']:.0%} of the rows of task {nearest['task_id']}, and on average "
-            f"{format_number(nearest['times_uniform'])} x its uniform share. Other rules: --sink-factor, --sink-share."
+            f"No key takes {rule}. The key that comes nearest, {nearest['description']} ({nearest['role']}), takes "
+            f"{format_percent(nearest['largest_mass'])} of the rows of a head of task {nearest['task_id']}, and "
+            f"{format_number(nearest['times_uniform'])} x its uniform share on average over the heads. {beyond} Other "
+            "rules: --sink-factor, --sink-share, --sink-mass."
         )
         return "\n".join(wrap(text))
     merged = merged_sinks(sinks)
-    header = ["key", "role", "tasks", "rows", "mass", "x uniform"]
+    header = ["key", "role", "tasks", "heads", "by mass", "mass", "x uniform", "most", "values"]
     rows = [
         [
-            str(row["key"]),
+            f"{row['key']}{'*' if row['widespread'] else ''}",
             row["role"],
             f"{row['num_tasks']} of {num_tasks}",
-            format_percent(row["share_of_rows"]),
+            format_percent(row["heads_share"]),
+            format_percent(row["heads_by_mass_share"]),
             format_percent(row["mean_mass"]),
             format_number(row["times_uniform"]),
+            format_percent(row["largest_mass"]),
+            kind_name(row["value_ratio"]) if row["value_ratio"] is None
+            else f"{kind_name(row['value_ratio'])} ({format_number(row['value_ratio'])})",
         ]
         for row in merged.head(_MOST_SINKS).iter_rows(named=True)
-    ]
+    ]  # fmt: skip
     texts = merged.head(_MOST_SINKS)["description"].to_list()
     lines = [text_table(header, rows, left=(0, 1), last="what it is", texts=texts, width=WIDTH)]
     if merged.height > _MOST_SINKS:
         lines.append(f"{merged.height - _MOST_SINKS} more in sinks.parquet.")
     note = (
-        "Searched task by task. rows: share of the (replan, layer, denoise step, head) rows in which the key takes "
-        "that much; mass: mean share of the valid keys' mass. Numbers without these keys: vla-analyze ratios "
-        "--without-sinks, with the same --sink-factor and --sink-share."
+        f"Searched task by task and head by head. heads: share of the layers' {num_heads:d} heads in which the key "
+        f"takes {rule}; by mass: the latter. mass: mean share of the valid keys' mass; most: in the head where it is "
+        "largest. values: length of what the key adds per unit of mass, beside all other valid keys together (small: "
+        f"below {SMALL_VALUES:g}); ?: not recorded, or the key is one of several in a segment, and contributions are "
+        f"of whole segments. *: in at least {rule.heads:.0%} of the heads; vla-analyze ratios --without-sinks (with "
+        f"the same --sink options) takes these out. {beyond}"
     )
     return "\n".join([*lines, *wrap(note)])
 

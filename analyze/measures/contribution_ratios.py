@@ -52,6 +52,12 @@ def joint_norm(gram: NDArray[np.floating], chosen: NDArray[np.bool_], weights: A
     return norm
 
 
+def segment_masses(item: SelectedEpisode, site: str, selection: Selection) -> Array:
+    """Masses (replan, layer, denoise, segment) of the selected layers and denoise steps, mean over all stored heads."""
+    atoms = item.episode.read(f"{site}/atoms")[:, list(selection.layers)][:, :, list(selection.denoise)]
+    return np.asarray(atoms.mean(axis=(3, 4), dtype=np.float64))
+
+
 def uniform_weights(item: SelectedEpisode, site: str, selection: Selection) -> Array:
     """u_i of every part (replan, layer, denoise, part): its mass under uniform attention / its mass.
 
@@ -65,8 +71,7 @@ def uniform_weights(item: SelectedEpisode, site: str, selection: Selection) -> A
     members = segment_members(layout, roles, segments) & ~np.isin(roles, INVALID_ROLES)[:, :, None]
     keys = members.sum(axis=1, dtype=np.float64)  # (replan or 1, segment)
     share = (keys / keys.sum(axis=1, keepdims=True))[:, None, None]
-    atoms = item.episode.read(f"{site}/atoms")[:, list(selection.layers)][:, :, list(selection.denoise)]
-    mass = atoms.mean(axis=(3, 4), dtype=np.float64)
+    mass = segment_masses(item, site, selection)
     if len(root.recording.heads) < root.policy.num_heads:
         mass = np.full_like(mass, np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):

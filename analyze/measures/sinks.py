@@ -1,12 +1,21 @@
-"""Sinks: keys that take far more than their share in most rows, and masses without them.
+"""Sinks: keys that take far more than their share in a head, and masses without the widespread ones.
 
-The rule. In a row whose n valid keys hold the mass S, the uniform share of a key is S / n. A key is a sink of a task
-when it takes more than `factor` times that share in at least the share `share` of the task's rows (every selected
-replan, layer, denoise step and head; the mean over the task's episodes, which weigh the same). It is the metric of Gu
-et al. (2024), "When Attention Sink Emerges in Language Models", section 3: the share of heads in which a key's
-attention exceeds a threshold. Their threshold is 0.3; here it is relative to the uniform share, because a row may have
-thirty keys or a thousand. Xiao et al. (2023), "Efficient Streaming Language Models with Attention Sinks", found that
-such keys get attention that no other key needs, whatever they hold.
+The rule. In a row whose n valid keys hold the mass S, the uniform share of a key is S / n. A key is a sink of one head
+of one layer, for one task, when over the rows of that head (every selected replan and denoise step; episodes weigh the
+same)
+
+    by multiple   it takes more than `factor` times its uniform share in at least the share `share` of the rows, or
+    by mass       its mean share of the row exceeds `mass`, and twice its uniform share.
+
+By mass is the metric of Gu et al. (2024), "When Attention Sink Emerges in Language Models", section 3, with their
+threshold 0.3: the share of heads in which a key's mean attention exceeds it. By multiple finds keys that take 5 % of
+500. With `factor` or fewer valid keys it cannot fire, because a key would have to take more than the whole row: such
+sites are judged by mass alone, and the text says so. Xiao et al. (2023), "Efficient Streaming Language Models with
+Attention Sinks", found that such keys get attention that no other key needs, whatever they hold.
+
+Heads differ: a key can take half of one head's rows and nothing of another's, and its mean over heads then shows
+nothing. A key that is a sink in one head alone may be what this head looks for, however. `--without-sinks` therefore
+takes out keys that are sinks in at least the share `heads` of the selected layers' heads (`widespread`), for all heads.
 
 Sinks are found per task, because the text depends on the instruction and the scene on the task. The rule cannot tell a
 sink from a key that deserves attention in most rows: look at the listed keys before you use a corrected number.
@@ -23,6 +32,8 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.measures.sink_kinds import value_ratios
+from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.analyze.stores.rows import layer_rows
@@ -33,44 +44,101 @@ from vla_attention.schemas.layout import Role
 
 DEFAULT_FACTOR = 10.0
 DEFAULT_SHARE = 0.5
+DEFAULT_MASS = 0.3
+DEFAULT_HEADS = 0.25
 #: A value that exceeds a limit by less than this share of it may exceed it by rounding only.
 _ROUNDING = 5e-6
 
 
 @dataclass(frozen=True)
 class SinkRule:
-    """When a key is a sink: more than `factor` times its uniform share in at least the share `share` of the rows.
+    """When a key is a sink of a head, and in how large a share of the heads it is a widespread one; see the module.
 
-    Raises `BadArgument` for a factor below 1 or a share outside (0, 1].
+    Raises `BadArgument` for a factor below 1, or a share outside (0, 1].
     """
 
     factor: float = DEFAULT_FACTOR
     share: float = DEFAULT_SHARE
+    mass: float = DEFAULT_MASS
+    heads: float = DEFAULT_HEADS
 
     def __post_init__(self) -> None:
-        """Check factor and share."""
+        """Check the numbers."""
         if not 1.0 <= self.factor < np.inf:
             raise BadArgument(
                 f"The sink factor {self.factor:g} must be at least 1: at 1 a key takes its uniform share."
             )
-        if not 0.0 < self.share <= 1.0:
-            raise BadArgument(f"The sink share {self.share:g} is no share of rows; expected more than 0 and at most 1.")
+        shares = (("share", self.share, "rows"), ("mass", self.mass, "a row"), ("heads", self.heads, "heads"))
+        for name, value, of in shares:
+            if not 0.0 < value <= 1.0:
+                raise BadArgument(f"The sink {name} {value:g} is no share of {of}; expected more than 0 and at most 1.")
 
     def __str__(self) -> str:
-        return f"more than {self.factor:g} x the uniform share in at least {self.share:.0%} of the rows"
+        return (
+            f"more than {self.factor:g} x the uniform share in at least {self.share:.0%} of a head's rows, or on "
+            f"average more than {self.mass:.0%} of a row"
+        )
+
+    def can_fire_by_multiple(self, num_valid: float) -> bool:
+        """Whether a key of so many valid ones can take more than `factor` times its uniform share."""
+        return num_valid > self.factor
 
 
 @dataclass(frozen=True)
 class KeyShares:
-    """How much each key of an episode takes, and in how many rows it takes more than the factor allows.
+    """How much each key of an episode takes in each head; `layer` counts blocks once.
 
     Attributes:
-        above: share of the rows in which the key takes more than the factor, shape (key,).
-        held: mean over rows of the key's share in the mass of the valid keys, shape (key,).
+        above: share of the rows in which the key takes more than the factor, shape (layer, head, key) float32.
+        held: mean over rows of the key's share in the mass of the valid keys, shape (layer, head, key) float32.
     """
 
-    above: NDArray[np.float64]
-    held: NDArray[np.float64]
+    above: NDArray[np.float32]
+    held: NDArray[np.float32]
+
+    @classmethod
+    def empty(cls, selection: Selection, num_keys: int) -> KeyShares:
+        """Zeros, to which `add` adds."""
+        shape = (len(layers_once(selection)), len(selection.heads), num_keys)
+        return cls(np.zeros(shape, np.float32), np.zeros(shape, np.float32))
+
+    def add(
+        self,
+        layer: int,
+        rows: NDArray[np.float32],
+        valid: NDArray[np.bool_],
+        factor: float,
+        selection: Selection,
+        keys: NDArray[np.int64] | slice = slice(None),
+    ) -> None:
+        """Count the rows (replan, head, key) of a layer (position in the selection) at one of its denoise steps.
+
+        A block that was named by two layer numbers counts once. `keys`: which keys the rows are of.
+        """
+        if selection.is_first_of_block(layer):
+            above, held = key_sums(rows, valid, factor)
+            count, at = rows.shape[0] * len(selection.denoise), layers_once(selection).index(layer)
+            self.above[at][:, keys] += (above / count).astype(np.float32)
+            self.held[at][:, keys] += (held / count).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class SinkSearch:
+    """Which keys are sinks of which heads; see `search_of`."""
+
+    keys: pl.DataFrame
+    heads: pl.DataFrame
+
+    @property
+    def sinks(self) -> pl.DataFrame:
+        """The rows of `keys` that are a sink of a head, the strongest of each task first."""
+        found = self.keys.filter(pl.col("sink_heads") > 0)
+        return found.sort("suite", "task_id", "mean_mass", "key", descending=[False, False, True, False])
+
+
+def layers_once(selection: Selection) -> list[int]:
+    """Positions of the selected layers, without those that name a block again."""
+    return [i for i in range(len(selection.layers)) if selection.is_first_of_block(i)]
 
 
 def key_sums(
@@ -84,7 +152,7 @@ def key_sums(
         factor: multiple of the uniform share.
 
     Returns:
-        Two arrays of shape (key,): number of rows, and the sum over rows of p_k / S.
+        Two arrays of shape (head, key): number of rows, and the sum over rows of p_k / S.
     """
     seen = rows if valid.all() else rows * valid[:, None, :]
     total = seen.sum(axis=2, dtype=np.float32)
@@ -93,61 +161,92 @@ def key_sums(
         limit = np.where(total > 0, factor * total / valid.sum(axis=1)[:, None], np.inf)
     # Sums in float32 err by some 1e-6: with a factor of 1, keys that share evenly must not exceed their share.
     limit = (limit * (1.0 + _ROUNDING)).astype(np.float32)
-    above = (seen > limit[:, :, None]).sum(axis=(0, 1))
-    held = inverse.reshape(1, -1) @ seen.reshape(-1, seen.shape[2])
-    return above, held[0].astype(np.float64)
+    above = (seen > limit[:, :, None]).sum(axis=0)
+    held = np.matmul(inverse.T[:, None, :], seen.transpose(1, 0, 2))[:, 0]
+    return above, held.astype(np.float64)
 
 
 def episode_key_shares(item: SelectedEpisode, selection: Selection, site: str, rule: SinkRule) -> KeyShares:
-    """Read an episode's rows once. A block that was named by two layer numbers counts once."""
+    """Read an episode's rows once."""
     valid = item.valid
-    above, held, count = np.zeros(valid.shape[1], np.int64), np.zeros(valid.shape[1]), 0
+    shares = KeyShares.empty(selection, valid.shape[1])
     for part in layer_rows(item.episode, selection, site):
-        if selection.is_first_of_block(part.layer):
-            more, mass = key_sums(part.rows, valid, rule.factor)
-            above, held, count = above + more, held + mass, count + part.rows.shape[0] * part.rows.shape[1]
-    return KeyShares(above / count, held / count)
+        shares.add(part.layer, part.rows, valid, rule.factor, selection)
+    return shares
 
 
-def key_shares_table(question: Question, shares: Sequence[KeyShares]) -> pl.DataFrame:
-    """One row per (task, key that is valid in one of its episodes), episodes weighing the same.
+def search_of(question: Question, shares: Sequence[KeyShares], rule: SinkRule) -> SinkSearch:
+    """Both tables of a search, episodes of a task weighing the same.
 
-    Columns: suite, task_id, num_episodes; key, span, role (the commonest over the replans at which the key is valid),
-    patch_row, patch_column (null unless the key is a patch), description (in words); share_of_rows, mean_mass (share of
-    the valid keys' mass), times_uniform (mean_mass x mean number of valid keys).
+    Returns:
+        keys: one row per (task, key that is valid in one of its episodes): suite, task_id, num_episodes; key, span,
+            role (the commonest over the replans at which the key is valid), patch_row, patch_column (null unless the
+            key is a patch), description (in words); num_valid (mean number of valid keys); share_of_rows (in which it
+            takes more than the factor), mean_mass (share of the valid keys' mass), times_uniform (mean_mass x
+            num_valid), largest_mass (mean mass in the head where it is largest), sink_heads (heads of layers in which
+            it is a sink), heads_by_mass (in which it is one by mass), num_heads (all heads of the selected layers),
+            widespread (sink_heads / num_heads is at least the rule's `heads`), value_ratio (see `sink_kinds`; null
+            where it cannot be told).
+        heads: one row per (task, key, layer, head) where the key is a sink: suite, task_id, key, layer, block, head,
+            share_of_rows, mean_mass, by_mass.
     """
-    frames = []
+    selection = question.selection
+    once = layers_once(selection)
+    frames, heads = [], []
     for (suite, task), positions in _tasks(question).items():
         items = [question.selected[i] for i in positions]
-        above = np.mean([shares[i].above for i in positions], axis=0)
-        held = np.mean([shares[i].held for i in positions], axis=0)
+        above, held = (
+            np.stack([getattr(shares[i], name) for i in positions]).mean(axis=0, dtype=np.float64)
+            for name in ("above", "held")
+        )
         valid = [item.valid for item in items]
-        num_valid = np.mean([part.sum(axis=1).mean() for part in valid])
+        num_valid = float(np.mean([part.sum(axis=1).mean() for part in valid]))
         keys = np.flatnonzero(np.any([part.any(axis=0) for part in valid], axis=0))
+        by_mass = held > max(rule.mass, 2.0 / num_valid)
+        # A share is a mean of quotients: rounding must not put one half below 0.5.
+        is_sink = by_mass | (above >= rule.share - _ROUNDING)
+        count = is_sink.sum(axis=(0, 1))
+        num_heads = above.shape[0] * above.shape[1]
         described = pl.DataFrame([_describe(int(key), items, valid) for key in keys], schema=_DESCRIPTION, orient="row")
+        labels = [pl.lit(suite).alias("suite"), pl.lit(task, dtype=pl.Int64).alias("task_id")]
+        mean_mass = held.mean(axis=(0, 1))
         frames.append(
             described.select(
-                pl.lit(suite).alias("suite"),
-                pl.lit(task, dtype=pl.Int64).alias("task_id"),
+                *labels,
                 pl.lit(len(items), dtype=pl.Int64).alias("num_episodes"),
                 pl.all(),
-                pl.Series("share_of_rows", above[keys]),
-                pl.Series("mean_mass", held[keys]),
-                pl.Series("times_uniform", held[keys] * num_valid),
+                pl.lit(num_valid).alias("num_valid"),
+                pl.Series("share_of_rows", above.mean(axis=(0, 1))[keys]),
+                pl.Series("mean_mass", mean_mass[keys]),
+                pl.Series("times_uniform", mean_mass[keys] * num_valid),
+                pl.Series("largest_mass", held.max(axis=(0, 1))[keys]),
+                pl.Series("sink_heads", count[keys]),
+                pl.Series("heads_by_mass", by_mass.sum(axis=(0, 1))[keys]),
+                pl.lit(num_heads, dtype=pl.Int64).alias("num_heads"),
+                pl.Series("widespread", (count[keys] > 0) & (count[keys] >= rule.heads * num_heads - 1e-9)),
             )
         )
-    return pl.concat(frames)
+        layer, head, key = np.nonzero(is_sink)
+        table = pl.DataFrame(
+            {
+                "key": key,
+                "layer": np.array([selection.layer_labels[i] for i in once])[layer],
+                "block": np.array([selection.blocks[i] for i in once])[layer],
+                "head": np.array(selection.head_numbers)[head],
+                "share_of_rows": above[layer, head, key],
+                "mean_mass": held[layer, head, key],
+                "by_mass": by_mass[layer, head, key],
+            }
+        )
+        heads.append(table.sort("key", "layer", "head").select(*labels, pl.all()))
+    of_heads = pl.concat(heads)
+    kinds = value_ratios(question, of_heads)
+    on = ["suite", "task_id", "key"]
+    return SinkSearch(pl.concat(frames).join(kinds, on=on, how="left", maintain_order="left"), of_heads)
 
 
-def sinks_of(key_shares: pl.DataFrame, rule: SinkRule) -> pl.DataFrame:
-    """The rows of `key_shares_table` that are sinks, the strongest of each task first."""
-    # A share is a mean of quotients: rounding must not put one half below 0.5.
-    found = key_shares.filter(pl.col("share_of_rows") >= rule.share - 1e-9)
-    return found.sort("suite", "task_id", "mean_mass", "key", descending=[False, False, True, False])
-
-
-def sinks_table(question: Question, rule: SinkRule | None = None) -> pl.DataFrame:
-    """The sinks of every task, in the columns of `key_shares_table`. Reads all selected rows once."""
+def search_sinks(question: Question, rule: SinkRule | None = None) -> SinkSearch:
+    """Look for sinks in every task; reads all selected rows once."""
     rule = rule or SinkRule()
 
     def measure(item: SelectedEpisode) -> KeyShares:
@@ -155,50 +254,85 @@ def sinks_table(question: Question, rule: SinkRule | None = None) -> pl.DataFram
 
     with progress_bar(len(question.selected), "episodes searched for sinks") as advance:
         shares = map_episodes(measure, question.selected, advance)
-    return sinks_of(key_shares_table(question, shares), rule)
+    return search_of(question, shares, rule)
 
 
 def without_sinks(question: Question, sinks: pl.DataFrame, rule: SinkRule) -> Question:
-    """The same question with every task's sinks taken out of all groups and of the valid keys.
+    """The same question with every task's widespread sinks taken out of all groups and of the valid keys.
 
-    Masses, fractions, lifts, ratios and uniform baselines then all are those of the remaining keys. The grouping is
-    called NAME-without-sinks, so that its results are not taken for those with all keys, and a note says what was taken
-    out. Norms of contributions cannot be corrected: their Gram matrices are of whole segments.
+    Masses, fractions, lifts, ratios and uniform baselines then all are those of the remaining keys, in every head. The
+    grouping is called NAME-without-sinks, so that its results are not taken for those with all keys, and a note says
+    what was taken out. Norms of contributions cannot be corrected: their Gram matrices are of whole segments.
+
+    Raises:
+        BadArgument: no valid key of a task would be left.
     """
     keys: dict[tuple[str, int], tuple[int, ...]] = {}
-    for suite, task, key in sinks.select("suite", "task_id", "key").iter_rows():
+    for suite, task, key in sinks.filter("widespread").select("suite", "task_id", "key").iter_rows():
         keys[suite, task] = (*keys.get((suite, task), ()), key)
     selected = tuple(
         replace(item, without=tuple(sorted({*item.without, *keys.get(_task_of(item), ())})))
         for item in question.selected
     )
+    for item in selected:
+        if not item.valid.any():
+            raise BadArgument(
+                f"Every valid key of task {_task_of(item)[1]} is a sink by this rule, so that nothing is left without "
+                "sinks; give a larger --sink-factor, --sink-mass or --sink-heads."
+            )
     grouping = replace(question.grouping, name=f"{question.grouping.name}-without-sinks")
-    notes = (*question.notes, describe_sinks(sinks, len(_tasks(question)), rule))
+    num_valid = max(float(item.valid.sum(axis=1).mean()) for item in question.selected)
+    notes = (*question.notes, describe_sinks(sinks, len(_tasks(question)), rule, num_valid))
     return replace(question, selected=selected, grouping=grouping, notes=notes)
 
 
 def merged_sinks(sinks: pl.DataFrame) -> pl.DataFrame:
-    """Sinks over tasks, one row per (key, description): num_tasks, and means over those tasks of the three numbers."""
-    numbers = ("share_of_rows", "mean_mass", "times_uniform")
+    """Sinks over tasks, one row per (key, description): num_tasks, and over those tasks means of the numbers.
+
+    `heads_share` and `heads_by_mass_share` are shares of the layers' heads; `widespread` holds when it does in a task.
+    """
+    numbers = ("share_of_rows", "mean_mass", "times_uniform", "value_ratio")
     merged = sinks.group_by("key", "span", "role", "description", maintain_order=True).agg(
         pl.struct("suite", "task_id").n_unique().cast(pl.Int64).alias("num_tasks"),
         *(pl.col(name).mean() for name in numbers),
+        pl.col("largest_mass").max(),
+        (pl.col("sink_heads") / pl.col("num_heads")).mean().alias("heads_share"),
+        (pl.col("heads_by_mass") / pl.col("num_heads")).mean().alias("heads_by_mass_share"),
+        pl.col("widespread").any(),
     )
     return merged.sort("num_tasks", "mean_mass", "key", descending=[True, True, False])
 
 
-def describe_sinks(sinks: pl.DataFrame, num_tasks: int, rule: SinkRule) -> str:
-    """The keys that were taken out, as a sentence for a summary."""
-    if sinks.is_empty():
-        return f"Without sinks: no key takes {rule}, so nothing was taken out."
+def cannot_fire(num_valid: float, rule: SinkRule) -> str:
+    """Why the rule's first part finds nothing among so few valid keys, as a sentence; empty where it can."""
+    if rule.can_fire_by_multiple(num_valid):
+        return ""
+    return (
+        f"With {num_valid:.3g} valid keys none can take more than {rule.factor:g} x its uniform share, which is all of "
+        f"the row: keys are judged by their mass alone, and a smaller --sink-factor judges by multiples too."
+    )
+
+
+def describe_sinks(sinks: pl.DataFrame, num_tasks: int, rule: SinkRule, num_valid: float) -> str:
+    """The keys that were taken out, as sentences for a summary; `num_valid`: most valid keys of a task."""
+    out = sinks.filter("widespread")
+    left = sinks.height - out.height
+    also = ""
+    if left:
+        also = f" Sinks of fewer heads stay: {plural(left, 'key')} of tasks (--sink-heads takes them out)."
+    of_rule = f"{rule}, in at least {rule.heads:.0%} of the layers' heads"
+    also += f" {cannot_fire(num_valid, rule)}".rstrip()
+    if out.is_empty():
+        return f"Without sinks: no key takes {of_rule}, so nothing was taken out.{also}"
     of = f"of {num_tasks} tasks" if num_tasks > 1 else "of the one task"
     named = [
-        f"{row['description']} ({row['role']}; in {row['num_tasks']} {of}, {row['mean_mass']:.1%} of the mass)"
-        for row in merged_sinks(sinks).iter_rows(named=True)
+        f"{row['description']} ({row['role']}; in {row['num_tasks']} {of}, in {row['heads_share']:.0%} of the heads, "
+        f"{row['mean_mass']:.1%} of the mass)"
+        for row in merged_sinks(out).iter_rows(named=True)
     ]
     return (
-        f"Without sinks, keys that take {rule}: {listing(named, 6)} {'is' if len(named) == 1 else 'are'} out of every "
-        "group and of the valid keys (but not of norms of contributions)."
+        f"Without sinks, keys that take {of_rule}: {listing(named, 6)} {'is' if len(named) == 1 else 'are'} out of "
+        f"every group and of the valid keys (but not of norms of contributions).{also}"
     )
 
 

@@ -22,7 +22,7 @@ from vla_attention.analyze.measures.frames import Tables, named_tables
 from vla_attention.analyze.measures.group_contributions import group_contribution_tables
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import resolve_all
-from vla_attention.analyze.measures.sinks import SinkRule, sinks_table
+from vla_attention.analyze.measures.sinks import SinkRule, search_sinks
 from vla_attention.analyze.measures.sinks import without_sinks as question_without_sinks
 from vla_attention.analyze.measures.steps import MeasuredEpisode, measure_episodes, step_tables
 from vla_attention.analyze.published.frame_proxy import frame_proxy
@@ -122,7 +122,7 @@ def analyse(question: Question, without_sinks: SinkRule | None = None) -> Analys
     """
     sinks = None
     if without_sinks is not None:
-        sinks = sinks_table(question, without_sinks)
+        sinks = search_sinks(question, without_sinks).sinks
         question = question_without_sinks(question, sinks, without_sinks)
     grouping = question.grouping
     resolved = resolve_all(grouping, question.selected, question.vocabulary)

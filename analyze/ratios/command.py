@@ -63,6 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Analyse, print the summary, and write tables and pictures."""
     # Imported here, so that `--help` does not wait for polars and zarr.
     from vla_attention.analyze.measures.question import ask
+    from vla_attention.analyze.measures.sinks import SinkRule
     from vla_attention.analyze.ratios.analysis import analyse, write_tables
     from vla_attention.schemas.errors import BadArgument
 
@@ -72,8 +73,8 @@ def run(arguments: argparse.Namespace) -> int:
 
         print("\n\n".join(describe_store(store, arguments.tasks) for store in stores))
         return 0
-    if not arguments.without_sinks and (arguments.sink_factor, arguments.sink_share) != (None, None):
-        raise BadArgument("--sink-factor and --sink-share define a sink for --without-sinks; give --without-sinks too.")
+    if not arguments.without_sinks and sink_rule(arguments) != SinkRule():
+        raise BadArgument("--sink-factor and its like define a sink for --without-sinks; give --without-sinks too.")
     rule = sink_rule(arguments) if arguments.without_sinks else None
     analysis = analyse(ask(stores, settings_of(arguments)), without_sinks=rule)
     folder = output_folder(arguments, analysis.grouping.name)

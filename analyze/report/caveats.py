@@ -9,6 +9,7 @@ from typing import ClassVar
 import polars as pl
 
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.sinks import SinkRule
 from vla_attention.analyze.ratios.analysis import Analysis
 from vla_attention.analyze.ratios.summary_text import FEW_EPISODES
 from vla_attention.analyze.report.section_parts import Section
@@ -181,14 +182,15 @@ def _sinks(sinks: pl.DataFrame | None) -> list[Caveat]:
             "This report did not look for keys that take far more than their share; vla-analyze heads lists them."
         )
         return [Caveat("Sinks", sentence)]
+    sinks = sinks.filter("widespread")
     if sinks.is_empty():
         return []
     share = format_percent(float(sinks["mean_mass"].sum()), 0)
     sentence = (
         f"{plural(sinks.height, 'key')} {'take' if sinks.height > 1 else 'takes'} far more than the share of a key in "
-        f"most rows ({listing(sinks['description'].to_list(), 3)}), together {share} of the attention to valid keys in "
-        "the tasks that have them. They may carry no information, and they change the ratio: compare with "
-        "--without-sinks."
+        f"{SinkRule().heads:.0%} or more of the layers' heads ({listing(sinks['description'].to_list(), 3)}), "
+        f"together {share} of the attention to valid keys in the tasks that have them. They may carry no information, "
+        "and they change the ratio: compare with --without-sinks."
     )
     return [Caveat("Sinks", sentence, True)]
 

@@ -12,7 +12,7 @@ import polars as pl
 
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.role_masses import role_masses
-from vla_attention.analyze.measures.sinks import merged_sinks, sinks_table
+from vla_attention.analyze.measures.sinks import merged_sinks, search_sinks
 from vla_attention.analyze.ratios.analysis import Analysis, analyse
 from vla_attention.analyze.report.caveats import Caveat, caveat_section, caveats
 from vla_attention.analyze.report.headline import headline_section
@@ -58,7 +58,7 @@ def write_report(question: Question, path: Path, settings: ReportSettings) -> No
 def report_html(analysis: Analysis, settings: ReportSettings) -> str:
     """One self-contained HTML page on an analysis. The same analysis gives the same page, to the byte."""
     question = analysis.question
-    sinks = merged_sinks(sinks_table(question)) if settings.rows else None
+    sinks = merged_sinks(search_sinks(question).sinks) if settings.rows else None
     notes = caveats(analysis, role_masses(question), sinks)
     found = []
     with tempfile.TemporaryDirectory() as folder:

@@ -8,6 +8,7 @@ from pathlib import Path
 import polars as pl
 
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.sink_kinds import SMALL_VALUES, kind_name
 from vla_attention.analyze.measures.sinks import SinkRule
 from vla_attention.analyze.objects.object_attention import object_tables
 from vla_attention.analyze.objects.object_settings import ObjectSettings
@@ -59,33 +60,37 @@ def time_section(analysis: Analysis, folder: Path) -> Section | None:
 
 
 def sink_section(sinks: pl.DataFrame) -> Section:
-    """Keys that take far more than their share in most rows, from `sinks.merged_sinks` with the default rule."""
+    """Keys that take far more than their share in a head, from `sinks.merged_sinks` with the default rule."""
     explanation = Paragraph(
-        f"A sink is a key that takes {SinkRule()} of a task. Trained transformers put attention that nothing needs on "
+        f"A sink is a key that takes {SinkRule()}. Trained transformers put attention that nothing needs on "
         "a few such keys, and their values may be near zero; a mass includes them like any other key."
     )
     if sinks.is_empty():
-        return Section("sinks", "Sinks", [explanation, Paragraph("There are none here.")])
+        return Section("sinks", "Sinks", [explanation, Paragraph("No key is one here.")])
     shown, heaviest = sinks.head(_MOST_ROWS), sinks.row(0, named=True)
     rows = [
         [
             text_cell(row["description"]),
             text_cell(row["role"]),
             count_cell(row["num_tasks"]),
+            percent_cell(row["heads_share"]),
+            percent_cell(row["heads_by_mass_share"]),
             percent_cell(row["share_of_rows"]),
             percent_cell(row["mean_mass"]),
             number_cell(row["times_uniform"]),
+            text_cell(kind_name(row["value_ratio"])),
         ]
         for row in shown.iter_rows(named=True)
     ]
     found = (
         f"{'One key is a sink' if sinks.height == 1 else f'{sinks.height} keys are sinks'} here; the first, "
         f"{heaviest['description']}, takes {format_percent(heaviest['mean_mass'])} of the attention to valid keys. "
-        "vla-analyze ratios --without-sinks computes everything without sinks."
+        "vla-analyze ratios --without-sinks computes everything without those of many heads. Values: what the key adds "
+        f"per unit of mass, beside all other keys (small: less than {SMALL_VALUES:g} of it; ?: it cannot be told)."
     )
     left = sinks.height - len(rows)
     caption = f"Sinks, the first {len(rows)}; vla-analyze heads lists {left} more" if left else "Sinks"
-    header = ["key", "role", "tasks", "rows %", "mass %", "times uniform"]
+    header = ["key", "role", "tasks", "heads %", "heads by mass %", "rows %", "mass %", "times uniform", "values"]
     return Section("sinks", "Sinks", [explanation, Paragraph(found), Table(caption, header, rows)])
 
 

@@ -180,7 +180,7 @@ def test_the_guide_names_every_column(run, tmp_path):
     names = ("heads", "heads_groups", "dispersion", "depth", "denoise", "denoise_groups")
     tables += [*(run.heads(name) for name in names), run.row_metrics(), run.row_metrics("groups")]
     run_with_norms = va.open(write_store(tmp_path / "a.zarr", contributions=True))
-    tables.append(run_with_norms.contributions())
+    tables += [run_with_norms.contributions(), run.sinks(), run.sinks("heads")]
     tables += [run.objects(name) for name in ("objects", "summary", "times", "pointing", "iou")]
     ends = ("_low", "_high", "_episodes")
     missing = {

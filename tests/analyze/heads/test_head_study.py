@@ -24,7 +24,7 @@ from vla_attention.analyze.heads.head_measures import ranked_heads
 from vla_attention.analyze.heads.head_study import study_heads
 from vla_attention.analyze.heads.row_metrics import RowOptions, row_metrics
 from vla_attention.analyze.heads.text import heads_text
-from vla_attention.analyze.measures.sinks import SinkRule, sinks_table, without_sinks
+from vla_attention.analyze.measures.sinks import SinkRule, search_sinks, without_sinks
 from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.groupings.resolve import resolve
 from vla_attention.schemas.precision import mass_error_bound
@@ -211,16 +211,16 @@ RULE = SinkRule(factor=5.0, share=0.7)
 
 def test_planted_sinks_are_found_and_named_per_task(sunken):
     question = question_about(sunken)
-    sinks = sinks_table(question, RULE)
+    sinks = search_sinks(question, RULE).sinks
     bos = question.selected[0].tokens.layout.span("prompt").start
     assert sinks.select("task_id", "key").rows() == [(0, bos), (1, 5), (1, bos)]
     patch = sinks.filter(key=5).row(0, named=True)
     assert (patch["span"], patch["role"], patch["patch_row"], patch["patch_column"]) == ("base_0_rgb", "image", 1, 1)
     assert "patch (1, 1)" in patch["description"]
     assert sinks.filter(key=bos)["role"].unique().to_list() == ["bos"]
-    of_study = study_heads(question, RowOptions(rule=RULE)).sinks
+    of_study = study_heads(question, RowOptions(rule=RULE)).search
     assert of_study is not None
-    assert_frame_equal(of_study, sinks, rel_tol=1e-5)
+    assert_frame_equal(of_study.sinks, sinks, rel_tol=1e-5)
     # The numbers, by hand.
     for row in sinks.iter_rows(named=True):
         above, held = [], []
@@ -237,7 +237,7 @@ def test_planted_sinks_are_found_and_named_per_task(sunken):
 
 def test_masses_without_sinks_are_those_of_the_remaining_keys(sunken):
     question = question_about(sunken)
-    sinks = sinks_table(question, RULE)
+    sinks = search_sinks(question, RULE).sinks
     corrected = without_sinks(question, sinks, RULE)
     assert corrected.grouping.name == "default-without-sinks"
     analysis = analyse(corrected)
@@ -290,8 +290,10 @@ def test_the_summary_without_sinks_names_the_keys_and_takes_a_folder_of_its_own(
     assert "(bos; in 2 of 2 tasks" in said
     folder = tmp_path / "results" / "a" / "default-without-sinks"
     assert pl.read_parquet(folder / "sinks.parquet").height == 3
-    assert main([str(sunken), "--without-sinks", "--sink-factor", "1000", "--no-plots"]) == 0
-    assert "nothing was taken out" in " ".join(capsys.readouterr().out.split())
+    assert main([str(sunken), "--without-sinks", "--sink-factor", "1000", "--sink-mass", "1", "--no-plots"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "nothing was taken out" in said
+    assert "valid keys none can take more than 1000 x its uniform share" in said
     assert main([str(sunken), "--sink-factor", "5", "--no-plots"]) == 2
     assert "give --without-sinks too" in capsys.readouterr().err
 
@@ -306,8 +308,8 @@ def test_the_command_writes_tables_and_pictures_and_names_the_nearest_key(tmp_pa
     path = write_store(tmp_path / "a.zarr")
     assert main(["heads", str(path), "--output", str(tmp_path / "out"), "--sink-factor", "1000", "--top", "2"]) == 0
     said = capsys.readouterr().out
-    assert "None. The key that comes nearest, key " in said
-    pairs, single = ("heads", "denoise", "row_metrics"), ("dispersion", "depth", "sinks")
+    assert "The key that comes nearest, key " in " ".join(said.split())
+    pairs, single = ("heads", "denoise", "row_metrics"), ("dispersion", "depth", "sinks", "sink_heads")
     pictures_of_groups = ("head_grid", "layer_profile", "denoise_profile")
     pictures = (*pictures_of_groups, "layer_time")
     written = {file.name for file in (tmp_path / "out").iterdir()}

@@ -92,19 +92,19 @@ def test_counts_of_keys_far_above_their_share_are_those_of_a_loop(drawn, factor)
     rows, weights = drawn
     valid = weights[:, :, 0] > 0
     above, held = key_sums(rows, valid, factor)
-    expected_above, expected_held = np.zeros(rows.shape[2]), np.zeros(rows.shape[2])
+    expected_above, expected_held = np.zeros(rows.shape[1:]), np.zeros(rows.shape[1:])
     for replan, head in np.ndindex(rows.shape[:2]):
         mask = valid[min(replan, len(valid) - 1)]
         total = rows[replan, head][mask].sum(dtype=np.float64)
         if total == 0:
             continue
         share = np.where(mask, rows[replan, head] / total, 0.0)
-        expected_held += share
+        expected_held[head] += share
         # A share that is equal to the limit but for rounding may fall on either side.
         near = np.isclose(share * mask.sum(), factor, rtol=1e-5)
         if near.any():
             return
-        expected_above += share > factor / mask.sum()
+        expected_above[head] += share > factor / mask.sum()
     np.testing.assert_array_equal(above, expected_above)
     np.testing.assert_allclose(held, expected_held, rtol=1e-4, atol=1e-6)
 
@@ -140,7 +140,9 @@ def test_depth_is_a_weighted_mean_of_blocks(seed, layers):
     assert np.isnan(depth_centre(np.zeros(layers), blocks))
 
 
-@pytest.mark.parametrize("wrong", [{"factor": 0.5}, {"factor": float("inf")}, {"share": 0.0}, {"share": 1.1}])
+@pytest.mark.parametrize(
+    "wrong", [{"factor": 0.5}, {"factor": float("inf")}, {"share": 0.0}, {"share": 1.1}, {"mass": 0.0}, {"heads": 2.0}]
+)
 def test_a_useless_sink_rule_is_refused(wrong):
     with pytest.raises(BadArgument, match="sink"):
         SinkRule(**wrong)

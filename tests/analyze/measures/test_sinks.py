@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,26 +18,32 @@ from tests.kit.questions import question_about
 from tests.kit.raw_rows import FEW, RawEpisode, leaky, raw_episodes, weights_of
 from vla_attention.analyze.heads.head_study import study_heads
 from vla_attention.analyze.heads.row_metrics import RowOptions, row_metrics
+from vla_attention.analyze.heads.text import sinks_text
 from vla_attention.analyze.measures.selected import resolve_all
-from vla_attention.analyze.measures.sinks import SinkRule, describe_sinks, key_sums, sinks_table, without_sinks
+from vla_attention.analyze.measures.sink_kinds import kind_name
+from vla_attention.analyze.measures.sinks import SinkRule, describe_sinks, key_sums, search_sinks, without_sinks
 from vla_attention.analyze.measures.steps import measure_episodes, step_tables
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
+from vla_attention.schemas.segments import segment_members, segments_of
+from vla_attention.testing import stores as made_up
 from vla_attention.testing.stores import StoreSpec, write_store
 from vla_attention.testing.strategies import episode_tokens, groupings
-from vla_attention.testing.tokens import small_layout, small_tokens
+from vla_attention.testing.tokens import site_layout, small_layout, small_tokens, spell_prompt, tokens_of
 
 BOS = small_layout().span("prompt").start
 
 
 def shares_of(raw: RawEpisode, factor: float) -> tuple[np.ndarray, np.ndarray]:
-    """Of each key the share of rows in which it takes more than factor x its uniform share, and its mean share."""
+    """(layer, head, key): share of rows in which a key takes more than factor x its uniform share, and mean share."""
     rows, valid = raw.held()
-    above, held, count = np.zeros(valid.shape[1]), np.zeros(valid.shape[1]), 0
+    above, held = np.zeros((2, *rows.shape[1:2], *rows.shape[3:]))
     for replan, layer, denoise, head in np.ndindex(rows.shape[:4]):
         row = rows[replan, layer, denoise, head]
-        above += row / row.sum() > factor / valid[replan].sum()
-        held += row / row.sum()
-        count += 1
+        above[layer, head] += row / row.sum() > factor / valid[replan].sum()
+        held[layer, head] += row / row.sum()
+    count = rows.shape[0] * rows.shape[2]
     return above / count, held / count
 
 
@@ -44,26 +51,41 @@ def shares_of(raw: RawEpisode, factor: float) -> tuple[np.ndarray, np.ndarray]:
 @given(data=st.data())
 def test_sinks_are_the_keys_that_a_loop_over_raw_rows_finds(data):
     tokens = data.draw(episode_tokens())
-    rule = SinkRule(data.draw(st.sampled_from([1.37, 2.11, 4.03])), data.draw(st.sampled_from([0.2, 0.5])))
+    rule = SinkRule(
+        data.draw(st.sampled_from([1.37, 2.11, 4.03])),
+        data.draw(st.sampled_from([0.2, 0.5])),
+        data.draw(st.sampled_from([0.1, 0.3])),
+        data.draw(st.sampled_from([0.25, 0.6])),
+    )
     spec = StoreSpec(
         tokens=tokens, plant_rows=leaky, tasks=(0, 1), episodes=1, queries=data.draw(st.sampled_from(["mean", "all"]))
     )
     with tempfile.TemporaryDirectory() as folder:
         path = write_store(Path(folder) / "a.zarr", spec=spec)
         # A block that is named twice has its rows counted once: the shares below are over the recorded layers.
-        found = sinks_table(question_about(path), rule)
+        search = search_sinks(question_about(path), rule)
+        found = search.sinks
         raws = raw_episodes(path, spec)
     for raw in raws:
         above, held = shares_of(raw, rule.factor)
         of_task = found.filter(task_id=raw.order[0])
-        assert sorted(of_task["key"]) == np.flatnonzero(above >= rule.share - 1e-9).tolist()
-        assert of_task["mean_mass"].is_sorted(descending=True)
         num_valid = raw.valid.sum(axis=1).mean()
+        by_mass = held > max(rule.mass, 2 / num_valid)
+        sinks = by_mass | (above >= rule.share - 1e-9)
+        assert sorted(of_task["key"]) == np.flatnonzero(sinks.any(axis=(0, 1))).tolist()
+        assert of_task["mean_mass"].is_sorted(descending=True)
+        of_heads = search.heads.filter(task_id=raw.order[0])
+        places = {(spec.layers[i], spec.heads[j], k) for i, j, k in np.argwhere(sinks)}
+        assert set(of_heads.select("block", "head", "key").rows()) == places
         for row in of_task.iter_rows(named=True):
             key = row["key"]
-            assert row["share_of_rows"] == pytest.approx(above[key])
-            assert row["mean_mass"] == pytest.approx(held[key], rel=1e-4)
-            assert row["times_uniform"] == pytest.approx(held[key] * num_valid, rel=1e-4)
+            assert row["share_of_rows"] == pytest.approx(above[..., key].mean(), rel=1e-5)
+            assert row["mean_mass"] == pytest.approx(held[..., key].mean(), rel=1e-4)
+            assert row["times_uniform"] == pytest.approx(held[..., key].mean() * num_valid, rel=1e-4)
+            assert row["largest_mass"] == pytest.approx(held[..., key].max(), rel=1e-4)
+            assert row["sink_heads"] == sinks[..., key].sum()
+            assert row["heads_by_mass"] == by_mass[..., key].sum()
+            assert row["widespread"] == (sinks[..., key].mean() >= rule.heads - 1e-9)
             span = next(span for span in tokens.layout.spans if span.start <= key < span.stop)
             assert row["span"] == span.name
             assert f"key {key} of span '{span.name}'" in row["description"]
@@ -78,7 +100,7 @@ def test_a_block_that_is_named_twice_does_not_count_twice(tmp_path):
     again = StoreSpec(layer_labels=(0, 2, 6))
     rule = SinkRule(1.5, 0.2)
     tables = [
-        sinks_table(question_about(write_store(tmp_path / f"{i}.zarr", spec=spec)), rule)
+        search_sinks(question_about(write_store(tmp_path / f"{i}.zarr", spec=spec)), rule).sinks
         for i, spec in enumerate((once, twice, again))
     ]
     assert tables[0].height > 0
@@ -91,7 +113,7 @@ def test_uniform_attention_has_no_sink_even_at_factor_one(keys):
     rows = np.full((2, 3, keys), 1.0 / keys, np.float32)
     above, held = key_sums(rows, np.ones((1, keys), bool), 1.0)
     assert not above.any()
-    np.testing.assert_allclose(held, 6.0 / keys, rtol=1e-4)
+    np.testing.assert_allclose(held, 2.0 / keys, rtol=1e-4)
 
 
 def test_rows_that_are_all_masked_count_for_nothing():
@@ -99,7 +121,7 @@ def test_rows_that_are_all_masked_count_for_nothing():
     valid = np.array([[True, True, False, False], [False] * 4])
     above, held = key_sums(rows, valid, 1.0)
     assert not above.any()
-    np.testing.assert_allclose(held, [0.5, 0.5, 0.0, 0.0])
+    np.testing.assert_allclose(held, [[0.5, 0.5, 0.0, 0.0]])
 
 
 def plant_late_sink(task, episode, tokens, rows):
@@ -118,10 +140,17 @@ def test_a_sink_has_the_role_of_the_replans_at_which_it_is_valid(tmp_path):
     key = BOS + 10
     assert 0 < seen.sum() < seen.size
     (row,) = [
-        row for row in sinks_table(question_about(path), SinkRule(3.0, 0.05)).iter_rows(named=True) if row["key"] == key
+        row
+        for row in search_sinks(question_about(path), SinkRule(3.0, 0.05)).sinks.iter_rows(named=True)
+        if row["key"] == key
     ]
     assert row["share_of_rows"] == pytest.approx(seen.mean(axis=1).mean())
     assert row["role"] == "state"
+
+
+def out_by_task(sinks: pl.DataFrame) -> list[set[int]]:
+    """The keys of each task that `without_sinks` takes out."""
+    return [set(part["key"]) for _, part in sinks.filter("widespread").group_by("task_id")]
 
 
 @FEW
@@ -136,7 +165,11 @@ def test_without_sinks_every_measure_is_that_of_the_other_keys(data):
     with tempfile.TemporaryDirectory() as folder:
         path = write_store(Path(folder) / "a.zarr", spec=spec)
         question = question_about(path, grouping)
-        sinks = sinks_table(question, rule)
+        sinks = search_sinks(question, rule).sinks
+        if any(keys == set(np.flatnonzero(tokens.valid.any(axis=0))) for keys in out_by_task(sinks)):
+            with pytest.raises(BadArgument, match="Every valid key of task"):
+                without_sinks(question, sinks, rule)
+            return
         corrected = without_sinks(question, sinks, rule)
         resolved = resolve_all(corrected.grouping, corrected.selected)
         steps = flat(step_tables(measure_episodes(corrected, resolved), corrected.grouping))
@@ -145,7 +178,7 @@ def test_without_sinks_every_measure_is_that_of_the_other_keys(data):
     weights = weights_of(grouping, tokens)
     assert study.rows is not None
     for raw in raws:
-        out = sinks.filter(task_id=raw.order[0])["key"].to_list()
+        out = sinks.filter("widespread", task_id=raw.order[0])["key"].to_list()
         rows, valid = raw.held(out)
         kept = weights.copy()
         kept[:, out] = 0.0
@@ -169,8 +202,8 @@ def test_without_sinks_every_measure_is_that_of_the_other_keys(data):
         entropies = entropy_of_scipy(rows, axis=-1)
         found = study.rows.cells.filter(task_id=raw.order[0])["entropy"].to_numpy().reshape(rows.shape[:4])
         np.testing.assert_allclose(found, entropies, atol=1e-4)
-    per_task = sinks.group_by("task_id").len().height
-    said = describe_sinks(sinks, 2, rule)
+    per_task = sinks.filter("widespread").group_by("task_id").len().height
+    said = describe_sinks(sinks, 2, rule, float(max(raw.valid.sum(axis=1).mean() for raw in raws)))
     assert said in corrected.notes
     assert ("nothing was taken out" in said) == (per_task == 0)
 
@@ -178,11 +211,100 @@ def test_without_sinks_every_measure_is_that_of_the_other_keys(data):
 def test_taking_out_the_sinks_again_takes_out_nothing_twice(tmp_path):
     question = question_about(write_store(tmp_path / "a.zarr"))
     rule = SinkRule(2.0, 0.2)
-    sinks = sinks_table(question, rule)
+    sinks = search_sinks(question, rule).sinks
     once = without_sinks(question, sinks, rule)
     again = without_sinks(once, sinks, rule)
     assert [item.without for item in again.selected] == [item.without for item in once.selected]
     assert all(list(item.without) == sorted(set(item.without)) for item in again.selected)
     gone = pl.Series(once.selected[0].without)
-    assert not sinks_table(once, rule).filter(task_id=0)["key"].is_in(gone.implode()).any()
+    assert not search_sinks(once, rule).sinks.filter(task_id=0)["key"].is_in(gone.implode()).any()
     assert row_metrics(once).cells["top1_mass"].max() <= 1.0
+
+
+def sink_of_some_heads(task, episode, tokens, rows):
+    """Bos takes 60 % of the rows of 6 of 16 layer-heads, and of the others as much as a key has by chance."""
+    noise = np.exp(np.random.default_rng([task, episode]).normal(0, 0.3, rows.shape))
+    planted = noise * tokens.valid[:, None, None, None, None]
+    for layer, head in [(0, 1), (0, 2), (1, 0), (2, 3), (3, 1), (3, 2)]:
+        part = planted[:, layer, :, head]
+        part *= 0.4 / (part.sum(axis=-1, keepdims=True) - part[..., [BOS]])
+        part[..., BOS] = 0.6
+    return planted / planted.sum(axis=-1, keepdims=True)
+
+
+def test_a_sink_of_some_heads_is_found_and_taken_out_where_it_is_widespread(tmp_path):
+    spec = StoreSpec(layers=(0, 1, 2, 3), heads=(0, 1, 2, 3), plant_rows=sink_of_some_heads)
+    path = write_store(tmp_path / "a.zarr", spec=spec)
+    question = question_about(path)
+    search = search_sinks(question)
+    assert search.sinks["key"].unique().to_list() == [BOS]
+    row = search.sinks.row(0, named=True)
+    assert (row["sink_heads"], row["heads_by_mass"], row["num_heads"]) == (6, 6, 16)
+    assert row["share_of_rows"] < 0.5, "over all rows it is no sink"
+    of_task = search.heads.filter(task_id=0).select("block", "head").rows()
+    assert of_task == [(0, 1), (0, 2), (1, 0), (2, 3), (3, 1), (3, 2)]
+    assert all(BOS in item.without for item in without_sinks(question, search.sinks, SinkRule()).selected)
+    strict = SinkRule(heads=0.5)
+    kept = without_sinks(question, search_sinks(question, strict).sinks, strict)
+    assert not any(item.without for item in kept.selected)
+    assert "Sinks of fewer heads stay: 2 keys of tasks" in kept.notes[-1]
+
+
+def few_keys(replans: int) -> EpisodeTokens:
+    """Seven valid keys: fewer than the factor of the default rule."""
+    site = site_layout({"base_0_rgb": (1, 2)}, 14, text_keys=5, action_keys=1)
+    prompt = spell_prompt(site, [("put ", Role.INSTRUCTION), ("it", Role.INSTRUCTION)], "put it")
+    return tokens_of(site, [prompt] * replans)
+
+
+def test_with_few_keys_the_text_says_that_the_rule_cannot_fire(tmp_path, capsys):
+    def lean(task, episode, tokens, rows):
+        planted = np.where(tokens.valid[:, None, None, None, None], 1.0, 0.0) * np.ones(rows.shape)
+        planted[..., 2] *= 8.0 if task else 1.0
+        return planted / planted.sum(axis=-1, keepdims=True)
+
+    for task, said in ((0, "No key takes more than 10 x"), (1, "by mass")):
+        path = write_store(
+            tmp_path / f"{task}.zarr", spec=StoreSpec(tokens=few_keys(2), plant_rows=lean, tasks=(task,))
+        )
+        search = search_sinks(question_about(path))
+        assert search.sinks["key"].to_list() == ([2] if task else [])
+        text = " ".join(sinks_text(search, SinkRule()).split())
+        assert said in text
+        assert "valid keys none can take more than 10 x its uniform share" in text
+        assert "None." not in text
+
+
+@pytest.mark.parametrize(("length", "kind"), [(0.01, "small"), (3.0, "large")])
+def test_the_kind_of_a_sink_that_is_a_segment_is_told_from_contributions(tmp_path, monkeypatch, length, kind):
+    """The planted contribution of every key is mass x value; bos has a value of the given length, other keys 1."""
+
+    def vectors(spec, tokens, seed, replan):
+        segments = segments_of(tokens.layout, tokens.key_role[replan])
+        _, records = made_up.episode_records(replace(spec, contributions=False), seed[1], seed[2])
+        rows = records[replan].rows["joint"].rows
+        members = segment_members(tokens.layout, tokens.key_role[[replan]], segments)[0]
+        mass = (rows @ members.astype(float)).mean(axis=(2, 3))  # (layer, denoise, segment)
+        lengths = np.array([length if segment.role == "bos" else 1.0 for segment in segments])
+        along = mass * lengths
+        return (along[..., None, :, None] * np.eye(4)[0]).repeat(spec.num_action_queries, axis=2)
+
+    monkeypatch.setattr(made_up, "contribution_vectors", vectors)
+    spec = StoreSpec(
+        layers=(0, 1, 2, 3), heads=(0, 1, 2, 3), plant_rows=sink_of_some_heads, contributions=True, tasks=(0,)
+    )
+    path = write_store(tmp_path / "a.zarr", spec=spec)
+    row = search_sinks(question_about(path)).sinks.row(0, named=True)
+    assert row["value_ratio"] == pytest.approx(length, rel=1e-3)
+    assert kind_name(row["value_ratio"]) == kind
+
+    def patch_sink(task, episode, tokens, rows):
+        return sink_of_some_heads(task, episode, tokens, rows)[..., swapped]
+
+    swapped = np.arange(small_layout().num_keys)
+    swapped[[5, BOS]] = BOS, 5
+    other = write_store(tmp_path / "b.zarr", spec=replace(spec, plant_rows=patch_sink))
+    patch = search_sinks(question_about(other)).sinks.filter(key=5).row(0, named=True)
+    assert patch["sink_heads"] == 6
+    assert patch["value_ratio"] is None
+    assert kind_name(patch["value_ratio"]) == "?"
