@@ -74,12 +74,21 @@ def add_selection(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     return chosen
 
 
+def add_intervals(parser: argparse.ArgumentParser) -> None:
+    """--intervals; its values are those of `statistics.intervals.Estimand`."""
+    parser.add_argument(
+        "--intervals",
+        choices=("tasks-like-these", "these-tasks"),
+        default="tasks-like-these",
+        help="what intervals over several tasks are about (default: %(default)s; see docs/statistics.md)",
+    )
+
+
 def add_output(parser: argparse.ArgumentParser, default: str = "results/STORE/GROUPING") -> argparse._ArgumentGroup:
-    """--output, --no-plots and --seed."""
+    """--output and --no-plots."""
     output = parser.add_argument_group("output")
     output.add_argument("--output", type=Path, metavar="PATH", help=f"folder (default: {default})")
     output.add_argument("--no-plots", action="store_true", help="numbers only")
-    output.add_argument("--seed", type=int, default=0, help="seed of the bootstrap (default: 0)")
     return output
 
 

@@ -1,18 +1,20 @@
-"""Coverage of intervals of nominal 95 %, measured on simulated stores with a known ratio per task.
+"""Coverage and power of the intervals of nominal 95 %, measured on simulated stores with a known ratio per task.
 
-    python benchmarks/interval_coverage.py                # 500 simulated stores of every size, about ten minutes
+    python benchmarks/interval_coverage.py                # 2000 simulated stores of every size, some minutes
     python benchmarks/interval_coverage.py --on-disk 20   # and 20 stores that are written to disk and read back
 
 The mean log ratios of tasks are drawn from a population with standard deviation `between`. Episodes differ from their
-task by `within` (both in natural logarithms: 0.3 is 30 %), and replans drift around their episode. Coverage of three
-truths is measured:
+task by `within` (both in natural logarithms: 0.3 is 30 %), and replans drift around their episode. Coverage:
 
-    the task's ratio          by the interval of each task, over its episodes
-    the population's ratio    by the two-level interval over all tasks: the ratio of tasks like these
-    these tasks' ratio        by the same interval: the mean over exactly these tasks, with endless episodes
+    one task           the task's ratio, by the interval of each task over its episodes
+    tasks like these   the population's ratio, by the interval of that estimand over all tasks
+    these tasks        the mean over exactly these tasks with endless episodes, by the interval of that estimand
 
-The intervals are those of `aggregate.task_tables`, column `geometric_mean`, as they are and as plain percentile
-intervals.
+The intervals are those of `aggregate.task_tables`: of the geometric mean, which texts and pictures show, and for
+comparison of the arithmetic mean of the episodes' mean ratios.
+
+Power: how often a paired comparison of two runs, as `vla-analyze compare` makes it, excludes 0, beside a t test over
+the task means of the differences.
 """
 
 from __future__ import annotations
@@ -22,7 +24,6 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import polars as pl
@@ -30,124 +31,130 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from tests.kit import made_up_steps
-from vla_attention.analyze.measures import aggregate
-from vla_attention.analyze.measures.frames import Tables
-from vla_attention.analyze.statistics import bootstrap
-from vla_attention.schemas.groupings.grouping import Grouping, Ratio
-
-GROUPING = Grouping(
-    "two", {"visual": ("role:image",), "linguistic": ("role:instruction",)}, Ratio(("visual",), ("linguistic",))
+from vla_attention.analyze.statistics.intervals import (
+    POSITIVE,
+    EpisodeStatistic,
+    Estimand,
+    estimates,
+    geometric_mean_over_episodes,
+    mean_over_episodes,
 )
+from vla_attention.analyze.statistics.student import student_quantile
+
 POPULATION = np.log(5.0)
 NUM_REPLANS = 8
-NUM_RESAMPLES = 2000
 
 
 @dataclass(frozen=True)
 class Case:
-    """A size of store and how much its tasks and episodes differ."""
+    """Episodes of every task, and how much tasks and episodes differ."""
 
-    num_tasks: int
-    num_episodes: int
+    episodes: tuple[int, ...]
     between: float
     within: float
 
+    @property
+    def tasks(self) -> NDArray[np.int64]:
+        """The task of every episode, (episode,)."""
+        return np.repeat(np.arange(len(self.episodes)), self.episodes)
+
+    @property
+    def size(self) -> str:
+        """`10 x 5`, or the numbers of episodes where tasks differ in them."""
+        if len(set(self.episodes)) == 1:
+            return f"{len(self.episodes)} x {self.episodes[0]}"
+        return "+".join(map(str, self.episodes))
+
 
 CASES = (
-    Case(10, 5, 0.3, 0.25),
-    Case(10, 5, 0.1, 0.25),
-    Case(10, 5, 0.0, 0.25),
-    Case(10, 5, 0.3, 0.6),
-    Case(10, 3, 0.3, 0.25),
-    Case(10, 10, 0.3, 0.25),
-    Case(10, 50, 0.3, 0.25),
-    Case(5, 5, 0.3, 0.25),
-    Case(3, 5, 0.3, 0.25),
-    Case(2, 5, 0.3, 0.25),
-    Case(90, 5, 0.3, 0.25),
+    Case((5,), 0.0, 0.25),
+    Case((5,), 0.0, 0.6),
+    Case((50,), 0.0, 0.6),
+    Case((5,) * 5, 0.3, 0.25),
+    Case((5,) * 5, 0.3, 0.6),
+    Case((2, 3, 5, 10, 30), 0.3, 0.6),
+    Case((3,) * 10, 0.3, 0.25),
+    Case((5,) * 10, 0.0, 0.25),
+    Case((5,) * 10, 0.1, 0.25),
+    Case((5,) * 10, 0.3, 0.25),
+    Case((5,) * 10, 0.3, 0.6),
+    Case((5,) * 10, 1.0, 0.6),
+    Case((2, 2, 3, 3, 5, 5, 10, 10, 20, 20), 0.3, 0.6),
+    Case((50,) * 10, 0.3, 0.25),
+    Case((5,) * 90, 0.3, 0.6),
+    Case((5,) * 2, 0.3, 0.25),
+    Case((5,) * 3, 0.3, 0.25),
 )
+#: Tasks x episodes of the paired comparisons; the true difference is `EFFECT` and differs between tasks by `SPREAD`.
+PAIRED = ((10, 5), (10, 10), (5, 5), (4, 4), (10, 50))
+EFFECT, SPREAD, NOISE = 0.25, 0.25, 0.35
 
 
 def log_ratios(case: Case, generator: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean log ratio of each task (task,), and log ratios (task, episode, replan)."""
-    tasks = POPULATION + generator.normal(0, case.between, case.num_tasks)
-    shape = (case.num_tasks, case.num_episodes, NUM_REPLANS)
-    episodes = tasks[:, None] + generator.normal(0, case.within, shape[:2])
+    """Mean log ratio of each task (task,), and log ratios (episode, replan)."""
+    tasks = POPULATION + generator.normal(0, case.between, len(case.episodes))
+    episodes = tasks[case.tasks] + generator.normal(0, case.within, len(case.tasks))
     # A walk whose mean over the episode is zero: replans are correlated, and the episode's mean does not change.
-    walk = generator.normal(0, 0.1, shape).cumsum(axis=2)
-    return tasks, episodes[:, :, None] + walk - walk.mean(axis=2, keepdims=True)
+    walk = generator.normal(0, 0.1, (len(episodes), NUM_REPLANS)).cumsum(axis=1)
+    return tasks, episodes[:, None] + walk - walk.mean(axis=1, keepdims=True)
 
 
-def replans_of(logs: NDArray[np.float64]) -> Tables:
-    """Tables as `aggregate.replan_tables` gives them, of one layer, from log ratios (task, episode, replan)."""
-    task, episode, replan = (part.ravel() for part in np.indices(logs.shape))
-    visual = 1 / (1 + np.exp(-logs.ravel()))
-    keys = {"visual": 512.0, "linguistic": 12.0}
-    columns: dict[str, object] = {
-        "suite": ["simulated"] * logs.size,
-        "task_id": task,
-        "instruction": [""] * logs.size,
-        "episode_index": episode,
-        "success": [True] * logs.size,
-        "num_steps": np.full(logs.size, 5 * NUM_REPLANS),
-        "replan": replan,
-        "env_step": 10 + 5 * replan,
-        "layer": np.zeros(logs.size, dtype=np.int64),
-        "block": np.zeros(logs.size, dtype=np.int64),
-        "denoise_step": np.full(logs.size, 9),
-        "denoise_time": np.full(logs.size, 0.1),
-        "head": pl.Series([None] * logs.size, dtype=pl.Int64),
-        "row_sum": np.ones(logs.size),
-        "valid_mass": np.ones(logs.size),
-        "num_valid": np.full(logs.size, 524),
-        "visual_mass": visual,
-        "linguistic_mass": 1 - visual,
-    }
-    columns |= {f"{name}_keys": np.full(logs.size, count) for name, count in keys.items()}
-    return made_up_steps.replans_of(pl.DataFrame(columns), GROUPING)
+def bounds(statistic: EpisodeStatistic, tasks: NDArray[np.int64], estimand: Estimand) -> tuple[float, float]:
+    """The ends of one interval."""
+    interval = estimates([statistic], tasks, estimand)[0].interval()
+    assert interval is not None
+    return interval.low, interval.high
 
 
-def tables(replans: Tables, seed: int) -> dict[str, pl.DataFrame]:
-    """`aggregate.task_tables` with the intervals of this program, and with plain percentile intervals."""
-    episodes = aggregate.episode_tables(replans, GROUPING)
-    with mock.patch.object(bootstrap, "widening", return_value=1.0):
-        percentile = aggregate.task_tables(episodes, GROUPING, NUM_RESAMPLES, seed=seed)
-    widened = aggregate.task_tables(episodes, GROUPING, NUM_RESAMPLES, seed=seed)
-    return {"widened": widened.cells, "percentile": percentile.cells}
+def simulate(case: Case, num_stores: int, seed: int) -> dict[str, float]:
+    """Share of the intervals that hold the truth, by what they are about, and the width of the one over all tasks."""
+    generator = np.random.default_rng([seed, len(case.tasks), int(100 * case.between), int(100 * case.within)])
+    # The arithmetic mean of log-normal ratios has another truth: exp(mu + variance / 2).
+    above = case.within**2 / 2
+    found: dict[str, list[float]] = {}
+
+    def note(
+        name: str, statistic: EpisodeStatistic, truth: float, estimand: Estimand, tasks: NDArray[np.int64]
+    ) -> None:
+        low, high = bounds(statistic, tasks, estimand)
+        found.setdefault(name, []).append(float(low <= truth <= high))
+        found.setdefault(f"width {name}", []).append(float(np.log(high / low)))
+
+    several = len(case.episodes) > 1
+    for _ in range(num_stores):
+        means, logs = log_ratios(case, generator)
+        of_episodes, flat = logs.mean(axis=1), np.exp(logs.mean(axis=1))
+        geometric, arithmetic = geometric_mean_over_episodes(of_episodes), mean_over_episodes(flat, POSITIVE)
+        first = case.episodes[0]
+        of_task = geometric_mean_over_episodes(of_episodes[:first])
+        note("task", of_task, np.exp(means[0]), Estimand.THESE_TASKS, case.tasks[:first])
+        if not several:
+            note("task mean", arithmetic, np.exp(means[0] + above), Estimand.THESE_TASKS, case.tasks)
+            continue
+        note("like", geometric, np.exp(POPULATION), Estimand.TASKS_LIKE_THESE, case.tasks)
+        note("these", geometric, np.exp(means.mean()), Estimand.THESE_TASKS, case.tasks)
+        population = np.exp(POPULATION + above + case.between**2 / 2)
+        note("like mean", arithmetic, population, Estimand.TASKS_LIKE_THESE, case.tasks)
+        note("these mean", arithmetic, float(np.exp(means + above).mean()), Estimand.THESE_TASKS, case.tasks)
+    return {name: float(np.mean(values)) for name, values in found.items()}
 
 
-def hits(table: pl.DataFrame, tasks: NDArray[np.float64]) -> dict[str, float]:
-    """Share of the intervals that hold each truth."""
-    table = table.filter(pl.col("layer") == "0")
-    of_tasks = table.filter(pl.col("scope") == "task").sort("task_id")
-    low, high = (of_tasks[f"geometric_mean_{end}"].to_numpy() for end in ("low", "high"))
-    inside = (low <= np.exp(tasks)) & (np.exp(tasks) <= high)
-    whole = table.filter(pl.col("scope") == "all").row(0, named=True)
-    bounds = (whole["geometric_mean_low"], whole["geometric_mean_high"])
-    return {
-        "task": float(inside.mean()),
-        "population": float(bounds[0] <= np.exp(POPULATION) <= bounds[1]),
-        "these tasks": float(bounds[0] <= np.exp(tasks.mean()) <= bounds[1]),
-        "width": float(np.log(bounds[1] / bounds[0])),
-    }
+def power(num_tasks: int, num_episodes: int, num_stores: int, seed: int, effect: float) -> tuple[float, float]:
+    """How often 0 is excluded: by the interval of a paired comparison, and by a t test over task means."""
+    generator = np.random.default_rng([seed, num_tasks, num_episodes])
+    tasks = np.repeat(np.arange(num_tasks), num_episodes)
+    ours = theirs = 0
+    for _ in range(num_stores):
+        differences = effect + generator.normal(0, SPREAD, num_tasks)[tasks] + generator.normal(0, NOISE, len(tasks))
+        low, high = bounds(mean_over_episodes(differences), tasks, Estimand.TASKS_LIKE_THESE)
+        ours += not low <= 0 <= high
+        means = differences.reshape(num_tasks, num_episodes).mean(axis=1)
+        t = means.mean() / (means.std(ddof=1) / np.sqrt(num_tasks))
+        theirs += abs(t) > student_quantile(0.95, num_tasks - 1)
+    return ours / num_stores, theirs / num_stores
 
 
-def simulate(case: Case, num_stores: int, seed: int) -> dict[tuple[str, str], float]:
-    """Mean of `hits` over simulated stores, by (interval, truth)."""
-    generator = np.random.default_rng(
-        [seed, case.num_tasks, case.num_episodes, int(100 * case.between), int(100 * case.within)]
-    )
-    found: dict[tuple[str, str], list[float]] = {}
-    for store in range(num_stores):
-        tasks, logs = log_ratios(case, generator)
-        for kind, table in tables(replans_of(logs), seed=store).items():
-            for truth, share in hits(table, tasks).items():
-                found.setdefault((kind, truth), []).append(share)
-    return {key: float(np.mean(values)) for key, values in found.items()}
-
-
-def through_files(case: Case, num_stores: int, seed: int) -> dict[tuple[str, str], float]:
+def through_files(case: Case, num_stores: int, seed: int) -> dict[str, float]:
     """The same with stores on disk: written by the real writer, read back and analysed."""
     from vla_attention.analyze.measures.question import ask
     from vla_attention.analyze.measures.question_settings import AnalysisSettings
@@ -157,58 +164,82 @@ def through_files(case: Case, num_stores: int, seed: int) -> dict[tuple[str, str
     from vla_attention.testing.stores import StoreSpec, write_store
 
     generator = np.random.default_rng([seed, 1])
-    found: dict[tuple[str, str], list[float]] = {}
-    for number in range(num_stores):
-        tasks, logs = log_ratios(case, generator)
+    num_tasks, num_episodes = len(case.episodes), case.episodes[0]
+    found: dict[str, list[float]] = {}
+    for _ in range(num_stores):
+        means, logs = log_ratios(case, generator)
 
         def plant(task: int, episode: int, tokens, rows, logs=logs):  # type: ignore[no-untyped-def]
             visual = tokens.key_role == Role.IMAGE
             linguistic = np.isin(tokens.key_role, [int(Role.INSTRUCTION), int(Role.BOS)])
-            share = 1 / (1 + np.exp(-logs[task, episode]))[:, None]
+            share = 1 / (1 + np.exp(-logs[task * num_episodes + episode]))[:, None]
             weight = share * visual / visual.sum(axis=1, keepdims=True)
             weight = weight + (1 - share) * linguistic / linguistic.sum(axis=1, keepdims=True)
             return np.broadcast_to(weight[:, None, None, None, None, :], rows.shape)
 
         spec = StoreSpec(
-            tasks=tuple(range(case.num_tasks)), episodes=case.num_episodes, replans=NUM_REPLANS, plant_rows=plant
-        )
-        spec = StoreSpec(
-            **{**vars(spec), "layers": (0,), "heads": (0,), "denoise_steps": (9,), "frames": False, "coverage": False}
+            tasks=tuple(range(num_tasks)),
+            episodes=num_episodes,
+            replans=NUM_REPLANS,
+            plant_rows=plant,
+            layers=(0,),
+            heads=(0,),
+            denoise_steps=(9,),
+            frames=False,
+            coverage=False,
         )
         with tempfile.TemporaryDirectory() as folder:
             store = open_store(write_store(Path(folder) / "simulated.zarr", spec=spec))
-            analysis = analyse(ask([store], AnalysisSettings(seed=number)))
-        for truth, share in hits(analysis.tasks.cells, tasks).items():
-            found.setdefault(("widened", truth), []).append(share)
-    return {key: float(np.mean(values)) for key, values in found.items()}
+            for name, estimand, truth in (
+                ("like", Estimand.TASKS_LIKE_THESE, np.exp(POPULATION)),
+                ("these", Estimand.THESE_TASKS, np.exp(means.mean())),
+            ):
+                cells = analyse(ask([store], AnalysisSettings(intervals=estimand))).tasks.cells
+                row = cells.filter(pl.col("layer") == "0", pl.col("scope") == "all").row(0, named=True)
+                held = row["geometric_mean_low"] <= truth <= row["geometric_mean_high"]
+                found.setdefault(name, []).append(float(held))
+    return {name: float(np.mean(values)) for name, values in found.items()}
 
 
-def line(case: Case, found: dict[tuple[str, str], float]) -> str:
-    cells = [f"{case.num_tasks:5d} x {case.num_episodes:<4d}", f"{case.between:7.2f}", f"{case.within:7.2f}"]
-    for truth in ("task", "population", "these tasks"):
-        keys = [(kind, truth) for kind in ("percentile", "widened")]
-        cells += [f"{100 * found[key]:7.1f}" if key in found else "      -" for key in keys]
-    return " ".join([*cells, f"{found['widened', 'width']:8.2f}"])
+def line(case: Case, found: dict[str, float]) -> str:
+    """One case as a line of the table."""
+    cells = [f"{case.size:26}", f"{case.between:5.1f}", f"{case.within:7.2f}"]
+    for name in ("task", "like", "these"):
+        for kind in ("", " mean"):
+            share = found.get(f"{name}{kind}")
+            cells.append("      -" if share is None else f"{100 * share:7.1f}")
+    cells += [f"{found[f'width {name}']:7.2f}" if f"width {name}" in found else "      -" for name in ("like", "these")]
+    return " ".join(cells)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Coverage of the intervals of nominal 95 %.")
-    parser.add_argument("--stores", type=int, default=500, help="simulated stores of every size (default: 500)")
+    parser = argparse.ArgumentParser(description="Coverage and power of the intervals of nominal 95 %.")
+    parser.add_argument("--stores", type=int, default=2000, help="simulated stores of every size (default: 2000)")
     parser.add_argument("--on-disk", type=int, default=0, metavar="N", help="also N stores of 10 x 5 through files")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    # Per-task coverage is a mean over stores and tasks; overall coverage is one hit or miss per store.
     error = 100 * np.sqrt(0.95 * 0.05 / max(1, arguments.stores))
-    print(f"Coverage in % of intervals of nominal 95 %, {arguments.stores} stores of each size.")
-    print(f"The standard error is {error:.1f} overall. p: plain percentile interval; w: widened as in")
-    print("vla_attention.analyze.statistics.small_samples; width: mean of log(high / low), widened.\n")
-    print("                  differences of     one task       population     these tasks")
-    print("tasks x episodes tasks episodes      p       w       p       w       p       w    width")
+    print(f"Coverage in % of intervals of nominal 95 %, {arguments.stores} stores of each size, error {error:.1f}.")
+    print(
+        "geo: of the geometric mean, which is printed; mean: of the arithmetic mean. width: log(high / low) of geo.\n"
+    )
+    print("                           differences of      one task  tasks like these    these tasks   width of geo")
+    print("tasks x episodes           tasks episodes  geo    mean     geo    mean     geo    mean    like   these")
     for case in CASES if arguments.stores else ():
         print(line(case, simulate(case, arguments.stores, arguments.seed)), flush=True)
+    if arguments.stores:
+        print(f"\nPaired comparisons that exclude 0, in % (difference {EFFECT}, between tasks {SPREAD}, noise {NOISE})")
+        print("tasks x episodes   interval  t test over task means   without a difference")
+    for num_tasks, num_episodes in PAIRED if arguments.stores else ():
+        ours, theirs = power(num_tasks, num_episodes, arguments.stores, arguments.seed, EFFECT)
+        null, _ = power(num_tasks, num_episodes, arguments.stores, arguments.seed, 0.0)
+        print(
+            f"{num_tasks:5d} x {num_episodes:<4d} {100 * ours:14.1f} {100 * theirs:15.1f} {100 * null:24.1f}",
+            flush=True,
+        )
     if arguments.on_disk:
-        print(f"\nthe same through {arguments.on_disk} stores on disk")
-        print(line(CASES[0], through_files(CASES[0], arguments.on_disk, arguments.seed)))
+        print(f"\nthe same through {arguments.on_disk} stores on disk of 10 x 5")
+        print(line(CASES[9], through_files(CASES[9], arguments.on_disk, arguments.seed)))
 
 
 if __name__ == "__main__":

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.analyze.objects.control_masks import control_source, controls
-from vla_attention.analyze.statistics.bootstrap import (
+from vla_attention.analyze.statistics.intervals import (
     POSITIVE,
     Interval,
-    bootstrap_interval,
+    estimates,
     mean_over_episodes,
     ratio_of_means_over_episodes,
 )
@@ -63,10 +63,9 @@ def intervals_of_store(
             sources.append(control_source(maps[:, None, None], area, episodes - 1))
         balanced += [control.balanced[0, 0, 0] for control in controls(sources)]
     of_task = np.repeat(np.arange(tasks), episodes)
-    return (
-        bootstrap_interval(mean_over_episodes(enrichment, POSITIVE), of_task, num_resamples=1000),
-        bootstrap_interval(ratio_of_means_over_episodes(enrichment, balanced), of_task, num_resamples=1000),
-    )
+    statistics = [mean_over_episodes(enrichment, POSITIVE), ratio_of_means_over_episodes(enrichment, balanced)]
+    plain, over = (one.interval() for one in estimates(statistics, of_task))
+    return plain, over
 
 
 def main() -> None:

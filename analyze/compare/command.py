@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vla_attention.analyze.arguments import add_grouping, add_output, add_selection, settings_of
+from vla_attention.analyze.arguments import add_grouping, add_intervals, add_output, add_selection, settings_of
 from vla_attention.analyze.show.output_files import report_files
 from vla_attention.schemas.command_line import command_parser
 
@@ -44,6 +44,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add_grouping(parser)
     add_selection(parser)
+    add_intervals(parser)
     add_output(parser, "results/A-vs-B/compare")
     return parser
 

@@ -1,9 +1,8 @@
 """Differences between runs: paired where they share initial states and seeds, otherwise between independent episodes.
 
 Two episodes are a pair when suite, task, initial state (by its digest) and seed are equal: the same scene, the same
-noise, other weights. Differences within pairs do not contain differences between scenes; their intervals are two-level
-bootstraps over tasks and pairs. The first run is what the others are compared with; every difference is other run minus
-first run.
+noise, other weights. Differences within pairs do not contain differences between scenes. The first run is what the
+others are compared with; every difference is other run minus first run.
 
 Quantities, one value per episode: `log2_ratio` (mean over replans of log2 of the ratio: 1 more is twice the ratio),
 `{group}_fraction` (mean over replans), and `success` (0 or 1).
@@ -23,20 +22,23 @@ from vla_attention.analyze.compare.runs import Run, RunArgument, check_comparabl
 from vla_attention.analyze.measures.aggregate import episode_tables, overall_layer, replans_of
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables, float_values
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
-from vla_attention.analyze.statistics.bootstrap import (
-    POSITIVE,
+from vla_attention.analyze.statistics.effect_sizes import contrast, standardised_mean
+from vla_attention.analyze.statistics.intervals import (
     SHARE,
-    Resamples,
-    bootstrap_intervals,
+    Estimand,
+    Estimate,
     ends,
+    estimates,
     geometric_mean_over_episodes,
     mean_over_episodes,
-    resample_episodes,
+    named_interval,
 )
-from vla_attention.analyze.statistics.effect_sizes import contrast
+from vla_attention.analyze.statistics.many_looks import adjusted_p_values
 from vla_attention.schemas.groupings.grouping import Grouping
 
 LOG2_RATIO, SUCCESS = "log2_ratio", "success"
+#: The effect sizes: of pairs, and of independent episodes.
+D_Z, HEDGES_G = "d_z", "hedges_g"
 #: Two episodes with equal values here are a pair; `occurrence` counts the episodes of a run with the same first state.
 PAIR_KEYS = ("suite", "task_id", "initial_state_digest", "seed", "occurrence")
 
@@ -55,12 +57,15 @@ class Comparison:
             (replans without a finite ratio).
         differences: one row per (run, scope, layer, quantity) for every run but the first: scope "task", "suite" (only
             when there are several) or "all"; `paired`; `num_pairs`, `num_first`, `num_other`, `num_tasks`;
-            `mean_first`, `mean_other`, `difference`, `low`, `high`; `effect` (mean / standard deviation of the paired
-            differences, or Hedges' g).
+            `mean_first`, `mean_other`, `difference`, `low`, `high`, `p` (of no difference). From five pairs on
+            `d_z` (mean / standard deviation of the paired differences, corrected for small samples), of independent
+            episodes `hedges_g`, each with `_low` and `_high`. `q` is p adjusted (Benjamini-Hochberg): of a task over
+            the tasks, of a suite or of all over the quantities; `layers_q` over the single layers.
         pairs: one row per (run, pair, layer, quantity): `episode_first`, `episode_other`, `first`, `other`,
             `difference`.
         unpaired: one row per episode that has no partner: `run`, `compared_with`, its suite, task and episode index.
         notes: one line per difference between the runs that was allowed, or that has no effect on the numbers.
+        ignores_seed: whether episodes of different seeds may be pairs.
     """
 
     runs: tuple[Run, ...]
@@ -71,6 +76,7 @@ class Comparison:
     pairs: pl.DataFrame
     unpaired: pl.DataFrame
     notes: tuple[str, ...]
+    ignores_seed: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -109,14 +115,14 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
     notes = [*check_comparable(runs, allowed), *noted_differences(runs)]
     notes += dict.fromkeys(line for run in runs for line in run.question.remarks)
     grouping = runs[0].question.grouping
-    seed = runs[0].question.settings.seed
+    estimand = runs[0].question.settings.intervals
     levels = [episode_tables(replans_of(run.question), run.question.grouping) for run in runs]
     having = {name for level in levels for name in level.groups_with_mass()}
     filled = [name for name in grouping.names if name in having]
     tables = [_episode_values(run, level, filled, "seed" in allowed) for run, level in zip(runs, levels, strict=True)]
     quantities = ((LOG2_RATIO,) if grouping.ratio else ()) + tuple(f"{name}_fraction" for name in filled) + (SUCCESS,)
     estimates = pl.concat(
-        [_estimates(run.name, table, quantities, seed) for run, table in zip(runs, tables, strict=True)]
+        [_estimates(run.name, table, quantities, estimand) for run, table in zip(runs, tables, strict=True)]
     )
     differences, pairs, unpaired = [], [], []
     for run, table in zip(runs[1:], tables[1:], strict=True):
@@ -124,17 +130,22 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
         pairs.append(_pairs_table(run.name, joined, quantities))
         unpaired += [_without_partner(tables[0], joined, "first", runs[0].name, run.name)]
         unpaired += [_without_partner(table, joined, "other", run.name, runs[0].name)]
-        rows = _paired(joined, quantities, seed) if joined.height else _unpaired(tables[0], table, quantities, seed)
+        rows = (
+            _paired(joined, quantities, estimand)
+            if joined.height
+            else _unpaired(tables[0], table, quantities, estimand)
+        )
         differences.append(rows.select(pl.lit(run.name).alias("run"), pl.all()))
     return Comparison(
         runs=tuple(runs),
         grouping=grouping,
         quantities=quantities,
         estimates=estimates,
-        differences=pl.concat(differences),
+        differences=_with_adjusted(pl.concat(differences)),
         pairs=pl.concat(pairs),
         unpaired=pl.concat(unpaired),
         notes=tuple(notes),
+        ignores_seed="seed" in allowed,
     )
 
 
@@ -223,43 +234,30 @@ def _without_partner(table: pl.DataFrame, joined: pl.DataFrame, side: str, run: 
     return alone.select(pl.lit(run).alias("run"), pl.lit(other).alias("compared_with"), pl.all())
 
 
-def _paired(joined: pl.DataFrame, quantities: Sequence[str], seed: int) -> pl.DataFrame:
+def _paired(joined: pl.DataFrame, quantities: Sequence[str], estimand: Estimand) -> pl.DataFrame:
     rows: list[dict[str, Any]] = []
     for scope, part in _scopes(joined):
         tasks = _tasks(part)
-        resamples = resample_episodes(tasks, seed=seed)
         values = [_numbers(part, f"{quantity}_difference") for quantity in quantities]
         statistics = [mean_over_episodes(value) for value in values]
-        intervals = bootstrap_intervals(statistics, resamples)
-        for quantity, value, statistic, interval in zip(quantities, values, statistics, intervals, strict=True):
+        found = estimates(statistics, tasks, estimand)
+        for quantity, value, statistic, one in zip(quantities, values, statistics, found, strict=True):
             used = statistic.used
-            certain = quantity == SUCCESS and bool(used.any()) and not np.ptp(value[used])
-            # Where all pairs end alike, all resamples do too, and the interval would have no width.
-            low, high = ends(None if certain else interval)
-            rows.append(
-                {
-                    **scope,
-                    "quantity": quantity,
-                    "paired": True,
-                    "num_tasks": len(set(tasks[used])),
-                    "num_pairs": int(used.sum()),
-                    "num_first": int(used.sum()),
-                    "num_other": int(used.sum()),
-                    "mean_first": _mean(_numbers(part, f"{quantity}_first")[used]),
-                    "mean_other": _mean(_numbers(part, f"{quantity}_other")[used]),
-                    "difference": statistic.value,
-                    "low": low,
-                    "high": high,
-                    "effect": _standardised(value[used]),
-                }
-            )
+            counts = {"num_tasks": len(set(tasks[used]))}
+            counts |= dict.fromkeys(("num_pairs", "num_first", "num_other"), int(used.sum()))
+            sides = {
+                f"mean_{side}": _mean(np.where(used, _numbers(part, f"{quantity}_{side}"), np.nan), tasks)
+                for side in ("first", "other")
+            }
+            of = {**scope, "quantity": quantity, "paired": True, **counts, **sides}
+            rows.append(of | _difference_row(one) | _effect(D_Z, standardised_mean(value[used], tasks[used], estimand)))
     return pl.DataFrame(rows, schema=_DIFFERENCE_SCHEMA)
 
 
-def _unpaired(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str], seed: int) -> pl.DataFrame:
+def _unpaired(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str], estimand: Estimand) -> pl.DataFrame:
     """Differences of means of independent episodes.
 
-    Tasks that both runs have are drawn together, others in each run alone.
+    A task that both runs have moves both means, and its difference has less noise than two different tasks.
     """
     both = pl.concat(
         [
@@ -273,12 +271,8 @@ def _unpaired(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str
         tasks = _tasks(part)
         if is_other.all() or not is_other.any():
             continue  # a task of one run only
-        resamples = _independent_draws(tasks, is_other, seed)
         for quantity in quantities:
-            values = _numbers(part, quantity)
-            certain = quantity == SUCCESS and not np.ptp(values[is_other]) and not np.ptp(values[~is_other])
-            found = contrast(values, is_other, resamples)
-            low, high = ends(None if certain else found.difference_interval)
+            found = contrast(_numbers(part, quantity), is_other, tasks, estimand)
             rows.append(
                 {
                     **scope,
@@ -290,25 +284,22 @@ def _unpaired(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str
                     "num_other": found.num_first,
                     "mean_first": found.mean_second,
                     "mean_other": found.mean_first,
-                    "difference": found.difference,
-                    "low": low,
-                    "high": high,
-                    "effect": found.hedges_g,
                 }
+                | _difference_row(found.difference)
+                | _effect(HEDGES_G, found.hedges_g)
             )
     return pl.DataFrame(rows, schema=_DIFFERENCE_SCHEMA)
 
 
-def _independent_draws(tasks: NDArray[np.int64], is_other: NDArray[np.bool_], seed: int) -> Resamples:
-    if set(tasks[is_other]) == set(tasks[~is_other]):
-        # Both runs have the same tasks, which are drawn for both at once.
-        return resample_episodes(tasks, seed=seed)
-    parts = [
-        resample_episodes(tasks[member], seed=seed + number) for number, member in enumerate((~is_other, is_other))
-    ]
-    counts = np.empty((len(parts[0].counts), len(tasks)))
-    counts[:, ~is_other], counts[:, is_other] = parts[0].counts, parts[1].counts
-    return Resamples(counts, tasks)
+def _difference_row(one: Estimate) -> dict[str, Any]:
+    low, high = ends(one.interval())
+    return {"difference": one.value, "low": low, "high": high, "p": one.p_value(0.0)}
+
+
+def _effect(name: str, one: Estimate) -> dict[str, Any]:
+    """An effect size with its interval; without an interval, none at all: it would look more certain than it is."""
+    interval = one.interval()
+    return named_interval(name, None if interval is None else one.value, interval)
 
 
 _DIFFERENCE_SCHEMA = {
@@ -319,8 +310,26 @@ _DIFFERENCE_SCHEMA = {
     "quantity": pl.String,
     "paired": pl.Boolean,
     **dict.fromkeys(("num_tasks", "num_pairs", "num_first", "num_other"), pl.Int64),
-    **dict.fromkeys(("mean_first", "mean_other", "difference", "low", "high", "effect"), pl.Float64),
+    **dict.fromkeys(("mean_first", "mean_other", "difference", "low", "high", "p"), pl.Float64),
+    **{f"{name}{end}": pl.Float64 for name in (D_Z, HEDGES_G) for end in ("", "_low", "_high")},
 }
+
+
+def _with_adjusted(differences: pl.DataFrame) -> pl.DataFrame:
+    """The columns `q` and `layers_q` of `Comparison.differences`."""
+    whole, single = pl.col("scope") == "all", pl.col("layer") != LAYERS_AVG
+    looks = (
+        ("q", pl.col("scope") == "task", ("run", "layer", "quantity")),
+        ("q", pl.col("scope") != "task", ("run", "scope", "suite", "layer")),
+        ("layers_q", whole & single, ("run", "quantity")),
+    )
+    numbered = differences.with_columns(pl.int_range(pl.len()).alias("_row"))
+    columns: dict[str, list[float | None]] = {"q": [None] * numbered.height, "layers_q": [None] * numbered.height}
+    for name, which, family in looks:
+        for part in numbered.filter(which).partition_by(family, maintain_order=True):
+            for row, q in zip(part["_row"], adjusted_p_values(part["p"].to_list()), strict=True):
+                columns[name][row] = q
+    return differences.with_columns(pl.Series(name, q, dtype=pl.Float64) for name, q in columns.items())
 
 
 def _scopes(table: pl.DataFrame) -> list[tuple[dict[str, Any], pl.DataFrame]]:
@@ -341,7 +350,7 @@ def _scopes(table: pl.DataFrame) -> list[tuple[dict[str, Any], pl.DataFrame]]:
     return scopes
 
 
-def _estimates(run: str, table: pl.DataFrame, quantities: Sequence[str], seed: int) -> pl.DataFrame:
+def _estimates(run: str, table: pl.DataFrame, quantities: Sequence[str], estimand: Estimand) -> pl.DataFrame:
     rows = []
     for part in table.partition_by("suite", "layer", maintain_order=True):
         tasks = _tasks(part)
@@ -354,17 +363,16 @@ def _estimates(run: str, table: pl.DataFrame, quantities: Sequence[str], seed: i
             for quantity in quantities
         }
         if LOG2_RATIO in quantities:
-            statistics["ratio_lift"] = mean_over_episodes(_numbers(part, "ratio_lift"), POSITIVE)
+            statistics["ratio_lift"] = geometric_mean_over_episodes(np.log(_numbers(part, "ratio_lift")))
         names = {"run": run, "suite": part["suite"][0], "layer": part["layer"][0], "block": part["block"][0]}
         counts = {"num_tasks": len(set(tasks)), "num_episodes": part.height}
-        intervals = bootstrap_intervals(list(statistics.values()), resample_episodes(tasks, seed=seed))
-        for (name, statistic), interval in zip(statistics.items(), intervals, strict=True):
-            # Where all episodes end alike, all resamples do too, and the interval would have no width.
-            certain = name == SUCCESS and statistic.value in (0.0, 1.0)
-            low, high = ends(None if certain else interval)
-            row = {**names, **counts, "quantity": name, "value": statistic.value, "low": low, "high": high}
+        found = estimates(list(statistics.values()), tasks, estimand)
+        for (name, statistic), one in zip(statistics.items(), found, strict=True):
+            low, high = ends(one.interval())
+            row = {**names, **counts, "quantity": name, "value": one.value, "low": low, "high": high}
             if name == "ratio":
-                row["uniform_ratio"] = mean_over_episodes(_numbers(part, "uniform_ratio")).value
+                baseline = geometric_mean_over_episodes(np.log(_numbers(part, "uniform_ratio")))
+                row["uniform_ratio"] = estimates([baseline], tasks, estimand)[0].value
                 row["episodes_without_ratio"] = statistic.num_left_out
                 row["num_nonfinite"] = int(part["num_nonfinite"].sum())
             rows.append(row)
@@ -388,11 +396,5 @@ def _numbers(part: pl.DataFrame, column: str) -> NDArray[np.float64]:
     return float_values(part[column])
 
 
-def _mean(values: NDArray[np.float64]) -> float | None:
-    return float(values.mean()) if len(values) else None
-
-
-def _standardised(differences: NDArray[np.float64]) -> float | None:
-    """Mean / standard deviation (ddof 1) of paired differences (Cohen 1988, d_z); None without any spread."""
-    spread = float(differences.std(ddof=1)) if len(differences) > 1 else 0.0
-    return float(differences.mean() / spread) if spread > 0 else None
+def _mean(values: NDArray[np.float64], tasks: NDArray[np.int64]) -> float | None:
+    return estimates([mean_over_episodes(values)], tasks)[0].value

@@ -16,7 +16,7 @@ from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, legend_above, n
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, NOTE_COLOR, SERIES_COLORS
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, ratio_name, title, wrapped
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,7 +52,7 @@ def plot_forest(
     rows = _rows(comparison, layer, quantity, shown)
     figure = new_figure(10, 1.9 + 0.34 * (rows.height + rows["suite"].n_unique()))
     which = layer_name(layer, "mean over layers", "block")
-    bars = f"{interval_name(level, 'bootstrap')}s over tasks and episodes"
+    bars = f"{interval_name(level)}s"
     note = f"n counts episodes (pairs where runs are paired). Bars: {bars}."
     if not comparison.differences["paired"].all():
         note += " Not every run is paired with the first one: those differences hold differences between scenes."

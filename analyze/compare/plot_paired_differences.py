@@ -17,7 +17,7 @@ from vla_attention.analyze.show.plot_axes import legend_above, note_at_row, scat
 from vla_attention.analyze.show.plot_colours import DATA_COLOR, DOT_COLOR, NOTE_COLOR, STRIPE_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, task_label, title, wrapped
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,11 +47,12 @@ def plot_paired_differences(
     which = layer_name(layer, "mean over layers", "block")
     first = comparison.names[0]
     paired = pairs.height > 0
+    equal = "task and initial state" if comparison.ignores_seed else "task, initial state and seed"
     note = (
-        f"{plural(pairs.height, 'pair')} of episodes of {plural(tasks.height, 'task')}, equal in task, initial state "
-        "and seed. n counts pairs."
+        f"{plural(pairs.height, 'pair')} of episodes of {plural(tasks.height, 'task')}, equal in {equal}. n counts "
+        "pairs."
         if paired
-        else "Not paired: no two episodes are equal in task, initial state and seed. n counts episodes of either run."
+        else f"Not paired: no two episodes are equal in {equal}. n counts episodes of either run."
     )
     title(figure, f"{name} against {first}: {named(comparison.grouping)}, {which}", note)
     axes = figure.subplots()
@@ -81,7 +82,7 @@ def plot_paired_differences(
     axes.grid(axis="x")
     axes.plot([], [], "o", color=DATA_COLOR, markersize=6, label="mean")
     if rows["low"].is_not_null().any():
-        axes.plot([], [], color=DATA_COLOR, linewidth=2, label=interval_name(level, "bootstrap"))
+        axes.plot([], [], color=DATA_COLOR, linewidth=2, label=interval_name(level))
     if paired:
         axes.scatter([], [], s=14, color=DOT_COLOR, linewidths=0, label="single pair")
     legend_above(axes, 3, handlelength=1.5)

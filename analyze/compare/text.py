@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import polars as pl
 
-from vla_attention.analyze.compare.comparison import LOG2_RATIO, SUCCESS, Comparison
+from vla_attention.analyze.compare.comparison import D_Z, HEDGES_G, LOG2_RATIO, SUCCESS, Comparison
 from vla_attention.analyze.measures.frames import LAYERS_AVG, layer_name
 from vla_attention.analyze.show.headings import (
     WIDTH,
@@ -15,10 +17,19 @@ from vla_attention.analyze.show.headings import (
     untrained_warning,
     wrap,
 )
-from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent, format_signed, plural
+from vla_attention.analyze.show.numbers import (
+    format_interval,
+    format_number,
+    format_percent,
+    format_signed,
+    plural,
+    row_interval,
+)
 from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.show.text_table import text_table
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.effect_sizes import FEWEST_EPISODES
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.stores.store_format import episode_name
 
@@ -44,9 +55,10 @@ def _header(comparison: Comparison, layer: str) -> str:
         stores = ", ".join(str(store.path) for store in run.stores)
         lines += wrap(f"{run.name}: {policy.name} ({policy.checkpoint}), {listing(run.suites)}; {stores}", rest="  ")
     which = layer_name(layer, LAYERS_AVG, "block")
+    about = comparison.runs[0].question.settings.intervals.words
     lines += wrap(
         f"Grouping '{comparison.grouping.name}', site {comparison.runs[0].question.site}, {which}; differences are run "
-        f"minus {comparison.names[0]}. {interval_note(DEFAULT_LEVEL)}",
+        f"minus {comparison.names[0]}. {interval_note(DEFAULT_LEVEL, about)}",
     )
     lines += note_lines(comparison.notes)
     return "\n".join(lines)
@@ -88,12 +100,12 @@ def _difference_section(comparison: Comparison, name: str, layer: str) -> str:
     rows = comparison.differences.filter(pl.col("run") == name, pl.col("scope") == "all", pl.col("layer") == layer)
     lines = [heading(f"{name} AGAINST {first}")]
     lines += _pairing(comparison, name, rows)
-    header = ["quantity", "n", first[:14], name[:14], "difference", "interval", "factor", "effect"]
+    paired = bool(rows["paired"].any())
+    effect, effect_name = (D_Z, "d_z") if paired else (HEDGES_G, "g")
+    header = ["quantity", "n", first[:14], name[:14], "difference", "interval", "q", effect_name, "interval"]
     body = []
     for row in rows.iter_rows(named=True):
-        is_ratio = row["quantity"] == LOG2_RATIO
         n = str(row["num_pairs"]) if row["paired"] else f"{row['num_first']}/{row['num_other']}"
-        factor = "" if not is_ratio or row["difference"] is None else f"x {format_number(2.0 ** row['difference'])}"
         body.append(
             [
                 shortened(row["quantity"], 26),
@@ -102,14 +114,22 @@ def _difference_section(comparison: Comparison, name: str, layer: str) -> str:
                 format_number(row["mean_other"]),
                 format_signed(row["difference"]),
                 format_interval(row["low"], row["high"]),
-                factor,
-                format_signed(row["effect"]),
+                format_number(row["q"]),
+                format_signed(row[effect]),
+                row_interval(row, effect),
             ]
         )
     lines.append(text_table(header, body, left=(0,)))
-    paired = bool(rows["paired"].any())
-    effect = "mean / standard deviation of the paired differences" if paired else "Hedges' g, in standard deviations"
-    lines += wrap(f"effect: {effect}. A difference of 1 in log2_ratio is a factor of 2 in the ratio.")
+    lines += wrap(f"{_factor(rows)}{_named_differences(rows['q'], 'quantity', rows['quantity'].to_list())}")
+    meaning = (
+        "d_z: mean / standard deviation of the paired differences (Cohen)"
+        if paired
+        else "g: Hedges' g, difference in standard deviations"
+    )
+    lines += wrap(
+        f"{meaning}, corrected for small samples; none below {FEWEST_EPISODES} pairs or episodes. q: p of no "
+        f"difference, adjusted for {plural(rows.height, 'quantity')} (Benjamini-Hochberg)."
+    )
     return "\n".join(lines)
 
 
@@ -121,17 +141,40 @@ def _pairing(comparison: Comparison, name: str, rows: pl.DataFrame) -> list[str]
     }
     if not rows["paired"].any():
         return wrap(
-            f"NOT PAIRED: no episode of {name} has the suite, task, initial state and seed of one of {first}, so this "
-            "compares means of independent episodes; differences between scenes are in it, and intervals are wider for "
-            "that.",
+            f"NOT PAIRED: no episode of {name} has the {_pairing_keys(comparison)} of one of {first}, so this compares "
+            "means of independent episodes; differences between scenes are in it, and intervals are wider for that.",
         )
     pairs = comparison.pairs.filter(pl.col("run") == name).select("suite", "task_id", "episode_first").unique().height
-    text = f"{plural(pairs, 'pair')} of episodes with the same task, initial state and seed."
+    text = f"{plural(pairs, 'pair')} of episodes with the same {_pairing_keys(comparison)}."
+    if comparison.ignores_seed:
+        text += " Their seeds may differ: environment and noise are not the same in both runs."
     for run, table in alone.items():
         if table.height:
             names = [episode_name(row["task_id"], row["episode_index"]) for row in table.iter_rows(named=True)]
             text += f" Of {run}, {table.height} have no partner and are left out: {listing(names, 6)}."
     return wrap(text)
+
+
+def _pairing_keys(comparison: Comparison) -> str:
+    return "suite, task and initial state" if comparison.ignores_seed else "suite, task, initial state and seed"
+
+
+def _factor(rows: pl.DataFrame) -> str:
+    ratio = rows.filter(pl.col("quantity") == LOG2_RATIO)
+    if ratio.is_empty() or ratio["difference"][0] is None:
+        return ""
+    return f"The ratio changes by a factor of {format_number(2.0 ** ratio['difference'][0])} (2 to the difference). "
+
+
+def _named_differences(q_values: pl.Series, kind: str, names: Sequence[str]) -> str:
+    """Which of many differences may be named after so many looks."""
+    found = [name for name, q in zip(names, q_values, strict=True) if q is not None and q <= NAMED_AT]
+    of = plural(len(names), kind)
+    return (
+        f"Of {of}, {listing(found, 8)} differ{'s' if len(found) == 1 else ''} (q <= {NAMED_AT:g})."
+        if found
+        else (f"Of {of}, none differs (q <= {NAMED_AT:g}).")
+    )
 
 
 def _tasks_section(comparison: Comparison, name: str, layer: str) -> str:
@@ -140,19 +183,26 @@ def _tasks_section(comparison: Comparison, name: str, layer: str) -> str:
         pl.col("run") == name, pl.col("scope") != "all", pl.col("layer") == layer, pl.col("quantity") == quantity
     )
     several = rows["suite"].n_unique() > 1
-    header = ["task", "n", "difference", "interval"]
+    header = ["task", "n", "difference", "interval", "q"]
     body = [
         [
             f"{row['suite']} {'all' if row['task_id'] is None else row['task_id']}" if several else str(row["task_id"]),
             str(row["num_pairs"]) if row["paired"] else f"{row['num_first']}/{row['num_other']}",
             format_signed(row["difference"]),
             format_interval(row["low"], row["high"]),
+            format_number(row["q"]),
         ]
         for row in rows.iter_rows(named=True)
     ]
+    tasks = rows.filter(pl.col("scope") == "task")
+    labels = [
+        f"{row['suite']} {row['task_id']}" if several else f"task {row['task_id']}"
+        for row in tasks.iter_rows(named=True)
+    ]
+    said = wrap(f"q: adjusted for the number of tasks. {_named_differences(tasks['q'], 'task', labels)}")
     texts = [row["instruction"] or "" for row in rows.iter_rows(named=True)]
     table = text_table(header, body, left=(0,), last="instruction", texts=texts, width=WIDTH)
-    return "\n".join([heading(f"PER TASK  {quantity}, {name} minus {comparison.names[0]}"), table])
+    return "\n".join([heading(f"PER TASK  {quantity}, {name} minus {comparison.names[0]}"), table, *said])
 
 
 def _layers_section(comparison: Comparison) -> str:
@@ -162,16 +212,16 @@ def _layers_section(comparison: Comparison) -> str:
         return ""
     cells = {(row["run"], row["layer"]): row for row in rows.iter_rows(named=True)}
     others = comparison.names[1:4]
-    header = ["block"] + [text for name in others for text in (name[:20], "interval")]
+    header = ["block"] + [text for name in others for text in (name[:20], "interval", "q")]
     body = []
     for layer in layers:
         line = [layer]
         for name in others:
             row = cells.get((name, layer))
             line += (
-                ["-", "-"]
+                ["-", "-", "-"]
                 if row is None
-                else [format_signed(row["difference"]), format_interval(row["low"], row["high"])]
+                else [format_signed(row["difference"]), row_interval(row), format_number(row["layers_q"])]
             )
         body.append(line)
     more = (
@@ -180,4 +230,5 @@ def _layers_section(comparison: Comparison) -> str:
         else ""
     )
     per_layer = f"PER LAYER  {comparison.quantities[0]}, run minus {comparison.names[0]}{more}"
-    return "\n".join([heading(per_layer), text_table(header, body, left=(0,))])
+    note = f"q: adjusted for {plural(len(layers), 'block')} (Benjamini-Hochberg)."
+    return "\n".join([heading(per_layer), text_table(header, body, left=(0,)), note])

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from vla_attention.analyze.arguments import (
     add_grouping,
+    add_intervals,
     add_selection,
     add_stores,
     output_folder,
@@ -55,10 +56,10 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add_grouping(parser)
     selection = add_selection(parser)
+    add_intervals(parser)
     selection.add_argument("--per-head", action="store_true", help="keep heads apart in the steps table")
     output = parser.add_argument_group("output")
     output.add_argument("--output", type=Path, metavar="PATH", help="folder (default: results/STORE/export)")
-    output.add_argument("--seed", type=int, default=0, help="seed of the bootstrap (default: 0)")
     return parser
 
 

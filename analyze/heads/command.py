@@ -6,6 +6,7 @@ import argparse
 
 from vla_attention.analyze.arguments import (
     add_grouping,
+    add_intervals,
     add_output,
     add_selection,
     add_sink_rule,
@@ -35,13 +36,14 @@ def build_parser() -> argparse.ArgumentParser:
     parser = command_parser(
         "vla-analyze heads",
         "Who looks and who reads: the most visual and most linguistic heads, how much heads differ, layers, depth and "
-        "denoise steps, with intervals over tasks and episodes; and of single rows entropy, effective number of keys, "
+        "denoise steps, with intervals; and of single rows entropy, effective number of keys, "
         "mass of the largest keys and sinks.",
         _EXAMPLES,
     )
     add_stores(parser)
     add_grouping(parser)
     add_selection(parser)
+    add_intervals(parser)
     rows = parser.add_argument_group("rows and heads")
     rows.add_argument("--top", type=int, default=5, metavar="N", help="heads listed on either end (default: 5)")
     rows.add_argument(
@@ -88,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
         grouping = question.grouping
         files += plot_head_grid(study.heads, grouping, folder)
         files += plot_layer_profile(study.tasks, grouping, folder)
-        time = layer_time_table(study.replans, grouping, seed=arguments.seed)
+        time = layer_time_table(study.replans, grouping, estimand=study.question.settings.intervals)
         files += plot_layer_time(time, study.replans, grouping, folder)
         files += plot_denoise_profile(study.denoise, grouping, folder)
     report_files(folder, files)

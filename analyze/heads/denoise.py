@@ -16,11 +16,13 @@ from vla_attention.analyze.measures.aggregate import (
 )
 from vla_attention.analyze.measures.frames import Tables, concat_tables
 from vla_attention.analyze.measures.steps import MeasuredEpisode
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_SEED
+from vla_attention.analyze.statistics.intervals import Estimand
 from vla_attention.schemas.groupings.grouping import Grouping
 
 
-def denoise_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping, seed: int = DEFAULT_SEED) -> Tables:
+def denoise_tables(
+    measured: Sequence[MeasuredEpisode], grouping: Grouping, estimand: Estimand = Estimand.TASKS_LIKE_THESE
+) -> Tables:
     """Every denoise step: the numbers over all tasks and layers of an analysis in which only this step is selected.
 
     Returns:
@@ -32,7 +34,7 @@ def denoise_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping, seed
     for position in np.argsort(selection.denoise_steps, kind="stable").tolist():
         episodes = episode_tables(replan_tables([one.at_denoise(position) for one in measured], grouping), grouping)
         layer = overall_layer(episodes.cells)
-        whole = overall_rows(task_tables(episodes.filter(pl.col("layer") == layer), grouping, seed=seed))
+        whole = overall_rows(task_tables(episodes.filter(pl.col("layer") == layer), grouping, estimand=estimand))
         times = [one.item.episode.read("denoise_time")[selection.denoise[position]] for one in measured]
         time = pl.lit(float(np.mean(times)), dtype=pl.Float64).alias("denoise_time")
         number = pl.lit(selection.denoise_steps[position], dtype=pl.Int64).alias("denoise_step")

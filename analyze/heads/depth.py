@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
 from vla_attention.analyze.measures.group_contributions import group_contribution_tables
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL, DEFAULT_SEED, NO_LIMITS
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL, NO_LIMITS, Estimand
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 
 
@@ -36,7 +36,10 @@ def depth_centre(amounts: ArrayLike, blocks: ArrayLike) -> NDArray[np.float64]:
 
 
 def depth_table(
-    episodes: Tables, norms: pl.DataFrame | None = None, seed: int = DEFAULT_SEED, level: float = DEFAULT_LEVEL
+    episodes: Tables,
+    norms: pl.DataFrame | None = None,
+    estimand: Estimand = Estimand.TASKS_LIKE_THESE,
+    level: float = DEFAULT_LEVEL,
 ) -> pl.DataFrame:
     """One row per group that has any amount: the mean over episodes of its centre, with a two-level interval.
 
@@ -48,7 +51,7 @@ def depth_table(
     Args:
         episodes: `aggregate.episode_tables`. A block that was named by two layer numbers counts once.
         norms: suite, task_id, episode_index, block, group, norm (see `contribution_norms`), where there are any.
-        seed: of the bootstrap.
+        estimand: what intervals are about.
         level: of the intervals.
     """
     single = episodes.groups.filter(pl.col("layer") != LAYERS_AVG)
@@ -58,7 +61,7 @@ def depth_table(
     blocks = single["block"].unique().sort()
     # With a single layer both limits are equal, and no interval could be widened between them.
     limits = (float(blocks[0]), float(blocks[-1])) if len(blocks) > 1 else NO_LIMITS
-    table = means_with_intervals(pl.concat(parts), ("group", "of"), {"centre": limits}, seed, level)
+    table = means_with_intervals(pl.concat(parts), ("group", "of"), {"centre": limits}, estimand, level)
     return table.filter(pl.col("centre").is_not_null()).with_columns(
         pl.lit(float(np.mean(blocks.to_numpy()))).alias("even"),
         pl.lit(blocks[0], dtype=pl.Int64).alias("first_block"),

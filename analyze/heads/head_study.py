@@ -71,7 +71,7 @@ def study_heads(question: Question, options: RowOptions | None = None) -> HeadSt
 
     Without `options` rows are only read when a group cuts a stored segment (a word, an object).
     """
-    grouping, seed, selection = question.grouping, question.settings.seed, question.selection
+    grouping, estimand, selection = question.grouping, question.settings.intervals, question.selection
     resolved = resolve_all(grouping, question.selected, question.vocabulary)
     shown = groups_with_valid_keys(question.selected, resolved)
     measures = None
@@ -105,11 +105,11 @@ def study_heads(question: Question, options: RowOptions | None = None) -> HeadSt
         question=question,
         options=options,
         replans=replans,
-        tasks=task_tables(episodes, grouping, seed=seed),
-        heads=heads_tables(heads, grouping, seed),
-        dispersion=dispersion_table(heads, grouping, seed),
-        depth=depth_table(episodes, contribution_norms(question, resolved), seed),
-        denoise=denoise_tables(over_heads, grouping, seed),
+        tasks=task_tables(episodes, grouping, estimand=estimand),
+        heads=heads_tables(heads, grouping, estimand),
+        dispersion=dispersion_table(heads, grouping, estimand),
+        depth=depth_table(episodes, contribution_norms(question, resolved), estimand),
+        denoise=denoise_tables(over_heads, grouping, estimand),
         rows=rows,
         search=search,
     )

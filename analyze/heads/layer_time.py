@@ -7,12 +7,11 @@ import polars as pl
 
 from vla_attention.analyze.measures.aggregate import layer_order
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
-from vla_attention.analyze.statistics.bootstrap import (
+from vla_attention.analyze.statistics.intervals import (
     DEFAULT_LEVEL,
-    DEFAULT_SEED,
-    bootstrap_intervals,
+    Estimand,
+    estimates,
     mean_over_episodes,
-    resample_episodes,
 )
 from vla_attention.analyze.time.alignment import on_episode_time
 from vla_attention.schemas.groupings.grouping import Grouping
@@ -26,7 +25,7 @@ def layer_time_table(
     replans: Tables,
     grouping: Grouping,
     num_bins: int | None = None,
-    seed: int = DEFAULT_SEED,
+    estimand: Estimand = Estimand.TASKS_LIKE_THESE,
     level: float = DEFAULT_LEVEL,
 ) -> pl.DataFrame:
     """Means over episodes with two-level intervals for every layer and equal part of the episodes' time.
@@ -40,7 +39,7 @@ def layer_time_table(
         replans: `aggregate.replan_tables`.
         grouping: the groups.
         num_bins: parts of the time; `MOST_BINS` unless no episode has as many replans.
-        seed: of the bootstrap.
+        estimand: what intervals are about.
         level: of the intervals.
     """
     tables = replans.filter(pl.col("layer") != LAYERS_AVG)
@@ -69,7 +68,8 @@ def layer_time_table(
         tasks.append(f"{key[0]}\t{key[1]}")
     stacked = np.stack(values).transpose(0, 3, 2, 1).reshape(len(values), -1)  # (episode, quantity x layer x bin)
     statistics = [mean_over_episodes(stacked[:, i]) for i in range(stacked.shape[1])]
-    intervals = bootstrap_intervals(statistics, resample_episodes(np.array(tasks), seed=seed), level)
+    found = estimates(statistics, np.array(tasks), estimand)
+    intervals = [one.interval(level) for one in found]
     quantity, layer, part_of = (axis.ravel() for axis in np.indices((len(quantities), len(layers), bins)))
     return pl.DataFrame(
         {
@@ -80,7 +80,7 @@ def layer_time_table(
             "start": part_of / bins,
             "stop": (part_of + 1) / bins,
             "num_episodes": [int(statistic.used.sum()) for statistic in statistics],
-            "mean": [statistic.value for statistic in statistics],
+            "mean": [one.value for one in found],
             "low": [interval.low if interval else None for interval in intervals],
             "high": [interval.high if interval else None for interval in intervals],
         },

@@ -12,7 +12,7 @@ from vla_attention.analyze.ratios.plot_profile_panels import draw_profile, shown
 from vla_attention.analyze.show.numbers import of_tasks
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import named, title
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.schemas.groupings.grouping import Grouping
 
 STEM = "denoise_profile"
@@ -35,7 +35,7 @@ def plot_denoise_profile(denoise: Tables, grouping: Grouping, folder: Path) -> l
     )
     columns = ["denoise_step", "denoise_time", "num_episodes", "num_replans"]
     if grouping.ratio is not None:
-        columns += ["ratio_mean", "ratio_mean_low", "ratio_mean_high", "uniform_ratio", "num_nonfinite"]
+        columns += ["geometric_mean", "geometric_mean_low", "geometric_mean_high", "uniform_ratio", "num_nonfinite"]
     groups = denoise.groups.filter(pl.col("group").is_in(shown_groups(denoise, grouping)))
     data = {"": table.select(columns), "_groups": groups.select("denoise_step", "group", *FRACTION_COLUMNS)}
     return save_figure(figure, folder, STEM, data)

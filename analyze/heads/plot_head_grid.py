@@ -14,7 +14,7 @@ from vla_attention.analyze.show.numbers import format_percent, interval_name, of
 from vla_attention.analyze.show.plot_heat_map import draw_log2_map, label_axis, map_height
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, ratio_name, title
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.schemas.groupings.grouping import Grouping
 
 STEM = "head_grid"
@@ -85,7 +85,7 @@ def _note(heads: pl.DataFrame, log2: NDArray[np.float64], dots: bool) -> str:
     episodes, tasks = int(heads["num_episodes"][0]), int(heads["num_tasks"][0])
     text = f"Means over {of_tasks(episodes, tasks)}."
     if dots:
-        text += f" Dot: the head's {interval_name(DEFAULT_LEVEL, 'bootstrap')} holds the uniform value."
+        text += f" Dot: the head's {interval_name(DEFAULT_LEVEL)} holds the uniform value."
         text += f" By chance alone, {format_percent(1 - DEFAULT_LEVEL, 0)} of the heads have no dot."
     infinite = int(np.isinf(log2).sum())
     if infinite:

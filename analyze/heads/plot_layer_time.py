@@ -13,7 +13,7 @@ from vla_attention.analyze.show.numbers import interval_name, of_tasks
 from vla_attention.analyze.show.plot_heat_map import draw_log2_map, label_axis, map_height
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, ratio_name, title, wrapped
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.schemas.groupings.grouping import Grouping
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def plot_layer_time(table: pl.DataFrame, replans: Tables, grouping: Grouping, fo
         if axes is shared[0]:
             axes.set_ylabel("layer")
     if dots:
-        note += f" Dot: the cell's {interval_name(DEFAULT_LEVEL, 'bootstrap')} holds the uniform value."
+        note += f" Dot: the cell's {interval_name(DEFAULT_LEVEL)} holds the uniform value."
     if undefined and grouping.ratio is not None:
         note += " Grey: no finite logarithm (infinite, undefined or zero ratios take no part)."
     about = ""

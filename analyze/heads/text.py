@@ -23,8 +23,8 @@ from vla_attention.analyze.show.numbers import (
     row_interval,
 )
 from vla_attention.analyze.show.text_table import text_table
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL, NO_LIMITS, POSITIVE
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL, NO_LIMITS, POSITIVE
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
 
@@ -56,7 +56,7 @@ def _row_means(episodes: pl.DataFrame, by: Sequence[str], study: HeadStudy) -> p
     measured = [name for name in episodes.columns if name not in (*EPISODE_ID, *by)]
     # A group may hold fewer than one key, and then its entropy is below 0.
     limits = {name: NO_LIMITS if name == "entropy" else POSITIVE for name in measured}
-    return means_with_intervals(episodes, by, limits, study.question.settings.seed)
+    return means_with_intervals(episodes, by, limits, study.question.settings.intervals)
 
 
 def _header(study: HeadStudy) -> str:
@@ -68,7 +68,7 @@ def _header(study: HeadStudy) -> str:
         f"{listing(chosen.head_numbers, 40)}",
         f"Grouping '{question.grouping.name}'; {_measure_name(study.heads, question.grouping)}",
         *([chosen.note] if chosen.note else []),
-        interval_note(DEFAULT_LEVEL),
+        interval_note(DEFAULT_LEVEL, question.settings.intervals.words),
     ]
     return "\n".join([*lines, *wrap_all(about)])
 
@@ -84,17 +84,15 @@ def _ranking(study: HeadStudy, top: int) -> str:
     ranked = ranked_heads(study.heads, grouping)
     if ranked.is_empty():
         return heading("HEADS") + "\nNo head has any mass on either side of the ratio."
-    if grouping.ratio is None:
-        most, least = f"MOST ON '{main_group(study.heads, grouping)}'", "LEAST"
-    elif grouping.compares_modalities:
-        most, least = "MOST VISUAL HEADS", "MOST LINGUISTIC HEADS"
-    else:
-        most, least = "HEADS WITH THE HIGHEST RATIO", "HEADS WITH THE LOWEST RATIO"
+    order = f"fraction of '{main_group(study.heads, grouping)}'" if grouping.ratio is None else "lift of the ratio"
     shown = min(top, ranked.height)
     first, last = ranked.head(shown), ranked.tail(min(shown, ranked.height - shown)).reverse()
-    lines = [heading(most), _head_rows(first, study)]
+    lines = [
+        heading(f"HEADS IN ORDER OF {order}: the first {first.height} of {ranked.height}"),
+        _head_rows(first, study),
+    ]
     if last.height:
-        lines += ["", heading(least), _head_rows(last, study)]
+        lines += ["", heading(f"and the last {last.height}"), _head_rows(last, study)]
     note = (
         f"{ranked.height} heads. The ends of so many are extreme partly by chance: their intervals are those of heads "
         "chosen beforehand."
@@ -180,7 +178,7 @@ def _profile(level: Tables, along: str, label: str, labels: Sequence[str], group
     of_group, groups = level.by_group(along), level.groups_with_mass()[:3]
     for name, row in zip(labels, level.cells.iter_rows(named=True), strict=True):
         if grouping.ratio is not None:
-            cells = [format_number(row["ratio_mean"]), row_interval(row, "ratio_mean")]
+            cells = [format_number(row["geometric_mean"]), row_interval(row, "geometric_mean")]
             cells += [
                 format_number(row["uniform_ratio"]),
                 format_number(row["ratio_lift"]),

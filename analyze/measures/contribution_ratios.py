@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.masses import ratio
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL, NO_LIMITS, POSITIVE
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL, NO_LIMITS, POSITIVE, Estimand
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.layout import INVALID_ROLES
 from vla_attention.schemas.segments import segment_members
@@ -102,7 +102,7 @@ def episode_means(table: pl.DataFrame, *measures: pl.Expr, by: tuple[str, ...] =
 
 
 def contribution_rows(
-    table: pl.DataFrame, above: str, below: str, seed: int, level: float = DEFAULT_LEVEL
+    table: pl.DataFrame, above: str, below: str, estimand: Estimand, level: float = DEFAULT_LEVEL
 ) -> pl.DataFrame:
     """Norms and their ratio of every layer and over all of them ("layers_avg"), over episodes, with intervals.
 
@@ -110,32 +110,37 @@ def contribution_rows(
         table: one row per (episode, replan, layer, denoise step), with the norms and `ratio_columns`.
         above: the column of the numerator's norm.
         below: the column of the denominator's norm.
-        seed: of the bootstrap.
+        estimand: what the intervals are about.
         level: of the intervals.
 
     Returns:
-        layer, layer_number (null for the average); means of `above`, `below` and uniform_ratio; and with `_low` and
-        `_high`
-            ratio_mean        mean over episodes of the mean ratio of norms
-            ratio_of_means    mean `above` / mean `below`
+        layer, layer_number (null for the average); means of `above` and `below`, geometric mean uniform_ratio; and with
+        `_low` and `_high`
             geometric_mean    exp of the mean log ratio
-            ratio_lift        mean over episodes of the mean of ratio / uniform ratio
+            ratio_lift        geometric mean of ratio / uniform ratio
+            ratio_mean        mean of the episodes' mean ratios of norms
+            ratio_of_means    mean `above` / mean `below`
         Ratios that are infinite or undefined are in no mean but `ratio_of_means`.
     """
-    log_ratio = pl.col("contribution_ratio").log()
+    logs = {
+        name: pl.col(column).log()
+        for name, column in (
+            ("geometric_mean", "contribution_ratio"),
+            ("uniform_ratio", "uniform_ratio"),
+            ("ratio_lift", "ratio_lift"),
+        )
+    }
     episodes = episode_means(
         table,
         pl.col(above, below).mean(),
         pl.col("contribution_ratio").filter(pl.col("contribution_ratio").is_finite()).mean().alias("ratio_mean"),
-        log_ratio.filter(log_ratio.is_finite()).mean().alias("geometric_mean"),
-        *(pl.col(name).filter(pl.col(name).is_finite()).mean() for name in ("uniform_ratio", "ratio_lift")),
+        *(log.filter(log.is_finite()).mean().alias(name) for name, log in logs.items()),
     )
-    values = dict.fromkeys((above, below, "ratio_mean", "uniform_ratio", "ratio_lift"), POSITIVE)
-    values |= {"geometric_mean": NO_LIMITS}
+    values = dict.fromkeys((above, below, "ratio_mean"), POSITIVE) | dict.fromkeys(logs, NO_LIMITS)
     quotients = {"ratio_of_means": (above, below)}
-    rows = means_with_intervals(episodes, ["layer"], values, seed, level, quotients=quotients)
+    rows = means_with_intervals(episodes, ["layer"], values, estimand, level, quotients=quotients)
     bounded = ("ratio_mean", "ratio_of_means", "geometric_mean", "ratio_lift")
-    return rows.with_columns(pl.col("^geometric_mean(_low|_high)?$").exp()).select(
+    return rows.with_columns(pl.col(rf"^({'|'.join(logs)})(_low|_high)?$").exp()).select(
         "layer",
         pl.col("layer").cast(pl.Int64, strict=False).alias("layer_number"),
         above,

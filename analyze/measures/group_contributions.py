@@ -32,6 +32,7 @@ from vla_attention.analyze.measures.frames import (
 )
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.statistics.intervals import Estimand
 from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 from vla_attention.schemas.segments import segment_members, weights_on_segments
@@ -112,9 +113,9 @@ def norms_by_layer(tables: Tables) -> dict[tuple[str, str], float]:
     return {(layer, group): norm for layer, group, norm in means.iter_rows()}
 
 
-def ratios_by_layer(cells: pl.DataFrame, seed: int) -> dict[str, dict[str, Any]]:
+def ratios_by_layer(cells: pl.DataFrame, estimand: Estimand) -> dict[str, dict[str, Any]]:
     """By layer the rows of `contribution_ratios.contribution_rows`; empty without a ratio."""
     if "contribution_ratio" not in cells.columns:
         return {}
-    rows = contribution_rows(cells, "numerator_norm", "denominator_norm", seed)
+    rows = contribution_rows(cells, "numerator_norm", "denominator_norm", estimand)
     return {row["layer"]: row for row in rows.iter_rows(named=True)}

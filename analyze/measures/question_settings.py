@@ -7,7 +7,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypedDict
 
-from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
+from vla_attention.analyze.statistics.intervals import Estimand
+from vla_attention.schemas.errors import BadArgument, did_you_mean, listing, unknown_name
 
 
 @dataclass(frozen=True)
@@ -23,8 +24,14 @@ class AnalysisSettings:
     per_head: bool = False
     tasks: tuple[int, ...] | None = None
     site: str | None = None
-    seed: int = 0
+    intervals: Estimand = Estimand.TASKS_LIKE_THESE
     skip_corrupt: bool = False
+
+    def __post_init__(self) -> None:
+        known = [member.value for member in Estimand]
+        if self.intervals not in known:
+            raise unknown_name("kind of intervals", self.intervals, known)
+        object.__setattr__(self, "intervals", Estimand(self.intervals))
 
 
 class SettingKeywords(TypedDict, total=False):
@@ -40,7 +47,7 @@ class SettingKeywords(TypedDict, total=False):
         denoise: "first", "last", "all", a number or several.
         per_head: whether heads are kept apart.
         site: the softmax family.
-        seed: of the bootstrap.
+        intervals: what intervals are about: "tasks-like-these" or "these-tasks".
         skip_corrupt: whether damaged and empty episodes are left out.
     """
 
@@ -53,7 +60,7 @@ class SettingKeywords(TypedDict, total=False):
     per_head: bool
     tasks: int | Sequence[int] | None
     site: str | None
-    seed: int
+    intervals: str
     skip_corrupt: bool
 
 

@@ -75,7 +75,7 @@ class Control:
 
     Attributes:
         enrichment: of its maps on control masks, (layer, head, item); NaN where there is no control.
-        balanced: what is resampled in place of `enrichment`, with the same mean over the task's episodes.
+        balanced: what stands for `enrichment` in intervals, with the same mean over the task's episodes.
         overlap: of its masks with its control masks, (item,).
     """
 

@@ -83,7 +83,7 @@ def object_tables(question: Question, settings: ObjectSettings | None = None, ke
                         uniform over the picture. A mean of quotients would give a sliver that is in sight at one
                         replan as much weight as all other replans.
             control_enrichment  the same of these maps on the item's masks of other episodes of the task
-            control_balanced    stands for it when episodes are resampled
+            control_balanced    stands for it in intervals
             control_overlap     how much these masks overlap with the episode's own (see `control_masks` for all three;
                         null where there is no control)
         times: one row per (episode, replan, camera, item) of the layers' and heads' mean: `share`, `area_share`,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import polars as pl
 
@@ -17,8 +18,9 @@ from vla_attention.analyze.objects.control_masks import STILL_OVERLAP
 from vla_attention.analyze.objects.object_attention import ObjectTables, object_tables
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_views import ALL_CAMERAS, CLASSES, site_of_pictures
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_SEED, POSITIVE, SHARE
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
+from vla_attention.analyze.statistics.intervals import POSITIVE, SHARE, Estimand, quotient_by_episode
+from vla_attention.analyze.statistics.many_looks import Leader, adjusted_p_values, leader_of_table
 from vla_attention.schemas.stores.reader import Store
 
 #: An item that covers less than this part of the pictures (one patch of 512) is not ranked by its enrichment.
@@ -51,31 +53,31 @@ class ObjectStudy:
     @cached_property
     def summary(self) -> pl.DataFrame:
         """Shares, enrichment and control; see `objects_summary`."""
-        return objects_summary(self.tables.objects, self.question.settings.seed)
+        return objects_summary(self.tables.objects, self.question.settings.intervals)
 
     @cached_property
     def pointing_summary(self) -> pl.DataFrame | None:
         """Pointing game and distances; see `pointing_summary`."""
         if self.tables.pointing is None:
             return None
-        return pointing_summary(self.tables.pointing, self.question.settings.seed)
+        return pointing_summary(self.tables.pointing, self.question.settings.intervals)
 
     @cached_property
     def iou_summary(self) -> pl.DataFrame | None:
         """IoU by threshold; see `iou_summary`."""
-        return None if self.tables.iou is None else iou_summary(self.tables.iou, self.question.settings.seed)
+        return None if self.tables.iou is None else iou_summary(self.tables.iou, self.question.settings.intervals)
 
     @property
-    def followers(self) -> pl.DataFrame:
-        """The layers and heads that follow objects; see `strongest_followers`."""
-        return strongest_followers(self.tables.objects)
+    def followed(self) -> list[tuple[dict[str, Any], Leader]]:
+        """Which object is followed more than the others; see `followed_objects`."""
+        return followed_objects(self.tables.objects, self.question.settings.intervals)
 
     @property
-    def finders(self) -> pl.DataFrame | None:
-        """The layers and heads that find the objects of interest; see `best_finders`."""
-        if self.tables.iou is None or self.tables.pointing is None:
+    def finder(self) -> tuple[dict[str, Any], Leader] | None:
+        """The layer and head that find the objects of interest; see `leading_finder`."""
+        if self.tables.iou is None:
             return None
-        return best_finders(self.tables.iou, self.tables.pointing, self.settings.shown_threshold)
+        return leading_finder(self.tables.iou, self.settings.shown_threshold, self.question.settings.intervals)
 
     def files(self) -> dict[str, pl.DataFrame]:
         """All tables by the names of their files."""
@@ -115,76 +117,94 @@ def study_objects(
     return ObjectStudy(question, chosen, example, object_tables(question, chosen, keep_steps))
 
 
-def objects_summary(objects: pl.DataFrame, seed: int = DEFAULT_SEED) -> pl.DataFrame:
+def objects_summary(objects: pl.DataFrame, estimand: Estimand = Estimand.TASKS_LIKE_THESE) -> pl.DataFrame:
     """Means of every item over the episodes that have it, with intervals, of the layers' mean.
 
     From `object_tables`, `objects`. Classes in their order, then objects by enrichment; per camera, all cameras first.
     `enrichment_over_control` is mean enrichment / mean `control_enrichment` over the episodes with a control, and null
-    where the control cannot tell (`control_overlap`, of masks with control masks, from `STILL_OVERLAP` on).
+    where the control cannot tell (`control_overlap`, of masks with control masks, from `STILL_OVERLAP` on); its `_q` is
+    the p-value of 1, adjusted for the number of classes or objects of the camera (Benjamini-Hochberg).
     """
     values = {"share": SHARE, "area_share": SHARE, "enrichment": POSITIVE}
     values |= {"control_enrichment": POSITIVE, "control_overlap": SHARE}
-    summary = _means(objects, _ITEM, values, seed, {_OVER_CONTROL: ("enrichment", "control_balanced")})
+    quotients = {_OVER_CONTROL: ("enrichment", "control_balanced")}
+    summary = _means(objects, _ITEM, values, estimand, quotients, {_OVER_CONTROL: 1.0})
     telling = pl.col("control_overlap") < STILL_OVERLAP
-    bounded = [_OVER_CONTROL, f"{_OVER_CONTROL}_low", f"{_OVER_CONTROL}_high"]
+    bounded = [f"{_OVER_CONTROL}{end}" for end in ("", "_low", "_high", "_p")]
     summary = summary.with_columns(pl.when(telling).then(pl.col(name)).alias(name) for name in bounded)
+    looks = summary.partition_by("camera", "kind", maintain_order=True)
+    summary = pl.concat(
+        part.with_columns(
+            pl.Series(f"{_OVER_CONTROL}_q", adjusted_p_values(part[f"{_OVER_CONTROL}_p"].to_list()), dtype=pl.Float64)
+        )
+        for part in looks
+    ).drop(f"{_OVER_CONTROL}_p")
     return _ordered(summary, "enrichment")
 
 
-def pointing_summary(pointing: pl.DataFrame, seed: int = DEFAULT_SEED) -> pl.DataFrame:
+def pointing_summary(pointing: pl.DataFrame, estimand: Estimand = Estimand.TASKS_LIKE_THESE) -> pl.DataFrame:
     """Mean pointing game and distances of every item over the episodes in which it has a mask, with intervals.
 
     From `object_tables`, `pointing`; of "layers_avg" (means of the layers' values) or the only layer.
     """
     values = {"mask_patches": POSITIVE, "distance": POSITIVE, "distance_uniform": POSITIVE}
     values |= {"pointing": SHARE, "pointing_chance": SHARE}
-    return _ordered(_means(pointing.filter(pl.col("mask_replans") > 0), _ITEM, values, seed), "pointing")
+    return _ordered(_means(pointing.filter(pl.col("mask_replans") > 0), _ITEM, values, estimand), "pointing")
 
 
-def iou_summary(iou: pl.DataFrame, seed: int = DEFAULT_SEED) -> pl.DataFrame:
+def iou_summary(iou: pl.DataFrame, estimand: Estimand = Estimand.TASKS_LIKE_THESE) -> pl.DataFrame:
     """Mean IoU of every item at every threshold, highest first, as in `pointing_summary`; from the table `iou`."""
     values = {"iou": SHARE, "iou_chance": SHARE}
-    return _ordered(_means(iou.drop_nulls("iou"), (*_ITEM, "threshold"), values, seed), "iou")
+    return _ordered(_means(iou.drop_nulls("iou"), (*_ITEM, "threshold"), values, estimand), "iou")
 
 
-def strongest_followers(objects: pl.DataFrame, most: int = 5) -> pl.DataFrame:
-    """The layers (and heads, where they were kept apart) in which an object's enrichment exceeds its control the most.
+def followed_objects(
+    objects: pl.DataFrame, estimand: Estimand = Estimand.TASKS_LIKE_THESE
+) -> list[tuple[dict[str, Any], Leader]]:
+    """The object that exceeds its control by the largest factor over layers, and the (object, layer, head) that does.
 
-    One row per object: `item`, `object_class`, `layer`, `head`, `enrichment` and `control_enrichment` (means over
-    episodes), `enrichment_over_control`, `num_episodes`. Left out are the background, items that cover hardly anything,
-    and those of which the control cannot tell.
+    From `object_tables`, `objects`, all cameras together. Each with how surely it exceeds all the others
+    (`many_looks.leader`). Left out are the background, items that cover hardly anything, and those of which the control
+    cannot tell.
     """
-    single = _single_layers(objects).filter(
+    candidates = objects.filter(
         (pl.col("kind") == "object")
         & (pl.col("camera") == ALL_CAMERAS)
         & (pl.col("object_class") != CLASSES[3])
         & (pl.col("area_share") >= _LEAST_AREA)
+        & pl.col("control_enrichment").is_not_null()
     )
-    controlled = pl.col("control_enrichment").is_not_null()
-    means = single.group_by("item", "layer", "head").agg(
-        pl.col("object_class").mode().sort().first(),
-        pl.col("enrichment").filter(controlled).mean(),
-        pl.col("control_enrichment").mean(),
-        pl.col("control_overlap").mean(),
-        controlled.sum().cast(pl.Int64).alias("num_episodes"),
-    )
-    over = (pl.col("enrichment") / pl.col("control_enrichment")).alias(_OVER_CONTROL)
-    telling = means.with_columns(over).filter(pl.col("control_overlap") < STILL_OVERLAP).drop("control_overlap")
-    ranked = telling.drop_nulls(_OVER_CONTROL).sort([_OVER_CONTROL, "item", "layer"], descending=[True, False, False])
-    return ranked.unique("item", keep="first", maintain_order=True).head(most)
+    still = candidates.group_by("item").agg(pl.col("control_overlap").mean() >= STILL_OVERLAP)
+    candidates = candidates.join(still.filter(~pl.col("control_overlap")).select("item"), on="item")
+    if candidates.is_empty():
+        return []
+    overall = candidates.filter(pl.col("layer") == overall_layer(objects))
+    found = []
+    for part, item in ((overall, ("item",)), (_single_layers(candidates), ("item", "layer", "head"))):
+        means = part.group_by(*EPISODE_ID, *item, maintain_order=True).agg(
+            pl.col("enrichment").mean(), pl.col("control_balanced").mean()
+        )
+        factors = [_linearised(of_item) for of_item in means.partition_by(item, maintain_order=True)]
+        leading = leader_of_table(pl.concat(factors), item, _OVER_CONTROL, estimand) if factors else None
+        found += [] if leading is None else [leading]
+    return found
 
 
-def best_finders(iou: pl.DataFrame, pointing: pl.DataFrame, threshold: str, most: int = 3) -> pl.DataFrame:
-    """The layers (and heads) whose maps have the highest IoU above chance with the objects of interest, by camera."""
+def _linearised(of_item: pl.DataFrame) -> pl.DataFrame:
+    """With a column `enrichment_over_control` whose mean is the quotient of the means of one item."""
+    tasks = of_item.select(pl.struct("suite", "task_id").rank("dense")).to_series().to_numpy()
+    values = quotient_by_episode(of_item["enrichment"].to_numpy(), of_item["control_balanced"].to_numpy(), tasks)
+    return of_item.with_columns(pl.Series(_OVER_CONTROL, values))
+
+
+def leading_finder(
+    iou: pl.DataFrame, threshold: str, estimand: Estimand = Estimand.TASKS_LIKE_THESE
+) -> tuple[dict[str, Any], Leader] | None:
+    """The (camera, layer, head) whose maps have the highest IoU above chance with the objects of interest."""
     of_interest = (pl.col("kind") == "class") & (pl.col("item") == CLASSES[0])
-    where = ["camera", "layer", "head"]
-    overlap = _single_layers(iou).filter(of_interest, pl.col("threshold") == threshold).group_by(where)
-    hits = _single_layers(pointing).filter(of_interest).group_by(where)
-    means = overlap.agg(pl.col("iou").mean(), pl.col("iou_chance").mean().alias("chance")).join(
-        hits.agg(pl.col("pointing").mean(), pl.col("pointing_chance").mean()), on=where, nulls_equal=True
-    )
-    above = means.drop_nulls("iou").with_columns((pl.col("iou") - pl.col("chance")).alias("above"))
-    return above.sort(["above", "camera", "layer"], descending=[True, False, False]).head(most)
+    found = _single_layers(iou).filter(of_interest, pl.col("threshold") == threshold).drop_nulls("iou")
+    above = found.with_columns((pl.col("iou") - pl.col("iou_chance")).alias("above"))
+    return leader_of_table(above, ("camera", "layer", "head"), "above", estimand) if above.height else None
 
 
 def _single_layers(table: pl.DataFrame) -> pl.DataFrame:
@@ -196,15 +216,16 @@ def _means(
     table: pl.DataFrame,
     item: Sequence[str],
     values: dict[str, tuple[float, float]],
-    seed: int,
+    estimand: Estimand,
     quotients: dict[str, tuple[str, str]] | None = None,
+    nulls: dict[str, float] | None = None,
 ) -> pl.DataFrame:
     chosen = table.filter(pl.col("layer") == overall_layer(table))
     names = {*values, *(name for sides in (quotients or {}).values() for name in sides)}
     episodes = chosen.group_by(*EPISODE_ID, *item, maintain_order=True).agg(
         *(pl.col(name).mean() for name in table.columns if name in names)
     )
-    return means_with_intervals(episodes, item, values, seed, quotients=quotients)
+    return means_with_intervals(episodes, item, values, estimand, quotients=quotients, nulls=nulls)
 
 
 def _ordered(summary: pl.DataFrame, by: str) -> pl.DataFrame:

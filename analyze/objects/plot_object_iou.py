@@ -18,7 +18,7 @@ from vla_attention.analyze.show.plot_axes import note_at_row
 from vla_attention.analyze.show.plot_colours import DATA_COLOR, GUIDE_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, shortened, title
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,7 +34,7 @@ def plot_object_iou(study: ObjectStudy, folder: Path) -> list[Path]:
     """Draw the study's `iou_summary` and `pointing_summary`; returns the paths of png, pdf and csv.
 
     A row of panels per camera: IoU at the shown percentile, IoU at Otsu's threshold, pointing game. Points are means
-    over episodes with bootstrap intervals, black ticks are chance.
+    over episodes with intervals, black ticks are chance.
     """
     data, settings = _data(study), study.settings
     panels = list(dict.fromkeys([settings.shown_threshold, "otsu", _POINTING]))
@@ -87,7 +87,7 @@ def _data(study: ObjectStudy) -> pl.DataFrame:
 def _note(settings: ObjectSettings, cut: bool) -> str:
     note = (
         f"Mask: patches covered by at least {100 * settings.mask_coverage:g}%. Points: mean over episodes with "
-        f"{interval_name(DEFAULT_LEVEL, 'bootstrap')}; n counts episodes in which the object has a mask. Black: chance "
+        f"{interval_name(DEFAULT_LEVEL)}; n counts episodes in which the object has a mask. Black: chance "
         "(mean over shifts of the map about the picture). Pointing game: within "
         f"{settings.tolerance:g} patch of the mask. Lines at the right edge go on."
     )

@@ -18,15 +18,14 @@ from vla_attention.analyze.show.plot_axes import legend_below, ratio_axis, unifo
 from vla_attention.analyze.show.plot_colours import FIXED_COLORS, FURTHER_COLORS
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import shortened, title
-from vla_attention.analyze.statistics.bootstrap import (
+from vla_attention.analyze.statistics.intervals import (
     DEFAULT_LEVEL,
     SHARE,
     EpisodeStatistic,
-    Resamples,
-    bootstrap_intervals,
+    Estimand,
+    estimates,
     mean_over_episodes,
     ratio_of_means_over_episodes,
-    resample_episodes,
 )
 from vla_attention.schemas.safe_text import visible
 
@@ -62,13 +61,13 @@ def plot_object_shares(study: ObjectStudy, folder: Path) -> list[Path]:
         figure,
         "Share of the image attention by object, all cameras, mean over layers and heads",
         f"Left: {example.episode.name}, '{visible(attributes.instruction)}'. Middle and right: mean over "
-        f"{of_tasks(num_episodes, num_tasks)} with {interval_name(DEFAULT_LEVEL, 'bootstrap')} at each time; "
+        f"{of_tasks(num_episodes, num_tasks)} with {interval_name(DEFAULT_LEVEL)} at each time; "
         "dashed: what uniform attention gives (in the middle: the covered area). Dotted: the control, the same maps on "
         "the objects' masks of other episodes.",
     )
     left, middle, right = figure.subplots(1, 3)
     shown = _draw_example(left, own)
-    classes = _draw_classes(middle, right, whole, _controls(study.summary), study.question.settings.seed)
+    classes = _draw_classes(middle, right, whole, _controls(study.summary), study.question.settings.intervals)
     return save_figure(figure, folder, STEM, pl.concat([shown, classes], how="diagonal"))
 
 
@@ -132,7 +131,7 @@ def _controls(summary: pl.DataFrame) -> dict[str, float]:
 
 
 def _draw_classes(
-    axes: Axes, enrichment_axes: Axes, whole: pl.DataFrame, controls: Mapping[str, float], seed: int
+    axes: Axes, enrichment_axes: Axes, whole: pl.DataFrame, controls: Mapping[str, float], estimand: Estimand
 ) -> pl.DataFrame:
     parts: list[pl.DataFrame] = []
     for name in CLASSES:
@@ -140,10 +139,9 @@ def _draw_classes(
         if part.is_empty():
             continue
         share, area, tasks = _by_phase(part)
-        resamples = resample_episodes(tasks, seed=seed)
-        shares = _with_intervals([mean_over_episodes(column, SHARE) for column in share.T], resamples)
+        shares = _with_intervals([mean_over_episodes(column, SHARE) for column in share.T], tasks, estimand)
         enrichments = _with_intervals(
-            [ratio_of_means_over_episodes(*columns) for columns in zip(share.T, area.T, strict=True)], resamples
+            [ratio_of_means_over_episodes(*columns) for columns in zip(share.T, area.T, strict=True)], tasks, estimand
         )
         covered, color = area.mean(axis=0), CLASS_COLORS[name]
         label = name if len(tasks) == whole.select(EPISODE_ID).unique().height else f"{name} (n = {len(tasks)})"
@@ -185,11 +183,12 @@ def _draw_classes(
 
 
 def _with_intervals(
-    statistics: list[EpisodeStatistic], resamples: Resamples
+    statistics: list[EpisodeStatistic], tasks: list[str], estimand: Estimand
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Value, low and high of each statistic; NaN where there is none."""
-    intervals = bootstrap_intervals(statistics, resamples)
-    values = [np.nan if statistic.value is None else statistic.value for statistic in statistics]
+    found = estimates(statistics, tasks, estimand)
+    values = [np.nan if one.value is None else one.value for one in found]
+    intervals = [one.interval() for one in found]
     low = [interval.low if interval else np.nan for interval in intervals]
     high = [interval.high if interval else np.nan for interval in intervals]
     return np.array(values), np.array(low), np.array(high)

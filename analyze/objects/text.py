@@ -11,9 +11,10 @@ from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_study import ObjectStudy
 from vla_attention.analyze.objects.object_views import ALL_CAMERAS, item_name
 from vla_attention.analyze.show.headings import interval_note, wrap
-from vla_attention.analyze.show.numbers import format_interval, format_number, plural
+from vla_attention.analyze.show.numbers import format_interval, format_number, plural, row_interval
 from vla_attention.analyze.show.text_table import episode_counts, text_table
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.many_looks import NAMED_AT
 
 #: Rows of a printed table; the written ones have all.
 _MOST_ROWS = 28
@@ -22,7 +23,8 @@ _SHARES_NOTE = (
     "picture's attention / mean area (1: attention that is uniform over the picture). over control: mean enrichment / "
     "mean enrichment of the same maps on the object's masks of other episodes of the task (1: attention that does not "
     f"depend on where the object is). cannot tell: these masks overlap with the object's by {STILL_OVERLAP:.0%} or "
-    f"more, because it hardly moves; -: there are no other masks. {interval_note(DEFAULT_LEVEL)}"
+    "more, because it hardly moves; -: there are no other masks. q: p of 1 over control, adjusted for the number of "
+    "classes or objects (Benjamini-Hochberg)."
 )
 
 
@@ -44,20 +46,30 @@ def _shares(study: ObjectStudy) -> list[str]:
         else:
             classes = part.filter(pl.col("kind") == "class")
             lines += ["", f"camera {camera}", _shares_table(classes, several)]
-    lines += ["", *wrap(_SHARES_NOTE)]
-    followers = [
-        f"'{row['item']}' ({row['object_class']}) in layer {row['layer']}{_head(row)} "
-        f"({format_number(row['enrichment_over_control'])} x the control)"
-        for row in study.followers.iter_rows(named=True)
+    about = study.question.settings.intervals.words
+    return [*lines, "", *wrap(f"{_SHARES_NOTE} {interval_note(DEFAULT_LEVEL, about)}"), "", *wrap(_followed(study))]
+
+
+def _followed(study: ObjectStudy) -> str:
+    """Which object, and which layer of an object, surely exceeds its control more than all the others do."""
+    leaders = study.followed
+    named = [
+        f"'{row['item']}'{_place(row)} exceeds its control by a larger factor ({format_number(found.value)}) than each "
+        f"of the other {found.num_items - 1} {'pairs of object and layer' if 'layer' in row else 'objects'}"
+        for row, found in leaders
+        if found.is_named(len(leaders))
     ]
-    return [*lines, "", *wrap(f"Followed most, by layer: {'; '.join(followers)}.")] if followers else lines
+    if named:
+        return f"{'; '.join(named)} (each difference tested at {NAMED_AT:g} / {len(leaders)})."
+    if not leaders:
+        return "There are no two objects whose control can tell."
+    return "No object, and no layer of an object, is surely followed more than all the others."
 
 
 def _finding(study: ObjectStudy) -> list[str]:
-    iou, pointing, finders = study.iou_summary, study.pointing_summary, study.finders
+    iou, pointing = study.iou_summary, study.pointing_summary
     assert iou is not None
     assert pointing is not None
-    assert finders is not None
     shown = study.settings.shown_threshold
     lines: list[str] = []
     for camera in iou["camera"].unique(maintain_order=True):
@@ -67,13 +79,20 @@ def _finding(study: ObjectStudy) -> list[str]:
         otsu = iou.filter(of_camera, pl.col("threshold") == "otsu")
         lines += [_finding_table(part.head(_MOST_ROWS), otsu, pointing.filter(of_camera), shown), *_more(part)]
     lines += ["", *wrap(_finding_note(study.settings))]
-    best = [
-        f"layer {row['layer']}{_head(row)} on {row['camera']} (IoU {format_number(row['iou'])}, chance "
-        f"{format_number(row['chance'])}; pointing {format_number(row['pointing'])}, chance "
-        f"{format_number(row['pointing_chance'])})"
-        for row in finders.iter_rows(named=True)
-    ]
-    return [*lines, *wrap(f"Objects of interest are found best by {'; '.join(best)}.")] if best else lines
+    return [*lines, *wrap(_found(study))]
+
+
+def _found(study: ObjectStudy) -> str:
+    """Which layer surely finds the objects of interest better than all the others."""
+    if study.finder is None:
+        return "There are no two layers that could find the objects of interest."
+    row, found = study.finder
+    if not found.is_named():
+        return f"None of {found.num_items} layers surely finds the objects of interest better than all the others."
+    return (
+        f"Objects of interest: the IoU{_place(row)} on {row['camera']} is further above chance (by "
+        f"{format_number(found.value)}) than each of the other {found.num_items - 1} (tested at {NAMED_AT:g})."
+    )
 
 
 def _finding_note(settings: ObjectSettings) -> str:
@@ -107,7 +126,6 @@ def _shares_table(part: pl.DataFrame, several_tasks: bool) -> str:
             item_name(row),
             count,
             format_number(row["share"]),
-            format_interval(row["share_low"], row["share_high"]),
             format_number(row["area_share"]),
             format_number(row["enrichment"]),
             format_interval(row["enrichment_low"], row["enrichment_high"]),
@@ -115,16 +133,16 @@ def _shares_table(part: pl.DataFrame, several_tasks: bool) -> str:
         ]
         for row, count in zip(rows, counts, strict=True)
     ]
-    header = ["object", heading, "share", "interval", "area", "enrichment", "interval", "over control", "interval"]
+    header = ["object", heading, "share", "area", "enrichment", "interval", "over control", "interval", "q"]
     return text_table(header, body, left=(0,))
 
 
-def _over_control(row: dict[str, Any]) -> tuple[str, str]:
+def _over_control(row: dict[str, Any]) -> tuple[str, str, str]:
     overlap = row["control_overlap"]
     if overlap is not None and overlap >= STILL_OVERLAP:
-        return "cannot tell", "-"
+        return "cannot tell", "-", "-"
     name = "enrichment_over_control"
-    return format_number(row[name]), format_interval(row[f"{name}_low"], row[f"{name}_high"])
+    return format_number(row[name]), row_interval(row, name), format_number(row[f"{name}_q"])
 
 
 def _finding_table(part: pl.DataFrame, otsu: pl.DataFrame, pointing: pl.DataFrame, shown: str) -> str:
@@ -155,5 +173,7 @@ def _short(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def _head(row: dict[str, Any]) -> str:
-    return f" head {row['head']}" if row["head"] is not None else ""
+def _place(row: dict[str, Any]) -> str:
+    if "layer" not in row:
+        return ""
+    return f" in layer {row['layer']}" + (f" head {row['head']}" if row["head"] is not None else "")

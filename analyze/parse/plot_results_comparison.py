@@ -17,7 +17,7 @@ from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, note_at_row, ra
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, FIXED_COLORS, NOTE_COLOR, SERIES_COLORS
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import title, wrapped
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,11 +32,11 @@ def comparison_table(tables: Sequence[ResultsTables], labels: Sequence[str]) -> 
     """One row per results file, over all its episodes, in its overall layer ("layers_avg", else the first).
 
     Columns: file, kind, layer, num_tasks, num_episodes, episodes_without_ratio, num_replans, num_nonfinite,
-    success_rate, ratio_mean with ratio_mean_low and ratio_mean_high (two-level bootstrap), ratio_std (over episodes),
-    uniform_ratio (null where the file has no numbers of keys).
+    success_rate, geometric_mean with geometric_mean_low and geometric_mean_high (about tasks like these), ratio_std
+    (over episodes), uniform_ratio (null where the file has no numbers of keys).
     """
     columns = ["num_tasks", "num_episodes", "episodes_without_ratio", "num_replans", "num_nonfinite", "success_rate"]
-    columns += ["ratio_mean", "ratio_mean_low", "ratio_mean_high", "ratio_std", "uniform_ratio"]
+    columns += ["geometric_mean", "geometric_mean_low", "geometric_mean_high", "ratio_std", "uniform_ratio"]
     rows = []
     for table, label in zip(tables, labels, strict=True):
         layer = overall_layer(table.tasks.cells)
@@ -67,8 +67,7 @@ def plot_results_comparison(tables: Sequence[ResultsTables], labels: Sequence[st
     kinds = data["kind"].unique(maintain_order=True).to_list()
     figure = new_figure(10, 1.9 + (0.42 if few else 0.22) * (data.height + 0.5) + 0.16 * len(kinds))
     note = (
-        f"n counts episodes. Means over episodes with {interval_name(DEFAULT_LEVEL)}s (two-level bootstrap over tasks "
-        "and episodes)."
+        f"n counts episodes. Geometric means over tasks with {interval_name(DEFAULT_LEVEL)}s (about tasks like these)."
     )
     if data["uniform_ratio"].null_count():
         note += " No uniform baseline where a results file does not hold the numbers of keys."
@@ -127,10 +126,10 @@ def _clipped(text: str, most: int = 40) -> str:
 def _ratios(axes: Axes, data: pl.DataFrame, tables: Sequence[ResultsTables], kinds: list[str], few: bool) -> None:
     generator = np.random.default_rng(0)
     dots = [
-        table.episodes.cells.filter(layer=layer)["ratio_mean"].drop_nulls().to_numpy()
+        table.episodes.cells.filter(layer=layer)["geometric_mean"].drop_nulls().to_numpy()
         for table, layer in zip(tables, data["layer"], strict=True)
     ]
-    bounds = [data[f"ratio_mean{end}"].drop_nulls().to_numpy() for end in ("", "_low", "_high")]
+    bounds = [data[f"geometric_mean{end}"].drop_nulls().to_numpy() for end in ("", "_low", "_high")]
     uniform = data["uniform_ratio"].drop_nulls().to_numpy()
     ratio_axis(axes.xaxis, np.concatenate([*bounds, *dots, uniform]))
     low, high = axes.get_xlim()
@@ -142,15 +141,15 @@ def _ratios(axes: Axes, data: pl.DataFrame, tables: Sequence[ResultsTables], kin
         values = values[values > 0]
         places = scattered(generator, position, len(values))
         axes.scatter(values, places, s=10 if few else 6, color=color, alpha=0.35, linewidths=0, zorder=2)
-        if row["ratio_mean"] is None or row["ratio_mean"] <= 0:
-            text = "no finite ratio" if row["ratio_mean"] is None else "mean ratio 0"
+        if row["geometric_mean"] is None or row["geometric_mean"] <= 0:
+            text = "no finite ratio" if row["geometric_mean"] is None else "mean ratio 0"
             note_at_row(axes, position, text, x=0.01)
         else:
-            if row["ratio_mean_low"] is not None:
-                ends = [max(row["ratio_mean_low"], low), row["ratio_mean_high"]]
+            if row["geometric_mean_low"] is not None:
+                ends = [max(row["geometric_mean_low"], low), row["geometric_mean_high"]]
                 axes.plot(ends, [position, position], color=color, linewidth=2.0, zorder=3)
             axes.plot(
-                row["ratio_mean"], position, marker, color=color, markersize=6.5, markeredgecolor="white", zorder=4
+                row["geometric_mean"], position, marker, color=color, markersize=6.5, markeredgecolor="white", zorder=4
             )
         if row["uniform_ratio"]:
             ends = [position - 0.42, position + 0.42]

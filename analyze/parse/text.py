@@ -22,7 +22,7 @@ from vla_attention.analyze.ratios.verdict import LINGUISTIC_BELOW, VISUAL_ABOVE,
 from vla_attention.analyze.show.headings import WIDTH, wrap
 from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent, interval_name, plural
 from vla_attention.analyze.show.text_table import text_table
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.results import ResultsError
 
@@ -183,15 +183,16 @@ def _baseline(rows: pl.DataFrame, spread: Spread) -> list[str]:
 def _over_episodes(tables: ResultsTables, layer: str) -> list[str]:
     """Replans of an episode are correlated: the interval is over episodes within tasks."""
     rows = overall_rows(tables.tasks).cells.filter(pl.col("layer") == layer)
-    if rows.is_empty() or rows["ratio_mean"][0] is None:
+    if rows.is_empty() or rows["geometric_mean"][0] is None:
         return []
     row = rows.row(0, named=True)
     taking_part = int(row["num_episodes"]) - int(row["episodes_without_ratio"])
-    text = f"  Mean over episodes (n = {taking_part}): {format_number(row['ratio_mean'])}"
-    if row["ratio_mean_low"] is None:
-        return [f"{text}; no interval from a single episode"]
-    interval = format_interval(row["ratio_mean_low"], row["ratio_mean_high"])
-    return [f"{text}, {interval_name(DEFAULT_LEVEL)} {interval} (two-level bootstrap: tasks, episodes)"]
+    text = f"  Geometric mean over episodes (n = {taking_part}): {format_number(row['geometric_mean'])}"
+    if row["geometric_mean_low"] is None:
+        return [f"{text}; no interval"]
+    interval = format_interval(row["geometric_mean_low"], row["geometric_mean_high"])
+    about = "tasks like these" if row["num_tasks"] > 1 else "episodes like these"
+    return [f"{text}, {interval_name(DEFAULT_LEVEL)} {interval} (about {about})"]
 
 
 def _fractions(rows: pl.DataFrame) -> list[str]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from vla_attention.analyze.measures.aggregate import episode_tables, layer_order, task_tables
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables, float_values
 from vla_attention.analyze.published.results_reader import ResultsFile, ResultsKind, SummaryNumber
-from vla_attention.analyze.statistics.bootstrap import SampleSummary, summarize
+from vla_attention.analyze.statistics.summaries import SampleSummary, summarize
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 
 #: The group of what is left: 1 minus the known fractions.

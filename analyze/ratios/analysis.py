@@ -103,12 +103,12 @@ class Analysis:
     @cached_property
     def summary(self) -> str:
         """The printed text: `summary_text`, then the sections on contributions where these were recorded."""
-        question, grouping, seed = self.question, self.grouping, self.question.settings.seed
+        question, grouping, estimand = self.question, self.grouping, self.question.settings.intervals
         parts = [summary_text(_described(question), grouping, self.episodes, self.tasks)]
         if self.contributions is not None:
-            parts.append(contributions_section(self.contributions, seed))
+            parts.append(contributions_section(self.contributions, estimand))
         if all(store.attributes.recording.contributions for store in question.stores):
-            parts.append(group_contributions_section(self.group_contributions, grouping, question.site, seed))
+            parts.append(group_contributions_section(self.group_contributions, grouping, question.site, estimand))
         return "\n".join(parts)
 
 
@@ -129,7 +129,7 @@ def analyse(question: Question, without_sinks: SinkRule | None = None) -> Analys
     measured = measure_episodes(question, resolved)
     replans = replan_tables(measured, grouping)
     episodes = episode_tables(replans, grouping)
-    tasks = task_tables(episodes, grouping, seed=question.settings.seed)
+    tasks = task_tables(episodes, grouping, estimand=question.settings.intervals)
     return Analysis(question, resolved, measured, replans, episodes, tasks, sinks)
 
 
@@ -143,6 +143,7 @@ def _described(question: Question) -> AnalysedRun:
         untrained=policy.untrained,
         denoise_steps=question.selection.denoise_steps,
         heads=describe_heads(question.selection, policy.num_heads),
+        estimand=question.settings.intervals,
         notes=[*_notes(root, question.selection, question.site), *question.remarks],
     )
 

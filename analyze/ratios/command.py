@@ -6,6 +6,7 @@ import argparse
 
 from vla_attention.analyze.arguments import (
     add_grouping,
+    add_intervals,
     add_output,
     add_selection,
     add_sink_rule,
@@ -46,6 +47,7 @@ def build_parser(prog: str = "vla-analyze") -> argparse.ArgumentParser:
     )
     add_grouping(parser)
     selection = add_selection(parser)
+    add_intervals(parser)
     selection.add_argument("--per-head", action="store_true", help="keep heads apart in the steps table")
     sinks = parser.add_argument_group("sinks")
     sinks.add_argument(

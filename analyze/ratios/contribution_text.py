@@ -13,23 +13,23 @@ from vla_attention.analyze.measures.group_contributions import norms_by_layer, r
 from vla_attention.analyze.show.headings import heading, wrap
 from vla_attention.analyze.show.numbers import format_number, interval_name, row_interval
 from vla_attention.analyze.show.text_table import text_table
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL, Estimand
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
 
-_RATIO_HEADER = ("mean", interval_name(DEFAULT_LEVEL), "of means", "geom.", "uniform", "lift", "interval")
+_RATIO_HEADER = ("ratio", interval_name(DEFAULT_LEVEL), "uniform", "lift", "interval", "of means", "mean")
 _RATIO_NOTE = (
-    "mean: over episodes, of the mean ratio of norms, with its interval. of means: mean norm / mean norm. geom.: "
-    "geometric mean of the ratios. uniform: the ratio that the same values would give if attention were shared out "
-    "between the segments as uniform attention is. lift: mean of ratio / uniform, with its interval."
+    "ratio, uniform, lift: geometric means; lift is ratio / uniform. uniform: the ratio that the same values would "
+    "give if attention were shared out between the segments as uniform attention is. of means: mean norm / mean "
+    "norm. mean: of the episodes' mean ratios."
 )
 
 
-def contributions_section(table: pl.DataFrame, seed: int) -> str:
+def contributions_section(table: pl.DataFrame, estimand: Estimand) -> str:
     """The summary's section: `contribution_rows` of both sides as text."""
     rows = [
         [row["layer"], format_number(row["visual_norm"]), format_number(row["linguistic_norm"]), *_ratio_cells(row)]
-        for row in contribution_rows(table, "visual_norm", "linguistic_norm", seed).iter_rows(named=True)
+        for row in contribution_rows(table, "visual_norm", "linguistic_norm", estimand).iter_rows(named=True)
     ]
     title = "CONTRIBUTIONS  |visual| / |linguistic|, norms of what the keys add to the residual stream"
     note = (
@@ -40,8 +40,8 @@ def contributions_section(table: pl.DataFrame, seed: int) -> str:
     return "\n".join([heading(title), text_table(header, rows, left=(0,)), "", *wrap(note), ""])
 
 
-def group_contributions_section(tables: Tables | None, grouping: Grouping, site: str, seed: int) -> str:
-    """The summary's section: per layer the groups' mean norms and the ratio of norms with a two-level interval."""
+def group_contributions_section(tables: Tables | None, grouping: Grouping, site: str, estimand: Estimand) -> str:
+    """The summary's section: per layer the groups' mean norms and the ratio of norms with its interval."""
     title = f"CONTRIBUTIONS OF GROUPS  norms of what they add to the residual stream at site '{site}'"
     measured = () if tables is None else tables.group_names()
     cut = [name for name in grouping.names if name not in measured]
@@ -59,7 +59,7 @@ def group_contributions_section(tables: Tables | None, grouping: Grouping, site:
     if nothing:
         note = f"The keys of {listing(nothing)} add exactly nothing. {note}".strip()
     norms = norms_by_layer(tables)
-    ratios = ratios_by_layer(tables.cells, seed)
+    ratios = ratios_by_layer(tables.cells, estimand)
     rows = []
     for layer in (*tables.cells["layer"].unique(maintain_order=True).cast(pl.String), LAYERS_AVG):
         cells = [layer, *(format_number(norms[layer, name]) for name in shown)]
@@ -73,5 +73,6 @@ def group_contributions_section(tables: Tables | None, grouping: Grouping, site:
 
 
 def _ratio_cells(row: Mapping[str, Any]) -> list[str]:
-    plain = (format_number(row[name]) for name in ("ratio_of_means", "geometric_mean", "uniform_ratio", "ratio_lift"))
-    return [format_number(row["ratio_mean"]), row_interval(row, "ratio_mean"), *plain, row_interval(row, "ratio_lift")]
+    cells = [format_number(row["geometric_mean"]), row_interval(row, "geometric_mean")]
+    cells += [format_number(row["uniform_ratio"]), format_number(row["ratio_lift"]), row_interval(row, "ratio_lift")]
+    return [*cells, format_number(row["ratio_of_means"]), format_number(row["ratio_mean"])]

@@ -56,7 +56,8 @@ def shown_groups(tables: Tables, grouping: Grouping) -> list[str]:
 def _ratio_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping, level: float) -> None:
     assert grouping.ratio is not None
     mean, low, high, uniform = (
-        float_values(rows[column]) for column in ("ratio_mean", "ratio_mean_low", "ratio_mean_high", "uniform_ratio")
+        float_values(rows[column])
+        for column in ("geometric_mean", "geometric_mean_low", "geometric_mean_high", "uniform_ratio")
     )
     drawn = np.isfinite(mean) & (mean > 0)
     if not drawn.any():
@@ -71,7 +72,7 @@ def _ratio_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping, level: floa
     low = np.where(low > 0, low, np.where(np.isnan(low), np.nan, axes.get_ylim()[0]))
     # The line breaks where there is no ratio.
     shown = np.where(drawn, mean, np.nan)
-    axes.plot(at, shown, "o-", color=DATA_COLOR, markersize=4.5, label="mean over episodes", zorder=3)
+    axes.plot(at, shown, "o-", color=DATA_COLOR, markersize=4.5, label="geometric mean", zorder=3)
     axes.vlines(at, low, high, color=DATA_COLOR, linewidth=2.2, alpha=0.55, zorder=2, label=_interval(low, level))
     axes.plot(at, uniform, "--", color=BASELINE_COLOR, linewidth=1.2, label=BASELINE_LABEL)
     if len(at) == 1 and np.isfinite(uniform[0]):
@@ -115,4 +116,4 @@ def _positions(axes: Axes, labels: Sequence[str]) -> None:
 
 
 def _interval(low: np.ndarray, level: float) -> str:
-    return interval_name(level, "bootstrap") if np.isfinite(low).any() else "no interval (one episode)"
+    return interval_name(level) if np.isfinite(low).any() else "no interval (one episode)"

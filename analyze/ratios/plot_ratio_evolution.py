@@ -12,6 +12,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables, float_values, layer_name
+from vla_attention.analyze.measures.masses import ratio
 from vla_attention.analyze.show.numbers import format_number, plural
 from vla_attention.analyze.show.plot_axes import (
     BASELINE_LABEL,
@@ -24,7 +25,7 @@ from vla_attention.analyze.show.plot_axes import (
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, LINE_OF_HATCH, NOTE_COLOR, group_styles
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, ratio_name, title, wrapped
-from vla_attention.analyze.statistics.bootstrap import geometric_mean, ratio_of_means_over_episodes, summarize
+from vla_attention.analyze.statistics.summaries import geometric_mean, summarize
 from vla_attention.schemas.groupings.grouping import Grouping
 
 if TYPE_CHECKING:
@@ -202,12 +203,12 @@ def _statistics_panel(
         values = float_values(episode["ratio"])
         summary = summarize(values)
         geometric, _ = geometric_mean(values)
-        of_means = ratio_of_means_over_episodes(episode["numerator_mass"], episode["denominator_mass"]).value
+        above, below = (np.asarray(episode[f"{side}_mass"].mean()) for side in ("numerator", "denominator"))
         lines += [
             ("ratio, mean ± std", _with_spread(format_number(summary.mean), format_number(summary.std), len(values))),
             ("ratio, median", format_number(summary.median)),
             ("ratio, min / max", f"{format_number(summary.min)} / {format_number(summary.max)}"),
-            ("ratio of mean masses", format_number(of_means)),
+            ("ratio of mean masses", format_number(float(ratio(above, below)))),
             ("geometric mean of ratios", format_number(geometric)),
             ("not finite, left out", f"{summary.num_nonfinite} of {len(values)}"),
             ("ratio of uniform attention", format_number(_finite_mean(episode["uniform_ratio"]))),

@@ -1,4 +1,4 @@
-"""`ratio_per_task`: mean ratio of every task with interval and uniform baseline, single episodes as dots."""
+"""`ratio_per_task`: geometric mean ratio of every task with interval and uniform baseline, single episodes as dots."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, legend_above, n
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, DOT_COLOR, STRIPE_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, ratio_name, task_label, title
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.schemas.groupings.grouping import Grouping
 
 if TYPE_CHECKING:
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 STEM = "ratio_per_task"
 _COLUMNS = (
-    "ratio_mean",
-    "ratio_mean_low",
-    "ratio_mean_high",
+    "geometric_mean",
+    "geometric_mean_low",
+    "geometric_mean_high",
     "uniform_ratio",
     "episodes_without_ratio",
     "num_nonfinite",
@@ -78,7 +78,7 @@ def plot_ratio_per_task(
     title(figure, f"Ratio per task, {name}, {about or named(grouping)}", f"{_counts(rows, dots)} {note}")
     axes = figure.subplots()
     values = [data[column].drop_nulls().to_numpy() for column in _COLUMNS[:4]] + [
-        dots["ratio_mean"].drop_nulls().to_numpy()
+        dots["geometric_mean"].drop_nulls().to_numpy()
     ]
     if not np.isfinite(np.concatenate(values[:3])).any():
         left_out = int(dots["num_nonfinite"].sum())
@@ -98,7 +98,7 @@ def plot_ratio_per_task(
     _legend(
         axes,
         level,
-        with_interval=shown["ratio_mean_low"].is_not_null().any(),
+        with_interval=shown["geometric_mean_low"].is_not_null().any(),
         with_baseline=shown["uniform_ratio"].is_not_null().any(),
     )
     return save_figure(figure, folder, stem, data)
@@ -112,11 +112,11 @@ def _draw_rows(axes: Axes, shown: pl.DataFrame, dots: pl.DataFrame, few: bool) -
             axes.axhspan(position - 0.5, position + 0.5, color=STRIPE_COLOR, linewidth=0, zorder=0)
         else:
             own = dots.filter((pl.col("suite") == row["suite"]) & (pl.col("task_id") == row["task_id"]))
-            values = own["ratio_mean"].drop_nulls().to_numpy()
+            values = own["geometric_mean"].drop_nulls().to_numpy()
             values = values[values > 0]
             places = scattered(generator, position, len(values))
             axes.scatter(values, places, s=14 if few else 8, color=DOT_COLOR, alpha=0.8, linewidths=0, zorder=2)
-        mean, low, high = row["ratio_mean"], row["ratio_mean_low"], row["ratio_mean_high"]
+        mean, low, high = row["geometric_mean"], row["geometric_mean_low"], row["geometric_mean_high"]
         if mean is not None and mean > 0:
             if low is not None and high is not None:
                 axes.plot([low, high], [position, position], color=DATA_COLOR, linewidth=2.0 if few else 1.4, zorder=3)
@@ -156,9 +156,9 @@ def _label(row: dict[str, Any], several: bool, few: bool) -> str:
 
 
 def _legend(axes: Axes, level: float, with_interval: bool, with_baseline: bool) -> None:
-    axes.plot([], [], "o", color=DATA_COLOR, markersize=6, label="mean over episodes")
+    axes.plot([], [], "o", color=DATA_COLOR, markersize=6, label="geometric mean")
     if with_interval:
-        axes.plot([], [], color=DATA_COLOR, linewidth=2, label=interval_name(level, "bootstrap"))
+        axes.plot([], [], color=DATA_COLOR, linewidth=2, label=interval_name(level))
     axes.scatter([], [], s=14, color=DOT_COLOR, linewidths=0, label="single episode")
     if with_baseline:
         axes.plot([], [], "--", color=BASELINE_COLOR, linewidth=1.2, label=BASELINE_LABEL)
@@ -170,6 +170,6 @@ def _counts(rows: pl.DataFrame, dots: pl.DataFrame) -> str:
     left_out = int(dots["num_nonfinite"].sum())
     if left_out:
         text += f" {left_out} of {int(dots['num_replans'].sum())} ratios are not finite and not in any mean."
-    if rows["ratio_mean_low"].null_count() and rows["ratio_mean"].is_not_null().any():
+    if rows["geometric_mean_low"].null_count() and rows["geometric_mean"].is_not_null().any():
         text += " No interval where fewer than two episodes have a ratio."
     return text

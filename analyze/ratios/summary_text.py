@@ -12,9 +12,10 @@ from vla_attention.analyze.measures.aggregate import layer_order, overall_layer,
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables, layer_name
 from vla_attention.analyze.ratios.verdict import LINGUISTIC_BELOW, VISUAL_ABOVE, meanings, reading, verdict
 from vla_attention.analyze.show.headings import WIDTH, heading, title, untrained_warning, wrap
-from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent, interval_name, plural
+from vla_attention.analyze.show.numbers import format_number, format_percent, interval_name, plural, row_interval
 from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.show.text_table import text_table
+from vla_attention.analyze.statistics.intervals import Estimand
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
 
@@ -33,6 +34,7 @@ class AnalysedRun:
         denoise_steps: denoise steps that were averaged over.
         heads: how heads were averaged, as text.
         level: level of the intervals in `tasks_table`.
+        estimand: what the intervals over several tasks are about.
         notes: further lines, for instance about translated layer numbers.
     """
 
@@ -42,6 +44,7 @@ class AnalysedRun:
     denoise_steps: Sequence[int]
     heads: str = "mean over all heads"
     level: float = 0.95
+    estimand: Estimand = Estimand.TASKS_LIKE_THESE
     notes: Sequence[str] = field(default_factory=tuple)
 
 
@@ -96,16 +99,16 @@ def _header(run: AnalysedRun, grouping: Grouping, episodes: Tables) -> str:
 def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: Tables) -> str:
     level = overall_rows(tasks)
     rows = level.cells
-    header = ["layer", "mean ± std", "median", "of means", "geom.", interval_name(run.level)]
-    header += ["uniform", "lift"] + ["verdict"] * grouping.compares_modalities
+    header = ["layer", "ratio", interval_name(run.level), "uniform", "lift", "of means", "mean ± std", "median"]
+    header += ["verdict"] * grouping.compares_modalities
     body = [
         [
             row["layer"],
+            format_number(row["geometric_mean"]),
+            row_interval(row, "geometric_mean"),
+            *(format_number(row[column]) for column in ("uniform_ratio", "ratio_lift", "ratio_of_means")),
             _mean_and_spread(row),
-            *(format_number(row[column]) for column in ("ratio_median", "ratio_of_means", "geometric_mean")),
-            format_interval(row["ratio_mean_low"], row["ratio_mean_high"]),
-            format_number(row["uniform_ratio"]),
-            format_number(row["ratio_lift"]),
+            format_number(row["ratio_median"]),
             *[reading(row, run.untrained)] * grouping.compares_modalities,
         ]
         for row in _by_layer(rows)
@@ -113,10 +116,9 @@ def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: Tables) -> str:
     overall = rows.filter(pl.col("layer") == overall_layer(rows)).row(0, named=True)
     words = meanings([reading(row, run.untrained) for row in _by_layer(rows)]) if grouping.compares_modalities else ""
     legend = (
-        f"mean, std, median: of the episodes' mean ratios (n = {overall['num_episodes']}). of means: mean numerator "
-        "mass / mean denominator mass. geom.: geometric mean of the ratios. uniform: mean of the ratios that uniform "
-        "attention gives. lift: mean of ratio / uniform ratio over replans and episodes (not mean ratio / mean uniform "
-        f"ratio), 1 = uniform attention. {_interval_note(run, overall)} {words}".strip()
+        "ratio, uniform, lift: geometric means; uniform: what uniform attention gives, lift: ratio / uniform. of "
+        "means: mean numerator mass / mean denominator mass. mean, std, median: of the episodes' mean ratios "
+        f"(n = {overall['num_episodes']}). {_interval_note(run, overall)} {words}".strip()
     )
     return "\n".join(
         [
@@ -132,9 +134,8 @@ def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: Tables) -> str:
 def _interval_note(run: AnalysedRun, overall: dict[str, object]) -> str:
     if overall["num_episodes"] == 1:
         return "No interval: a single episode says nothing about how much episodes differ."
-    units = "tasks and episodes within tasks" if overall["num_tasks"] != 1 else "episodes of the one task"
-    about = ", for tasks like these" if overall["num_tasks"] != 1 else ""
-    return f"interval: of the mean{about}; bootstrap over {units}, widened for their number."
+    about = run.estimand.words if overall["num_tasks"] != 1 else "episodes like these of the one task"
+    return f"interval: of the geometric mean, about {about}."
 
 
 def _baseline_sentence(grouping: Grouping, uniform: float | None, level: Tables) -> str:
@@ -225,7 +226,7 @@ def _across_section(run: AnalysedRun, grouping: Grouping, tasks: Tables, scope: 
     name = "suite" if scope == "all" else "task"
     header = [name, "n", "success"]
     if grouping.ratio:
-        header += ["mean", interval_name(run.level), "of means", "geom.", "uniform", "lift"]
+        header += ["ratio", interval_name(run.level), "uniform", "lift", "of means", "mean"]
     else:
         header += [shortened(group, 12) for group in grouping.names[:5]]
     body = []
@@ -237,9 +238,9 @@ def _across_section(run: AnalysedRun, grouping: Grouping, tasks: Tables, scope: 
         ]
         if grouping.ratio:
             cells += [
-                format_number(row["ratio_mean"]),
-                format_interval(row["ratio_mean_low"], row["ratio_mean_high"]),
-                *(format_number(row[c]) for c in ("ratio_of_means", "geometric_mean", "uniform_ratio", "ratio_lift")),
+                format_number(row["geometric_mean"]),
+                row_interval(row, "geometric_mean"),
+                *(format_number(row[c]) for c in ("uniform_ratio", "ratio_lift", "ratio_of_means", "ratio_mean")),
             ]
         else:
             cells += [

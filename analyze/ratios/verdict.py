@@ -37,17 +37,17 @@ def verdict(ratio: float | None) -> str:
 def reading(row: Mapping[str, Any], untrained: bool) -> str:
     """What a row of `aggregate.task_tables` may be called: the guide's word, or the reason why it has none.
 
-    `row` has ratio_mean, ratio_lift and their bounds, and uniform_ratio. Without a uniform ratio (a side without keys)
-    there is nothing to compare with, and the guide's word stands.
+    `row` has geometric_mean, ratio_lift and their bounds, and uniform_ratio. Without a uniform ratio (a side without
+    keys) there is nothing to compare with, and the guide's word stands.
     """
     if untrained:
         return UNTRAINED
-    word, uniform = verdict(row["ratio_mean"]), row["uniform_ratio"]
+    word, uniform = verdict(row["geometric_mean"]), row["uniform_ratio"]
     if word == "undefined" or uniform is None or not math.isfinite(uniform):
         return word
-    if row["ratio_mean_low"] is None:
+    if row["geometric_mean_low"] is None:
         return UNDECIDED
-    of_ratio = row["ratio_mean_low"] <= uniform <= row["ratio_mean_high"]
+    of_ratio = row["geometric_mean_low"] <= uniform <= row["geometric_mean_high"]
     of_lift = row["ratio_lift_low"] is not None and row["ratio_lift_low"] <= 1.0 <= row["ratio_lift_high"]
     return AS_UNIFORM if of_ratio or of_lift else word
 
@@ -59,14 +59,14 @@ def meanings(readings: list[str]) -> str:
 
 def verdict_sentence(grouping: Grouping, row: Mapping[str, Any], untrained: bool) -> str:
     """What the ratio of a row may be called, beside uniform attention; empty where the guide does not apply."""
-    ratio, uniform = row["ratio_mean"], row["uniform_ratio"]
+    ratio, uniform = row["geometric_mean"], row["uniform_ratio"]
     if not grouping.compares_modalities or ratio is None or uniform is None:
         return ""
     word, of_uniform = reading(row, untrained), verdict(uniform)
     if word == UNTRAINED:
         return "The weights are untrained: the ratio says nothing about seeing or reading."
     if word == AS_UNIFORM:
-        bounds = format_interval(row["ratio_mean_low"], row["ratio_mean_high"])
+        bounds = format_interval(row["geometric_mean_low"], row["geometric_mean_high"])
         return (
             f"The attention looks as uniform attention does, whose ratio is {format_number(uniform)}: the interval of "
             f"the ratio, {bounds}, holds it, or that of the lift holds 1."

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from vla_attention.analyze.arguments import add_grouping, add_selection, add_stores, settings_of
+from vla_attention.analyze.arguments import add_grouping, add_intervals, add_selection, add_stores, settings_of
 from vla_attention.analyze.report.report_settings import ReportSettings
 from vla_attention.schemas.command_line import command_parser
 
@@ -31,6 +31,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_stores(parser)
     add_grouping(parser)
     add_selection(parser)
+    add_intervals(parser)
     content, defaults = parser.add_argument_group("content"), ReportSettings()
     content.add_argument(
         "--episodes",
@@ -54,7 +55,6 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="PATH",
         help="folder, in which report.html is written, or a file FILE.html (default: results/STORE)",
     )
-    output.add_argument("--seed", type=int, default=0, help="seed of the bootstrap (default: 0)")
     return parser
 
 

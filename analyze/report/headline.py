@@ -20,7 +20,7 @@ from vla_attention.analyze.show.numbers import (
     plural,
 )
 from vla_attention.analyze.show.plot_text import shortened
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 
 #: Boxes for fractions when the grouping has no ratio.
 _MOST_FRACTIONS = 3
@@ -55,8 +55,11 @@ def headline_section(analysis: Analysis, notes: Sequence[Caveat]) -> Section:
         sentence = verdict_sentence(analysis.grouping, row, analysis.question.untrained)
         parts += [Paragraph(sentence)] if sentence else []
         other = [
-            f"{name} {format_number(row[column])} {format_interval(row[f'{column}_low'], row[f'{column}_high'])}"
-            for name, column in (("Ratio of means", "ratio_of_means"), ("geometric mean", "geometric_mean"))
+            f"{name} {format_number(row[column])}"
+            for name, column in (
+                ("Ratio of means", "ratio_of_means"),
+                ("mean of the episodes' mean ratios", "ratio_mean"),
+            )
         ]
         other.append(f"median of the episodes {format_number(row['ratio_median'])}")
         parts.append(Paragraph(f"{', '.join(other)}.", quiet=True))
@@ -66,12 +69,14 @@ def headline_section(analysis: Analysis, notes: Sequence[Caveat]) -> Section:
 def _ratio_boxes(row: Mapping[str, Any], numerator: Sequence[str], denominator: Sequence[str]) -> list[Box]:
     name = " / ".join(shortened(" + ".join(side), 60) for side in (numerator, denominator))
     over = layer_name(row["layer"])
-    if row["ratio_mean"] is None:
+    if row["geometric_mean"] is None:
         ratio = Box(f"ratio {name}", "none", f"no replan has a finite ratio; {over}")
     else:
-        ratio = Box(f"ratio {name}", format_number(row["ratio_mean"]), f"{_interval(row, 'ratio_mean')}; {over}")
+        ratio = Box(
+            f"ratio {name}", format_number(row["geometric_mean"]), f"{_interval(row, 'geometric_mean')}; {over}"
+        )
     uniform = format_number(row["uniform_ratio"])
-    lift = f"{_interval(row, 'ratio_lift')}; mean of ratio / uniform ratio"
+    lift = f"{_interval(row, 'ratio_lift')}; ratio / uniform ratio"
     return [
         ratio,
         Box("with uniform attention", uniform, "what the numbers of keys alone give"),

@@ -99,7 +99,7 @@ def _section_makers(
         lambda: contribution_section(analysis),
         lambda: overlay_section(question, analysis.replans.cells, settings),
         lambda: run_section(analysis),
-        method_section,
+        lambda: method_section(analysis.question.settings.intervals),
     ]
 
 

@@ -28,7 +28,7 @@ from vla_attention.analyze.report.section_parts import (
     text_cell,
 )
 from vla_attention.analyze.show.numbers import format_number, format_percent, interval_name
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.analyze.time.plot_time_course import plot_time_courses
 from vla_attention.analyze.time.time_courses import time_courses
 from vla_attention.analyze.words.plot_word_bars import plot_word_bars

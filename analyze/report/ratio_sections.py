@@ -31,7 +31,7 @@ from vla_attention.analyze.report.section_parts import (
     text_cell,
 )
 from vla_attention.analyze.show.numbers import format_number, format_percent, interval_name
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 
 _INTERVAL = interval_name(DEFAULT_LEVEL)
 #: Groups with a column of their own in the table of tasks: beside a ratio, and alone.
@@ -69,23 +69,22 @@ def task_section(analysis: Analysis, folder: Path) -> Section:
 
 def _ratio_cells(row: dict[str, Any], *columns: str) -> list[Cell]:
     """The mean ratio with its interval, further columns, and how many replans have no finite ratio."""
-    interval = interval_cell(row["ratio_mean_low"], row["ratio_mean_high"])
+    interval = interval_cell(row["geometric_mean_low"], row["geometric_mean_high"])
     numbers = [number_cell(row[column]) for column in columns]
-    return [number_cell(row["ratio_mean"]), interval, *numbers, count_cell(row["num_nonfinite"])]
+    return [number_cell(row["geometric_mean"]), interval, *numbers, count_cell(row["num_nonfinite"])]
 
 
 def _tasks_diagram(analysis: Analysis, tasks: pl.DataFrame, folder: Path) -> Diagram:
-    known = tasks.filter(pl.col("ratio_mean").is_not_null()).sort("ratio_mean").rows(named=True)
+    known = tasks.filter(pl.col("geometric_mean").is_not_null()).sort("geometric_mean").rows(named=True)
     extremes = "".join(
-        f" {which}: task {row['task_id']} with {format_number(row['ratio_mean'])}."
+        f" {which} estimate: task {row['task_id']} with {format_number(row['geometric_mean'])}."
         for which, row in zip(("Lowest", "Highest"), (*known[:1], *known[-1:]), strict=False)
     )
     return drawn(
         lambda where: plot_ratio_per_task(analysis.episodes.cells, analysis.tasks.cells, analysis.grouping, where),
         folder,
-        f"Mean ratio of every task with its interval, single episodes, and the uniform baseline.{extremes}",
-        "Ratio per task: mean over episodes with its bootstrap interval, single episodes as dots, uniform attention "
-        "dashed.",
+        f"Geometric mean ratio of every task with its interval, single episodes, and the uniform baseline.{extremes}",
+        "Ratio per task: geometric mean with its interval, single episodes as dots, uniform attention dashed.",
     )
 
 
@@ -122,19 +121,19 @@ def layer_section(analysis: Analysis, folder: Path) -> Section:
 
 def _layer_diagrams(analysis: Analysis, folder: Path) -> list[Diagram]:
     """Layer profile, and layers over time."""
-    grouping, seed = analysis.grouping, analysis.question.settings.seed
+    grouping, estimand = analysis.grouping, analysis.question.settings.intervals
     what = "fractions" if grouping.ratio is None else "ratio"
     extremes = ""
-    time = layer_time_table(analysis.replans, grouping, seed=seed)
+    time = layer_time_table(analysis.replans, grouping, estimand=estimand)
     if grouping.ratio is not None:
         known = time.filter(pl.col("mean").is_not_null()).sort("mean")["layer"].to_list()
-        extremes = f" Lowest in layer {known[0]}, highest in layer {known[-1]}." if known else ""
+        extremes = f" The lowest estimate is in layer {known[0]}, the highest in layer {known[-1]}." if known else ""
     return [
         drawn(
             lambda where: plot_layer_profile(analysis.tasks, grouping, where),
             folder,
-            f"Lines of the {what} over the layers with bootstrap intervals.",
-            "Every layer with its interval over tasks and episodes.",
+            f"Lines of the {what} over the layers with intervals.",
+            "Every layer with its interval.",
         ),
         drawn(
             lambda where: plot_layer_time(time, analysis.replans, grouping, where),
@@ -186,20 +185,20 @@ def contribution_section(analysis: Analysis) -> Section | None:
             Cell(row["layer"], row["layer_number"]),
             number_cell(row["visual_norm"]),
             number_cell(row["linguistic_norm"]),
-            number_cell(row["ratio_mean"]),
-            interval_cell(row["ratio_mean_low"], row["ratio_mean_high"]),
-            *(number_cell(row[name]) for name in ("ratio_of_means", "geometric_mean", "uniform_ratio", "ratio_lift")),
+            number_cell(row["geometric_mean"]),
+            interval_cell(row["geometric_mean_low"], row["geometric_mean_high"]),
+            *(number_cell(row[name]) for name in ("uniform_ratio", "ratio_lift")),
             interval_cell(row["ratio_lift_low"], row["ratio_lift_high"]),
+            *(number_cell(row[name]) for name in ("ratio_of_means", "ratio_mean")),
         ]
         for row in contribution_rows(
-            analysis.contributions, "visual_norm", "linguistic_norm", analysis.question.settings.seed
+            analysis.contributions, "visual_norm", "linguistic_norm", analysis.question.settings.intervals
         ).iter_rows(named=True)
     ]
     caption = (
-        "Norms of contributions. Mean ratio: mean over episodes of the mean ratio of norms. Uniform: the ratio that "
-        "the same values would give if attention were shared out between the segments as uniform attention is; lift: "
-        "mean of ratio / uniform"
+        "Norms of contributions. Ratio, uniform, lift: geometric means. Uniform: the ratio that the same values would "
+        "give if attention were shared out between the segments as uniform attention is; lift: ratio / uniform"
     )
-    header = ["layer", "visual norm", "linguistic norm", "mean ratio", _INTERVAL, "of means", "geom."]
-    table = Table(caption, [*header, "uniform", "lift", _INTERVAL], rows)
+    header = ["layer", "visual norm", "linguistic norm", "ratio", _INTERVAL, "uniform", "lift", _INTERVAL]
+    table = Table(caption, [*header, "of means", "mean"], rows)
     return Section("contributions", "Contributions", [Paragraph(note), table])

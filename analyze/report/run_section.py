@@ -5,7 +5,7 @@ from __future__ import annotations
 from vla_attention.analyze.ratios.analysis import Analysis, describe_heads
 from vla_attention.analyze.report.section_parts import Definitions, Item, Part, Section
 from vla_attention.analyze.show.numbers import format_percent, plural
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_RESAMPLES
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
@@ -98,5 +98,5 @@ def _question_items(analysis: Analysis) -> list[Item]:
         Item("grouping", f"{grouping.name}{described}"),
         *(Item(f"group {name}", " | ".join(parts), code=True) for name, parts in grouping.groups.items()),
         Item("ratio", " / ".join(" + ".join(side) for side in sides) or "none"),
-        Item("bootstrap", f"{DEFAULT_RESAMPLES} resamples, seed {settings.seed}"),
+        Item("intervals", f"{100 * DEFAULT_LEVEL:g}%, about {settings.intervals.words}"),
     ]

@@ -86,7 +86,13 @@ def note_lines(notes: Iterable[str]) -> list[str]:
     return wrap_all((f"note: {note}" for note in notes), rest="  ")
 
 
-def interval_note(level: float, kind: str = "") -> str:
-    """The sentence below tables with intervals; `kind` adds a property, for instance that they are pointwise."""
-    which = ", ".join(part for part in (f"{100 * level:g}%", kind, "two-level bootstrap") if part)
-    return f"Intervals: {which} over tasks and episodes; - where fewer than two episodes."
+def interval_note(level: float, about: str, kind: str = "") -> str:
+    """The sentence below tables with intervals.
+
+    Args:
+        level: their level.
+        about: the estimand in words: "tasks like these", "these tasks".
+        kind: a property, for instance that they are pointwise.
+    """
+    which = ", ".join(part for part in (f"{100 * level:g}%", kind) if part)
+    return f"Intervals: {which}, about {about} (with one task, episodes like these); - where there can be none."

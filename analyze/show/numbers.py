@@ -54,9 +54,9 @@ def format_percent_interval(low: float | None, high: float | None, decimals: int
     return f"[{100 * low:.{decimals}f}, {100 * high:.{decimals}f}]%"
 
 
-def interval_name(level: float, kind: str = "") -> str:
-    """The name of an interval of a level: `95% interval`, or with `kind`, `95% bootstrap interval`."""
-    return " ".join(part for part in (f"{100 * level:g}%", kind, "interval") if part)
+def interval_name(level: float) -> str:
+    """The name of an interval of a level: `95% interval`."""
+    return f"{100 * level:g}% interval"
 
 
 def plural(count: int, noun: str) -> str:

@@ -1,35 +1,43 @@
 """Effect sizes: how much larger a quantity is in one of two classes of episodes, such as solved and failed.
 
-A contrast gives two differences. `difference` is that of the means over all episodes of either class. Where some tasks
-are solved more often than others, it also contains the difference between tasks. `within_tasks` does not: it is the
-coefficient of the class in a linear model with a constant for every task, which is the mean of the tasks' differences
-with weights n_first * n_second / (n_first + n_second). Tasks with one class only have weight 0.
+A contrast gives two differences. `difference` is that of the classes' means, each the mean over its tasks of the tasks'
+means. Where some tasks are solved more often than others, it also contains the difference between tasks.
+`within_tasks` does not: it is the mean over the tasks with both classes of the difference inside the task.
 
-Every interval is a two-level bootstrap (see `bootstrap`); tasks are the units where several tasks have the rarer
-class. Pure numpy functions of one value per episode.
+Their intervals are those of `intervals`: tasks are the units where both classes have several, else episodes. Effect
+sizes are over all episodes of a class, without regard to tasks; their standard errors come from leaving out one unit
+after the other (jackknife: Efron & Tibshirani 1993, chapter 11), with Student's t. Fewer than `FEWEST_EPISODES` in
+either class show too little of their own spread, and have no such interval. Pure numpy functions of one value per
+episode.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vla_attention.analyze.statistics.bootstrap import (
+from vla_attention.analyze.statistics.intervals import (
     DEFAULT_LEVEL,
     NO_LIMITS,
-    Interval,
-    Resamples,
-    interval_of_values,
+    UNKNOWN,
+    Estimand,
+    Estimate,
     named_interval,
+    to_scale,
+    welch_degrees,
 )
 
 #: Each class needs at least this many episodes for a comparison.
 FEWEST = 2
+#: Each class needs at least this many episodes for the interval of an effect size, and this many tasks where tasks are
+#: the units.
+FEWEST_EPISODES, FEWEST_TASKS = 5, 3
 _BETWEEN_MINUS_ONE_AND_ONE = (-1.0, 1.0)
-#: Resamples handled at once where all pairs of episodes are compared.
+#: Leave-one-out samples handled at once where all pairs of episodes are compared.
 _AT_ONCE = 256
 
 
@@ -39,12 +47,11 @@ class Contrast:
 
     Attributes:
         num_first, num_second: episodes of either class with a finite value.
-        mean_first, mean_second: means over these.
-        difference: mean_first - mean_second, with its interval.
-        within_tasks: the difference inside tasks, with its interval, over the `num_tasks_with_both` tasks with both
-            classes.
-        hedges_g: the difference in standard deviations, with its interval.
-        cliffs_delta: P(first > second) - P(first < second), with its interval.
+        mean_first, mean_second: means over tasks of the means over these.
+        difference: mean_first - mean_second.
+        within_tasks: the mean difference inside tasks, over the `num_tasks_with_both` tasks with both classes.
+        hedges_g: the difference between all episodes of either class, in standard deviations.
+        cliffs_delta: P(first > second) - P(first < second).
         note: why something is missing.
     """
 
@@ -52,24 +59,25 @@ class Contrast:
     num_second: int
     mean_first: float | None
     mean_second: float | None
-    difference: float | None = None
-    difference_interval: Interval | None = None
-    within_tasks: float | None = None
-    within_tasks_interval: Interval | None = None
+    difference: Estimate = UNKNOWN
+    within_tasks: Estimate = UNKNOWN
     num_tasks_with_both: int = 0
-    hedges_g: float | None = None
-    hedges_g_interval: Interval | None = None
-    cliffs_delta: float | None = None
-    cliffs_delta_interval: Interval | None = None
+    hedges_g: Estimate = UNKNOWN
+    cliffs_delta: Estimate = UNKNOWN
     note: str = ""
+
+
+def small_sample_factor(degrees: ArrayLike) -> NDArray[np.float64]:
+    """J = 1 - 3 / (4 m - 1): makes a standardised difference with m degrees of freedom unbiased (Hedges 1981)."""
+    return 1 - 3 / (4 * np.asarray(degrees, dtype=np.float64) - 1)
 
 
 def hedges_g(first: ArrayLike, second: ArrayLike) -> float | None:
     """Standardised mean difference of two samples (n,) and (m,), corrected for small samples.
 
-    g = J * (mean1 - mean2) / s, with s^2 = ((n - 1) s1^2 + (m - 1) s2^2) / (n + m - 2)
-    and J = 1 - 3 / (4 (n + m - 2) - 1) (Hedges 1981, Journal of Educational Statistics 6).
-    None with fewer than two values in either sample, or without any spread.
+    g = J(n + m - 2) * (mean1 - mean2) / s, with s^2 = ((n - 1) s1^2 + (m - 1) s2^2) / (n + m - 2)
+    (Hedges 1981, Journal of Educational Statistics 6). None with fewer than two values in either sample, or without
+    any spread.
     """
     x, y = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     if len(x) < FEWEST or len(y) < FEWEST:
@@ -92,66 +100,198 @@ def cliffs_delta(first: ArrayLike, second: ArrayLike) -> float | None:
     return float(np.sign(x[:, None] - y[None, :]).mean())
 
 
-def contrast(values: ArrayLike, is_first: ArrayLike, resamples: Resamples, level: float = DEFAULT_LEVEL) -> Contrast:
+def standardised_mean(
+    differences: ArrayLike, tasks: ArrayLike, estimand: Estimand = Estimand.TASKS_LIKE_THESE
+) -> Estimate:
+    """Mean / standard deviation of paired differences (pair,), corrected for small samples: d_z (Cohen 1988) times J.
+
+    `tasks`: (pair,) labels. Undefined below `FEWEST_EPISODES` pairs or without any spread.
+    """
+    sample = np.asarray(differences, dtype=np.float64)
+    if len(sample) < FEWEST_EPISODES or not np.ptp(sample) > 0:
+        return UNKNOWN
+    factor = float(small_sample_factor(len(sample) - 1))
+
+    def value(weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        number, total, squares = _moments(weights, sample, np.ones(len(sample), dtype=bool))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return factor * total / number / np.sqrt(squares / (number - 1))
+
+    task_of = np.unique(np.asarray(tasks), return_inverse=True)[1]
+    return _jackknife(value, task_of, [np.ones(len(sample), dtype=bool)], estimand)
+
+
+def contrast(
+    values: ArrayLike, is_first: ArrayLike, tasks: ArrayLike, estimand: Estimand = Estimand.TASKS_LIKE_THESE
+) -> Contrast:
     """Compare the episodes for which `is_first` is true with the others.
 
     Args:
         values: (episode,) one value per episode; values that are not finite are left out.
         is_first: (episode,) bool.
-        resamples: draws of these episodes.
-        level: level of the intervals.
+        tasks: (episode,) labels of the episodes' tasks.
+        estimand: what the intervals are about.
     """
     sample, chosen = np.asarray(values, dtype=np.float64), np.asarray(is_first, dtype=bool)
     finite = np.isfinite(sample)
+    task_of = np.unique(np.asarray(tasks), return_inverse=True)[1]
     classes = (finite & chosen, finite & ~chosen)
     sizes = [int(member.sum()) for member in classes]
-    means = [float(sample[member].mean()) if size else None for member, size in zip(classes, sizes, strict=True)]
+    x = np.where(finite, sample, 0.0)
+    cells = [_TaskCells.of(x, member, task_of) for member in classes]
+    means = [cell.mean if size else None for cell, size in zip(cells, sizes, strict=True)]
     if min(sizes) < FEWEST:
         note = f"{sizes[0]} against {sizes[1]} episodes: at least {FEWEST} of either are needed"
         return Contrast(sizes[0], sizes[1], means[0], means[1], note=note)
-    x = np.where(finite, sample, 0.0)
-    counts = resamples.counts
-    num_units = min(resamples.num_units(member) for member in classes)
+    both = (cells[0].size > 0) & (cells[1].size > 0)
+    within = _difference(cells[0].part(both), cells[1].part(both), estimand) if both.any() else UNKNOWN
 
-    def interval(
-        of: NDArray[np.float64], estimate: float | None, limits: tuple[float, float] = NO_LIMITS, units: int = num_units
-    ) -> Interval | None:
-        return interval_of_values(of, estimate, units, level, limits)
+    def standardised(weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        first, second = (_moments(weights, x, member) for member in classes)
+        return _standardised(first, second)
 
-    original = np.ones((1, len(x)))
-    moments = [[_moments(weights, x, member) for member in classes] for weights in (original, counts)]
-    difference = [_mean(first) - _mean(second) for first, second in moments]
-    standardised = [_standardised(first, second) for first, second in moments]
-    dominance = [_dominance(weights, x, *classes) for weights in (original, counts)]
-    within = [_within_tasks(weights, x, classes, resamples.task_of) for weights in (original, counts)]
-    both = np.intersect1d(*(resamples.task_of[member] for member in classes))
-    in_both = np.isin(resamples.task_of, both)
-    units_within = min(resamples.num_units(member & in_both) for member in classes) if len(both) else 0
-    estimates = [_or_none(of[0][0]) for of in (difference, within, standardised, dominance)]
-    note = "" if len(both) else "no task holds both outcomes: the difference may be one between tasks"
+    def dominance(weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        return _dominance(weights, x, *classes)
+
     return Contrast(
         num_first=sizes[0],
         num_second=sizes[1],
         mean_first=means[0],
         mean_second=means[1],
-        difference=estimates[0],
-        difference_interval=interval(difference[1], estimates[0]),
-        within_tasks=estimates[1],
-        within_tasks_interval=interval(within[1], estimates[1], units=units_within),
-        num_tasks_with_both=len(both),
-        hedges_g=estimates[2],
-        hedges_g_interval=interval(standardised[1], estimates[2]),
-        cliffs_delta=estimates[3],
-        cliffs_delta_interval=interval(dominance[1], estimates[3], _BETWEEN_MINUS_ONE_AND_ONE),
-        note=note,
+        difference=_difference(cells[0], cells[1], estimand),
+        within_tasks=within,
+        num_tasks_with_both=int(both.sum()),
+        hedges_g=_jackknife(standardised, task_of, classes, estimand),
+        cliffs_delta=_jackknife(dominance, task_of, classes, estimand, _BETWEEN_MINUS_ONE_AND_ONE),
+        note="" if both.any() else "no task holds both outcomes: the difference may be one between tasks",
     )
+
+
+def mean_difference(
+    values: ArrayLike, is_first: ArrayLike, tasks: ArrayLike, estimand: Estimand = Estimand.TASKS_LIKE_THESE
+) -> Estimate:
+    """`Contrast.difference` alone; unknown where a class has no finite value."""
+    sample, chosen = np.asarray(values, dtype=np.float64), np.asarray(is_first, dtype=bool)
+    finite = np.isfinite(sample)
+    task_of = np.unique(np.asarray(tasks), return_inverse=True)[1]
+    x = np.where(finite, sample, 0.0)
+    first, second = (_TaskCells.of(x, finite & member, task_of) for member in (chosen, ~chosen))
+    return _difference(first, second, estimand) if first.num_tasks and second.num_tasks else UNKNOWN
+
+
+@dataclass(frozen=True)
+class _TaskCells:
+    """The episodes of one class by task: number, mean and sum of squared deviations, each (task,); 0 where none."""
+
+    size: NDArray[np.float64]
+    means: NDArray[np.float64]
+    squares: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, x: NDArray[np.float64], member: NDArray[np.bool_], task_of: NDArray[np.intp]) -> _TaskCells:
+        count = int(task_of.max()) + 1
+        size = np.bincount(task_of[member], minlength=count).astype(np.float64)
+        total: NDArray[np.float64] = np.bincount(task_of[member], x[member], minlength=count).astype(np.float64)
+        means = np.divide(total, size, out=np.zeros(count), where=size > 0)
+        deviations = (x[member] - means[task_of[member]]) ** 2
+        return cls(size, means, np.bincount(task_of[member], deviations, minlength=count).astype(np.float64))
+
+    def part(self, tasks: NDArray[np.bool_]) -> _TaskCells:
+        """The tasks that are chosen."""
+        return _TaskCells(self.size[tasks], self.means[tasks], self.squares[tasks])
+
+    @property
+    def num_tasks(self) -> int:
+        return int((self.size > 0).sum())
+
+    @property
+    def mean(self) -> float:
+        return float(self.means.sum() / self.num_tasks)
+
+
+def _difference(first: _TaskCells, second: _TaskCells, estimand: Estimand) -> Estimate:
+    """Difference of the means of two classes, with tasks or the episodes of every (class, task) as units."""
+    value = first.mean - second.mean
+    sides = (first, second)
+    if estimand == Estimand.TASKS_LIKE_THESE and min(side.num_tasks for side in sides) > 1:
+        # A task in both classes moves both means: its deviations are subtracted before they are squared.
+        shares = [
+            np.where(side.size > 0, side.means - side.mean, 0.0) / math.sqrt(side.num_tasks * (side.num_tasks - 1))
+            for side in sides
+        ]
+        variance = float(((shares[0] - shares[1]) ** 2).sum())
+        degrees = float(min(side.num_tasks for side in sides) - 1)
+        if not ((first.size > 0) & (second.size > 0)).any():
+            of_side = np.array([(share**2).sum() for share in shares])
+            degrees = float(welch_degrees(of_side, np.array([side.num_tasks - 1.0 for side in sides])))
+    else:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            parts = [(side.squares / (side.size - 1) / side.size / side.num_tasks**2)[side.size > 0] for side in sides]
+        strata = np.concatenate(parts)
+        variance = float(strata.sum())  # not a number where a task has a single episode
+        degrees = float(welch_degrees(strata, np.concatenate([side.size[side.size > 0] - 1 for side in sides])))
+    largest = max(float(np.abs(side.means).max()) for side in sides)
+    if not variance > (1e-12 * largest) ** 2 or degrees < 1:
+        return Estimate(value)
+    return Estimate(value, math.sqrt(variance), int(degrees))
+
+
+def _jackknife(
+    statistic: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    task_of: NDArray[np.intp],
+    classes: tuple[NDArray[np.bool_], ...] | list[NDArray[np.bool_]],
+    estimand: Estimand,
+    limits: tuple[float, float] = NO_LIMITS,
+) -> Estimate:
+    """A statistic of weighted episodes, with the standard error from leaving out one unit after the other.
+
+    Args:
+        statistic: from weights (sample, episode) to values (sample,).
+        task_of: (episode,).
+        classes: (episode,) bool each; the statistic uses the episodes in them.
+        estimand: tasks are the units where every class has several, else the episodes of every (class, task).
+        limits: of the statistic.
+    """
+    estimate = _or_none(float(statistic(np.ones((1, len(task_of))))[0]))
+    num_tasks = [len(np.unique(task_of[member])) for member in classes]
+    clusters = estimand == Estimand.TASKS_LIKE_THESE and min(num_tasks) > 1
+    few = min(int(member.sum()) for member in classes) < FEWEST_EPISODES or (clusters and min(num_tasks) < FEWEST_TASKS)
+    low, high = limits
+    if estimate is None or few or not low < estimate < high:
+        return Estimate(estimate)
+    used = np.any(classes, axis=0)
+    variances, degrees = [], []
+    if clusters:
+        units = np.unique(task_of[used])
+        variances.append(_left_out_variance(statistic(1.0 - (task_of[None, :] == units[:, None]))))
+        degrees.append(min(num_tasks) - 1.0)
+    else:
+        for member in classes:
+            for task in np.unique(task_of[member]):
+                stratum = np.flatnonzero(member & (task_of == task))
+                if len(stratum) < 2:
+                    return Estimate(estimate)
+                weights = np.ones((len(stratum), len(task_of)))
+                # The others of the stratum take the weight of the one that is left out.
+                weights[:, stratum] = (1.0 - np.eye(len(stratum))) * len(stratum) / (len(stratum) - 1)
+                variances.append(_left_out_variance(statistic(weights)))
+                degrees.append(len(stratum) - 1.0)
+    variance, freedom = float(np.sum(variances)), float(welch_degrees(np.array(variances), np.array(degrees)))
+    if not (math.isfinite(variance) and variance > 0):
+        return Estimate(estimate)
+    return Estimate(estimate, to_scale(estimate, limits)[1] * math.sqrt(variance), int(freedom), limits)
+
+
+def _left_out_variance(values: NDArray[np.float64]) -> float:
+    """(n - 1) / n times the sum of squared deviations of the leave-one-out values (n,)."""
+    return float((len(values) - 1) / len(values) * ((values - values.mean()) ** 2).sum())
 
 
 _Moments = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
 def _moments(weights: NDArray[np.float64], x: NDArray[np.float64], member: NDArray[np.bool_]) -> _Moments:
-    """Number, sum, and sum of squared deviations of the members, each (resample,)."""
+    """Number, sum, and sum of squared deviations of the members, each (sample,)."""
     of_class, values = weights[:, member], x[member]
     number, total = of_class.sum(axis=1), of_class @ values
     # Deviations from the class's mean over all episodes: sums of squares of raw values would lose the last digits.
@@ -161,22 +301,18 @@ def _moments(weights: NDArray[np.float64], x: NDArray[np.float64], member: NDArr
         return number, total, squares - (total - number * centre) ** 2 / number
 
 
-def _mean(moments: _Moments) -> NDArray[np.float64]:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return moments[1] / moments[0]
-
-
 def _standardised(first: _Moments, second: _Moments) -> NDArray[np.float64]:
     degrees = first[0] + second[0] - 2
     with np.errstate(divide="ignore", invalid="ignore"):
         pooled = np.sqrt(np.maximum(first[2] + second[2], 0.0) / degrees)
-        return (1 - 3 / (4 * degrees - 1)) * (_mean(first) - _mean(second)) / pooled
+        gap: NDArray[np.float64] = first[1] / first[0] - second[1] / second[0]
+        return small_sample_factor(degrees) * gap / pooled
 
 
 def _dominance(
     weights: NDArray[np.float64], x: NDArray[np.float64], first: NDArray[np.bool_], second: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Cliff's delta in every resample, (resample,)."""
+    """Cliff's delta of every weighted sample, (sample,)."""
     signs = np.sign(x[first][:, None] - x[second][None, :])
     values = np.empty(len(weights))
     for start in range(0, len(weights), _AT_ONCE):
@@ -188,42 +324,22 @@ def _dominance(
     return values
 
 
-def _within_tasks(
-    weights: NDArray[np.float64],
-    x: NDArray[np.float64],
-    classes: tuple[NDArray[np.bool_], NDArray[np.bool_]],
-    task_of: NDArray[np.int64],
-) -> NDArray[np.float64]:
-    """The difference inside tasks in every resample, (resample,)."""
-    membership = (task_of[:, None] == np.unique(task_of)[None, :]).astype(np.float64)
-
-    def per_task(member: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        of_class = weights * member
-        return of_class @ membership, (of_class * x) @ membership
-
-    (number, total), (other_number, other_total) = per_task(classes[0]), per_task(classes[1])
-    both = (number > 0) & (other_number > 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        weight = np.where(both, number * other_number / (number + other_number), 0.0)
-        gap = np.where(both, total / number - other_total / other_number, 0.0)
-        within: NDArray[np.float64] = (weight * gap).sum(axis=1) / weight.sum(axis=1)
-    return within
-
-
 def _or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-#: The columns of a contrast in a table: its value and interval by name.
-CONTRAST_COLUMNS: dict[str, Callable[[Contrast], tuple[float | None, Interval | None]]] = {
-    "difference": lambda found: (found.difference, found.difference_interval),
-    "within_tasks": lambda found: (found.within_tasks, found.within_tasks_interval),
-    "hedges_g": lambda found: (found.hedges_g, found.hedges_g_interval),
-    "cliffs_delta": lambda found: (found.cliffs_delta, found.cliffs_delta_interval),
+#: The columns of a contrast in a table: its estimates by name.
+CONTRAST_COLUMNS: dict[str, Callable[[Contrast], Estimate]] = {
+    "difference": lambda found: found.difference,
+    "within_tasks": lambda found: found.within_tasks,
+    "hedges_g": lambda found: found.hedges_g,
+    "cliffs_delta": lambda found: found.cliffs_delta,
 }
 
 
-def contrast_row(found: Contrast, first: str, second: str) -> dict[str, float | int | str | None]:
+def contrast_row(
+    found: Contrast, first: str, second: str, level: float = DEFAULT_LEVEL
+) -> dict[str, float | int | str | None]:
     """A contrast as a table row.
 
     Columns: `num_NAME` and `mean_NAME` of either class, `num_tasks_with_both`, and `X`, `X_low`, `X_high` of every X in
@@ -237,5 +353,6 @@ def contrast_row(found: Contrast, first: str, second: str) -> dict[str, float | 
         "num_tasks_with_both": found.num_tasks_with_both,
     }
     for name, read in CONTRAST_COLUMNS.items():
-        row |= named_interval(name, *read(found))
+        estimate = read(found)
+        row |= named_interval(name, estimate.value, estimate.interval(level))
     return row | {"note": found.note or None}

@@ -10,14 +10,13 @@ from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.statistics.bootstrap import (
+from vla_attention.analyze.statistics.intervals import (
     DEFAULT_LEVEL,
-    DEFAULT_RESAMPLES,
-    DEFAULT_SEED,
+    Estimand,
+    estimates,
     mean_over_episodes,
+    named_interval,
     ratio_of_means_over_episodes,
-    resample_episodes,
-    values_with_intervals,
 )
 
 _TASK = "_task_of_suite"
@@ -27,30 +26,31 @@ def means_with_intervals(
     table: pl.DataFrame,
     by: Sequence[str],
     values: Mapping[str, tuple[float, float]],
-    seed: int = DEFAULT_SEED,
+    estimand: Estimand = Estimand.TASKS_LIKE_THESE,
     level: float = DEFAULT_LEVEL,
-    num_resamples: int = DEFAULT_RESAMPLES,
     quotients: Mapping[str, tuple[str, str]] | None = None,
+    nulls: Mapping[str, float] | None = None,
 ) -> pl.DataFrame:
-    """Mean over episodes of each value for every item, with its two-level interval (see `bootstrap`).
+    """Mean of each value for every item, over tasks of the tasks' means, with its interval (see `intervals`).
 
-    The mean and the interval of an item use the episodes that have it, and tasks and episodes are drawn from these
-    alone. Values that are null or not finite are left out of their mean.
+    The mean and the interval of an item use the episodes that have it. Values that are null or not finite are left out
+    of their mean.
 
     Args:
         table: one row per (episode, item), with `suite` and `task_id`.
         by: the columns that identify an item.
-        values: columns to average, with their natural limits (`bootstrap.NO_LIMITS`, `POSITIVE`, `SHARE`).
-        seed: seed of the bootstrap.
+        values: columns to average, with their natural limits (`intervals.NO_LIMITS`, `POSITIVE`, `SHARE`).
+        estimand: what the intervals are about.
         level: level of the intervals.
-        num_resamples: number of resamples.
         quotients: further columns, each the mean of one column / the mean of another over the episodes that have both.
+        nulls: for some of the values or quotients, what they would be if nothing were there.
 
     Returns:
         One row per item in order of first appearance: `by`, `num_episodes`, `num_tasks`, and per value or quotient `V`,
-        `V_low`, `V_high` (null where there is none) and `V_episodes`, the number of episodes with a finite value.
+        `V_low`, `V_high` (null where there is none) and `V_episodes`, the number of episodes with a finite value; for
+        those in `nulls` also `V_p`, the p-value of that null, not adjusted for the number of items.
     """
-    # Tasks in the order of their names as text: the draws depend on it.
+    nulls = nulls or {}
     task = pl.concat_str("suite", "task_id", separator="\t").rank("dense").cast(pl.Int64).alias(_TASK)
     rows = []
     for key, part in table.with_columns(task).group_by(by, maintain_order=True):
@@ -63,11 +63,15 @@ def means_with_intervals(
             statistics[name] = ratio_of_means_over_episodes(*pair)
         row: dict[str, Any] = dict(zip(by, key, strict=True))
         row |= {"num_episodes": part.height, "num_tasks": part[_TASK].n_unique()}
-        row |= values_with_intervals(statistics, resample_episodes(tasks, num_resamples, seed), level)
+        found = dict(zip(statistics, estimates(list(statistics.values()), tasks, estimand), strict=True))
+        for name, one in found.items():
+            row |= named_interval(name, one.value, one.interval(level))
+        row |= {f"{name}_p": found[name].p_value(null) for name, null in nulls.items()}
         row |= {f"{name}_episodes": int(statistic.used.sum()) for name, statistic in statistics.items()}
         rows.append(row)
     schema: dict[str, Any] = {name: table.schema[name] for name in by}
     schema |= {"num_episodes": pl.Int64, "num_tasks": pl.Int64}
     for name in (*values, *(quotients or {})):
         schema |= dict.fromkeys((name, f"{name}_low", f"{name}_high"), pl.Float64) | {f"{name}_episodes": pl.Int64}
+    schema |= dict.fromkeys((f"{name}_p" for name in nulls), pl.Float64)
     return pl.DataFrame(rows, schema=schema)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from vla_attention.analyze.arguments import (
     add_grouping,
+    add_intervals,
     add_output,
     add_selection,
     add_stores,
@@ -48,6 +49,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add_grouping(parser)
     add_selection(parser)
+    add_intervals(parser)
     add_output(parser, "results/STORE/time")
     return parser
 

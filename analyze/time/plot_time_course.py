@@ -18,7 +18,7 @@ from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, legend_above, r
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, LINE_OF_HATCH, NOTE_COLOR, group_styles
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, ratio_name, shortened, title
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.analyze.time.time_courses import (
     ALL,
     EPISODE_TIME,
@@ -170,7 +170,7 @@ def _note(courses: TimeCourses, alignment: str, level: float) -> str:
     episodes = courses.autocorrelation.height
     tasks = courses.autocorrelation.select("suite", "task_id").n_unique()
     text = f"{of_tasks(episodes, tasks)}. "
-    text += f"Bands: pointwise {interval_name(level, 'bootstrap')}s over tasks and episodes."
+    text += f"Bands: pointwise {interval_name(level)}s."
     if alignment == GRIPPER_CLOSING:
         closers = courses.closing["closing_replan"].is_not_null().sum()
         others = "; the others are not shown" if closers < courses.closing.height else ""

@@ -16,7 +16,7 @@ from vla_attention.analyze.show.numbers import (
 )
 from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.show.text_table import text_table
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.analyze.time.time_courses import (
     ALL,
     EPISODE_TIME,
@@ -49,7 +49,8 @@ def _header(question: Question, courses: TimeCourses) -> str:
     lines += wrap(f"stores: {', '.join(str(store.path) for store in question.stores)}")
     lines += wrap(
         f"{of_tasks(of.height, of.select('suite', 'task_id').n_unique())}, {int(of['success'].sum())} successful; "
-        f"{layer}; grouping '{question.grouping.name}'. {interval_note(DEFAULT_LEVEL, 'pointwise')}"
+        f"{layer}; grouping '{question.grouping.name}'. "
+        f"{interval_note(DEFAULT_LEVEL, question.settings.intervals.words, 'pointwise')}"
     )
     for line in question.remarks:
         lines += wrap(line)
@@ -102,6 +103,7 @@ def _gripper_section(courses: TimeCourses, settings: TimeSettings) -> str:
             shortened(row["quantity"], 40),
             ("x " if row["quantity"] == RATIO else "") + format_number(row["change"]),
             row_interval(row),
+            format_number(row["q"]),
             str(row["num_episodes"]),
         ]
         for row in courses.change.iter_rows(named=True)
@@ -109,11 +111,12 @@ def _gripper_section(courses: TimeCourses, settings: TimeSettings) -> str:
     note = (
         f"change: mean over the {settings.window + 1} replans from the closing on, against the {settings.window} "
         "before it, within each episode; a factor for the ratio, a difference of fractions for groups. No causal "
-        "claim: much else changes then."
+        "claim: much else changes then. q: p of no change, adjusted for the number of quantities (Benjamini-Hochberg). "
+        "The table also has Hedges' g and Cliff's delta."
     )
     if not courses.change["num_episodes"].max():
         return "\n".join([above, *wrap(f"{rule} No episode shows both sides of a closing.")])
-    table = text_table(["quantity", "change", "interval", "episodes"], body, left=(0,))
+    table = text_table(["quantity", "change", "interval", "q", "episodes"], body, left=(0,))
     return "\n".join([above, *wrap(rule), table, *wrap(note)])
 
 
@@ -126,26 +129,26 @@ def outcomes_section(outcomes: pl.DataFrame) -> str:
         numbers = f"{counts[f'num_{SUCCESS}']} solved and {counts[f'num_{FAILURE}']} failed"
         said = f"Not compared: of the episodes, {numbers}; at least 2 of either are needed."
         return "\n".join([above, *wrap(said)])
-    header = ["quantity", "n", "difference", "interval", "in tasks", "interval", "g", "delta"]
+    header = ["quantity", "n", "difference", "interval", "q", "in tasks", "interval", "q"]
     body = [
         [
             shortened(row["quantity"], 24),
             f"{row[f'num_{SUCCESS}']}/{row[f'num_{FAILURE}']}",
             format_signed(row["difference"]),
             row_interval(row, "difference"),
+            format_number(row["difference_q"]),
             format_signed(row["within_tasks"]),
             row_interval(row, "within_tasks"),
-            format_signed(row["hedges_g"]),
-            format_signed(row["cliffs_delta"]),
+            format_number(row["within_tasks_q"]),
         ]
         for row in outcomes.iter_rows(named=True)
     ]
     both = max(outcomes["num_tasks_with_both"])
     note = (
         "n: solved / failed episodes. difference: solved minus failed (for log2_ratio, 1 is a factor of 2). in tasks: "
-        f"the same inside tasks ({both} hold both outcomes), free of differences between tasks. g: Hedges' g, in "
-        "standard deviations. delta: Cliff's delta, P(solved > failed) - P(solved < failed). Their intervals are in "
-        "the table."
+        f"the same inside tasks ({both} hold both outcomes), free of differences between tasks. q: p of no "
+        "difference, adjusted for the number of quantities (Benjamini-Hochberg). The table also has Hedges' g and "
+        "Cliff's delta."
     )
     return "\n".join([above, text_table(header, body, left=(0,)), *wrap(note), *(w for n in notes for w in wrap(n))])
 

@@ -2,7 +2,8 @@
 
 Quantities are the ratio and the fractions of all groups that take any mass, in one layer ("layers_avg" unless one layer
 is chosen). The ratio is averaged geometrically, because an arithmetic mean follows the episode with the largest ratio.
-Intervals are pointwise two-level bootstraps: each holds for its point, not for the whole curve.
+Intervals are pointwise: each holds for its point. `curve_low` and `curve_high` hold for all points of a curve at once
+(Bonferroni).
 """
 
 from __future__ import annotations
@@ -18,18 +19,19 @@ from vla_attention.analyze.measures.aggregate import overall_layer, replans_of
 from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, Tables, episode_id, float_values
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.statistics.bootstrap import (
+from vla_attention.analyze.statistics.effect_sizes import contrast, contrast_row
+from vla_attention.analyze.statistics.intervals import (
+    DEFAULT_LEVEL,
     SHARE,
     EpisodeStatistic,
-    Resamples,
-    bootstrap_intervals,
+    Estimand,
     ends,
+    estimates,
     geometric_mean_over_episodes,
     mean_over_episodes,
-    resample_episodes,
-    summarize,
 )
-from vla_attention.analyze.statistics.effect_sizes import contrast, contrast_row
+from vla_attention.analyze.statistics.many_looks import adjusted_p_values
+from vla_attention.analyze.statistics.summaries import summarize
 from vla_attention.analyze.time.alignment import (
     around_event,
     change_at_event,
@@ -45,6 +47,10 @@ RATIO = "ratio"
 EPISODE_TIME, GRIPPER_CLOSING = "episode", "gripper"
 #: Which episodes a curve is of.
 ALL, SUCCESS, FAILURE = "all", "success", "failure"
+
+
+#: The differences between success and failure whose p-values are adjusted for the number of quantities.
+_ADJUSTED = ("difference", "within_tasks")
 
 
 @dataclass(frozen=True)
@@ -69,14 +75,16 @@ class TimeCourses:
         layer: the layer.
         quantities: "ratio" (when the grouping has one) and the groups whose fractions are followed.
         course: one row per (alignment, outcome, quantity, position): `position_low`, `position`, `position_high`
-            (episode time 0 to 1, or replans from the closing), `value`, `low`, `high`, `num_episodes`, `num_tasks`,
+            (episode time 0 to 1, or replans from the closing), `value`, `low`, `high` (pointwise), `curve_low`,
+            `curve_high` (all points at once), `num_episodes`, `num_tasks`,
             `uniform` (of the ratio).
         closing: one row per episode: its identity, `closing_replan` (null when the gripper never closes) and
             `closing_time` (0 to 1); empty when the stores hold no actions.
         change: one row per quantity: mean change from before to after the closing (a factor for the ratio, a difference
-            for fractions) with `low` and `high`, and how many episodes show both sides.
+            for fractions) with `low`, `high` and `q` (Benjamini-Hochberg over the quantities; null: no change), and how
+            many episodes show both sides.
         outcomes: success against failure, one row per quantity, columns of `effect_sizes.contrast_row`; the ratio as
-            log2.
+            log2. `difference_q` and `within_tasks_q` are adjusted for the number of quantities.
         autocorrelation: one row per episode, see `effective_replans.effective_replans_table`.
         num_nonfinite: (episode, replan) pairs without a finite log ratio, which take no part in the ratio's course.
     """
@@ -128,13 +136,13 @@ def time_courses(
     fractions = of_layer.groups.partition_by(EPISODE_ID, as_dict=True)
     for key, part in rows.partition_by(EPISODE_ID, as_dict=True, maintain_order=True).items():
         episodes.append(_episode(by_name[key], Tables(part, fractions[key]), quantities, has_actions))
-    seed = question.settings.seed
+    estimand = question.settings.intervals
     classes = {ALL: episodes}
     solved = [episode for episode in episodes if episode.success]
     if 0 < len(solved) < len(episodes):
         classes |= {SUCCESS: solved, FAILURE: [episode for episode in episodes if not episode.success]}
     course = [
-        _course(members, outcome, alignment, quantities, settings, seed)
+        _course(members, outcome, alignment, quantities, settings, estimand)
         for outcome, members in classes.items()
         for alignment in ((EPISODE_TIME, GRIPPER_CLOSING) if has_actions else (EPISODE_TIME,))
     ]
@@ -144,8 +152,8 @@ def time_courses(
         quantities=quantities,
         course=pl.concat(course),
         closing=_closing_table(episodes if has_actions else [], rows),
-        change=_change_table(episodes, quantities, settings.window, seed),
-        outcomes=_outcomes_table(episodes, quantities, seed),
+        change=_change_table(episodes, quantities, settings.window, estimand),
+        outcomes=_outcomes_table(episodes, quantities, estimand),
         autocorrelation=effective_replans_table(of_layer, grouping),
         num_nonfinite=int(sum((~np.isfinite(values)).sum() for values in ratios)),
     )
@@ -191,7 +199,7 @@ def _course(
     alignment: str,
     quantities: Sequence[str],
     settings: TimeSettings,
-    seed: int,
+    estimand: Estimand,
 ) -> pl.DataFrame:
     if alignment == EPISODE_TIME:
         aligned = [on_episode_time(e.values, e.starts, e.num_steps, settings.num_bins) for e in episodes]
@@ -204,32 +212,35 @@ def _course(
         places = np.stack([offsets, offsets, offsets], axis=1)
     rows: list[tuple[object, ...]] = []
     if episodes:
-        resamples = _resamples(episodes, seed)
+        tasks = _task_numbers(episodes)
         statistics = _statistics(np.stack(aligned), quantities)
-        intervals = bootstrap_intervals(statistics, resamples)
+        found = estimates(statistics, tasks, estimand)
+        # Bonferroni over the points of one curve: all of it lies within, at the level of a single point.
+        together = 1.0 - (1.0 - DEFAULT_LEVEL) / len(places)
         known = np.array([episode.uniform for episode in episodes])
-        for number, (statistic, interval) in enumerate(zip(statistics, intervals, strict=True)):
+        for number, (statistic, one) in enumerate(zip(statistics, found, strict=True)):
             quantity, position = quantities[number // len(places)], number % len(places)
             # The baseline is known also where no ratio is finite.
             of = statistic.used if statistic.used.any() else np.isfinite(known)
-            uniform = mean_over_episodes(known[of]).value if quantity == RATIO else None
-            num_tasks = len(np.unique(resamples.task_of[statistic.used]))
+            uniform = estimates([mean_over_episodes(known[of])], tasks[of])[0].value if quantity == RATIO else None
+            num_tasks = len(np.unique(tasks[statistic.used]))
             rows.append(
                 (
                     *(alignment, outcome, quantity, *(float(place) for place in places[position])),
-                    *(statistic.value, *ends(interval), int(statistic.used.sum()), num_tasks, uniform),
+                    *(one.value, *ends(one.interval()), *ends(one.interval(together))),
+                    *(int(statistic.used.sum()), num_tasks, uniform),
                 )
             )
     text = dict.fromkeys(("alignment", "outcome", "quantity"), pl.String)
-    numbers = ("position_low", "position", "position_high", "value", "low", "high")
+    numbers = ("position_low", "position", "position_high", "value", "low", "high", "curve_low", "curve_high")
     counts = dict.fromkeys(("num_episodes", "num_tasks"), pl.Int64)
     schema = {**text, **dict.fromkeys(numbers, pl.Float64), **counts, "uniform": pl.Float64}
     return pl.DataFrame(rows, schema=schema, orient="row")
 
 
-def _resamples(episodes: Sequence[_Episode], seed: int) -> Resamples:
+def _task_numbers(episodes: Sequence[_Episode]) -> NDArray[np.int64]:
     tasks = sorted({episode.task for episode in episodes})
-    return resample_episodes([tasks.index(episode.task) for episode in episodes], seed=seed)
+    return np.array([tasks.index(episode.task) for episode in episodes])
 
 
 def _closing_table(episodes: Sequence[_Episode], rows: pl.DataFrame) -> pl.DataFrame:
@@ -241,12 +252,15 @@ def _closing_table(episodes: Sequence[_Episode], rows: pl.DataFrame) -> pl.DataF
     return pl.DataFrame(found, schema={**kinds, "closing_replan": pl.Int64, "closing_time": pl.Float64}, orient="row")
 
 
-def _change_table(episodes: Sequence[_Episode], quantities: Sequence[str], window: int, seed: int) -> pl.DataFrame:
+def _change_table(
+    episodes: Sequence[_Episode], quantities: Sequence[str], window: int, estimand: Estimand
+) -> pl.DataFrame:
     schema = {
         "quantity": pl.String,
         "change": pl.Float64,
         "low": pl.Float64,
         "high": pl.Float64,
+        "q": pl.Float64,
         "num_episodes": pl.Int64,
         "num_tasks": pl.Int64,
     }
@@ -257,34 +271,41 @@ def _change_table(episodes: Sequence[_Episode], quantities: Sequence[str], windo
     ]
     if not closers:
         return pl.DataFrame(schema=schema)
-    resamples = _resamples([episode for episode, _ in closers], seed)
+    tasks = _task_numbers([episode for episode, _ in closers])
     changes = np.stack([change for _, change in closers])
     statistics = [
         geometric_mean_over_episodes(changes[:, i]) if quantity == RATIO else mean_over_episodes(changes[:, i])
         for i, quantity in enumerate(quantities)
     ]
+    found = estimates(statistics, tasks, estimand)
+    q_values = adjusted_p_values(
+        [one.p_value(1.0 if quantity == RATIO else 0.0) for quantity, one in zip(quantities, found, strict=True)]
+    )
     rows = [
         (
-            *(quantity, statistic.value, *ends(interval)),
-            *(int(statistic.used.sum()), len(np.unique(resamples.task_of[statistic.used]))),
+            *(quantity, one.value, *ends(one.interval()), q),
+            *(int(statistic.used.sum()), len(np.unique(tasks[statistic.used]))),
         )
-        for quantity, statistic, interval in zip(
-            quantities, statistics, bootstrap_intervals(statistics, resamples), strict=True
-        )
+        for quantity, statistic, one, q in zip(quantities, statistics, found, q_values, strict=True)
     ]
     return pl.DataFrame(rows, schema=schema, orient="row")
 
 
-def _outcomes_table(episodes: Sequence[_Episode], quantities: Sequence[str], seed: int) -> pl.DataFrame:
+def _outcomes_table(episodes: Sequence[_Episode], quantities: Sequence[str], estimand: Estimand) -> pl.DataFrame:
     """Success against failure on the episodes' means over replans: log2 of the ratio, and fractions."""
-    resamples = _resamples(episodes, seed)
+    tasks = _task_numbers(episodes)
     solved = np.array([episode.success for episode in episodes])
     means = np.array([[summarize(column).mean for column in episode.values.T] for episode in episodes], np.float64)
-    rows = []
+    names, found = [], []
     for i, quantity in enumerate(quantities):
         values = means[:, i] / np.log(2.0) if quantity == RATIO else means[:, i]
-        name = "log2_ratio" if quantity == RATIO else f"{quantity}_fraction"
-        rows.append({"quantity": name, **contrast_row(contrast(values, solved, resamples), SUCCESS, FAILURE)})
+        names.append("log2_ratio" if quantity == RATIO else f"{quantity}_fraction")
+        found.append(contrast(values, solved, tasks, estimand))
+    looks = {name: adjusted_p_values([getattr(one, name).p_value(0.0) for one in found]) for name in _ADJUSTED}
+    rows = [
+        {"quantity": name, **contrast_row(one, SUCCESS, FAILURE), **{f"{of}_q": looks[of][i] for of in _ADJUSTED}}
+        for i, (name, one) in enumerate(zip(names, found, strict=True))
+    ]
     texts = {"quantity": pl.String, "note": pl.String}
     return pl.DataFrame(rows, schema_overrides=texts, infer_schema_length=None).with_columns(
         pl.col(pl.Null).cast(pl.Float64)

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import argparse
 
-from vla_attention.analyze.arguments import add_output, add_selection, add_stores, output_folder, settings_of, stores_of
+from vla_attention.analyze.arguments import (
+    add_intervals,
+    add_output,
+    add_selection,
+    add_stores,
+    output_folder,
+    settings_of,
+    stores_of,
+)
 from vla_attention.analyze.show.output_files import report_files, write_parquet
 from vla_attention.schemas.command_line import command_parser
 
@@ -24,12 +32,13 @@ def build_parser() -> argparse.ArgumentParser:
     parser = command_parser(
         "vla-analyze words",
         "Which words of the instruction are read: mass, lift over uniform attention and share of the linguistic mass "
-        "of every word, with intervals over tasks and episodes; content and stop words, bos, template and state beside "
+        "of every word, with intervals; content and stop words, bos, template and state beside "
         "them.",
         _EXAMPLES,
     )
     add_stores(parser)
     selection = add_selection(parser)
+    add_intervals(parser)
     selection.add_argument(
         "--task", type=int, metavar="N", help="one task only: its instruction word by word, in reading order"
     )

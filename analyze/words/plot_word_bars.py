@@ -14,7 +14,7 @@ from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, legend_above, n
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, shortened, title
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,8 +41,8 @@ def plot_word_bars(
     dense = shown.height > 30
     figure = new_figure(8.4, 1.7 + (0.19 if dense else 0.27) * shown.height)
     heading = f"Words of '{instruction}' in reading order" if instruction else "Words of the instructions, by lift"
-    whiskers = interval_name(DEFAULT_LEVEL, "bootstrap")
-    note = f"Bars: mean over episodes; whiskers: {whiskers} over tasks and episodes; n counts episodes."
+    whiskers = interval_name(DEFAULT_LEVEL)
+    note = f"Bars: mean over episodes; whiskers: {whiskers}; n counts episodes."
     if words.height > _MOST:
         note += f" The {_MOST} words with the highest lift of {words.height}."
     title(figure, f"{heading}; {layer_name(layer)}", note)

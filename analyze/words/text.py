@@ -9,12 +9,13 @@ import polars as pl
 from vla_attention.analyze.show.headings import interval_note, wrap
 from vla_attention.analyze.show.numbers import format_interval, format_number
 from vla_attention.analyze.show.text_table import episode_counts, text_table
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.analyze.words.word_study import WordStudy
 
 _NOTE = (
-    "lift: mean over replans of mass per piece / mass per valid key (1: uniform attention). share: of all "
-    f"linguistic mass (bos, template, instruction). {interval_note(DEFAULT_LEVEL)}"
+    "lift: mean over replans of mass per piece / mass per valid key (1: uniform attention). share: of all linguistic "
+    "mass (bos, template, instruction). q: p of lift 1, adjusted for the number of words (Benjamini-Hochberg)."
 )
 
 
@@ -32,17 +33,30 @@ def words_text(study: WordStudy) -> str:
         "",
         *wrap(_NOTE),
     ]
-    readers = study.readers
-    if readers.height:
-        found = "; ".join(_reader(row) for row in readers.iter_rows(named=True))
-        lines += ["", *wrap(f"Read most, by layer: {found}.")]
-    return "\n".join(lines)
+    lines += wrap(interval_note(DEFAULT_LEVEL, study.question.settings.intervals.words))
+    return "\n".join([*lines, "", *wrap(_leading(study))])
+
+
+def _leading(study: WordStudy) -> str:
+    """Which word, and which layer of a word, is surely above all the others."""
+    leaders = study.leaders
+    said = [
+        f"{_cell(row)} has a higher lift ({format_number(found.value)}) than each of the other {found.num_items - 1} "
+        f"{'words' if 'layer' not in row else 'pairs of word and layer'}"
+        for row, found in leaders
+        if found.is_named(len(leaders))
+    ]
+    if said:
+        return f"{'; '.join(said)} (each difference tested at {NAMED_AT:g} / {len(leaders)})."
+    if not leaders:
+        return "There are no two words to compare."
+    return "No word, and no layer of a word, is surely read more than all the others: the order may be due to chance."
 
 
 def _table(summary: pl.DataFrame, several_tasks: bool) -> str:
     rows = summary.to_dicts()
     heading, counts = episode_counts(rows, several_tasks)
-    header = ["word", "class", "pieces", heading, "mass", "lift", "interval", "share", "interval"]
+    header = ["word", "class", "pieces", heading, "mass", "lift", "interval", "q", "share", "interval"]
     body = [
         [
             row["item"],
@@ -52,6 +66,7 @@ def _table(summary: pl.DataFrame, several_tasks: bool) -> str:
             format_number(row["mass"]),
             format_number(row["lift"]),
             format_interval(row["lift_low"], row["lift_high"]),
+            format_number(row["lift_q"]),
             format_number(row["share"]),
             format_interval(row["share_low"], row["share_high"]),
         ]
@@ -60,6 +75,6 @@ def _table(summary: pl.DataFrame, several_tasks: bool) -> str:
     return text_table(header, body, left=(0, 1))
 
 
-def _reader(row: dict[str, Any]) -> str:
-    head = f" head {row['head']}" if row["head"] is not None else ""
-    return f"'{row['item']}' in layer {row['layer']}{head} (lift {format_number(row['lift'])})"
+def _cell(row: dict[str, Any]) -> str:
+    head = f" head {row['head']}" if row.get("head") is not None else ""
+    return f"'{row['item']}'" + (f" in layer {row['layer']}{head}" if "layer" in row else "")

@@ -1,10 +1,11 @@
-"""Which words are read, over episodes: means with intervals, and the layers and heads that read most."""
+"""Which words are read, over episodes: means with intervals, and which word leads."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import polars as pl
 
@@ -12,8 +13,9 @@ from vla_attention.analyze.measures.aggregate import overall_layer
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
-from vla_attention.analyze.statistics.bootstrap import DEFAULT_SEED, POSITIVE, SHARE
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
+from vla_attention.analyze.statistics.intervals import POSITIVE, SHARE, Estimand
+from vla_attention.analyze.statistics.many_looks import Leader, adjusted_p_values, leader_of_table
 from vla_attention.analyze.stores.selection import site_that
 from vla_attention.analyze.words.word_reading import words_table
 from vla_attention.schemas.errors import BadArgument
@@ -43,12 +45,12 @@ class WordStudy:
     @cached_property
     def summary(self) -> pl.DataFrame:
         """Means over episodes with intervals; see `words_summary`."""
-        return words_summary(self.episodes, self.instruction is not None, seed=self.question.settings.seed)
+        return words_summary(self.episodes, self.instruction is not None, estimand=self.question.settings.intervals)
 
     @property
-    def readers(self) -> pl.DataFrame:
-        """The layers and heads that read most; see `strongest_readers`."""
-        return strongest_readers(self.episodes)
+    def leaders(self) -> list[tuple[dict[str, Any], Leader]]:
+        """The leading word, and the leading (word, layer, head); see `leading_words`."""
+        return leading_words(self.episodes, self.question.settings.intervals)
 
     @property
     def layer(self) -> str:
@@ -87,14 +89,18 @@ def site_of_words(root: RootAttributes, wanted: str | None) -> str:
 
 
 def words_summary(
-    table: pl.DataFrame, by_place: bool = False, layer: str | None = None, seed: int = DEFAULT_SEED
+    table: pl.DataFrame,
+    by_place: bool = False,
+    layer: str | None = None,
+    estimand: Estimand = Estimand.TASKS_LIKE_THESE,
 ) -> pl.DataFrame:
     """Mean of every word over the episodes that have it, with two-level intervals, from `words_table`.
 
     A word that occurs twice in an instruction is one item (its masses are added up) unless `by_place`, which keeps the
     places of one instruction apart and in reading order. `layer`: the label of one layer, else "layers_avg" where there
     is one. Heads that were kept apart are averaged. Sorted by lift, words first and scale last; columns as in
-    `episode_intervals.means_with_intervals`.
+    `episode_intervals.means_with_intervals`, and `lift_q`: the p-value of lift 1 (uniform attention), adjusted for the
+    number of words (Benjamini-Hochberg; apart from the rows for scale).
     """
     chosen = table.filter(pl.col("layer") == (layer or overall_layer(table)))
     if chosen.is_empty():
@@ -111,23 +117,31 @@ def words_summary(
     episodes = joined.group_by(*EPISODE_ID, *item, maintain_order=True).agg(
         pl.col("pieces").first(), *(pl.col(name).mean() for name in _VALUES)
     )
-    summary = means_with_intervals(episodes, item, {"pieces": POSITIVE, **_VALUES}, seed)
+    summary = means_with_intervals(episodes, item, {"pieces": POSITIVE, **_VALUES}, estimand, nulls={"lift": 1.0})
     summary = summary.drop("pieces_low", "pieces_high", "pieces_episodes")
-    words = summary.filter(pl.col("kind") == "word")
+    is_word = pl.col("kind") == "word"
+    summary = pl.concat(
+        part.with_columns(pl.Series("lift_q", adjusted_p_values(part["lift_p"].to_list()), dtype=pl.Float64))
+        for part in (summary.filter(is_word), summary.filter(~is_word))
+    ).drop("lift_p")
+    words = summary.filter(is_word)
     words = words.sort("place") if by_place else words.sort("lift", descending=True, nulls_last=True)
     return pl.concat([words, summary.filter(pl.col("kind") == "scale")])
 
 
-def strongest_readers(table: pl.DataFrame, most: int = 5) -> pl.DataFrame:
-    """The layers (and heads, where they were kept apart) in which a word has its highest lift, mean over episodes.
+def leading_words(
+    table: pl.DataFrame, estimand: Estimand = Estimand.TASKS_LIKE_THESE
+) -> list[tuple[dict[str, Any], Leader]]:
+    """The word with the highest lift over layers, and the (word, layer, head) with the highest, from `words_table`.
 
-    One row per (word, layer, head), highest lift first, at most one per word; words that occur twice count by their
-    mean.
+    Each with how surely it is above all the others (`many_looks.leader`). A word that occurs twice counts by the mean
+    of its lifts. Fewer where there are no two words, or no two cells.
     """
-    layers = table.filter((pl.col("kind") == "word") & (pl.col("layer") != LAYERS_AVG))
-    episodes = layers.group_by(*EPISODE_ID, "item", "word_class", "layer", "head").agg(pl.col("lift").mean())
-    means = episodes.group_by("item", "word_class", "layer", "head").agg(
-        pl.col("lift").mean(), pl.len().cast(pl.Int64).alias("num_episodes")
-    )
-    ranked = means.drop_nulls("lift").sort(["lift", "item", "layer"], descending=[True, False, False])
-    return ranked.unique("item", keep="first", maintain_order=True).head(most)
+    words = table.filter(pl.col("kind") == "word")
+    overall, single = pl.col("layer") == overall_layer(table), pl.col("layer") != LAYERS_AVG
+    found = []
+    for which, item in ((overall, ("item",)), (single, ("item", "layer", "head"))):
+        episodes = words.filter(which).group_by(*EPISODE_ID, *item, maintain_order=True).agg(pl.col("lift").mean())
+        leading = leader_of_table(episodes, item, "lift", estimand)
+        found += [] if leading is None else [leading]
+    return found

@@ -67,8 +67,25 @@ def test_every_method_has_an_example():
 
 @pytest.mark.parametrize("level", ["tasks", "episodes", "steps"])
 def test_ratios_are_those_of_the_command(run, store, tmp_path, level):
-    assert main(["ratios", str(store), "--no-plots", "--output", str(tmp_path), "--layers", "2", "--seed", "3"]) == 0
-    assert_frame_equal(run.ratios(level, layers=[2], seed=3), pl.read_parquet(tmp_path / f"{level}.parquet"))
+    assert (
+        main(
+            [
+                "ratios",
+                str(store),
+                "--no-plots",
+                "--output",
+                str(tmp_path),
+                "--layers",
+                "2",
+                "--intervals",
+                "these-tasks",
+            ]
+        )
+        == 0
+    )
+    assert_frame_equal(
+        run.ratios(level, layers=[2], intervals="these-tasks"), pl.read_parquet(tmp_path / f"{level}.parquet")
+    )
 
 
 def test_masses_in_long_form_are_sums_over_the_raw_rows(run, store):

@@ -88,7 +88,9 @@ def test_paired_differences_are_those_of_the_planted_pairs(stores):
     row = one(found.differences, scope="all", layer="layers_avg", quantity="log2_ratio")
     values = np.array(list(expected.values()))
     assert row["difference"] == pytest.approx(values.mean(), rel=1e-4)
-    assert row["effect"] == pytest.approx(values.mean() / values.std(ddof=1), rel=1e-3)
+    corrected = 1 - 3 / (4 * (len(values) - 1) - 1)
+    assert row["d_z"] == pytest.approx(corrected * values.mean() / values.std(ddof=1), rel=1e-3)
+    assert row["hedges_g"] is None
     assert (row["paired"], row["num_pairs"], row["num_tasks"]) == (True, 16, 4)
     assert row["low"] < 0.25 / np.log(2) < row["high"]
     assert row["low"] > 0.2
@@ -96,11 +98,8 @@ def test_paired_differences_are_those_of_the_planted_pairs(stores):
         own = np.array([value for (of, _), value in expected.items() if of == task])
         row = one(found.differences, scope="task", task_id=task, layer="1", quantity="log2_ratio")
         assert row["difference"] == pytest.approx(own.mean(), rel=1e-3)
-        # One task is a plain bootstrap over its pairs, widened for their number.
-        theirs = stats.bootstrap((own,), np.mean, n_resamples=20000, method="percentile", rng=np.random.default_rng(0))
-        factor = stats.t.ppf(0.975, 3) / stats.norm.ppf(0.975) * np.sqrt(4 / 3)
-        ends = [own.mean() + factor * (end - own.mean()) for end in theirs.confidence_interval]
-        assert (row["low"], row["high"]) == pytest.approx(ends, abs=0.012)
+        ends = stats.t.interval(0.95, 3, own.mean(), stats.sem(own))
+        assert (row["low"], row["high"]) == pytest.approx(ends, rel=1e-2)
     pair = one(found.pairs, task_id=5, episode_first=3, layer="layers_avg", quantity="log2_ratio")
     assert pair["difference"] == pytest.approx(expected[5, 3], rel=1e-3)
     assert found.unpaired.is_empty()

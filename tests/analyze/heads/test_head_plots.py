@@ -61,7 +61,7 @@ def test_every_picture_of_every_case_is_drawn_without_a_warning(case, tmp_path):
     steps = make_steps(**({"grouping": grouping} | wanted))
     measured, replans = measured_of(steps, grouping), replans_of(steps, grouping)
     heads = concat_tables([episode_heads(episode, grouping) for episode in measured])
-    tasks = task_tables(episode_tables(replans, grouping), grouping, num_resamples=50)
+    tasks = task_tables(episode_tables(replans, grouping), grouping)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         paths = plot_head_grid(heads_tables(heads, grouping), grouping, tmp_path)

@@ -178,7 +178,9 @@ def test_planted_specialist_heads_are_found_and_named(tmp_path):
     assert first["log2_lift_low"] > 0 > last["log2_lift_high"]
     text = heads_text(study, top=1)
     lines = text.splitlines()
-    looking, reading = lines.index("MOST VISUAL HEADS"), lines.index("MOST LINGUISTIC HEADS")
+    assert ranked.height == 4
+    looking = lines.index("HEADS IN ORDER OF lift of the ratio: the first 1 of 4")
+    reading = lines.index("and the last 1")
     assert lines[looking + 4].split()[:2] == ["2", "1"]
     assert lines[reading + 4].split()[:2] == ["0", "0"]
     assert max(map(len, lines)) <= 100

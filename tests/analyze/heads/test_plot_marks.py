@@ -22,7 +22,7 @@ from vla_attention.schemas.groupings.grouping import Grouping
 def drawn(steps: pl.DataFrame, grouping: Grouping):
     """The axes of a profile over layers, laid out."""
     replans = replans_of(steps, grouping)
-    tasks = overall_rows(task_tables(episode_tables(replans, grouping), grouping, num_resamples=50))
+    tasks = overall_rows(task_tables(episode_tables(replans, grouping), grouping))
     level = tasks.filter(pl.col("layer") != LAYERS_AVG)
     figure = new_figure(7, 5)
     draw_profile(figure, level, grouping, level.cells["layer"].to_list(), "layer", 0.95)
@@ -61,7 +61,7 @@ def test_the_line_of_ratios_breaks_where_a_layer_has_none():
     axes, rows = drawn(steps, default_grouping())
     heights = np.asarray(axes[0].lines[0].get_ydata(), dtype=float)
     assert np.isnan(heights).tolist() == [False, False, True, False]
-    np.testing.assert_allclose(heights[[0, 1, 3]], rows["ratio_mean"].to_numpy()[[0, 1, 3]])
+    np.testing.assert_allclose(heights[[0, 1, 3]], rows["geometric_mean"].to_numpy()[[0, 1, 3]])
 
 
 def test_a_note_on_grey_cells_only_where_there_are_some(tmp_path, monkeypatch):

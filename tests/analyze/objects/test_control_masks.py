@@ -24,11 +24,11 @@ from vla_attention.analyze.objects.control_masks import (
 )
 from vla_attention.analyze.objects.object_attention import object_tables
 from vla_attention.analyze.objects.object_settings import ObjectSettings
-from vla_attention.analyze.objects.object_study import objects_summary, strongest_followers
-from vla_attention.analyze.statistics.bootstrap import (
+from vla_attention.analyze.objects.object_study import followed_objects, objects_summary
+from vla_attention.analyze.statistics.intervals import (
     POSITIVE,
     Interval,
-    bootstrap_interval,
+    estimates,
     mean_over_episodes,
     ratio_of_means_over_episodes,
 )
@@ -120,7 +120,7 @@ def test_of_an_object_that_does_not_move_the_control_cannot_tell(tmp_path, capsy
     (line, *_) = [line for line in printed.splitlines() if line.lstrip().startswith("[of interest]")]
     assert "cannot tell" in line
     tables = object_tables(question_about(path), ObjectSettings(spatial=False))
-    assert strongest_followers(tables.objects).is_empty()
+    assert followed_objects(tables.objects) == []
 
 
 def raw(path: Path, task: int, episode: int, camera: str) -> tuple[np.ndarray, np.ndarray]:
@@ -214,8 +214,8 @@ def made_up_store(generator: np.random.Generator, episodes: int, follow: float) 
         sources.append(control_source(maps[:, None, None], area.astype(np.float32), episodes - 1))
     found = controls(sources)
     balanced, tasks = [control.balanced[0, 0, 0] for control in found], np.zeros(episodes)
-    plain = bootstrap_interval(mean_over_episodes(enrichment, POSITIVE), tasks, 500)
-    over = bootstrap_interval(ratio_of_means_over_episodes(enrichment, balanced), tasks, 500)
+    statistics = [mean_over_episodes(enrichment, POSITIVE), ratio_of_means_over_episodes(enrichment, balanced)]
+    plain, over = (one.interval() for one in estimates(statistics, tasks))
     assert plain is not None
     assert over is not None
     return float(np.mean([control.overlap[0] for control in found])), plain, over

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.kit.made_up_steps import flat
@@ -14,6 +15,7 @@ from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.analyze.ratios.contribution_text import contributions_section, group_contributions_section
+from vla_attention.analyze.statistics.intervals import Estimand
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.testing.stores import StoreSpec, write_store
 
@@ -36,13 +38,13 @@ def tables_of(question: Question) -> Tables | None:
 def test_the_summary_has_a_line_per_layer_and_an_interval(store):
     analysis = analyse(question_about(store))
     assert analysis.contributions is not None
-    section = contributions_section(analysis.contributions, seed=0)
+    section = contributions_section(analysis.contributions, estimand=Estimand.TASKS_LIKE_THESE)
     assert section in analysis.summary
     lines = [line.split() for line in section.splitlines()]
     assert [line[0] for line in lines if line and line[0] in ("0", "2", "layers_avg")] == ["0", "2", "layers_avg"]
     assert all("[" in " ".join(line) for line in lines if line and line[0] in ("0", "2", "layers_avg"))
     assert max(map(len, section.splitlines())) <= 100
-    for name in ("of means", "geom.", "uniform", "lift"):
+    for name in ("ratio", "of means", "uniform", "lift"):
         assert name in section
 
 
@@ -71,21 +73,23 @@ def test_a_block_that_is_named_twice_counts_once_in_the_average_over_layers(tmp_
     assert tables is not None
     table = flat(tables)
     assert table["layer"].unique().sort().to_list() == [0, 2, 4]
-    text = group_contributions_section(tables, question.grouping, "joint", seed=0)
+    text = group_contributions_section(tables, question.grouping, "joint", estimand=Estimand.TASKS_LIKE_THESE)
     lines = {line.split()[0]: line.split() for line in text.splitlines() if line[:1].strip()}
     means = {layer: table.filter(layer=layer)["images_norm"].mean() for layer in (0, 2)}
     # Episodes have as many replans each, so that the mean over episodes is that over rows.
     assert float(lines["layers_avg"][1]) == pytest.approx((means[0] + means[2]) / 2, rel=1e-3)
     assert lines["4"][1] == lines["0"][1]
-    ratios = {layer: table.filter(layer=layer)["contribution_ratio"].mean() for layer in (0, 2)}
-    assert float(lines["layers_avg"][3]) == pytest.approx((ratios[0] + ratios[2]) / 2, rel=1e-3)
+    ratios = {layer: table.filter(layer=layer)["contribution_ratio"].log().mean() for layer in (0, 2)}
+    assert float(lines["layers_avg"][3]) == pytest.approx(np.exp((ratios[0] + ratios[2]) / 2), rel=1e-3)
     assert "Not of bowl" in text
     assert max(map(len, text.splitlines())) <= 100
 
 
 def test_a_group_without_keys_is_named_and_has_no_column(store):
     grouping = grouping_of(images=("role:image",), nothing=("span:right_wrist_0_rgb & role:image",))
-    text = group_contributions_section(tables_of(question_about(store, grouping)), grouping, "joint", seed=0)
+    text = group_contributions_section(
+        tables_of(question_about(store, grouping)), grouping, "joint", estimand=Estimand.TASKS_LIKE_THESE
+    )
     assert "The keys of nothing add exactly nothing." in text
     assert "|images|" in text
     assert "|nothing|" not in text
@@ -94,5 +98,5 @@ def test_a_group_without_keys_is_named_and_has_no_column(store):
 def test_when_every_group_is_cut_the_summary_says_why(store):
     question = question_about(store, grouping_of(word=("word:the",)))
     assert tables_of(question) is None
-    text = group_contributions_section(None, question.grouping, "joint", seed=0)
+    text = group_contributions_section(None, question.grouping, "joint", estimand=Estimand.TASKS_LIKE_THESE)
     assert "Not of word: contributions are stored for whole segments" in text

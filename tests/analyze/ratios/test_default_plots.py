@@ -60,7 +60,7 @@ def test_every_picture_of_every_case_is_drawn_without_a_warning(case, tmp_path):
     steps, grouping = CASES[case]()
     replans = replans_of(steps, grouping)
     episodes = episode_tables(replans, grouping)
-    tasks = task_tables(episodes, grouping, num_resamples=50)
+    tasks = task_tables(episodes, grouping)
     with warnings.catch_warnings():
         # Layout that does not fit, missing glyphs and empty limits are warnings of matplotlib.
         warnings.simplefilter("error")
@@ -127,7 +127,7 @@ def test_importing_analyze_and_its_plots_does_not_import_matplotlib():
         "measures.aggregate",
         "ratios.summary_text",
         "published.results_writer",
-        "statistics.bootstrap",
+        "statistics.intervals",
         "show.plot_style",
     ]
     modules += [f"ratios.plot_{name}" for name in ("ratio_distribution", "ratio_per_task", "ratio_evolution")]

@@ -17,11 +17,13 @@ from vla_attention.testing.stores import StoreSpec, write_store
 
 def row_of(mean: float | None, low: float | None, high: float | None, uniform: float | None = 40.0) -> dict[str, Any]:
     """A row of the tasks table; the lift is the ratio over the uniform one."""
-    values = {"ratio_mean": mean, "ratio_mean_low": low, "ratio_mean_high": high, "uniform_ratio": uniform}
-    ends = ("ratio_mean", "ratio_mean_low", "ratio_mean_high")
+    values = {"geometric_mean": mean, "geometric_mean_low": low, "geometric_mean_high": high, "uniform_ratio": uniform}
+    ends = ("geometric_mean", "geometric_mean_low", "geometric_mean_high")
     known = uniform is not None
     lifts = {
-        name.replace("mean", "lift"): None if values[name] is None or not known else values[name] / uniform
+        name.replace("geometric_mean", "ratio_lift"): None
+        if values[name] is None or not known
+        else values[name] / uniform
         for name in ends
     }
     return values | lifts

@@ -47,8 +47,8 @@ def test_the_warning_of_untrained_weights_comes_before_every_number():
 
 def test_notes_and_the_level_of_intervals():
     assert note_lines(["first", "second"]) == ["note: first", "note: second"]
-    assert interval_note(0.95).startswith("Intervals: 95%, two-level bootstrap")
-    assert interval_note(0.9, "pointwise").startswith("Intervals: 90%, pointwise, two-level bootstrap")
+    assert interval_note(0.95, "tasks like these").startswith("Intervals: 95%, about tasks like these")
+    assert interval_note(0.9, "these tasks", "pointwise").startswith("Intervals: 90%, pointwise, about these tasks")
 
 
 def test_a_table_is_aligned_and_counts_tasks_where_there_are_several():

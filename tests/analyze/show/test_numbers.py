@@ -42,7 +42,6 @@ def test_percent(share, decimals, text):
 
 def test_the_name_of_an_interval_has_its_level():
     assert interval_name(0.95) == "95% interval"
-    assert interval_name(0.9, "bootstrap") == "90% bootstrap interval"
     assert interval_name(0.995) == "99.5% interval"
 
 

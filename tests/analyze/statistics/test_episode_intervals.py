@@ -7,8 +7,8 @@ import polars as pl
 import pytest
 import scipy.stats
 
-from vla_attention.analyze.statistics.bootstrap import POSITIVE, bootstrap_interval, mean_over_episodes
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
+from vla_attention.analyze.statistics.intervals import POSITIVE, Estimand, estimates, mean_over_episodes
 
 
 def table_of(values: dict[tuple[str, int], list[float | None]]) -> pl.DataFrame:
@@ -26,19 +26,22 @@ def test_a_thing_is_about_the_episodes_that_have_it():
     values = {("a", task): list(generator.gamma(4, size=3)) for task in range(4)} | {
         ("b", 2): list(generator.gamma(4, size=5))
     }
-    found = means_with_intervals(table_of(values), ["thing"], {"value": POSITIVE}, seed=3)
+    found = means_with_intervals(
+        table_of(values), ["thing"], {"value": POSITIVE}, Estimand.THESE_TASKS, nulls={"value": 4.0}
+    )
     assert found["thing"].to_list() == ["a", "b"]
     assert found.select("num_episodes", "num_tasks").rows() == [(12, 4), (5, 1)]
     for row, thing in zip(found.iter_rows(named=True), ("a", "b"), strict=True):
         own = [(task, value) for (name, task), several in values.items() if name == thing for value in several]
         sample = [value for _, value in own]
         assert row["value"] == pytest.approx(np.mean(sample))
-        interval = bootstrap_interval(mean_over_episodes(sample, POSITIVE), [f"s\t{task}" for task, _ in own], seed=3)
-        assert interval is not None
+        estimate = estimates([mean_over_episodes(sample, POSITIVE)], [t for t, _ in own], Estimand.THESE_TASKS)[0]
+        interval = estimate.interval()
         assert (row["value_low"], row["value_high"]) == pytest.approx((interval.low, interval.high))
+        assert row["value_p"] == estimate.p_value(4.0)
 
 
-def test_the_interval_of_one_task_is_near_the_bootstrap_of_scipy():
+def test_the_interval_of_many_episodes_of_one_task_is_near_the_bootstrap_of_scipy():
     sample = np.random.default_rng(1).gamma(9, size=60)
     row = means_with_intervals(table_of({("a", 0): list(sample)}), ["thing"], {"value": POSITIVE}).row(0, named=True)
     theirs = scipy.stats.bootstrap((sample,), np.mean, method="percentile", rng=0).confidence_interval

@@ -9,8 +9,15 @@ from scipy import stats
 
 from tests.kit.made_up_steps import default_grouping, make_steps, replans_of
 from vla_attention.analyze.statistics.autocorrelation import autocorrelation_table, autocovariances, effective_count
-from vla_attention.analyze.statistics.bootstrap import resample_episodes
-from vla_attention.analyze.statistics.effect_sizes import cliffs_delta, contrast, contrast_row, hedges_g
+from vla_attention.analyze.statistics.effect_sizes import (
+    cliffs_delta,
+    contrast,
+    contrast_row,
+    hedges_g,
+    mean_difference,
+    standardised_mean,
+)
+from vla_attention.analyze.statistics.intervals import Estimand
 
 GENERATOR = np.random.default_rng(8)
 FIRST, SECOND = GENERATOR.normal(1.0, 0.5, 12), GENERATOR.normal(0.4, 0.5, 9)
@@ -48,66 +55,115 @@ def test_effect_sizes_do_not_depend_on_unit_or_origin(first, second):
     assert hedges_g(3 * first + 7, 3 * second + 7) == pytest.approx(plain, rel=1e-6, abs=1e-6)
 
 
-def test_the_whole_contrast_agrees_with_scipy_and_plain_loops():
+@pytest.mark.parametrize("estimand", Estimand)
+def test_the_contrast_of_one_task_agrees_with_scipy(estimand):
     values, is_first = both(FIRST, SECOND)
-    found = contrast(values, is_first, resample_episodes(np.zeros(len(values)), 20000))
+    found = contrast(values, is_first, np.zeros(len(values)), estimand)
     assert (found.num_first, found.num_second) == (12, 9)
-    assert found.difference == pytest.approx(FIRST.mean() - SECOND.mean())
-    assert found.within_tasks == pytest.approx(found.difference)  # one task
-    assert found.hedges_g == pytest.approx(hedges_g(FIRST, SECOND))
-    assert found.cliffs_delta == pytest.approx(cliffs_delta(FIRST, SECOND))
-    # Our resamples draw from all episodes, scipy's from each class: the same to a few hundredths, but for our widening.
-    theirs = stats.bootstrap(
-        (FIRST, SECOND),
-        lambda x, y, axis: x.mean(axis=axis) - y.mean(axis=axis),
-        n_resamples=20000,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    ).confidence_interval
-    factor = stats.t.ppf(0.975, 8) / stats.norm.ppf(0.975) * np.sqrt(9 / 8)
-    expected = [found.difference + factor * (end - found.difference) for end in theirs]
-    assert (found.difference_interval.low, found.difference_interval.high) == pytest.approx(expected, abs=0.08)
+    assert found.difference.value == pytest.approx(FIRST.mean() - SECOND.mean())
+    assert found.within_tasks == found.difference
+    assert mean_difference(values, is_first, np.zeros(len(values)), estimand) == found.difference
+    assert found.hedges_g.value == pytest.approx(hedges_g(FIRST, SECOND))
+    assert found.cliffs_delta.value == pytest.approx(cliffs_delta(FIRST, SECOND))
+    welch = stats.ttest_ind(FIRST, SECOND, equal_var=False)
+    assert found.difference.degrees == pytest.approx(welch.df, abs=2)
+    interval, theirs = found.difference.interval(), welch.confidence_interval()
+    assert (interval.low, interval.high) == pytest.approx((theirs.low, theirs.high), rel=0.03)
 
 
-def test_resampled_effect_sizes_are_those_of_the_drawn_episodes():
+def test_a_contrast_over_common_tasks_is_the_paired_t_test_over_task_means():
+    generator = np.random.default_rng(7)
+    tasks = np.repeat(np.arange(8), 6)
+    is_first = np.tile([True, True, True, True, False, False], 8)
+    values = generator.normal(0, 2.0, 8)[tasks] + 0.3 * is_first + generator.normal(0, 0.4, 48)
+    gaps = [values[(tasks == t) & is_first].mean() - values[(tasks == t) & ~is_first].mean() for t in range(8)]
+    found = contrast(values, is_first, tasks)
+    for estimate in (found.difference, found.within_tasks):
+        assert estimate.p_value(0.0) == pytest.approx(stats.ttest_1samp(gaps, 0.0).pvalue)
+        interval = estimate.interval()
+        expected = stats.t.interval(0.95, 7, np.mean(gaps), stats.sem(gaps))
+        assert (interval.low, interval.high) == pytest.approx(expected)
+
+
+def test_a_contrast_of_different_tasks_is_the_t_test_between_their_means():
+    generator = np.random.default_rng(7)
+    tasks = np.repeat(np.arange(12), 4)
+    is_first = tasks < 5
+    values = generator.normal(0, 1.0, 12)[tasks] + generator.normal(0, 0.4, 48)
+    means = np.array([values[tasks == task].mean() for task in range(12)])
+    found = contrast(values, is_first, tasks)
+    welch = stats.ttest_ind(means[:5], means[5:], equal_var=False)
+    assert found.difference.value == pytest.approx(means[:5].mean() - means[5:].mean())
+    assert found.difference.error == pytest.approx(found.difference.value / welch.statistic)
+    assert found.within_tasks.value is None
+
+
+def test_effect_sizes_have_the_jackknifes_standard_error():
     values, is_first = both(FIRST, SECOND)
-    tasks = np.arange(len(values)) % 4
-    resamples = resample_episodes(tasks, 300, seed=2)
-    found = contrast(values, is_first, resamples, level=0.9)
-    g, delta, difference, within = [], [], [], []
-    for counts in resamples.counts.astype(int):
-        drawn = np.repeat(np.arange(len(values)), counts)
-        x, y = values[drawn[is_first[drawn]]], values[drawn[~is_first[drawn]]]
-        g.append(hedges_g(x, y))
-        delta.append(cliffs_delta(x, y))
-        difference.append(x.mean() - y.mean())
-        # The coefficient of the class in a linear model with a constant per task.
-        design = np.stack([is_first[drawn], *(tasks[drawn] == task for task in np.unique(tasks[drawn]))], axis=1)
-        within.append(np.linalg.lstsq(design.astype(float), values[drawn], rcond=None)[0][0])
-    factor = stats.t.ppf(0.95, 3) / stats.norm.ppf(0.95) * np.sqrt(4 / 3)
-    for name, drawn in (("difference", difference), ("hedges_g", g), ("within_tasks", within)):
-        value, interval = getattr(found, name), getattr(found, f"{name}_interval")
-        low, high = np.quantile(np.array(drawn, dtype=float), [0.05, 0.95])
-        assert interval.low == pytest.approx(value + factor * (low - value)), name
-        assert interval.high == pytest.approx(value + factor * (high - value)), name
-    odds = lambda x: np.log((1 + x) / (1 - x))  # noqa: E731
-    low, high = odds(np.quantile(delta, [0.05, 0.95]))
-    centre = odds(found.cliffs_delta)
-    assert odds(found.cliffs_delta_interval.low) == pytest.approx(centre + factor * (low - centre))
-    assert odds(found.cliffs_delta_interval.high) == pytest.approx(centre + factor * (high - centre))
+    found = contrast(values, is_first, np.zeros(len(values)))
+    for size, estimate in ((hedges_g, found.hedges_g), (cliffs_delta, found.cliffs_delta)):
+        variance = 0.0
+        for member, other in ((FIRST, SECOND), (SECOND, FIRST)):
+            # One episode less changes the correction for small samples; the weights keep it.
+            n, m = len(member), len(other)
+            keep = (1 - 3 / (4 * (n + m - 2) - 1)) / (1 - 3 / (4 * (n + m - 3) - 1)) if size is hedges_g else 1.0
+            left_out = [keep * size(np.delete(member, i), other) for i in range(n)]
+            variance += (n - 1) / n * ((left_out - np.mean(left_out)) ** 2).sum()
+        slope = 1.0 if size is hedges_g else 2 / (1 - estimate.value**2)
+        assert estimate.error == pytest.approx(slope * np.sqrt(variance), rel=0.02)
+        interval = estimate.interval()
+        assert interval.low < estimate.value < interval.high
+    assert -1 < found.cliffs_delta.interval().low < found.cliffs_delta.interval().high < 1
+
+
+@pytest.mark.parametrize("sizes", [(2, 2), (4, 9)])
+def test_effect_sizes_of_few_episodes_have_no_interval(sizes):
+    """Two against two episodes had an interval of width zero, and a third of null samples excluded 0."""
+    generator = np.random.default_rng(0)
+    for _ in range(50):
+        values, is_first = both(generator.normal(size=sizes[0]), generator.normal(size=sizes[1]))
+        found = contrast(values, is_first, np.zeros(len(values)))
+        assert found.cliffs_delta.interval() is found.hedges_g.interval() is None
+    row = contrast_row(found, "success", "failure")
+    assert row["cliffs_delta"] is not None
+    assert row["cliffs_delta_low"] is row["cliffs_delta_high"] is None
+
+
+@pytest.mark.parametrize("sizes", [(5, 5), (6, 20)])
+def test_null_samples_seldom_exclude_zero(sizes):
+    generator = np.random.default_rng(1)
+    excluded = {"difference": 0, "hedges_g": 0, "cliffs_delta": 0}
+    for _ in range(400):
+        values, is_first = both(generator.normal(size=sizes[0]), generator.normal(size=sizes[1]))
+        found = contrast(values, is_first, np.zeros(len(values)))
+        for name in excluded:
+            interval = getattr(found, name).interval()
+            excluded[name] += interval is not None and not interval.low <= 0 <= interval.high
+    assert all(count / 400 <= 0.083 for count in excluded.values()), excluded  # 5 % and three standard errors
+
+
+def test_the_standardised_mean_of_pairs_is_cohens_d_z_corrected():
+    differences = FIRST
+    found = standardised_mean(differences, np.zeros(12))
+    assert found.value == pytest.approx((1 - 3 / (4 * 11 - 1)) * differences.mean() / differences.std(ddof=1))
+    interval = found.interval()
+    assert interval.low < found.value < interval.high
+    assert standardised_mean(FIRST[:4], np.zeros(4)).value is None
+    assert standardised_mean(np.ones(9), np.zeros(9)).value is None
 
 
 def test_a_difference_between_tasks_is_not_one_within_tasks():
-    """Easy tasks have high values and are solved; inside tasks success changes nothing."""
+    """Easy tasks have high values, and three of the four are always solved; inside tasks success changes nothing."""
     generator = np.random.default_rng(1)
     tasks = np.repeat(np.arange(8), 20)
     easy = tasks < 4
-    solved = generator.random(len(tasks)) < np.where(easy, 0.9, 0.1)
+    solved = np.where(tasks % 4 < 3, easy, generator.random(len(tasks)) < 0.5)
     values = 2.0 * easy + generator.normal(0, 0.2, len(tasks))
-    found = contrast(values, solved, resample_episodes(tasks))
-    assert found.difference > 1.2
-    assert abs(found.within_tasks) < 0.15
-    assert found.within_tasks_interval.low < 0 < found.within_tasks_interval.high
+    found = contrast(values, solved, tasks)
+    assert found.difference.value > 0.8
+    assert found.num_tasks_with_both == 2
+    assert abs(found.within_tasks.value) < 0.15
+    assert found.within_tasks.interval().low < 0 < found.within_tasks.interval().high
 
 
 def test_a_planted_effect_is_found_inside_tasks():
@@ -115,9 +171,9 @@ def test_a_planted_effect_is_found_inside_tasks():
     tasks = np.repeat(np.arange(10), 12)
     solved = generator.random(len(tasks)) < 0.5
     values = generator.normal(0, 1.0, 10)[tasks] + 0.5 * solved + generator.normal(0, 0.3, len(tasks))
-    found = contrast(values, solved, resample_episodes(tasks))
-    assert found.within_tasks_interval.low < 0.5 < found.within_tasks_interval.high
-    assert found.within_tasks_interval.low > 0.2
+    found = contrast(values, solved, tasks)
+    assert found.within_tasks.interval().low < 0.5 < found.within_tasks.interval().high
+    assert found.within_tasks.interval().low > 0.2
 
 
 @pytest.mark.parametrize(
@@ -125,7 +181,7 @@ def test_a_planted_effect_is_found_inside_tasks():
 )
 def test_classes_of_none_or_one_are_said_and_not_computed(solved, said):
     values = np.arange(6.0)
-    found = contrast(values, np.arange(6) < solved, resample_episodes(np.zeros(6), 50))
+    found = contrast(values, np.arange(6) < solved, np.zeros(6))
     row = contrast_row(found, "success", "failure")
     assert said in row["note"]
     assert row["difference"] is row["hedges_g"] is row["cliffs_delta"] is row["difference_low"] is None
@@ -134,13 +190,13 @@ def test_classes_of_none_or_one_are_said_and_not_computed(solved, said):
 
 def test_values_that_are_not_finite_leave_the_class_they_are_in():
     values = np.array([1.0, np.inf, 2.0, 5.0, np.nan, 6.0])
-    found = contrast(values, np.array([True, True, True, False, False, False]), resample_episodes(np.zeros(6), 200))
-    assert (found.num_first, found.num_second, found.difference) == (2, 2, -4.0)
+    found = contrast(values, np.array([True, True, True, False, False, False]), np.zeros(6))
+    assert (found.num_first, found.num_second, found.difference.value) == (2, 2, -4.0)
 
 
 def test_tasks_with_one_outcome_each_have_no_difference_within():
-    found = contrast(np.arange(6.0), np.arange(6) < 3, resample_episodes(np.repeat([0, 1], 3), 200))
-    assert found.within_tasks is found.within_tasks_interval is None
+    found = contrast(np.arange(6.0), np.arange(6) < 3, np.repeat([0, 1], 3))
+    assert found.within_tasks.value is found.within_tasks.interval() is None
     assert found.num_tasks_with_both == 0
     assert "between tasks" in found.note
 

@@ -13,7 +13,7 @@ from tests.kit.bowl_scene import bowl_tokens, write_bowl_store
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.words.word_reading import words_table
-from vla_attention.analyze.words.word_study import strongest_readers, words_summary
+from vla_attention.analyze.words.word_study import leading_words, words_summary
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
 from vla_attention.testing.stores import write_store
@@ -104,9 +104,12 @@ def test_classes_add_up_to_their_words(reader_store):
 
 def test_a_planted_reader_is_found_and_named(reader_store):
     table = words_table(question_about(reader_store, per_head=True))
-    best = strongest_readers(table).row(0, named=True)
-    assert (best["item"], best["layer"], best["head"], best["num_episodes"]) == ("bowl", "3", 1, 4)
-    assert best["lift"] > 15
+    (word, leading), (cell, leading_cell) = leading_words(table)
+    assert word == {"item": "bowl"}
+    assert cell == {"item": "bowl", "layer": "3", "head": 1}
+    assert leading_cell.value > 15
+    assert leading.is_named(2)
+    assert leading_cell.is_named(2)
     summary = words_summary(table)
     first = summary.row(0, named=True)
     assert first["item"] == "bowl"
@@ -148,7 +151,11 @@ def test_words_of_several_tasks_are_averaged_over_the_episodes_that_have_them(tm
 def test_the_command_prints_writes_and_draws(reader_store, tmp_path, capsys):
     assert main(["words", str(reader_store), "--output", str(tmp_path), "--per-head"]) == 0
     printed = capsys.readouterr().out
-    assert "Read most, by layer: 'bowl' in layer 3 head 1" in printed
+    words = " ".join(printed.split())
+    assert "'bowl' has a higher lift (3.627) than each of the other 5 words" in words
+    assert (
+        "'bowl' in layer 3 head 1 has a higher lift (16.79) than each of the other 35 pairs of word and layer" in words
+    )
     assert "stop words" in printed
     assert all(len(line) <= 100 for line in printed.splitlines() if str(tmp_path) not in line)
     assert {path.name for path in tmp_path.iterdir()} == {

@@ -1,0 +1,278 @@
+"""Means over episodes and tasks, with intervals. Pure numpy functions on arrays, no draws, no tables and no I/O.
+
+Replans of one episode follow each other within a second and are strongly correlated. The episode is therefore the unit:
+every function here takes one value (or one pair of values) per episode. Episodes of one task share their instruction
+and their scene, so a mean is the mean over tasks of the tasks' means: every task weighs the same.
+
+An interval is about one of two things (`Estimand`):
+
+    tasks like these   the mean over a population of tasks of which the store's tasks are a sample. The units are the
+                       tasks, each with its mean: t = (mean - truth) / (s / sqrt(T)) has T - 1 degrees of freedom.
+                       Episodes vary inside the tasks' means already. To count them once more, as a bootstrap of
+                       tasks and then of episodes does, makes the interval too wide (Field & Welsh 2007, "Bootstrapping
+                       clustered data", Journal of the Royal Statistical Society B 69).
+    these tasks        the mean over exactly these tasks, with endless episodes of each. Tasks are strata: the variance
+                       is the sum over tasks of s_t^2 / n_t, divided by T^2, with the degrees of freedom of Welch 1947
+                       (Biometrika 34; the approximation with n_t + 1 and - 2, which is unbiased for equal variances).
+
+With one task both are the same: t over its episodes. A quotient of two means is linearised (delta method), which for
+these units is the infinitesimal jackknife (Efron & Tibshirani 1993, "An introduction to the bootstrap", chapter 11).
+The interval is symmetric on a scale on which the quantity has no limits: the logarithm for masses and ratios, the
+log odds for fractions. `benchmarks/interval_coverage.py` measures the coverage.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vla_attention.analyze.statistics.student import student_quantile, two_sided_p
+
+DEFAULT_LEVEL = 0.95
+#: Natural limits of a quantity, for `mean_over_episodes`. An interval never leaves them.
+NO_LIMITS = (-np.inf, np.inf)
+POSITIVE = (0.0, np.inf)
+SHARE = (0.0, 1.0)
+#: A spread below this share of the values is rounding. Values without spread have no interval.
+_ROUNDING = 1e-12
+
+
+class Estimand(StrEnum):
+    """What an interval over several tasks is about; see the module."""
+
+    TASKS_LIKE_THESE = "tasks-like-these"
+    THESE_TASKS = "these-tasks"
+
+    @property
+    def words(self) -> str:
+        """The name in running text."""
+        return self.value.replace("-", " ")
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Both ends of an interval."""
+
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class EpisodeStatistic:
+    """A statistic over episodes: g(mean of `numerator` / mean of `denominator`), both means over tasks of task means.
+
+    Attributes:
+        numerator: (episode,) float64.
+        denominator: (episode,) float64; 1 for a plain mean.
+        used: (episode,) bool, which episodes are used.
+        exponentiate: g is exp (geometric mean) instead of the identity.
+        limits: natural limits of the quotient before g: `NO_LIMITS`, `POSITIVE`, `SHARE`.
+    """
+
+    numerator: NDArray[np.float64]
+    denominator: NDArray[np.float64]
+    used: NDArray[np.bool_]
+    exponentiate: bool = False
+    limits: tuple[float, float] = NO_LIMITS
+
+    @property
+    def num_left_out(self) -> int:
+        """Number of episodes that have no finite value and are not used."""
+        return int((~self.used).sum())
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value with its standard error on a scale without limits.
+
+    Attributes:
+        value: the statistic; +inf for a positive mean over zero, None when it is undefined.
+        error: standard error of `on_scale(value)`, None where there is none: fewer than two units, no spread between
+            them, or a value on a limit.
+        degrees: degrees of freedom of the error, rounded down.
+        limits, exponentiate: as in `EpisodeStatistic`.
+    """
+
+    value: float | None
+    error: float | None = None
+    degrees: int = 0
+    limits: tuple[float, float] = NO_LIMITS
+    exponentiate: bool = False
+
+    def interval(self, level: float = DEFAULT_LEVEL) -> Interval | None:
+        """The interval of this level, None without a standard error."""
+        if self.error is None or self.value is None:
+            return None
+        centre, reach = self._on_scale(self.value), student_quantile(level, self.degrees) * self.error
+        return Interval(self._from_scale(centre - reach), self._from_scale(centre + reach))
+
+    def p_value(self, null: float) -> float | None:
+        """Two-sided p of the hypothesis that the truth is `null` (inside the limits); None without a standard error."""
+        if self.error is None or self.value is None:
+            return None
+        return two_sided_p((self._on_scale(self.value) - self._on_scale(null)) / self.error, self.degrees)
+
+    def _on_scale(self, value: float) -> float:
+        return to_scale(math.log(value) if self.exponentiate else value, self.limits)[0]
+
+    def _from_scale(self, place: float) -> float:
+        value = _from_scale(place, self.limits)
+        return _exp(value) if self.exponentiate else value
+
+
+#: No value at all.
+UNKNOWN = Estimate(None)
+
+
+def mean_over_episodes(values: ArrayLike, limits: tuple[float, float] = NO_LIMITS) -> EpisodeStatistic:
+    """Mean of one value per episode, shape (episode,); episodes whose value is not finite are left out and counted.
+
+    `limits`: `POSITIVE` for masses and ratios, `SHARE` for fractions; an interval never contains impossible values.
+    """
+    sample = np.asarray(values, dtype=np.float64)
+    used = np.isfinite(sample)
+    return EpisodeStatistic(np.where(used, sample, 0.0), used.astype(np.float64), used, limits=limits)
+
+
+def ratio_of_means_over_episodes(numerator: ArrayLike, denominator: ArrayLike) -> EpisodeStatistic:
+    """Mean numerator mass / mean denominator mass, both (episode,). It uses episodes with an infinite ratio."""
+    above, below = np.asarray(numerator, dtype=np.float64), np.asarray(denominator, dtype=np.float64)
+    used = np.isfinite(above) & np.isfinite(below)
+    return EpisodeStatistic(np.where(used, above, 0.0), np.where(used, below, 0.0), used, limits=POSITIVE)
+
+
+def geometric_mean_over_episodes(log_means: ArrayLike) -> EpisodeStatistic:
+    """exp of the mean over episodes of each episode's mean log ratio (natural logarithm), shape (episode,)."""
+    mean = mean_over_episodes(log_means)
+    return EpisodeStatistic(mean.numerator, mean.denominator, mean.used, exponentiate=True)
+
+
+def estimates(
+    statistics: Sequence[EpisodeStatistic], tasks: ArrayLike, estimand: Estimand = Estimand.TASKS_LIKE_THESE
+) -> list[Estimate]:
+    """Values and standard errors of several statistics over the same episodes.
+
+    Args:
+        statistics: over the same episodes.
+        tasks: (episode,) labels of the episodes' tasks.
+        estimand: what the intervals are about. Each task counts with the episodes that the statistic uses; for
+            `THESE_TASKS` every task needs two of them.
+    """
+    if not statistics:
+        return []
+    task_of = np.unique(np.asarray(tasks), return_inverse=True)[1]
+    member = (task_of[:, None] == np.arange(task_of.max() + 1)).astype(np.float64)  # (episode, task)
+    used = np.stack([statistic.used for statistic in statistics]).astype(np.float64)  # (statistic, episode)
+    above = np.stack([statistic.numerator for statistic in statistics]) * used
+    below = np.stack([statistic.denominator for statistic in statistics]) * used
+    size = used @ member  # (statistic, task)
+    num_tasks = (size > 0).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        task_above, task_below = (np.where(size > 0, (part @ member) / size, 0.0) for part in (above, below))
+        mean_above, mean_below = (part.sum(axis=1) / num_tasks for part in (task_above, task_below))
+        quotient = mean_above / mean_below
+        # One episode's, and one task's, share in the deviation of the quotient from its truth, to first order.
+        by_episode = (above - quotient[:, None] * below) / mean_below[:, None]
+        by_task = (task_above - quotient[:, None] * task_below) / mean_below[:, None]
+        between = (by_task**2 * (size > 0)).sum(axis=1) / (num_tasks - 1) / num_tasks
+        inside = (((by_episode - by_task[:, task_of]) ** 2 * used) @ member) / (size - 1) / size
+        of_task = np.where(size > 0, inside, 0.0) / num_tasks[:, None] ** 2
+        in_strata, welch = of_task.sum(axis=1), welch_degrees(of_task, np.maximum(size - 1, 0.0))
+    found = []
+    for i, statistic in enumerate(statistics):
+        clusters = estimand == Estimand.TASKS_LIKE_THESE and num_tasks[i] > 1
+        variance, degrees = (between[i], float(num_tasks[i] - 1)) if clusters else (in_strata[i], welch[i])
+        scale = float(np.abs(above[i]).max(initial=0.0) / mean_below[i]) if mean_below[i] else 0.0
+        found.append(_estimate(float(quotient[i]), float(variance), degrees, scale, statistic))
+    return found
+
+
+def quotient_by_episode(numerator: ArrayLike, denominator: ArrayLike, tasks: ArrayLike) -> NDArray[np.float64]:
+    """One value per episode, whose mean over tasks is the quotient of means, with the quotient's variance (episode,).
+
+    quotient + (numerator - quotient * denominator) / mean denominator: the quotient to first order. It makes quotients
+    of different items comparable episode by episode.
+    """
+    above, below = np.asarray(numerator, dtype=np.float64), np.asarray(denominator, dtype=np.float64)
+    quotient, mean_below = (
+        one.value for one in estimates([ratio_of_means_over_episodes(above, below), mean_over_episodes(below)], tasks)
+    )
+    if quotient is None or not mean_below:
+        return np.full(len(above), np.nan)
+    return quotient + (above - quotient * below) / mean_below
+
+
+def welch_degrees(variances: NDArray[np.float64], degrees: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Degrees of freedom of a sum of independent variances (..., part) with `degrees` (..., part) each (Welch 1947).
+
+    (sum v)^2 / sum(v^2 / (d + 2)) - 2, at least the smallest and at most the sum of the parts' degrees; parts without
+    degrees count nothing.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        raw = variances.sum(axis=-1) ** 2 / (variances**2 / (degrees + 2)).sum(axis=-1) - 2
+    known = degrees > 0
+    fewest = np.where(known, degrees, np.inf).min(axis=-1)
+    clipped: NDArray[np.float64] = np.clip(raw, fewest, np.where(known, degrees, 0.0).sum(axis=-1))
+    return clipped
+
+
+def _estimate(quotient: float, variance: float, degrees: float, size: float, statistic: EpisodeStatistic) -> Estimate:
+    value = None if math.isnan(quotient) else _exp(quotient) if statistic.exponentiate else quotient
+    low, high = statistic.limits
+    spread = math.isfinite(variance) and variance > (_ROUNDING * size) ** 2 and low < quotient < high
+    if value is None or not spread or not degrees >= 1:
+        return Estimate(value)
+    _, slope = to_scale(quotient, statistic.limits)
+    return Estimate(value, slope * math.sqrt(variance), int(degrees), statistic.limits, statistic.exponentiate)
+
+
+def to_scale(value: float, limits: tuple[float, float]) -> tuple[float, float]:
+    """`value` on a scale without limits, and the slope there: log(x - low), log odds, or x itself without limits."""
+    low, high = limits
+    if math.isinf(low) and math.isinf(high):
+        return value, 1.0
+    if math.isinf(high):
+        return math.log(value - low), 1.0 / (value - low)
+    return math.log((value - low) / (high - value)), 1.0 / (value - low) + 1.0 / (high - value)
+
+
+def _from_scale(place: float, limits: tuple[float, float]) -> float:
+    low, high = limits
+    if math.isinf(low) and math.isinf(high):
+        return place
+    if math.isinf(high):
+        return low + _exp(place)
+    return low + (high - low) / (1.0 + _exp(-place))
+
+
+def _exp(value: float) -> float:
+    return math.exp(value) if value < 709.0 else math.inf
+
+
+def values_with_intervals(
+    statistics: Mapping[str, EpisodeStatistic],
+    tasks: ArrayLike,
+    estimand: Estimand = Estimand.TASKS_LIKE_THESE,
+    level: float = DEFAULT_LEVEL,
+) -> dict[str, float | None]:
+    """Columns `X`, `X_low`, `X_high` of a table row for every statistic X; None without a value or an interval."""
+    row: dict[str, float | None] = {}
+    for name, estimate in zip(statistics, estimates(list(statistics.values()), tasks, estimand), strict=True):
+        row |= named_interval(name, estimate.value, estimate.interval(level))
+    return row
+
+
+def named_interval(name: str, value: float | None, interval: Interval | None) -> dict[str, float | None]:
+    """Columns `name`, `name_low`, `name_high` of a table row; None without an interval."""
+    low, high = ends(interval)
+    return {name: value, f"{name}_low": low, f"{name}_high": high}
+
+
+def ends(interval: Interval | None) -> tuple[float | None, float | None]:
+    """Both ends of an interval; None twice without one."""
+    return (None, None) if interval is None else (interval.low, interval.high)

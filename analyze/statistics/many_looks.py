@@ -1,0 +1,129 @@
+"""What may be said after many looks: adjusted p-values, and when one of many items leads. Pure functions.
+
+The largest of many estimates is large by selection too: among ten words that are read alike, one is always first. Two
+tools answer this. `adjusted_p_values` bounds the expected share of false findings among those that are named
+(Benjamini & Hochberg 1995, Journal of the Royal Statistical Society B 57). `leader` names an item only if it is above
+every other one, each difference taken by itself; that the item was chosen by looking does not raise the rate of false
+names above the level (Gutmann & Maymin 1987, "Is the selected population the best?", Annals of Statistics 15).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import ArrayLike, NDArray
+
+from vla_attention.analyze.statistics.effect_sizes import mean_difference
+from vla_attention.analyze.statistics.intervals import Estimand, Estimate, estimates, mean_over_episodes
+
+#: What identifies an episode in a table.
+EPISODE_COLUMNS = ("suite", "task_id", "episode_index")
+#: A name is printed when its p-value is at most this, divided by the number of names that a text could print.
+NAMED_AT = 0.05
+
+
+def adjusted_p_values(p_values: Sequence[float | None]) -> list[float | None]:
+    """Benjamini-Hochberg q of every p (None stays None and does not count as a look).
+
+    q_(i) = min over j >= i of p_(j) * n / j, with p sorted upwards. Naming all items with q <= 0.05 makes at most 5 %
+    of the named ones false on average, for independent and for positively dependent p-values.
+    """
+    known = [i for i, p in enumerate(p_values) if p is not None]
+    p = np.array([p_values[i] for i in known], dtype=np.float64)
+    order = np.argsort(p, kind="stable")
+    scaled = p[order] * len(p) / np.arange(1, len(p) + 1)
+    adjusted = np.minimum(np.minimum.accumulate(scaled[::-1])[::-1], 1.0)
+    found: list[float | None] = [None] * len(p_values)
+    for place, q in zip(order, adjusted, strict=True):
+        found[known[place]] = float(q)
+    return found
+
+
+@dataclass(frozen=True)
+class Leader:
+    """The item with the highest mean.
+
+    Attributes:
+        item: its number.
+        value: its mean over tasks.
+        p_value: the largest p of its differences to the other items; None where one has none.
+        num_items: how many items have a mean.
+    """
+
+    item: int
+    value: float
+    p_value: float | None
+    num_items: int
+
+    def is_named(self, num_names: int = 1) -> bool:
+        """Whether it may be called the first, in a text that could name `num_names` leaders (Bonferroni)."""
+        return self.p_value is not None and self.p_value <= NAMED_AT / num_names
+
+
+def leader(values: ArrayLike, tasks: ArrayLike, estimand: Estimand = Estimand.TASKS_LIKE_THESE) -> Leader | None:
+    """The item with the highest mean over tasks, and how surely it is above every other item.
+
+    Two items are compared within the episodes that have both; where there are none, between episodes.
+
+    Args:
+        values: (episode, item); not finite where an episode lacks the item.
+        tasks: (episode,) labels.
+        estimand: what the differences are about.
+
+    Returns:
+        None without two items that have a mean.
+    """
+    table, task_of = np.asarray(values, dtype=np.float64), np.asarray(tasks)
+    means = [one.value for one in estimates([mean_over_episodes(column) for column in table.T], task_of, estimand)]
+    known = [i for i, mean in enumerate(means) if mean is not None]
+    if len(known) < 2:
+        return None
+    highest = np.array([np.nan if mean is None else mean for mean in means])
+    first = int(np.nanargmax(highest))
+    others = [i for i in known if i != first]
+    gaps = table[:, [first]] - table[:, others]
+    paired = estimates([mean_over_episodes(gap) for gap in gaps.T], task_of, estimand)
+    p_values = [
+        _one_above(
+            gap if gap.value is not None else _between_episodes(table[:, first], table[:, other], task_of, estimand)
+        )
+        for gap, other in zip(paired, others, strict=True)
+    ]
+    missing = any(p is None for p in p_values)
+    p_value = None if missing else max(p for p in p_values if p is not None)
+    return Leader(first, float(highest[first]), p_value, len(known))
+
+
+def leader_of_table(
+    table: pl.DataFrame, item: Sequence[str], value: str, estimand: Estimand = Estimand.TASKS_LIKE_THESE
+) -> tuple[dict[str, Any], Leader] | None:
+    """`leader` of a table with one row per (episode, item): the leading item's columns `item`, and the leader."""
+    names = table.select(item).unique(maintain_order=True)
+    episodes = table.select(EPISODE_COLUMNS).unique(maintain_order=True)
+    place = names.with_row_index("_item")
+    wide = np.full((episodes.height, names.height), np.nan)
+    numbered = table.join(place, on=list(item), nulls_equal=True).join(
+        episodes.with_row_index("_episode"), on=list(EPISODE_COLUMNS)
+    )
+    wide[numbered["_episode"].to_numpy(), numbered["_item"].to_numpy()] = (
+        numbered[value].cast(pl.Float64).fill_null(np.nan).to_numpy()
+    )
+    tasks = episodes.select(pl.struct("suite", "task_id").rank("dense")).to_series().to_numpy()
+    found = leader(wide, tasks, estimand)
+    return None if found is None else (names.row(found.item, named=True), found)
+
+
+def _one_above(difference: Estimate) -> float | None:
+    # Within the episodes that have both, the order may be the other way round.
+    return 1.0 if difference.value is not None and difference.value <= 0 else difference.p_value(0.0)
+
+
+def _between_episodes(
+    first: NDArray[np.float64], other: NDArray[np.float64], tasks: NDArray[np.generic], estimand: Estimand
+) -> Estimate:
+    is_first = np.repeat([True, False], len(first))
+    return mean_difference(np.concatenate([first, other]), is_first, np.concatenate([tasks, tasks]), estimand)

@@ -1,0 +1,42 @@
+"""Student's t distribution: quantiles and tails. Pure functions; degrees of freedom are rounded down, which is safe."""
+
+from __future__ import annotations
+
+import functools
+import math
+from statistics import NormalDist
+
+#: Beyond this many degrees of freedom Student's t is the normal distribution to three digits.
+_MANY = 2000
+
+
+@functools.lru_cache(maxsize=4096)
+def student_quantile(level: float, degrees: int) -> float:
+    """The x with P(|t| < x) = `level` for Student's t with `degrees` degrees of freedom (a whole number from 1)."""
+    if degrees > _MANY:
+        return NormalDist().inv_cdf(0.5 + level / 2)
+    low, high = 0.0, math.pi / 2
+    # The sums take the angle atan(t / sqrt(degrees)), which is bounded; t is not.
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if _share_within(middle, degrees) < level else (low, middle)
+    return math.sqrt(degrees) * math.tan((low + high) / 2)
+
+
+def two_sided_p(t: float, degrees: int) -> float:
+    """P(|T| > |t|) for Student's t with `degrees` degrees of freedom (a whole number from 1)."""
+    if degrees > _MANY:
+        return math.erfc(abs(t) / math.sqrt(2))
+    return max(0.0, 1.0 - _share_within(math.atan(abs(t) / math.sqrt(degrees)), degrees))
+
+
+def _share_within(angle: float, degrees: int) -> float:
+    """P(|t| < sqrt(degrees) * tan(angle)), by the finite sums of Abramowitz & Stegun 1964, 26.7.3 and 26.7.4."""
+    cosine_squared = math.cos(angle) ** 2
+    odd = degrees % 2 == 1
+    term, total = (math.cos(angle), 0.0) if odd else (1.0, 0.0)
+    for k in range(degrees // 2):
+        total += term
+        # Odd: 2/3, 4/5, 6/7 ... ; even: 1/2, 3/4, 5/6 ...
+        term *= cosine_squared * ((2 * k + 2) / (2 * k + 3) if odd else (2 * k + 1) / (2 * k + 2))
+    return 2 / math.pi * (angle + math.sin(angle) * total) if odd else math.sin(angle) * total
