@@ -6,7 +6,6 @@ They go into `NAME.zarr.quarantine/`, beside the store as all folders that reade
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -121,7 +120,7 @@ def _quarantine(store: Path, folder: Path, damaged: DamagedEpisode) -> Path:
     }
     # The reason first: a process that is killed here leaves an entry without an episode, and the episode in the store.
     (entry / _REASON).write_text(json.dumps(reason, indent=1), encoding="utf-8")
-    os.rename(folder, entry / folder.name)
+    folder.rename(entry / folder.name)
     return entry
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
+from tests.kit.crashes import before_call, die, run_child
 from tests.kit.slow import slow_except
 from tests.kit.still_scene import capture_without_simulator
 from vla_attention.analyze.__main__ import main as analyze
@@ -20,7 +22,7 @@ from vla_attention.capture.jobs.claims import Claims, holders
 from vla_attention.capture.jobs.damaged_episodes import DamagedEpisodesLeft
 from vla_attention.capture.jobs.repair import quarantine_folder, repair_store
 from vla_attention.capture.jobs.status import store_status
-from vla_attention.capture.jobs.worker import Worker
+from vla_attention.capture.jobs.worker import Worker, this_worker
 from vla_attention.capture.published.evaluate import evaluate_attention_ratio
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import StoreError
@@ -206,18 +208,18 @@ def test_a_changed_root_is_no_damage_of_the_episodes(store, episode, capsys):
     assert files(store) == before
 
 
-def test_a_killed_or_failing_repair_harms_nothing(store, episode, monkeypatch):
+def test_a_failing_repair_harms_nothing(store, episode, monkeypatch):
     empty(episode)
 
-    rename = os.rename
+    rename = Path.rename
 
     def refuse(source: Path, target: Path) -> None:
-        if quarantine_folder(store) in Path(target).parents:
+        if quarantine_folder(store) in target.parents:
             raise PermissionError(13, "Permission denied")
         rename(source, target)
 
     with monkeypatch.context() as patch:
-        patch.setattr(repair.os, "rename", refuse)
+        patch.setattr(Path, "rename", refuse)
         with pytest.raises(StoreError, match=f"Cannot move {DAMAGED} of .*: Permission denied"):
             repair_store(store)
     assert episode.is_dir()
@@ -229,6 +231,27 @@ def test_a_killed_or_failing_repair_harms_nothing(store, episode, monkeypatch):
     (finding,) = repair_store(store)
     assert finding.moved_to is not None
     assert verify_store(open_store(store)) == []
+
+
+def repair_and_die(store: Path, kind: str, number: int) -> None:
+    with before_call(kind, number, die):
+        repair_store(store)
+
+
+@pytest.mark.parametrize("number", slow_except((1,), range(3)))  # renames: the claim, the episode, the claim's end
+@pytest.mark.parametrize("kind", ["rename", "renamed"])
+def test_a_killed_repair_harms_nothing(store, episode, original, kind, number):
+    empty(episode)
+    assert run_child(repair_and_die, store, kind, number) == -signal.SIGKILL
+    assert [found.name for found in open_store(store).episodes if found.name != DAMAGED] == WHOLE
+    repair_store(store)
+    assert names(store) == WHOLE
+    assert len(list(quarantine_folder(store).glob(f"*/{DAMAGED}"))) == 1
+    write_store(store, mode="resume", spec=SPEC)
+    assert files(store) == files(original)
+    claims = Claims(store, this_worker())
+    assert claims.acquire(DAMAGED) is None  # the claim of the killed process does not stay
+    claims.release(DAMAGED)
 
 
 def test_a_link_to_a_store_and_several_stores(store, episode, tmp_path, capsys):

@@ -7,18 +7,15 @@ from __future__ import annotations
 
 import errno
 import functools
-import multiprocessing
 import os
 import shutil
 import signal
 import subprocess
 from collections.abc import Callable
-from contextlib import contextmanager
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -26,6 +23,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 from zarr.storage import LocalStore
 
+from tests.kit.crashes import PROCESSES, before_call, die, run_child
 from tests.kit.examples import examples
 from tests.kit.slow import slow_except
 from vla_attention.capture.store.durable_files import StoreWriteFailed
@@ -54,9 +52,6 @@ from vla_attention.testing.stores import write_store as write_made_up_store
 #: Everything here is about durability.
 write_store = functools.partial(write_made_up_store, durable=True)
 SPEC = StoreSpec(tasks=(0,), episodes=2, replans=9, layers=(0,), heads=(0,), frames=False)
-#: Processes that have imported everything and started no thread yet, so that a child is there at once.
-PROCESSES = multiprocessing.get_context("forkserver")
-PROCESSES.set_forkserver_preload(["vla_attention.testing.stores"])
 
 
 def store_bytes(path: Path) -> dict[str, bytes]:
@@ -76,54 +71,9 @@ def uninterrupted(tmp_path_factory) -> dict[str, bytes]:
     return store_bytes(write_store(tmp_path_factory.mktemp("reference") / "a.zarr", spec=SPEC))
 
 
-@contextmanager
-def before_call(kind: str, number: int, action: Callable[[], None]):
-    """Act before the number-th (from 0) call of a kind: `set` (a file), `fsync`, `rename`; "renamed": after one."""
-    owner: Any = {"set": LocalStore, "fsync": os, "rename": Path, "renamed": Path}[kind]
-    name = kind.removesuffix("d")
-    original = getattr(owner, name)
-    calls = 0
-
-    def note() -> None:
-        nonlocal calls
-        calls += 1
-        if calls == number + 1:
-            action()
-
-    async def noted_set(self, *arguments, **keywords):
-        note()
-        return await original(self, *arguments, **keywords)
-
-    def noted(*arguments, **keywords):
-        if kind != "renamed":
-            note()
-        result = original(*arguments, **keywords)
-        if kind == "renamed":
-            note()
-        return result
-
-    setattr(owner, name, noted_set if kind == "set" else noted)
-    try:
-        yield lambda: calls
-    finally:
-        setattr(owner, name, original)
-
-
-def die() -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
 def write_and_die(path: Path, kind: str, number: int) -> None:
     with before_call(kind, number, die):
         write_store(path, mode="resume", spec=SPEC)
-
-
-def run_child(target: Callable[..., None], *arguments: Any) -> int | None:
-    child = PROCESSES.Process(target=target, args=arguments)
-    child.start()
-    child.join(60)
-    assert child.exitcode is not None, "the child hangs"
-    return child.exitcode
 
 
 def count_calls(kind: str, path: Path) -> int:
