@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.schemas.jsonable import to_json
-from vla_attention.schemas.stores.store_format import JOB_RECORDS, EpisodeSeal
+from vla_attention.schemas.stores.store_format import JOB_RECORDS
 
 
 class ArrayDigest:
@@ -56,11 +55,9 @@ def run_digest(attributes: Mapping[str, Any]) -> str:
     return bytes_digest(_canonical(run_configuration(attributes)))
 
 
-def seal_digest(seal: EpisodeSeal) -> str:
-    """The digest of a seal over all its fields but `digest`."""
-    document = to_json(seal)
-    del document["digest"]
-    return bytes_digest(_canonical(document))
+def seal_digest(attributes: Mapping[str, Any]) -> str:
+    """The digest of a seal over all its fields but `digest`; `attributes` are those in its `zarr.json`."""
+    return bytes_digest(_canonical({name: value for name, value in attributes.items() if name != "digest"}))
 
 
 def _canonical(document: object) -> bytes:

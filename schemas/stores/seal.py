@@ -41,7 +41,7 @@ def seal_episode(folder: Path, name: str, run: str, copied_from: str = "") -> Ep
         chunks = None if file.name == "zarr.json" else next((shards[at] for at in file.parents if at in shards), None)
         records[file.relative_to(folder).as_posix()] = _file_record(file.read_bytes(), chunks)
     seal = EpisodeSeal(name, run, records, digest="", copied_from=copied_from)
-    seal = replace(seal, digest=seal_digest(seal))
+    seal = replace(seal, digest=seal_digest(to_json(seal)))
     (folder / SEAL_GROUP).mkdir(exist_ok=True)
     group = {"zarr_format": 3, "node_type": "group", "attributes": to_json(seal)}
     (folder / _FILE).write_text(json.dumps(group, separators=(",", ":")), encoding="utf-8")
@@ -55,10 +55,10 @@ def read_seal(folder: Path) -> EpisodeSeal:
         OSError: it cannot be read.
         ValueError: it is no seal, or its own digest does not fit.
     """
-    seal = from_json(EpisodeSeal, group_attributes((folder / _FILE).read_bytes()))
-    if seal.digest != seal_digest(seal):
+    attributes = group_attributes((folder / _FILE).read_bytes())
+    if attributes.get("digest") != seal_digest(attributes):
         raise ValueError("its own digest does not fit")
-    return seal
+    return from_json(EpisodeSeal, attributes)
 
 
 def identity_problem(seal: EpisodeSeal, name: str, run: str) -> str | None:
