@@ -17,8 +17,9 @@ from vla_attention.analyze.measures.aggregate import (
     replan_tables,
     task_tables,
 )
+from vla_attention.analyze.measures.contribution_ratios import contribution_rows
 from vla_attention.analyze.measures.contributions import contribution_table
-from vla_attention.analyze.measures.frames import Tables, named_tables
+from vla_attention.analyze.measures.frames import Tables, layer_name, named_tables
 from vla_attention.analyze.measures.group_contributions import group_contribution_tables
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import resolve_all
@@ -27,9 +28,22 @@ from vla_attention.analyze.measures.sinks import without_sinks as question_witho
 from vla_attention.analyze.measures.steps import MeasuredEpisode, measure_episodes, step_tables
 from vla_attention.analyze.published.frame_proxy import frame_proxy
 from vla_attention.analyze.published.results_writer import write_results_of_suites
-from vla_attention.analyze.ratios.contribution_text import contributions_section, group_contributions_section
-from vla_attention.analyze.ratios.summary_text import AnalysedRun, summary_text
+from vla_attention.analyze.ratios.answer import (
+    HEADLINE_NAME,
+    Headline,
+    conclusion,
+    headline_of,
+    ratio_sentence,
+    run_sentence,
+)
+from vla_attention.analyze.ratios.contribution_text import (
+    contributions_section,
+    group_contributions_section,
+    same_sides,
+)
+from vla_attention.analyze.ratios.summary_text import AnalysedRun, ratio_definition, summary_text
 from vla_attention.analyze.show.output_files import write_parquet, write_text, writing
+from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.stores.selection import Selection, denoise_text, heads_text
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
@@ -101,14 +115,60 @@ class Analysis:
         return group_contribution_tables(self.question, self.resolved)
 
     @cached_property
+    def contribution_rows(self) -> pl.DataFrame | None:
+        """See `measures.contribution_ratios.contribution_rows`, of both sides; None when they were not recorded."""
+        if self.contributions is None:
+            return None
+        return contribution_rows(self.contributions, "visual_norm", "linguistic_norm", self.question.settings.intervals)
+
+    @property
+    def headline(self) -> Headline | None:
+        """The ratio over all tasks and layers; None for a grouping without one.
+
+        Where a site has one of the modalities only (Cosmos), it is that of the norms of contributions.
+        """
+        several = self.overall["num_tasks"] > 1
+        about = self.question.settings.intervals.words if several else "episodes like these of the one task"
+        untrained, layers = self.question.untrained, layer_name(self.overall["layer"], "average over layers")
+        if self.grouping.ratio is not None:
+            what = " / ".join(shortened(side, 40) for side in ratio_definition(self.grouping).split(" / "))
+            return headline_of(self.overall, what, f"{HEADLINE_NAME}, {layers}", about, untrained)
+        if self.contribution_rows is None or not {"visual", "linguistic"} <= set(self.grouping.names):
+            return None
+        row, name = self.contribution_rows.row(-1, named=True), f"norms of contributions, {HEADLINE_NAME}, {layers}"
+        return headline_of(row, "|visual| / |linguistic|", name, about, untrained)
+
+    @property
+    def answer(self) -> list[str]:
+        """Three sentences: what was run, the ratio beside that of uniform attention, what may be concluded."""
+        question, headline, row = self.question, self.headline, self.overall
+        untrained = question.untrained
+        policy = question.stores[0].attributes.policy
+        name = f"{policy.name}{', untrained' if untrained else ''} ({shortened(policy.checkpoint, 60)})"
+        suites = sorted(self.episodes.cells["suite"].unique())
+        layers, steps = len(set(question.selection.blocks)), question.selection.denoise_steps
+        found = [run_sentence(name, row, suites, layers, steps, question.site)]
+        if headline is not None:
+            found.append(ratio_sentence(headline))
+        return [*found, conclusion(headline, untrained, row["num_tasks"], row["num_episodes"])]
+
+    @property
+    def notes(self) -> list[str]:
+        """What to know beside the numbers: what was left out, which steps they are of, other sites."""
+        question = self.question
+        return [*question.remarks, *_notes(question.stores[0].attributes, question.selection, question.site)]
+
+    @cached_property
     def summary(self) -> str:
-        """The printed text: `summary_text`, then the sections on contributions where these were recorded."""
-        question, grouping, estimand = self.question, self.grouping, self.question.settings.intervals
-        parts = [summary_text(_described(question), grouping, self.episodes, self.tasks)]
-        if self.contributions is not None:
-            parts.append(contributions_section(self.contributions, estimand))
+        """The whole text: `summary_text`, then the section on contributions where these were recorded."""
+        question = self.question
+        parts = [summary_text(_described(self), self.grouping, self.episodes, self.tasks)]
         if all(store.attributes.recording.contributions for store in question.stores):
-            parts.append(group_contributions_section(self.group_contributions, grouping, question.site, estimand))
+            tables, estimand = self.group_contributions, question.settings.intervals
+            if self.contributions is not None and not same_sides(self.contributions, tables):
+                parts.append(contributions_section(self.contributions, estimand))
+            first = len(parts) == 1
+            parts.append(group_contributions_section(tables, self.grouping, question.site, estimand, first))
         return "\n".join(parts)
 
 
@@ -133,10 +193,10 @@ def analyse(question: Question, without_sinks: SinkRule | None = None) -> Analys
     return Analysis(question, resolved, measured, replans, episodes, tasks, sinks)
 
 
-def _described(question: Question) -> AnalysedRun:
+def _described(analysis: Analysis) -> AnalysedRun:
     """The lines of the summary's header that the tables do not hold."""
-    root = question.stores[0].attributes
-    policy = root.policy
+    question = analysis.question
+    policy = question.stores[0].attributes.policy
     return AnalysedRun(
         stores=[str(store.path) for store in question.stores],
         policy=f"{policy.name} ({policy.checkpoint_format}: {policy.checkpoint})",
@@ -144,7 +204,8 @@ def _described(question: Question) -> AnalysedRun:
         denoise_steps=question.selection.denoise_steps,
         heads=describe_heads(question.selection, policy.num_heads),
         estimand=question.settings.intervals,
-        notes=[*_notes(root, question.selection, question.site), *question.remarks],
+        notes=analysis.notes,
+        answer=analysis.answer,
     )
 
 

@@ -17,7 +17,7 @@ from vla_attention.analyze.arguments import (
     stores_of,
 )
 from vla_attention.analyze.commands import list_of_commands
-from vla_attention.analyze.show.output_files import report_files
+from vla_attention.analyze.show.output_files import files_lines
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
@@ -67,6 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
     from vla_attention.analyze.measures.question import ask
     from vla_attention.analyze.measures.sinks import SinkRule
     from vla_attention.analyze.ratios.analysis import analyse, write_tables
+    from vla_attention.analyze.ratios.screen_text import screen_text
     from vla_attention.schemas.errors import BadArgument
 
     stores = stores_of(arguments)
@@ -81,10 +82,9 @@ def run(arguments: argparse.Namespace) -> int:
     analysis = analyse(ask(stores, settings_of(arguments)), without_sinks=rule)
     folder = output_folder(arguments, analysis.grouping.name)
     written = write_tables(analysis, folder)
-    print(analysis.summary)
     if not arguments.no_plots:
         from vla_attention.analyze.ratios.default_plots import write_plots
 
         written += write_plots(analysis, folder, arguments.save_viz)
-    report_files(folder, written)
+    print(screen_text(analysis, folder, files_lines(folder, written)))
     return 0

@@ -23,6 +23,17 @@ _RATIO_NOTE = (
     "give if attention were shared out between the segments as uniform attention is. of means: mean norm / mean "
     "norm. mean: of the episodes' mean ratios."
 )
+_HOW = (
+    "Value-weighted, through output projection and gate; root mean square over action queries, mean over replans and "
+    "denoise steps."
+)
+
+
+def same_sides(contributions: pl.DataFrame, tables: Tables | None) -> bool:
+    """Whether the ratio of a grouping's groups is that of `contribution_table` at every replan, layer and step."""
+    if tables is None or "contribution_ratio" not in tables.cells.columns:
+        return False
+    return tables.cells["contribution_ratio"].equals(contributions["contribution_ratio"])
 
 
 def contributions_section(table: pl.DataFrame, estimand: Estimand) -> str:
@@ -32,17 +43,20 @@ def contributions_section(table: pl.DataFrame, estimand: Estimand) -> str:
         for row in contribution_rows(table, "visual_norm", "linguistic_norm", estimand).iter_rows(named=True)
     ]
     title = "CONTRIBUTIONS  |visual| / |linguistic|, norms of what the keys add to the residual stream"
-    note = (
-        "Value-weighted, through output projection and gate; root mean square over action queries, mean over replans "
-        f"and denoise steps. Norms of different sites may be divided; masses may not. {_RATIO_NOTE}"
-    )
+    note = f"{_HOW} Norms of different sites may be divided; masses may not. {_RATIO_NOTE}"
     header = ["layer", "|visual|", "|linguistic|", *_RATIO_HEADER]
     return "\n".join([heading(title), text_table(header, rows, left=(0,)), "", *wrap(note), ""])
 
 
-def group_contributions_section(tables: Tables | None, grouping: Grouping, site: str, estimand: Estimand) -> str:
-    """The summary's section: per layer the groups' mean norms and the ratio of norms with its interval."""
-    title = f"CONTRIBUTIONS OF GROUPS  norms of what they add to the residual stream at site '{site}'"
+def group_contributions_section(
+    tables: Tables | None, grouping: Grouping, site: str, estimand: Estimand, first: bool = True
+) -> str:
+    """The summary's section: per layer the groups' mean norms and the ratio of norms with its interval.
+
+    `first`: whether no `contributions_section` stands above it.
+    """
+    title = f"norms of what they add to the residual stream at site '{site}'"
+    title = f"CONTRIBUTIONS OF GROUPS  {title}" if first else f"OF GROUPS  {title}"
     measured = () if tables is None else tables.group_names()
     cut = [name for name in grouping.names if name not in measured]
     note = (
@@ -58,6 +72,8 @@ def group_contributions_section(tables: Tables | None, grouping: Grouping, site:
     nothing = [name for name in measured if name not in shown]
     if nothing:
         note = f"The keys of {listing(nothing)} add exactly nothing. {note}".strip()
+    if first:
+        note = f"{_HOW} {note}".strip()
     norms = norms_by_layer(tables)
     ratios = ratios_by_layer(tables.cells, estimand)
     rows = []

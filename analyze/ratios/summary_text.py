@@ -11,7 +11,7 @@ import polars as pl
 from vla_attention.analyze.measures.aggregate import layer_order, overall_layer, overall_rows
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables, layer_name
 from vla_attention.analyze.ratios.verdict import LINGUISTIC_BELOW, VISUAL_ABOVE, meanings, reading, verdict
-from vla_attention.analyze.show.headings import WIDTH, heading, title, untrained_warning, wrap
+from vla_attention.analyze.show.headings import WIDTH, heading, title, untrained_warning, wrap, wrap_all
 from vla_attention.analyze.show.numbers import format_number, format_percent, interval_name, plural, row_interval
 from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.show.text_table import text_table
@@ -36,6 +36,7 @@ class AnalysedRun:
         level: level of the intervals in `tasks_table`.
         estimand: what the intervals over several tasks are about.
         notes: further lines, for instance about translated layer numbers.
+        answer: the sentences that stand first.
     """
 
     stores: Sequence[str]
@@ -46,6 +47,7 @@ class AnalysedRun:
     level: float = 0.95
     estimand: Estimand = Estimand.TASKS_LIKE_THESE
     notes: Sequence[str] = field(default_factory=tuple)
+    answer: Sequence[str] = ()
 
 
 def summary_text(run: AnalysedRun, grouping: Grouping, episodes: Tables, tasks: Tables) -> str:
@@ -71,7 +73,7 @@ def _header(run: AnalysedRun, grouping: Grouping, episodes: Tables) -> str:
     layers = [layer for layer in layer_order(episodes.cells) if layer != LAYERS_AVG]
     blocks = dict(episodes.cells.select("layer", "block").unique().iter_rows())
     translated = [f"{layer} = block {blocks[layer]}" for layer in layers if str(blocks[layer]) != layer]
-    lines = title("ATTENTION SUMMARY")
+    lines = [*title("ATTENTION SUMMARY"), *wrap_all(run.answer), *([""] if run.answer else [])]
     if run.untrained:
         lines += ["!" * WIDTH, *wrap(untrained_warning()), "!" * WIDTH]
     lines += _labelled("store", ", ".join(run.stores))
@@ -90,7 +92,7 @@ def _header(run: AnalysedRun, grouping: Grouping, episodes: Tables) -> str:
         absent = "" if name in having else "   (no keys here)"
         lines += wrap(f"{name} = {' | '.join(selectors)}{absent}", first=" " * 17, rest=" " * 21)
     if grouping.ratio:
-        lines += _labelled("ratio", _ratio_definition(grouping))
+        lines += _labelled("ratio", ratio_definition(grouping))
     for note in run.notes:
         lines += _labelled("note", note)
     return "\n".join(lines)
@@ -122,7 +124,7 @@ def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: Tables) -> str:
     )
     return "\n".join(
         [
-            heading(f"RATIO  {_ratio_definition(grouping)}"),
+            heading(f"RATIO  {ratio_definition(grouping)}"),
             text_table(header, body, left=(0, 8) if grouping.compares_modalities else (0,)),
             "",
             *wrap(legend),
@@ -274,7 +276,8 @@ def _mean_and_spread(row: dict[str, Any]) -> str:
     return f"{format_number(row['ratio_mean'])} ± {format_number(row['ratio_std'])}"
 
 
-def _ratio_definition(grouping: Grouping) -> str:
+def ratio_definition(grouping: Grouping) -> str:
+    """The ratio of a grouping as text, `visual / linguistic`; of a side with many groups, the first four."""
     assert grouping.ratio is not None
     sides = []
     for names in (grouping.ratio.numerator, grouping.ratio.denominator):

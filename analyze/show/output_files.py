@@ -8,8 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vla_attention.analyze.show.headings import wrap
 from vla_attention.analyze.show.numbers import plural
-from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.errors import BadArgument, UserError, listing
 
 if TYPE_CHECKING:
     import polars as pl
@@ -86,7 +87,26 @@ def _write(
 
 
 def report_files(folder: Path, files: Sequence[Path]) -> None:
-    """Print which files were written into a folder."""
-    print(f"{plural(len(files), 'file')} in {folder}:")
+    """Print which files were written into a folder, see `files_lines`."""
+    print("\n".join(files_lines(folder, files)))
+
+
+def files_lines(folder: Path, files: Sequence[Path]) -> list[str]:
+    """How many files were written into a folder, and their names.
+
+    Names that differ in their ending stand once, and of the files in a folder inside it only their number.
+    """
+    endings: dict[str, list[str]] = {}
+    inside: dict[str, int] = {}
     for file in files:
-        print(f"  {file.relative_to(folder)}")
+        *folders, _ = file.relative_to(folder).parts
+        if folders:
+            inside[f"{folders[0]}/"] = inside.get(f"{folders[0]}/", 0) + 1
+        else:
+            endings.setdefault(file.stem, []).append(file.suffix)
+    names: dict[str, list[str]] = {}
+    for name, kinds in endings.items():
+        names.setdefault(" ".join(kinds), []).append(name)
+    listed = [f"{listing(stems, 4)} ({kinds})" for kinds, stems in names.items()]
+    listed += [f"{count} in {name}" for name, count in inside.items()]
+    return wrap(f"{plural(len(files), 'file')} in {folder}: {'; '.join(listed)}", rest="  ")

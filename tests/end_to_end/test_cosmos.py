@@ -73,7 +73,10 @@ def test_objects_lie_where_the_picture_shows_them(cosmos_store):
 
 def test_each_site_is_analysed_by_itself(cosmos_store, tmp_path, capsys):
     assert analyze([str(cosmos_store), "--output", str(tmp_path / "self"), "--no-plots"]) == 0
-    printed = " ".join(capsys.readouterr().out.split())
+    said = capsys.readouterr().out
+    assert len(said.splitlines()) <= 40
+    printed = " ".join(said.split())
+    assert "The ratio |visual| / |linguistic| is" in printed
     assert "must not be divided by a mass of another" in printed
     steps = written_steps(tmp_path / "self")
     assert "ratio" not in steps.columns

@@ -14,7 +14,11 @@ from vla_attention.analyze.measures.group_contributions import group_contributio
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.analyze.ratios.analysis import analyse
-from vla_attention.analyze.ratios.contribution_text import contributions_section, group_contributions_section
+from vla_attention.analyze.ratios.contribution_text import (
+    contributions_section,
+    group_contributions_section,
+    same_sides,
+)
 from vla_attention.analyze.statistics.intervals import Estimand
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.testing.stores import StoreSpec, write_store
@@ -36,16 +40,25 @@ def tables_of(question: Question) -> Tables | None:
 
 
 def test_the_summary_has_a_line_per_layer_and_an_interval(store):
-    analysis = analyse(question_about(store))
+    analysis = analyse(question_about(store, "objects"))  # cut segments, and have no norms
     assert analysis.contributions is not None
     section = contributions_section(analysis.contributions, estimand=Estimand.TASKS_LIKE_THESE)
     assert section in analysis.summary
+    assert analysis.summary.count("CONTRIBUTIONS") == 1
     lines = [line.split() for line in section.splitlines()]
     assert [line[0] for line in lines if line and line[0] in ("0", "2", "layers_avg")] == ["0", "2", "layers_avg"]
     assert all("[" in " ".join(line) for line in lines if line and line[0] in ("0", "2", "layers_avg"))
     assert max(map(len, section.splitlines())) <= 100
     for name in ("ratio", "of means", "uniform", "lift"):
         assert name in section
+
+
+def test_groups_that_are_both_sides_have_their_ratio_once(store):
+    analysis = analyse(question_about(store))
+    assert same_sides(analysis.contributions, analysis.group_contributions)
+    assert analysis.summary.count("CONTRIBUTIONS") == 1
+    assert "CONTRIBUTIONS OF GROUPS" in analysis.summary
+    assert "root mean square over action queries" in " ".join(analysis.summary.split())
 
 
 def test_a_store_without_contributions_has_no_section(tmp_path):
@@ -81,7 +94,7 @@ def test_a_block_that_is_named_twice_counts_once_in_the_average_over_layers(tmp_
     assert lines["4"][1] == lines["0"][1]
     ratios = {layer: table.filter(layer=layer)["contribution_ratio"].log().mean() for layer in (0, 2)}
     assert float(lines["layers_avg"][3]) == pytest.approx(np.exp((ratios[0] + ratios[2]) / 2), rel=1e-3)
-    assert "Not of bowl" in text
+    assert "Not of bowl" in " ".join(text.split())
     assert max(map(len, text.splitlines())) <= 100
 
 

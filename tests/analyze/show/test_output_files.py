@@ -36,5 +36,7 @@ def test_tables_become_files_and_are_listed(tmp_path: Path, capsys: pytest.Captu
     files = [*write_parquet(tmp_path / "out", a=table), *write_csv(tmp_path / "out", a=table)]
     assert pl.read_parquet(files[0]).equals(table)
     assert files[1].read_text() == "ratio\n1.5\ninf\n\n"
-    report_files(tmp_path / "out", files[:1])
-    assert capsys.readouterr().out == f"1 file in {tmp_path / 'out'}:\n  a.parquet\n"
+    inside = [tmp_path / "out" / "episodes" / f"{i}.png" for i in range(3)]
+    report_files(tmp_path / "out", [*files, *inside])
+    printed = " ".join(capsys.readouterr().out.split())
+    assert printed == f"5 files in {tmp_path / 'out'}: a (.parquet .csv); 3 in episodes/"

@@ -1,0 +1,176 @@
+"""What `vla-analyze STORE` prints: the answer in three sentences, then one compact table per question.
+
+At most `SCREEN_LINES` lines with those about the files; `summary_text` has the whole, for summary.txt.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from vla_attention.analyze.measures.aggregate import HEADLINE, layer_order, overall_layer, overall_rows
+from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables
+from vla_attention.analyze.ratios.analysis import Analysis
+from vla_attention.analyze.show.headings import WIDTH, wrap, wrap_all
+from vla_attention.analyze.show.numbers import (
+    format_number,
+    format_percent,
+    format_percent_interval,
+    interval_name,
+    row_interval,
+)
+from vla_attention.analyze.show.plot_text import shortened
+from vla_attention.analyze.show.text_table import text_table
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
+
+#: Lines of a terminal that show everything at once.
+SCREEN_LINES = 40
+#: Lines of notes, rows of groups, and blocks of layers beside each other, before "in summary.txt" stands for the rest.
+_MOST_NOTES, _MOST_GROUPS, _MOST_BLOCKS = 4, 6, 2
+_REST = "in summary.txt"
+#: Groups whose fractions stand in rows where there is no ratio.
+_MOST_FRACTIONS = 3
+
+
+def screen_text(analysis: Analysis, folder: Path, files: Sequence[str]) -> str:
+    """The lines to print.
+
+    Args:
+        analysis: the tables.
+        folder: where summary.txt is.
+        files: the lines about further files, which stand last.
+    """
+    last = [*wrap(f"The whole, with every interval: {folder / 'summary.txt'}", rest="  "), *files]
+    parts = [wrap_all(analysis.answer), _notes(analysis), _layers(analysis), _groups(analysis)]
+    above = [line for part in parts if part for line in (*part, "")]
+    room = SCREEN_LINES - len(above) - len(last) - 1
+    return "\n".join([*above, *_tasks(analysis, room), "", *last])
+
+
+def _notes(analysis: Analysis) -> list[str]:
+    lines = wrap_all((f"note: {note}" for note in analysis.notes), rest="  ")
+    if len(lines) <= _MOST_NOTES:
+        return lines
+    return [*lines[: _MOST_NOTES - 1], f"  ... further notes {_REST}"]
+
+
+def _layers(analysis: Analysis) -> list[str]:
+    """Layers beside each other: ratio and lift, or fractions, and the ratio of the norms of contributions."""
+    level = overall_rows(analysis.tasks)
+    cells = {row["layer"]: row for row in level.cells.iter_rows(named=True)}
+    layers = [layer for layer in layer_order(level.cells) if layer != LAYERS_AVG]
+    rows: dict[str, list[str]] = {}
+    if analysis.grouping.ratio is not None:
+        title = "LAYERS  ratio, and its lift over uniform attention"
+        for label, column in (("ratio", HEADLINE), ("lift", "ratio_lift")):
+            rows[label] = [format_number(cells[layer][column]) for layer in layers]
+    else:
+        title = "LAYERS  fractions of the summed masses"
+        of_group = level.by_group("layer")
+        for name in analysis.present_groups[:_MOST_FRACTIONS]:
+            rows[shortened(name, 14)] = [format_percent(of_group[layer, name]["fraction"]) for layer in layers]
+    below = ""
+    if analysis.contribution_rows is not None:
+        norms = {row["layer"]: row for row in analysis.contribution_rows.iter_rows(named=True)}
+        rows["|v| / |l|"] = [format_number(norms[layer][HEADLINE]) for layer in layers]
+        whole = norms[LAYERS_AVG]
+        bounds = row_interval(whole, HEADLINE)
+        below = "CONTRIBUTIONS  |v| / |l|, norms of what visual and linguistic keys add: "
+        below += f"{format_number(whole[HEADLINE])}{'' if bounds == '-' else f' {bounds}'}"
+    return [title, *_beside_each_other("layer", layers, rows), *wrap(below, rest="  ")]
+
+
+def _beside_each_other(name: str, columns: Sequence[str], rows: Mapping[str, Sequence[str]]) -> list[str]:
+    """A table with many columns as blocks of equal width below each other, without rules."""
+    labels = max(map(len, [name, *rows]))
+    width = max((len(cell) for cells in (columns, *rows.values()) for cell in cells), default=1) + 1
+    fit = (WIDTH - labels - 1) // width
+    blocks = ceil(len(columns) / fit)
+    shown = columns if blocks <= _MOST_BLOCKS else columns[: fit * _MOST_BLOCKS]
+    per_block = ceil(len(shown) / min(blocks, _MOST_BLOCKS))
+    lines = []
+    for start in range(0, len(shown), per_block):
+        for label, cells in ((name, columns), *rows.items()):
+            part = cells[start : min(start + per_block, len(shown))]
+            lines.append(f"{label.ljust(labels)} " + "".join(cell.rjust(width) for cell in part))
+    more = len(columns) - len(shown)
+    return [*lines, f"{more} more {name}s {_REST}"] if more else lines
+
+
+def _groups(analysis: Analysis) -> list[str]:
+    """The groups that get attention, over all tasks and layers."""
+    found = [(name, analysis.overall_groups[name]) for name in analysis.present_groups]
+    found = [(name, row) for name, row in found if row["mass"]]
+    rows = [
+        (
+            shortened(name, 40),
+            format_number(row["keys"]),
+            format_percent(row["fraction"]),
+            format_percent_interval(row["fraction_low"], row["fraction_high"]),
+            format_number(row["lift"]),
+        )
+        for name, row in found[:_MOST_GROUPS]
+    ]
+    table = _table(("GROUPS", "keys", "fraction", interval_name(DEFAULT_LEVEL), "lift"), rows)
+    more = len(found) - len(rows)
+    return [*table, f"{more} more groups {_REST}"] if more else table
+
+
+def _tasks(analysis: Analysis, room: int) -> list[str]:
+    """The tasks, or the suites where there are several, as many as `room` lines hold."""
+    tasks = analysis.tasks.filter(pl.col("layer") == overall_layer(analysis.tasks.cells))
+    several = tasks.cells["suite"].drop_nulls().n_unique() > 1
+    level = tasks.filter(pl.col("scope") == ("all" if several else "task"))
+    noun, cells = ("suite" if several else "task"), list(level.cells.iter_rows(named=True))
+    fits = len(cells) if len(cells) < room else max(room - 2, 0)
+    values = _ratio_cells if analysis.grouping.ratio is not None else _fraction_cells
+    header, rows = values(analysis, level, cells[:fits])
+    names = [row["suite"] if several else str(row["task_id"]) for row in cells[:fits]]
+    rows = [
+        (name, str(row["num_episodes"]), format_percent(row["success_rate"], 0), *more)
+        for name, row, more in zip(names, cells[:fits], rows, strict=True)
+    ]
+    texts = None if several else [row["instruction"] or "" for row in cells[:fits]]
+    table = _table((f"{noun.upper()}S", "n", "solved", *header), rows, texts)
+    left = len(cells) - fits
+    return [*table, f"{left} more {noun}s {_REST}"] if left else table
+
+
+def _ratio_cells(
+    analysis: Analysis, level: Tables, rows: Sequence[dict[str, Any]]
+) -> tuple[list[str], list[Sequence[str]]]:
+    header = ["ratio", interval_name(DEFAULT_LEVEL), "uniform", "lift"]
+    return header, [
+        (
+            format_number(row[HEADLINE]),
+            row_interval(row, HEADLINE),
+            format_number(row["uniform_ratio"]),
+            format_number(row["ratio_lift"]),
+        )
+        for row in rows
+    ]
+
+
+def _fraction_cells(
+    analysis: Analysis, level: Tables, rows: Sequence[dict[str, Any]]
+) -> tuple[list[str], list[Sequence[str]]]:
+    names, of_group = analysis.present_groups[:_MOST_FRACTIONS], level.by_group("suite", "task_id")
+    return [shortened(name, 14) for name in names], [
+        [format_percent(of_group[row["suite"], row["task_id"], name]["fraction"]) for name in names] for row in rows
+    ]
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]], texts: Sequence[str] | None = None) -> list[str]:
+    """A table without a rule, one line per row; `texts` stand in what is left of the width, cut where they are long."""
+    lines = [line for line in text_table(header, rows, left=(0,)).splitlines() if not line.startswith("·")]
+    if texts is None:
+        return lines
+    width = max(map(len, lines))
+    room = WIDTH - width - 2
+    cut = [textwrap.shorten(text, room, placeholder=" ...") if room > 0 else "" for text in texts]
+    return [lines[0], *(f"{line:<{width}}  {text}".rstrip() for line, text in zip(lines[1:], cut, strict=True))]
