@@ -145,7 +145,7 @@ def _add_evaluation_arguments(
             "that of the checkpoint's format)",
         )
     seeds = ", ".join(f"{protocol.default_seed} for {protocol.name}" for protocol in family.protocols)
-    group.add_argument("--seed", type=int, help=f"seed of the simulator and of all noise (default: {seeds})")
+    group.add_argument("--seed", type=int, metavar="N", help=f"{family.seed_of} (default: {seeds})")
     group.add_argument(
         "--replan-steps",
         type=int,

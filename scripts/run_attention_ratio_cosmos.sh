@@ -21,7 +21,7 @@
 #                  standard suites: libero_spatial, libero_object, libero_goal, libero_10 (default: libero_10)
 #   TASK_ID        one task of the suite, or several: TASK_ID="0 3" (default: all; in an array the index is the task)
 #   NUM_EPISODES   episodes per task (default: 5)
-#   SEED           seed of the simulator and of all noise (default: 7)
+#   SEED           seed of the noise; the simulator's is 0, as published (default: 7)
 #   REPLAN_STEPS   actions executed per policy call (default: the whole chunk of 16)
 # What is analysed (all layers are recorded, independently of LAYERS, so that other layers need no second capture)
 #   LAYERS         block numbers 0 to 27 (default: 25 26 27)

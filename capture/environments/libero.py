@@ -60,7 +60,7 @@ class LiberoEnvironment(SimulatedEnvironment):
     """One LIBERO task. An initial state is one of the 50 that are stored with the task.
 
     What a reset draws: a stored state holds joint positions and velocities, but cabinets, stoves and racks have no
-    joint. Every reset places them at random in small regions of the table (measured: up to 15 mm and 3 degrees apart),
+    joint. Every reset places them at random in small regions of the table (measured: up to 18 mm and 3 degrees apart),
     with numbers of numpy's global generator; no step draws any. Two things decide these numbers:
 
     - The state of the generator. The published loop of openpi seeds it once per task, so the furniture of episode i

@@ -74,6 +74,8 @@ class PolicyFamily:
     replan_default: str
     #: the evaluations that `--protocol` offers; each policy has one of them as its default
     protocols: tuple[EvaluationProtocol, ...] = (OPENPI,)
+    #: what `--seed` decides, for its help text
+    seed_of: str = "seed of the simulator and of all noise"
     #: a note on further layer numbers, for the help text of `--layers`
     layers_note: str = ""
     #: checkpoints that come with the program and run without a GPU

@@ -118,6 +118,7 @@ FAMILY = PolicyFamily(
     store_prefix="cosmos_",
     replan_default="--num-open-loop-steps",
     protocols=(COSMOS,),
+    seed_of="seed of the noise; the simulator's is 0, as published",
     untrained=UNTRAINED,
     analysis_arguments=_analysis_arguments,
     parity=ParityCases(recognises=_is_cosmos_case, run=_run_parity),
