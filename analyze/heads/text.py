@@ -284,7 +284,7 @@ def sinks_text(search: SinkSearch, rule: SinkRule) -> str:
     """The sinks as a table over tasks, or the key that comes nearest to being one."""
     keys, sinks = search.keys, search.sinks
     num_tasks, num_heads = keys.select("suite", "task_id").n_unique(), int(keys["num_heads"][0])
-    beyond = cannot_fire(float(keys["num_valid"].max()), rule)  # type: ignore[arg-type]
+    beyond = cannot_fire(search.num_valid, rule)
     if sinks.is_empty():
         nearest = keys.sort("largest_mass", descending=True).row(0, named=True)
         text = (

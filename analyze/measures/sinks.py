@@ -79,10 +79,6 @@ class SinkRule:
             f"average more than {self.mass:.0%} of a row"
         )
 
-    def can_fire_by_multiple(self, num_valid: float) -> bool:
-        """Whether a key of so many valid ones can take more than `factor` times its uniform share."""
-        return num_valid > self.factor
-
 
 @dataclass(frozen=True)
 class KeyShares:
@@ -134,6 +130,11 @@ class SinkSearch:
         """The rows of `keys` that are a sink of a head, the strongest of each task first."""
         found = self.keys.filter(pl.col("sink_heads") > 0)
         return found.sort("suite", "task_id", "mean_mass", "key", descending=[False, False, True, False])
+
+    @property
+    def num_valid(self) -> float:
+        """Mean number of valid keys, of the task with most."""
+        return float(max(self.keys["num_valid"].to_list()))
 
 
 def layers_once(selection: Selection) -> list[int]:
@@ -305,7 +306,7 @@ def merged_sinks(sinks: pl.DataFrame) -> pl.DataFrame:
 
 def cannot_fire(num_valid: float, rule: SinkRule) -> str:
     """Why the rule's first part finds nothing among so few valid keys, as a sentence; empty where it can."""
-    if rule.can_fire_by_multiple(num_valid):
+    if num_valid > rule.factor:
         return ""
     return (
         f"With {num_valid:.3g} valid keys none can take more than {rule.factor:g} x its uniform share, which is all of "

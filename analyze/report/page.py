@@ -8,11 +8,10 @@ from importlib import metadata
 from pathlib import Path
 
 import jinja2
-import polars as pl
 
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.role_masses import role_masses
-from vla_attention.analyze.measures.sinks import merged_sinks, search_sinks
+from vla_attention.analyze.measures.sinks import SinkSearch, merged_sinks, search_sinks
 from vla_attention.analyze.ratios.analysis import Analysis, analyse
 from vla_attention.analyze.report.caveats import Caveat, caveat_section, caveats
 from vla_attention.analyze.report.headline import headline_section
@@ -58,11 +57,11 @@ def write_report(question: Question, path: Path, settings: ReportSettings) -> No
 def report_html(analysis: Analysis, settings: ReportSettings) -> str:
     """One self-contained HTML page on an analysis. The same analysis gives the same page, to the byte."""
     question = analysis.question
-    sinks = merged_sinks(search_sinks(question).sinks) if settings.rows else None
-    notes = caveats(analysis, role_masses(question), sinks)
+    search = search_sinks(question) if settings.rows else None
+    notes = caveats(analysis, role_masses(question), None if search is None else merged_sinks(search.sinks))
     found = []
     with tempfile.TemporaryDirectory() as folder:
-        makers = _section_makers(analysis, notes, sinks, Path(folder), settings)
+        makers = _section_makers(analysis, notes, search, Path(folder), settings)
         with progress_bar(len(makers), "sections") as advance:
             for make in makers:
                 section = make()
@@ -75,7 +74,7 @@ def report_html(analysis: Analysis, settings: ReportSettings) -> str:
 def _section_makers(
     analysis: Analysis,
     notes: Sequence[Caveat],
-    sinks: pl.DataFrame | None,
+    search: SinkSearch | None,
     folder: Path,
     settings: ReportSettings,
 ) -> list[Callable[[], Section | None]]:
@@ -88,9 +87,9 @@ def _section_makers(
         lambda: layer_section(analysis, folder),
         lambda: time_section(analysis, folder),
     ]
-    if sinks is not None:
+    if search is not None:
         makers += [
-            lambda: sink_section(sinks),
+            lambda: sink_section(search),
             lambda: word_section(question, folder),
             lambda: object_section(question, folder),
         ]

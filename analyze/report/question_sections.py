@@ -9,7 +9,7 @@ import polars as pl
 
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.sink_kinds import SMALL_VALUES, kind_name
-from vla_attention.analyze.measures.sinks import SinkRule
+from vla_attention.analyze.measures.sinks import SinkRule, SinkSearch, cannot_fire, merged_sinks
 from vla_attention.analyze.objects.object_attention import object_tables
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_study import ObjectStudy
@@ -59,11 +59,13 @@ def time_section(analysis: Analysis, folder: Path) -> Section | None:
     return Section("time", "Over time", diagrams)
 
 
-def sink_section(sinks: pl.DataFrame) -> Section:
-    """Keys that take far more than their share in a head, from `sinks.merged_sinks` with the default rule."""
+def sink_section(search: SinkSearch) -> Section:
+    """Keys that take far more than their share in a head, by the default rule."""
+    sinks, beyond = merged_sinks(search.sinks), cannot_fire(search.num_valid, SinkRule())
     explanation = Paragraph(
         f"A sink is a key that takes {SinkRule()}. Trained transformers put attention that nothing needs on "
-        "a few such keys, and their values may be near zero; a mass includes them like any other key."
+        "a few such keys, and their values may be near zero; a mass includes them like any other key. "
+        f"{beyond}".rstrip()
     )
     if sinks.is_empty():
         return Section("sinks", "Sinks", [explanation, Paragraph("No key is one here.")])
