@@ -223,6 +223,11 @@ def _add_output_arguments(
     existing = group.add_mutually_exclusive_group()
     resume = "continue an existing store with what is missing" + (" (default)" if script else "")
     existing.add_argument("--resume", action="store_true", help=resume)
+    group.add_argument(
+        "--verify",
+        action="store_true",
+        help="with --resume: read every byte of the episodes that are there, instead of only seals, presence and sizes",
+    )
     existing.add_argument("--overwrite", action="store_true", help="delete an existing store first")
 
 

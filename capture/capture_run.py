@@ -117,7 +117,7 @@ def run_capture(
     """
     results, damaged = _record_missing(settings, policy, device, termination or Termination())
     say(f"{len(results)} episodes added, {sum(result.success for result in results)} solved. Store: {settings.store}")
-    left = find_damaged(settings.store, damaged) if damaged else []
+    left = find_damaged(settings.store, damaged, settings.verify) if damaged else []
     if left:
         raise DamagedEpisodesLeft(what_to_do(settings.store, left))
     return results
@@ -159,7 +159,7 @@ def _record_missing(
     ]
     todo.sort(key=lambda item: item[0].task_id)
     names = {episode_name(task.task_id, episode) for task in wanted for episode in range(settings.num_episodes)}
-    damaged = find_damaged(store.path, names) if done else []
+    damaged = find_damaged(store.path, names, settings.verify) if done else []
     _announce(policy, store, len(names), len(todo), len(damaged))
     for fault in damaged:
         say(f"Not recorded again without vla-capture repair: {fault.describe()}")

@@ -41,7 +41,8 @@ class RunSettings:
 
     task_ids: None runs all tasks of the suite. protocol: the published evaluation that is followed; None takes that of
     the policy. seed, replan_steps, max_steps: None takes the protocol's number. array_task_ids: tasks that
-    other processes of the same array job run; the store is expected to hold these too.
+    other processes of the same array job run; the store is expected to hold these too. verify: read every byte of the
+    episodes that an existing store has, before they count as done.
     """
 
     suite: Suite
@@ -56,6 +57,7 @@ class RunSettings:
     libero_assets: Path | None
     recording: RecordingSettings
     array_task_ids: tuple[int, ...] = ()
+    verify: bool = False
 
 
 def run_settings(arguments: argparse.Namespace) -> RunSettings:
@@ -67,6 +69,8 @@ def run_settings(arguments: argparse.Namespace) -> RunSettings:
         raise BadArgument(f"Cannot use --num-episodes {arguments.num_episodes}; expected at least 1.")
     if arguments.seed is not None and arguments.seed < 0:
         raise BadArgument(f"Cannot use --seed {arguments.seed}; expected 0 or more.")
+    if arguments.verify and not arguments.resume:
+        raise BadArgument("Cannot use --verify without --resume: a new store has no episodes that could be read.")
     return RunSettings(
         suite=suite,
         task_ids=None if arguments.task_id is None else tuple(sorted(set(arguments.task_id))),
@@ -76,6 +80,7 @@ def run_settings(arguments: argparse.Namespace) -> RunSettings:
         replan_steps=arguments.replan_steps,
         max_steps=arguments.max_steps,
         store=store_path(arguments),
+        verify=arguments.verify,
         mode="overwrite" if arguments.overwrite else "resume" if arguments.resume else "new",
         libero_assets=arguments.libero_assets,
         recording=RecordingSettings(

@@ -41,10 +41,10 @@ def look_at(store: Store, episode: StoredEpisode, verify: bool = False) -> Damag
     return DamagedEpisode(episode.name, tuple(problems)) if problems else None
 
 
-def find_damaged(path: Path, names: Collection[str]) -> list[DamagedEpisode]:
-    """Return the damaged episodes among those named; a cheap look. An episode that the store lacks is not damaged."""
+def find_damaged(path: Path, names: Collection[str], verify: bool = False) -> list[DamagedEpisode]:
+    """Return the damaged episodes among those named. An episode that the store lacks is not damaged."""
     store = open_store(path)
-    looks = (look_at(store, episode) for episode in store.episodes if episode.name in names)
+    looks = (look_at(store, episode, verify) for episode in store.episodes if episode.name in names)
     return [damaged for damaged in looks if damaged is not None]
 
 

@@ -291,12 +291,19 @@ def test_resuming_records_what_is_missing_and_says_what_is_damaged(tmp_path, mon
         assert said.err.count("\n") == 1
         assert (store / "episodes/task000_episode002").is_dir()
     assert not store_status(store).complete
+    with (store / "episodes/task000_episode002/actions/c/0/0/0").open("r+b") as file:
+        file.seek(30)
+        file.write(b"??")
+    assert main([*given, "--resume", "--verify"]) == 2
+    assert "3 of the episodes asked for are damaged" in capsys.readouterr().err
     # An episode that was not asked for is no business of this capture.
     assert main([*given, "--resume", "--num-episodes", "1"]) == 2
     assert "1 of the episodes asked for is damaged" in capsys.readouterr().err
-    assert main(["repair", str(store)]) == 0
-    assert main([*given, "--resume"]) == 0
+    assert main(["repair", str(store), "--verify"]) == 0
+    assert main([*given, "--resume", "--verify"]) == 0
     assert files(store) == reference
+    assert main([*given, "--verify"]) == 2
+    assert "Cannot use --verify without --resume" in capsys.readouterr().err
     assert store_status(store).complete
     assert analyze(["verify", str(store)]) == 0
 
