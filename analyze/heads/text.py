@@ -168,9 +168,7 @@ def _layers(study: HeadStudy) -> str:
     labels = [str(layer) for layer in level.cells["layer"]]
     lines = [heading("LAYERS  mean over heads"), _profile(level, "layer", "layer", labels, grouping)]
     if grouping.ratio is not None:
-        lines += wrap(
-            "ratio, uniform, lift: geometric means over replans and episodes, so that lift is ratio / uniform."
-        )
+        lines += wrap("ratio, uniform, lift: geometric means, so that lift is ratio / uniform.")
     return "\n".join(lines)
 
 

@@ -332,8 +332,8 @@ def describe_sinks(sinks: pl.DataFrame, num_tasks: int, rule: SinkRule, num_vali
         for row in merged_sinks(out).iter_rows(named=True)
     ]
     return (
-        f"Without sinks, keys that take {of_rule}: {listing(named, 6)} {'is' if len(named) == 1 else 'are'} out of "
-        f"every group and of the valid keys (but not of norms of contributions).{also}"
+        f"Without sinks: {listing(named, 6)} {'is' if len(named) == 1 else 'are'} out of every group and of the valid "
+        f"keys (but not of norms of contributions). A sink takes {of_rule}.{also}"
     )
 
 
