@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import polars as pl
 
 from vla_attention.analyze.compare.comparison import D_Z, HEDGES_G, LOG2_RATIO, SUCCESS, Comparison
 from vla_attention.analyze.measures.frames import LAYERS_AVG, layer_name
+from vla_attention.analyze.show.findings import findings
 from vla_attention.analyze.show.headings import (
     WIDTH,
     heading,
@@ -29,9 +28,11 @@ from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.effect_sizes import FEWEST_EPISODES
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
-from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.stores.store_format import episode_name
+
+#: Sentences about a compared run that name what differs: of the quantities, and of the tasks.
+_SENTENCES = 2
 
 
 def comparison_text(comparison: Comparison) -> str:
@@ -120,7 +121,7 @@ def _difference_section(comparison: Comparison, name: str, layer: str) -> str:
             ]
         )
     lines.append(text_table(header, body, left=(0,)))
-    lines += wrap(f"{_factor(rows)}{_named_differences(rows['q'], 'quantity', rows['quantity'].to_list())}")
+    lines += wrap(f"{_factor(rows)}{findings(rows['q'], rows['quantity'].to_list(), 'quantity', 'differ', _SENTENCES)}")
     meaning = (
         "d_z: mean / standard deviation of the paired differences (Cohen)"
         if paired
@@ -166,17 +167,6 @@ def _factor(rows: pl.DataFrame) -> str:
     return f"The ratio changes by a factor of {format_number(2.0 ** ratio['difference'][0])} (2 to the difference). "
 
 
-def _named_differences(q_values: pl.Series, kind: str, names: Sequence[str]) -> str:
-    """Which of many differences may be named after so many looks."""
-    found = [name for name, q in zip(names, q_values, strict=True) if q is not None and q <= NAMED_AT]
-    of = plural(len(names), kind)
-    return (
-        f"Of {of}, {listing(found, 8)} differ{'s' if len(found) == 1 else ''} (q <= {NAMED_AT:g})."
-        if found
-        else (f"Of {of}, none differs (q <= {NAMED_AT:g}).")
-    )
-
-
 def _tasks_section(comparison: Comparison, name: str, layer: str) -> str:
     quantity = comparison.quantities[0]
     rows = comparison.differences.filter(
@@ -199,7 +189,7 @@ def _tasks_section(comparison: Comparison, name: str, layer: str) -> str:
         f"{row['suite']} {row['task_id']}" if several else f"task {row['task_id']}"
         for row in tasks.iter_rows(named=True)
     ]
-    said = wrap(f"q: adjusted for the number of tasks. {_named_differences(tasks['q'], 'task', labels)}")
+    said = wrap(f"q: adjusted for the number of tasks. {findings(tasks['q'], labels, 'task', 'differ', _SENTENCES)}")
     texts = [row["instruction"] or "" for row in rows.iter_rows(named=True)]
     table = text_table(header, body, left=(0,), last="instruction", texts=texts, width=WIDTH)
     return "\n".join([heading(f"PER TASK  {quantity}, {name} minus {comparison.names[0]}"), table, *said])

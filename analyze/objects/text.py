@@ -18,6 +18,8 @@ from vla_attention.analyze.statistics.many_looks import NAMED_AT
 
 #: Rows of a printed table; the written ones have all.
 _MOST_ROWS = 28
+#: Names that the text could print: an object, a layer of an object, a layer that finds them.
+_NAMES = 3
 _SHARES_NOTE = (
     "share: of the attention on all cameras' patches. area: covered part of the picture. enrichment: mean share of the "
     "picture's attention / mean area (1: attention that is uniform over the picture). over control: mean enrichment / "
@@ -57,10 +59,10 @@ def _followed(study: ObjectStudy) -> str:
         f"'{row['item']}'{_place(row)} exceeds its control by a larger factor ({format_number(found.value)}) than each "
         f"of the other {found.num_items - 1} {'pairs of object and layer' if 'layer' in row else 'objects'}"
         for row, found in leaders
-        if found.is_named(len(leaders))
+        if found.is_named(_NAMES)
     ]
     if named:
-        return f"{'; '.join(named)} (each difference tested at {NAMED_AT:g} / {len(leaders)})."
+        return f"{'; '.join(named)} (each difference tested at {NAMED_AT:g} / {_NAMES})."
     if not leaders:
         return "There are no two objects whose control can tell."
     return "No object, and no layer of an object, is surely followed more than all the others."
@@ -87,11 +89,12 @@ def _found(study: ObjectStudy) -> str:
     if study.finder is None:
         return "There are no two layers that could find the objects of interest."
     row, found = study.finder
-    if not found.is_named():
+    if not found.is_named(_NAMES):
         return f"None of {found.num_items} layers surely finds the objects of interest better than all the others."
     return (
         f"Objects of interest: the IoU{_place(row)} on {row['camera']} is further above chance (by "
-        f"{format_number(found.value)}) than each of the other {found.num_items - 1} (tested at {NAMED_AT:g})."
+        f"{format_number(found.value)}) than each of the other {found.num_items - 1} (each difference tested at "
+        f"{NAMED_AT:g} / {_NAMES})."
     )
 
 

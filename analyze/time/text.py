@@ -6,6 +6,7 @@ import polars as pl
 
 from vla_attention.analyze.measures.frames import LAYERS_AVG, layer_name
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.show.findings import findings
 from vla_attention.analyze.show.headings import heading, interval_note, title, untrained_warning, wrap
 from vla_attention.analyze.show.numbers import (
     format_number,
@@ -31,6 +32,8 @@ from vla_attention.analyze.time.time_courses import (
 _SHOWN = 10
 #: Groups of the printed course.
 _MOST_GROUPS = 5
+#: Sentences that name quantities: at the gripper's closing, and of success against failure.
+_SENTENCES = 2
 
 
 def time_text(question: Question, courses: TimeCourses, settings: TimeSettings) -> str:
@@ -117,7 +120,8 @@ def _gripper_section(courses: TimeCourses, settings: TimeSettings) -> str:
     if not courses.change["num_episodes"].max():
         return "\n".join([above, *wrap(f"{rule} No episode shows both sides of a closing.")])
     table = text_table(["quantity", "change", "interval", "q", "episodes"], body, left=(0,))
-    return "\n".join([above, *wrap(rule), table, *wrap(note)])
+    named = findings(courses.change["q"], courses.change["quantity"].to_list(), "quantity", "change", _SENTENCES)
+    return "\n".join([above, *wrap(rule), table, *wrap(named), *wrap(note)])
 
 
 def outcomes_section(outcomes: pl.DataFrame) -> str:
@@ -150,7 +154,10 @@ def outcomes_section(outcomes: pl.DataFrame) -> str:
         "difference, adjusted for the number of quantities (Benjamini-Hochberg). The table also has Hedges' g and "
         "Cliff's delta."
     )
-    return "\n".join([above, text_table(header, body, left=(0,)), *wrap(note), *(w for n in notes for w in wrap(n))])
+    named = findings(outcomes["within_tasks_q"], outcomes["quantity"].to_list(), "quantity", "differ", _SENTENCES)
+    table = text_table(header, body, left=(0,))
+    said = f"Inside tasks: {named[0].lower()}{named[1:]}"
+    return "\n".join([above, table, *wrap(said), *wrap(note), *(w for n in notes for w in wrap(n))])
 
 
 def _counts_section(courses: TimeCourses) -> str:

@@ -1,0 +1,142 @@
+"""How often the commands name something in stores in which there is nothing to name.
+
+    python benchmarks/null_stores.py                  # 200 stores of each kind, some minutes
+    python benchmarks/null_stores.py --planted        # the same with something to find
+
+In a null store every key's attention is the same in expectation; episodes and keys scatter around it. The nulls:
+
+    words     every word has the same lift in every layer and head
+    objects   attention does not depend on where the objects are
+    time      nothing changes when the gripper closes, and solved episodes are as failed ones
+    compare   two runs of the same distribution, paired by initial state
+
+A planted store differs in one place: the attention to the word "the", to the first object, after the gripper closed,
+or of the second run, is a third higher.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import re
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
+from vla_attention.schemas.layout import Role
+from vla_attention.testing.stores import StoreSpec, write_store
+
+TASKS, EPISODES, REPLANS = 5, 4, 6
+FACTOR = 4 / 3
+#: A sentence that names something.
+NAMES = re.compile(
+    r"has a higher lift|exceeds its control by a larger factor|is further above chance|"
+    r"Of \d+ \w+, \d+ (differs?|changes?) |of \d+ \w+, \d+ (differs?|changes?) "
+)
+
+Rows = NDArray[np.float64]
+
+
+def scattered(generator: np.random.Generator, rows: Rows) -> Rows:
+    """Rows (replan, layer, denoise, head, query, key) with noise of every key, layer and head, and of every replan."""
+    keys = generator.normal(0, 0.3, (1, rows.shape[1], 1, rows.shape[3], 1, rows.shape[5]))
+    noisy: Rows = np.where(rows > 0, np.exp(keys + generator.normal(0, 0.2, rows.shape)), 0.0)
+    return noisy
+
+
+def normalised(rows: Rows) -> Rows:
+    """Rows that sum to 1."""
+    whole: Rows = rows / rows.sum(axis=-1, keepdims=True)
+    return whole
+
+
+def plant_of(kind: str, seed: int, planted: bool) -> Callable[[int, int, EpisodeTokens, Rows], Rows]:
+    """The rows of one store."""
+
+    def plant(task: int, episode: int, tokens: EpisodeTokens, rows: Rows) -> Rows:
+        made = scattered(np.random.default_rng([seed, task, episode]), rows)
+        factor = np.ones((len(made), made.shape[-1]))
+        image = tokens.key_role == Role.IMAGE
+        if kind == "words":
+            assert tokens.prompt_index is not None
+            start = tokens.layout.span("prompt").start
+            prompt = tokens.prompts[tokens.prompt_index[0]]
+            for place, piece in enumerate(prompt.pieces):
+                if piece.text.strip(" ▁").lower() == "the":
+                    factor[:, start + place] = FACTOR**2
+        elif kind == "objects":
+            for span in tokens.layout.spans:
+                if span.camera in (tokens.coverage or {}):
+                    factor[:, span.start : span.stop] += (FACTOR**3 - 1) * tokens.coverage[span.camera][:, :, 0]
+        elif kind == "time":
+            factor[REPLANS // 2 :] = np.where(image[REPLANS // 2 :], FACTOR, 1.0)
+        elif seed % 2:  # the second run of a comparison
+            factor = np.where(image, FACTOR, 1.0)
+        return normalised(made * (factor[:, None, None, None, None, :] if planted else 1.0))
+
+    return plant
+
+
+def close_half_way(task: int, episode: int, num_replans: int) -> NDArray[np.float64]:
+    """Actions (replan, horizon, number) whose gripper closes half way."""
+    actions = np.zeros((num_replans, 5, 7))
+    actions[..., -1] = np.where(np.arange(num_replans) < num_replans // 2, -1.0, 1.0)[:, None]
+    return actions
+
+
+def printed(kind: str, number: int, planted: bool, folder: Path) -> str:
+    """What the command prints about one store, or about two."""
+    spec = StoreSpec(
+        tasks=tuple(range(TASKS)),
+        episodes=EPISODES,
+        replans=REPLANS,
+        layers=(0, 1, 2),
+        heads=(0, 1),
+        denoise_steps=(9,),
+        frames=False,
+        coverage=kind == "objects",
+        plant_actions=close_half_way,
+        plant_success=lambda task, episode: episode % 2 == 0,
+        mantissa_bits=23,
+    )
+    paths = []
+    for run in range(2 if kind == "compare" else 1):
+        own = replace(spec, plant_rows=plant_of(kind, 2 * number + run, planted))
+        paths.append(str(write_store(folder / f"run{run}.zarr", spec=own)))
+    output, errors = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
+        code = analyze([kind, *paths, "--no-plots", "--output", str(folder / "out")])
+    if code:
+        raise RuntimeError(errors.getvalue())
+    return " ".join(output.getvalue().split())
+
+
+def main() -> None:
+    """Print a line per command."""
+    parser = argparse.ArgumentParser(description="How often commands name something in null stores.")
+    parser.add_argument("--stores", type=int, default=200, help="stores of each kind (default: 200)")
+    parser.add_argument("--planted", action="store_true", help="with something to find")
+    parser.add_argument("--kinds", nargs="+", default=["words", "objects", "time", "compare"])
+    arguments = parser.parse_args()
+    what = "planted" if arguments.planted else "null"
+    print(f"{arguments.stores} {what} stores of {TASKS} tasks x {EPISODES} episodes x {REPLANS} replans each:")
+    for kind in arguments.kinds:
+        named = 0
+        for number in range(arguments.stores):
+            with tempfile.TemporaryDirectory() as folder:
+                named += bool(NAMES.search(printed(kind, number, arguments.planted, Path(folder))))
+        print(f"  {kind:8} names something in {named:4d} ({100 * named / arguments.stores:.1f} %)", flush=True)
+
+
+if __name__ == "__main__":
+    main()
