@@ -69,11 +69,9 @@ def plant_of(kind: str, seed: int, planted: bool) -> Callable[[int, int, Episode
         image = tokens.key_role == Role.IMAGE
         if kind == "words":
             assert tokens.prompt_index is not None
-            start = tokens.layout.span("prompt").start
-            prompt = tokens.prompts[tokens.prompt_index[0]]
-            for place, piece in enumerate(prompt.pieces):
-                if piece.text.strip(" ▁").lower() == "the":
-                    factor[:, start + place] = FACTOR**2
+            for piece in tokens.prompts[tokens.prompt_index[0]].pieces:
+                if piece.text.strip() == "the":
+                    factor[:, piece.key] = FACTOR**2
         elif kind == "objects":
             for span in tokens.layout.spans:
                 if span.camera in (tokens.coverage or {}):

@@ -41,7 +41,7 @@ def depth_table(
     estimand: Estimand = Estimand.TASKS_LIKE_THESE,
     level: float = DEFAULT_LEVEL,
 ) -> pl.DataFrame:
-    """One row per group that has any amount: the mean over episodes of its centre, with a two-level interval.
+    """One row per group that has any amount: the mean over episodes of its centre, with its interval.
 
     Columns: group; of: "mass", or "contribution" (the norm of what the group's keys add to the residual stream; norms
     may grow with depth, so compare this centre only with those of other groups); num_episodes, num_tasks,

@@ -73,7 +73,7 @@ def dispersion(values: NDArray[np.float64], axis: int = -1) -> tuple[NDArray[np.
 
 
 def heads_tables(episodes: Tables, grouping: Grouping, estimand: Estimand = Estimand.TASKS_LIKE_THESE) -> Tables:
-    """Every (layer, head), from `episode_heads` of all episodes: means over episodes with two-level intervals.
+    """Every (layer, head), from `episode_heads` of all episodes: means over episodes with intervals.
 
     X_low and X_high bound X, and X_episodes says how many episodes have a finite value.
 
@@ -106,7 +106,7 @@ def dispersion_table(
 ) -> pl.DataFrame:
     """How much the heads of a layer differ, one row per layer, from `episode_heads` of all episodes.
 
-    Means over episodes with two-level intervals: `fraction_std` and `fraction_cv`, standard deviation and coefficient
+    Means over episodes with intervals: `fraction_std` and `fraction_cv`, standard deviation and coefficient
     of variation over heads of the numerator's fraction (without a ratio: of `main_group`'s); with a ratio
     `log2_ratio_std`, over the heads with a finite one. Further columns: layer, block, num_heads, num_episodes,
     num_tasks. Null with a single head.

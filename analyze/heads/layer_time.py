@@ -28,7 +28,7 @@ def layer_time_table(
     estimand: Estimand = Estimand.TASKS_LIKE_THESE,
     level: float = DEFAULT_LEVEL,
 ) -> pl.DataFrame:
-    """Means over episodes with two-level intervals for every layer and equal part of the episodes' time.
+    """Means over episodes with intervals for every layer and equal part of the episodes' time.
 
     An episode's time is divided as in `on_episode_time`. Columns: quantity, layer, block, bin, start, stop
     (0..1), num_episodes (with a finite value), mean, low, high. The quantity with a ratio is `log2_lift`, log2 of ratio

@@ -123,8 +123,8 @@ def _episodes(analysis: Analysis) -> list[Caveat]:
         low, high = min(counts), max(counts)
         several = plural(high, "episode") if low == high else f"{low} to {high} episodes"
         sentence = (
-            f"Tasks have {several} each. Intervals are widened for small numbers, and are still unreliable with fewer "
-            f"than {FEW_EPISODES} episodes of a task."
+            f"Tasks have {several} each: the interval of a task with fewer than {FEW_EPISODES} episodes is wide, and "
+            "relies on ratios that are normal on a logarithmic scale."
         )
         found.append(Caveat("Few episodes", sentence))
     if len(counts) == 1:

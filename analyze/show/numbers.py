@@ -60,8 +60,10 @@ def interval_name(level: float) -> str:
 
 
 def plural(count: int, noun: str) -> str:
-    """`1 task`, `2 tasks`."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
+    """`1 task`, `2 tasks`, `2 quantities`."""
+    if count == 1:
+        return f"1 {noun}"
+    return f"{count} {noun[:-1]}ies" if noun.endswith("ty") else f"{count} {noun}s"
 
 
 def of_tasks(num_episodes: int, num_tasks: int) -> str:

@@ -114,8 +114,7 @@ def _gripper_section(courses: TimeCourses, settings: TimeSettings) -> str:
     note = (
         f"change: mean over the {settings.window + 1} replans from the closing on, against the {settings.window} "
         "before it, within each episode; a factor for the ratio, a difference of fractions for groups. No causal "
-        "claim: much else changes then. q: p of no change, adjusted for the number of quantities (Benjamini-Hochberg). "
-        "The table also has Hedges' g and Cliff's delta."
+        "claim: much else changes then. q: p of no change, adjusted for the number of quantities (Benjamini-Hochberg)."
     )
     if not courses.change["num_episodes"].max():
         return "\n".join([above, *wrap(f"{rule} No episode shows both sides of a closing.")])

@@ -94,7 +94,7 @@ def words_summary(
     layer: str | None = None,
     estimand: Estimand = Estimand.TASKS_LIKE_THESE,
 ) -> pl.DataFrame:
-    """Mean of every word over the episodes that have it, with two-level intervals, from `words_table`.
+    """Mean of every word over the episodes that have it, with intervals, from `words_table`.
 
     A word that occurs twice in an instruction is one item (its masses are added up) unless `by_place`, which keeps the
     places of one instruction apart and in reading order. `layer`: the label of one layer, else "layers_avg" where there
