@@ -19,7 +19,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.null_stores import EPISODES, REPLANS, TASKS, Rows, close_half_way, normalised, plant_of
+from benchmarks.null_stores import EPISODES, OPTIONS, REPLANS, TASKS, Rows, close_half_way, normalised, plant_of
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.testing.stores import StoreSpec, write_store
@@ -36,6 +36,7 @@ SPEC = StoreSpec(
     plant_actions=close_half_way,
     plant_success=lambda task, episode: episode % 2 == 0,
     contributions=True,
+    prompts="same",
 )
 
 
@@ -52,7 +53,8 @@ def printed(*arguments: str) -> str:
     """What one command prints, without the lines that name the written files."""
     output = io.StringIO()
     with contextlib.redirect_stdout(output):
-        code = analyze([*arguments, "--no-plots", "--output", "out"] if arguments[0] != "groups" else [*arguments])
+        plots = () if arguments[0] == "groups" else ("--no-plots", "--output", "out")
+        code = analyze([*arguments, *OPTIONS.get(arguments[0], ()), *plots])
     if code:
         raise SystemExit(f"vla-analyze {' '.join(arguments)} failed")
     return output.getvalue()

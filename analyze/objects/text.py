@@ -55,6 +55,7 @@ def _shares(study: ObjectStudy) -> list[str]:
 def _followed(study: ObjectStudy) -> str:
     """Which object, and which layer of an object, surely exceeds its control more than all the others do."""
     leaders = study.followed
+    about = study.question.settings.intervals.words
     named = [
         f"'{row['item']}'{_place(row)} exceeds its control by a larger factor ({format_number(found.value)}) than each "
         f"of the other {found.num_items - 1} {'pairs of object and layer' if 'layer' in row else 'objects'}"
@@ -62,7 +63,7 @@ def _followed(study: ObjectStudy) -> str:
         if found.is_named(_NAMES)
     ]
     if named:
-        return f"{'; '.join(named)} (each difference tested at {NAMED_AT:g} / {_NAMES})."
+        return f"{'; '.join(named)} (each difference tested at {NAMED_AT:g} / {_NAMES}, about {about})."
     if not leaders:
         return "There are no two objects whose control can tell."
     return "No object, and no layer of an object, is surely followed more than all the others."

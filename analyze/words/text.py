@@ -40,6 +40,7 @@ def words_text(study: WordStudy) -> str:
 def _leading(study: WordStudy) -> str:
     """Which word, and which layer of a word, is surely above all the others."""
     leaders = study.leaders
+    about = study.question.settings.intervals.words
     said = [
         f"{_cell(row)} has a higher lift ({format_number(found.value)}) than each of the other {found.num_items - 1} "
         f"{'words' if 'layer' not in row else 'pairs of word and layer'}"
@@ -47,7 +48,7 @@ def _leading(study: WordStudy) -> str:
         if found.is_named(len(leaders))
     ]
     if said:
-        return f"{'; '.join(said)} (each difference tested at {NAMED_AT:g} / {len(leaders)})."
+        return f"{'; '.join(said)} (each difference tested at {NAMED_AT:g} / {len(leaders)}, about {about})."
     if not leaders:
         return "There are no two words to compare."
     return "No word, and no layer of a word, is surely read more than all the others: the order may be due to chance."
