@@ -76,10 +76,8 @@ def _ratio_cells(row: dict[str, Any], *columns: str) -> list[Cell]:
 
 def _tasks_diagram(analysis: Analysis, tasks: pl.DataFrame, folder: Path) -> Diagram:
     known = tasks.filter(pl.col("geometric_mean").is_not_null()).sort("geometric_mean").rows(named=True)
-    extremes = "".join(
-        f" {which} estimate: task {row['task_id']} with {format_number(row['geometric_mean'])}."
-        for which, row in zip(("Lowest", "Highest"), (*known[:1], *known[-1:]), strict=False)
-    )
+    ends = [f"{format_number(row['geometric_mean'])} (task {row['task_id']})" for row in (*known[:1], *known[-1:])]
+    extremes = f" The estimates run from {' to '.join(ends)}." if ends else ""
     return drawn(
         lambda where: plot_ratio_per_task(analysis.episodes.cells, analysis.tasks.cells, analysis.grouping, where),
         folder,
@@ -127,7 +125,7 @@ def _layer_diagrams(analysis: Analysis, folder: Path) -> list[Diagram]:
     time = layer_time_table(analysis.replans, grouping, estimand=estimand)
     if grouping.ratio is not None:
         known = time.filter(pl.col("mean").is_not_null()).sort("mean")["layer"].to_list()
-        extremes = f" The lowest estimate is in layer {known[0]}, the highest in layer {known[-1]}." if known else ""
+        extremes = f" The estimates run from layer {known[0]} to layer {known[-1]}." if known else ""
     return [
         drawn(
             lambda where: plot_layer_profile(analysis.tasks, grouping, where),

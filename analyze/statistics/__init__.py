@@ -1,1 +1,1 @@
-"""Statistics over episodes: intervals, effect sizes, autocorrelation. Pure functions on arrays."""
+"""Statistics over episodes: intervals, effect sizes, many looks, autocorrelation. Pure functions, no draws."""

@@ -24,7 +24,7 @@ log odds for fractions. `benchmarks/interval_coverage.py` measures the coverage.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -252,19 +252,6 @@ def _from_scale(place: float, limits: tuple[float, float]) -> float:
 
 def _exp(value: float) -> float:
     return math.exp(value) if value < 709.0 else math.inf
-
-
-def values_with_intervals(
-    statistics: Mapping[str, EpisodeStatistic],
-    tasks: ArrayLike,
-    estimand: Estimand = Estimand.TASKS_LIKE_THESE,
-    level: float = DEFAULT_LEVEL,
-) -> dict[str, float | None]:
-    """Columns `X`, `X_low`, `X_high` of a table row for every statistic X; None without a value or an interval."""
-    row: dict[str, float | None] = {}
-    for name, estimate in zip(statistics, estimates(list(statistics.values()), tasks, estimand), strict=True):
-        row |= named_interval(name, estimate.value, estimate.interval(level))
-    return row
 
 
 def named_interval(name: str, value: float | None, interval: Interval | None) -> dict[str, float | None]:

@@ -17,7 +17,6 @@ from vla_attention.analyze.statistics.intervals import (
     geometric_mean_over_episodes,
     mean_over_episodes,
     ratio_of_means_over_episodes,
-    values_with_intervals,
     welch_degrees,
 )
 from vla_attention.analyze.statistics.student import student_quantile, two_sided_p
@@ -176,15 +175,6 @@ def test_several_statistics_at_once_are_the_same_as_one_by_one():
             of_both = [[np.nan if x is None else x for x in (which.value, which.error)] for which in (estimate, alone)]
             assert of_both[0] == pytest.approx(of_both[1], rel=1e-12, nan_ok=True)
     assert estimates([], UNBALANCED) == []
-
-
-def test_columns_of_a_row_are_values_and_ends_by_name():
-    statistics = {"mean": mean_over_episodes(SAMPLE), "nothing": mean_over_episodes(np.full(25, np.nan))}
-    row = values_with_intervals(statistics, UNBALANCED, level=0.8)
-    low, high = ends_of(one(statistics["mean"], UNBALANCED), 0.8)
-    assert list(row) == ["mean", "mean_low", "mean_high", "nothing", "nothing_low", "nothing_high"]
-    assert (row["mean_low"], row["mean_high"]) == (low, high)
-    assert row["nothing"] is row["nothing_low"] is row["nothing_high"] is None
 
 
 @pytest.mark.parametrize("level", [0.5, 0.9, 0.95, 0.999])
