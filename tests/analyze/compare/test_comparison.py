@@ -121,6 +121,10 @@ def test_with_another_seed_allowed_the_initial_state_alone_makes_a_pair(stores):
     assert (row["paired"], row["num_pairs"]) == (True, 4)
     assert found.pairs.height == 4 * 3 * len(found.quantities)
     assert [note for note in found.notes if "seed" in note]
+    text = " ".join(comparison_text(found).split())
+    assert "4 pairs of episodes with the same suite, task and initial state. Their seeds may differ" in text
+    assert "initial state and seed" not in text
+    assert (row["d_z"], row["d_z_low"]) == (None, None)  # four pairs are too few for an effect size
 
 
 def test_episodes_without_a_partner_are_counted_and_named(stores):
