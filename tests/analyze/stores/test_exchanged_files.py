@@ -185,6 +185,15 @@ def test_exchanged_episodes_are_left_out_by_name_when_asked(stores, tmp_path, ca
     assert set(pl.read_parquet(tmp_path / "out/episodes.parquet")["task_id"]) == {1}
 
 
+def test_an_episode_copied_under_another_name_counts_once_when_asked(stores, originals, tmp_path, capsys):
+    assert main([str(originals[0]), "--no-plots", "--output", str(tmp_path / "whole")]) == 0
+    shutil.copytree(first(stores[0]), stores[0] / "episodes/task000_episode007")
+    assert main([str(stores[0]), "--no-plots", "--skip-corrupt", "--output", str(tmp_path / "out")]) == 0
+    assert "task000_episode007 of" in " ".join(capsys.readouterr().out.split())
+    tables = [pl.read_parquet(tmp_path / folder / "episodes.parquet") for folder in ("whole", "out")]
+    assert tables[0].equals(tables[1])
+
+
 def test_the_records_of_a_job_may_differ(originals, stores, answers):
     """Another job, on another machine, may have added the episodes; the weights may lie elsewhere."""
     edit_root(stores[0], ("provenance", "numpy"))
