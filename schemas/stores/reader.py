@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     import zarr
 
     from vla_attention.schemas.stores.shards import ShardedLayers
+    from vla_attention.schemas.stores.single_chunks import SingleChunk
 
 
 @dataclass(frozen=True)
@@ -98,11 +99,19 @@ class StoredEpisode:
         return {}
 
     @cached_property
+    def _single_chunks(self) -> dict[str, SingleChunk | None]:
+        return {}
+
+    @cached_property
     def _layers(self) -> dict[str, ShardedLayers | None]:
         return {}
 
     def array(self, name: str) -> zarr.Array[Any]:
-        """Open one array; raises `CorruptEpisode` when it has another shape than in the attributes."""
+        """Open one array with zarr-python, which gets the array's files through the seal.
+
+        Raises:
+            CorruptEpisode: it has another shape than in the attributes, or its metadata are damaged.
+        """
         if name not in self._opened:
             self._opened[name] = self._open(name)
         return self._opened[name]
@@ -113,26 +122,30 @@ class StoredEpisode:
 
         from vla_attention.schemas.stores.sealed_zarr import SealedArrayStore
 
+        metadata = self._metadata(name)
+        try:
+            # Opened from the bytes that were checked against the seal: zarr does not read the file a second time.
+            place = StorePath(SealedArrayStore(self.files, name, metadata))
+            array: zarr.Array[Any] = zarr.Array(zarr.AsyncArray(metadata=cast(Any, metadata), store_path=place))
+        except (KeyError, TypeError, ValueError) as error:
+            raise CorruptEpisode(f"Episode {self.name} lacks the array {name} ({error}).") from None
+        return array
+
+    def _metadata(self, name: str) -> dict[str, Any]:
+        """An array's `zarr.json`, which must have the shape that the attributes list."""
         recorded = self.attributes.arrays.get(name)
         if recorded is None:
             raise CorruptEpisode(f"Episode {self.name} lacks the array {name}: its attributes do not list it.")
-        document = self.sealed(f"{name}/zarr.json")
-        try:
-            metadata = json.loads(document)
-            # Opened from the bytes that were checked against the seal: zarr does not read the file a second time.
-            place = StorePath(SealedArrayStore(self.files, name, metadata))
-            array: zarr.Array[Any] = zarr.Array(zarr.AsyncArray(metadata=metadata, store_path=place))
-        except (KeyError, TypeError, ValueError) as error:
-            raise CorruptEpisode(f"Episode {self.name} lacks the array {name} ({error}).") from None
-        if tuple(array.shape) != recorded.shape:
+        document = json.loads(self.sealed(f"{name}/zarr.json"))
+        if not isinstance(document, dict) or document.get("shape") != list(recorded.shape):
             raise CorruptEpisode(f"Array {name} of episode {self.name} has another shape than its attributes say.")
-        return array
+        return document
 
     def read(self, name: str, index: Any = ...) -> NDArray[Any]:
-        """Values of one array; a chunk that is missing or fails its checksum raises `CorruptEpisode`."""
-        array = self.array(name)
+        """Values of one array; a chunk that is missing or not the one that was sealed raises `CorruptEpisode`."""
+        stored: Any = self._single_chunk(name) or self.array(name)
         try:
-            values = np.asarray(array[index])
+            values = np.asarray(stored[index])
         except IndexError:
             raise  # the caller's mistake
         except Exception as error:  # damaged bytes can make codecs raise anything
@@ -141,6 +154,13 @@ class StoredEpisode:
         if name.endswith("/key_role") and not values.all():
             raise _lost_chunk(self, name)
         return self._without_missing(name, values)
+
+    def _single_chunk(self, name: str) -> SingleChunk | None:
+        if name not in self._single_chunks:
+            from vla_attention.schemas.stores.single_chunks import SingleChunk
+
+            self._single_chunks[name] = SingleChunk.of(self._metadata(name), self.files, name)
+        return self._single_chunks[name]
 
     def read_layer(self, name: str, layer: int, denoise: int) -> NDArray[np.float32]:
         """One layer and denoise step (positions) of an array (replan, layer, denoise, ...), without those two axes."""
