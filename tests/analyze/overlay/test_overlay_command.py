@@ -67,7 +67,7 @@ def test_the_follower_s_attention_is_drawn_on_what_it_follows(tmp_path: Path, up
     item = question.selected[0]
     overlay = episode_overlay(question, item, camera_names(question, None), ratios_of(question, item))
     scale, values = overlay.scale("lift", range(3)), overlay.values("lift")
-    view = PolicyCameraView(CAMERA, "", upright, mirrored)
+    view = PolicyCameraView(CAMERA, "agentview", upright, mirrored)
     assert overlay.views[CAMERA].mirrored == mirrored
     for replan in range(3):
         frame = zarr.open_array(store.path / f"episodes/{item.episode.name}/frames/{CAMERA}", mode="r")[replan]
