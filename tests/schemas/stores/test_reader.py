@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
+from numcodecs import blosc
 from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
 
-from tests.kit.attacks import exchange, files_of
+from tests.kit.attacks import exchange, files_of, with_checksum
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import (
     FORMAT_VERSION,
@@ -133,6 +134,23 @@ def test_an_array_of_any_layout_is_bound_to_its_episode(path, layout):
     files[0].unlink()
     with pytest.raises(CorruptEpisode, match="lost its joint/rows"):
         open_store(path).episodes[0].read("joint/rows")
+
+
+@pytest.mark.parametrize("array", ["joint/atoms", "joint/key_role", "noise_seed", "frames/base_0_rgb", "state"])
+def test_a_single_chunk_that_decodes_to_another_size_is_refused(path, array):
+    """Its checksum and its seal are right: the rest of the array would be what was in memory before."""
+    folder = path / "episodes" / "task001_episode000"
+    values = zarr.open_array(folder / array)[...]
+    (file,) = files_of(folder, array)
+    for other in (values[:1], np.concatenate([values, values])):
+        frame = blosc.compress(np.ascontiguousarray(other), b"zstd", 3, blosc.SHUFFLE, typesize=values.itemsize)
+        file.write_bytes(with_checksum(frame))
+        reseal(folder)
+        for index in (..., 0):
+            with pytest.raises(
+                CorruptEpisode, match=rf"{array} of episode task001_episode000.*header says \d+ decoded"
+            ):
+                open_store(path).episodes[0].read(array, index)
 
 
 def test_an_index_that_does_not_exist_is_the_callers_mistake(original):
