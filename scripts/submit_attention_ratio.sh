@@ -30,7 +30,7 @@ for word in "$@"; do
   *) die "unknown word '$word'; expected pi, cosmos, --dry-run or options of sbatch as --NAME=VALUE." ;;
   esac
 done
-[ -z "${TASK_ID:-}" ] || die "TASK_ID is '$TASK_ID', and an array runs a task per index; give --array=$TASK_ID instead."
+[ -z "${TASK_ID:-}" ] || die "TASK_ID is '$TASK_ID', and an array runs a task per index; give --array=${TASK_ID// /,} instead."
 [ -z "${STAGE:-}" ] || die "STAGE is '$STAGE'; this script sets it itself."
 
 if [ -z "$array" ]; then

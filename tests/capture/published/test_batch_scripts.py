@@ -83,6 +83,7 @@ def test_the_helper_prints_what_it_would_submit(tmp_path):
     [
         (["cosmo"], {}, "unknown word 'cosmo'"),
         (["--array=0-2"], {"TASK_ID": "2"}, "give --array=2 instead"),
+        (["--array=0-2"], {"TASK_ID": "0 2"}, "give --array=0,2 instead"),
         (["--dry-run"], {"TASK_SUITE": "libero_11"}, "Unknown task suite 'libero_11'"),
         (["--array=0-2"], {}, "there is no sbatch here"),
     ],
