@@ -95,7 +95,7 @@ def close_half_way(task: int, episode: int, num_replans: int) -> NDArray[np.floa
 
 
 def printed(kind: str, number: int, planted: bool, folder: Path) -> str:
-    """What the command prints about one store, or about two."""
+    """The whole text of the command about one store, or about two."""
     spec = StoreSpec(
         tasks=tuple(range(TASKS)),
         episodes=EPISODES,
@@ -115,12 +115,12 @@ def printed(kind: str, number: int, planted: bool, folder: Path) -> str:
     for run in range(2 if kind == "compare" else 1):
         own = replace(spec, plant_rows=plant_of(kind, 2 * number + run, planted))
         paths.append(str(write_store(folder / f"run{run}.zarr", spec=own)))
-    output, errors = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
+    errors = io.StringIO()
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(errors):
         code = analyze([kind, *paths, *OPTIONS.get(kind, ()), "--no-plots", "--output", str(folder / "out")])
     if code:
         raise RuntimeError(errors.getvalue())
-    return " ".join(output.getvalue().split())
+    return " ".join((folder / "out" / "summary.txt").read_text(encoding="utf-8").split())
 
 
 def main() -> None:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from vla_attention.analyze.arguments import add_grouping, add_intervals, add_output, add_selection, settings_of
-from vla_attention.analyze.show.output_files import report_files
+from vla_attention.analyze.show.screen import fitted, write_whole
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     from vla_attention.analyze.show.plot_text import shortened
 
     comparison = compare_stores(parse_runs(arguments.runs), settings_of(arguments), arguments.allow_mismatch)
-    print(comparison_text(comparison))
+    text = comparison_text(comparison)
     joined = shortened("-vs-".join(comparison.names).replace("/", "-"), 100)
     folder: Path = arguments.output or Path("results") / joined / "compare"
     files = write_parquet(
@@ -68,6 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
         runs=comparison.estimates,
         unpaired=comparison.unpaired,
     )
+    files.append(write_whole(folder, text))
     if not arguments.no_plots:
         from vla_attention.analyze.compare.plot_forest import plot_forest
         from vla_attention.analyze.compare.plot_paired_differences import plot_paired_differences
@@ -75,5 +76,5 @@ def run(arguments: argparse.Namespace) -> int:
         files += plot_forest(comparison, folder)
         for name in comparison.runs_with_common_tasks:
             files += plot_paired_differences(comparison, name, folder)
-    report_files(folder, files)
+    print(fitted(text, folder, files))
     return 0

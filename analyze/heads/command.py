@@ -15,7 +15,7 @@ from vla_attention.analyze.arguments import (
     settings_of,
     sink_rule,
 )
-from vla_attention.analyze.show.output_files import report_files
+from vla_attention.analyze.show.screen import fitted, write_whole
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
@@ -79,7 +79,8 @@ def run(arguments: argparse.Namespace) -> int:
     study = study_heads(question, options)
     folder = output_folder(arguments, "heads")
     files = write_parquet(folder, **study.tables())
-    print(heads_text(study, arguments.top))
+    text = heads_text(study, arguments.top)
+    files.append(write_whole(folder, text))
     if not arguments.no_plots:
         from vla_attention.analyze.heads.layer_time import layer_time_table
         from vla_attention.analyze.heads.plot_denoise_profile import plot_denoise_profile
@@ -93,5 +94,5 @@ def run(arguments: argparse.Namespace) -> int:
         time = layer_time_table(study.replans, grouping, estimand=study.question.settings.intervals)
         files += plot_layer_time(time, study.replans, grouping, folder)
         files += plot_denoise_profile(study.denoise, grouping, folder)
-    report_files(folder, files)
+    print(fitted(text, folder, files))
     return 0

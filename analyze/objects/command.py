@@ -13,7 +13,8 @@ from vla_attention.analyze.arguments import (
     settings_of,
     stores_of,
 )
-from vla_attention.analyze.show.output_files import report_files, write_parquet
+from vla_attention.analyze.show.output_files import write_parquet
+from vla_attention.analyze.show.screen import fitted, write_whole
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
@@ -88,9 +89,8 @@ def run(arguments: argparse.Namespace) -> int:
         task=arguments.task,
         episode=arguments.episode,
     )
-    print(objects_text(study))
-    folder = output_folder(arguments, "objects")
-    files = write_parquet(folder, **study.files())
+    text, folder = objects_text(study), output_folder(arguments, "objects")
+    files = [*write_parquet(folder, **study.files()), write_whole(folder, text)]
     if not arguments.no_plots:
         from vla_attention.analyze.objects.plot_object_iou import plot_object_iou
         from vla_attention.analyze.objects.plot_object_shares import plot_object_shares
@@ -98,5 +98,5 @@ def run(arguments: argparse.Namespace) -> int:
         files += plot_object_shares(study, folder)
         if object_settings.spatial:
             files += plot_object_iou(study, folder)
-    report_files(folder, files)
+    print(fitted(text, folder, files))
     return 0

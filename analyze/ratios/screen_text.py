@@ -25,14 +25,15 @@ from vla_attention.analyze.show.numbers import (
     row_interval,
 )
 from vla_attention.analyze.show.plot_text import shortened
+from vla_attention.analyze.show.screen import SCREEN_LINES, WHOLE_TEXT
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 
-#: Lines of a terminal that show everything at once.
-SCREEN_LINES = 40
-#: Lines of notes, rows of groups, and blocks of layers beside each other, before "in summary.txt" stands for the rest.
-_MOST_NOTES, _MOST_GROUPS, _MOST_BLOCKS = 4, 6, 2
-_REST = "in summary.txt"
+#: Rows of groups, and blocks of layers beside each other, before "in summary.txt" stands for the rest.
+_MOST_GROUPS, _MOST_BLOCKS = 6, 2
+#: Notes leave room for so many tasks.
+_FEWEST_TASKS = 3
+_REST = f"in {WHOLE_TEXT}"
 #: Groups whose fractions stand in rows where there is no ratio.
 _MOST_FRACTIONS = 3
 
@@ -45,18 +46,18 @@ def screen_text(analysis: Analysis, folder: Path, files: Sequence[str]) -> str:
         folder: where summary.txt is.
         files: the lines about further files, which stand last.
     """
-    last = [*wrap(f"The whole, with every interval: {folder / 'summary.txt'}", rest="  "), *files]
-    parts = [wrap_all(analysis.answer), _notes(analysis), _layers(analysis), _groups(analysis)]
-    above = [line for part in parts if part for line in (*part, "")]
-    room = SCREEN_LINES - len(above) - len(last) - 1
+    last = [*wrap(f"The whole, with every interval: {folder / WHOLE_TEXT}", rest="  "), *files]
+    answer, tables = wrap_all(analysis.answer), [*_layers(analysis), "", *_groups(analysis), ""]
+    room = SCREEN_LINES - len(answer) - len(tables) - len(last) - 2
+    notes = _notes(analysis, room - _FEWEST_TASKS - 3)
+    above = [*answer, "", *notes, *([""] if notes else []), *tables]
+    room -= len(notes) + bool(notes)
     return "\n".join([*above, *_tasks(analysis, room), "", *last])
 
 
-def _notes(analysis: Analysis) -> list[str]:
-    lines = wrap_all((f"note: {note}" for note in analysis.notes), rest="  ")
-    if len(lines) <= _MOST_NOTES:
-        return lines
-    return [*lines[: _MOST_NOTES - 1], f"  ... further notes {_REST}"]
+def _notes(analysis: Analysis, room: int) -> list[str]:
+    lines, most = wrap_all((f"note: {note}" for note in analysis.notes), rest="  "), max(room, 2)
+    return lines if len(lines) <= most else [*lines[: most - 1], f"  ... the whole note {_REST}"]
 
 
 def _layers(analysis: Analysis) -> list[str]:

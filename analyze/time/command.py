@@ -15,7 +15,7 @@ from vla_attention.analyze.arguments import (
     settings_of,
     stores_of,
 )
-from vla_attention.analyze.show.output_files import report_files
+from vla_attention.analyze.show.screen import fitted, write_whole
 from vla_attention.schemas.command_line import command_parser
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     settings = TimeSettings(arguments.bins, arguments.window)
     question = ask(stores_of(arguments), settings_of(arguments))
     courses = time_courses(question, settings)
-    print(time_text(question, courses, settings))
+    text = time_text(question, courses, settings)
     folder: Path = output_folder(arguments, "time")
     files = write_parquet(
         folder,
@@ -74,9 +74,10 @@ def run(arguments: argparse.Namespace) -> int:
         success_against_failure=courses.outcomes,
         autocorrelation=courses.autocorrelation,
     )
+    files.append(write_whole(folder, text))
     if not arguments.no_plots:
         from vla_attention.analyze.time.plot_time_course import plot_time_courses
 
         files += plot_time_courses(courses, question.grouping, folder)
-    report_files(folder, files)
+    print(fitted(text, folder, files))
     return 0

@@ -13,7 +13,8 @@ from vla_attention.analyze.arguments import (
     settings_of,
     stores_of,
 )
-from vla_attention.analyze.show.output_files import report_files, write_parquet
+from vla_attention.analyze.show.output_files import write_parquet
+from vla_attention.analyze.show.screen import fitted, write_whole
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
@@ -53,12 +54,13 @@ def run(arguments: argparse.Namespace) -> int:
     from vla_attention.analyze.words.word_study import study_words
 
     study = study_words(stores_of(arguments), settings_of(arguments), arguments.task)
-    print(words_text(study))
+    text = words_text(study)
     folder = output_folder(arguments, "words" if arguments.task is None else f"words/task{arguments.task:03d}")
     files = write_parquet(folder, words=study.episodes, words_summary=study.summary)
+    files.append(write_whole(folder, text))
     if not arguments.no_plots:
         from vla_attention.analyze.words.plot_word_bars import plot_word_bars
 
         files += plot_word_bars(study.summary, folder, study.layer, study.instruction)
-    report_files(folder, files)
+    print(fitted(text, folder, files))
     return 0

@@ -309,7 +309,8 @@ def test_the_command_writes_tables_and_pictures_and_names_the_nearest_key(tmp_pa
 
     path = write_store(tmp_path / "a.zarr")
     assert main(["heads", str(path), "--output", str(tmp_path / "out"), "--sink-factor", "1000", "--top", "2"]) == 0
-    said = capsys.readouterr().out
+    assert "SINKS" in capsys.readouterr().out
+    said = (tmp_path / "out" / "summary.txt").read_text()
     assert "The key that comes nearest, key " in " ".join(said.split())
     pairs, single = ("heads", "denoise", "row_metrics"), ("dispersion", "depth", "sinks", "sink_heads")
     pictures_of_groups = ("head_grid", "layer_profile", "denoise_profile")
@@ -320,6 +321,7 @@ def test_the_command_writes_tables_and_pictures_and_names_the_nearest_key(tmp_pa
         | {f"{name}_groups.parquet" for name in pairs}
         | {f"{name}.{kind}" for name in pictures for kind in ("png", "pdf", "csv")}
         | {f"{name}_groups.csv" for name in pictures_of_groups}
+        | {"summary.txt"}
     )
     rows, groups = (pl.read_parquet(tmp_path / "out" / f"row_metrics{end}.parquet") for end in ("", "_groups"))
     assert rows.height == 4 * 3 * 2 * 2 * 2

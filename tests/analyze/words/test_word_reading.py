@@ -159,7 +159,7 @@ def test_the_command_prints_writes_and_draws(reader_store, tmp_path, capsys):
     assert "stop words" in printed
     assert all(len(line) <= 100 for line in printed.splitlines() if str(tmp_path) not in line)
     assert {path.name for path in tmp_path.iterdir()} == {
-        "words.parquet", "words_summary.parquet", "word_bars.png", "word_bars.pdf", "word_bars.csv",
+        "summary.txt", "words.parquet", "words_summary.parquet", "word_bars.png", "word_bars.pdf", "word_bars.csv",
     }  # fmt: skip
     assert pl.read_parquet(tmp_path / "words.parquet")["head"].n_unique() == 2
     assert main(["words", str(reader_store), "--output", str(tmp_path / "one"), "--task", "1"]) == 0
