@@ -21,12 +21,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import google_crc32c
 import numpy as np
-from numcodecs import blosc
 from numpy.typing import NDArray
 
-from vla_attention.schemas.stores.digest import bytes_digest
+from vla_attention.schemas.stores.digest import bytes_digest, crc32c
 from vla_attention.schemas.stores.store_format import CorruptEpisode, FileRecord
 
 CHECKSUM_BYTES = 4
@@ -69,7 +67,7 @@ def read_index(stored: bytes, file_size: int) -> NDArray[np.uint64]:
         CorruptEpisode: the checksum does not fit, or the chunks overlap or reach beyond the file's chunks.
     """
     content, checksum = stored[:-CHECKSUM_BYTES], stored[-CHECKSUM_BYTES:]
-    if google_crc32c.value(content) != int.from_bytes(checksum, "little"):
+    if crc32c(content) != int.from_bytes(checksum, "little"):
         raise CorruptEpisode("the checksum of its index does not fit")
     index = np.frombuffer(content, dtype="<u8").reshape(-1, 2).copy()
     index[(index == _ABSENT).all(axis=1)] = 0
@@ -137,7 +135,7 @@ class SealedShard:
             raise CorruptEpisode(f"its {self.file} cannot be read: {error.strerror or error}") from None
         if len(encoded) != length or checksum != self.checksum(number):
             raise CorruptEpisode(f"chunk {number} of its {self.file} does not agree with its seal")
-        if google_crc32c.value(encoded) != int.from_bytes(checksum, "little"):
+        if crc32c(encoded) != int.from_bytes(checksum, "little"):
             raise CorruptEpisode(f"the checksum of chunk {number} of its {self.file} does not fit")
         return encoded
 
@@ -217,6 +215,8 @@ class ShardedLayers:
         Raises:
             CorruptEpisode: a chunk is missing, is not the one that was sealed, or decodes to another size.
         """
+        from numcodecs import blosc
+
         if not (0 <= layer < self.shape[1] and 0 <= denoise < self.shape[2]):
             raise IndexError(f"layer {layer} and denoise {denoise} of an array of shape {self.shape}")
         number = layer * self.shape[2] + denoise

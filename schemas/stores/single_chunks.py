@@ -10,11 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import google_crc32c
 import numpy as np
 from numcodecs import blosc
 from numpy.typing import NDArray
 
+from vla_attention.schemas.stores.digest import crc32c
 from vla_attention.schemas.stores.sealed_files import SealedFiles
 from vla_attention.schemas.stores.shards import CHECKSUM_BYTES, check_blosc_frame
 from vla_attention.schemas.stores.store_format import CorruptEpisode
@@ -65,7 +65,7 @@ class SingleChunk:
         """Values at a numpy index; raises `CorruptEpisode` for other bytes than were sealed, and for other sizes."""
         content = self.files.whole(self.file)
         frame, checksum = content[:-CHECKSUM_BYTES], content[-CHECKSUM_BYTES:]
-        if google_crc32c.value(frame) != int.from_bytes(checksum, "little"):
+        if crc32c(frame) != int.from_bytes(checksum, "little"):
             raise CorruptEpisode(f"the checksum of its {self.file} does not fit")
         values = np.empty(self.shape, self.dtype)
         try:
