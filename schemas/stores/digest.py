@@ -15,7 +15,7 @@ from vla_attention.schemas.stores.store_format import JOB_RECORDS
 
 
 def crc32c(content: bytes) -> int:
-    """The checksum (Castagnoli) that Zarr's codec `crc32c` writes after a chunk; imports its library when first used."""
+    """The checksum that Zarr's codec `crc32c` writes after a chunk; imports its library when first used."""
     import google_crc32c
 
     checksum: int = google_crc32c.value(content)
