@@ -56,8 +56,14 @@ def screen_text(analysis: Analysis, folder: Path, files: Sequence[str]) -> str:
 
 
 def _notes(analysis: Analysis, room: int) -> list[str]:
-    lines, most = wrap_all((f"note: {note}" for note in analysis.notes), rest="  "), max(room, 2)
-    return lines if len(lines) <= most else [*lines[: most - 1], f"  ... the whole note {_REST}"]
+    """The notes; where they are too long the first line of each, which names what it is about."""
+    notes, most = [wrap(f"note: {note}", rest="  ") for note in analysis.notes], max(room, 2)
+    if sum(map(len, notes)) <= most:
+        return [line for lines in notes for line in lines]
+    shown = notes if len(notes) <= most - 1 else notes[: most - 2]
+    more = len(notes) - len(shown)
+    rest = f"  {more} more notes {_REST}" if more else f"  ... the whole of the notes {_REST}"
+    return [*(lines[0] for lines in shown), rest]
 
 
 def _layers(analysis: Analysis) -> list[str]:

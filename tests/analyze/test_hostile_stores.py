@@ -148,9 +148,8 @@ def test_hostile_texts_are_printed_visibly_and_nothing_is_written_elsewhere(
             for line in path.read_text(encoding="utf-8").split("\n"):
                 assert line.isprintable(), (path.name, line)
     if command == "ratios":
-        text = (out / "summary.txt").read_text()
-        assert r"put\x1b[2J the\u202e" in text
-        assert text in printed
+        for text in ((out / "summary.txt").read_text(), printed):
+            assert r"put\x1b[2J the\u202e" in text
         assert (out / "attention_ratio_results_%24x%5E%7B%24 %3Cb%3E%252E.json").is_file()
         assert parse(["--results", str(out), "--output", str(out / "parsed.txt")]) == 0
         assert r"put\x1b[2J the\u202e" in check_output(capsys)
