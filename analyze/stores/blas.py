@@ -1,4 +1,8 @@
-"""One thread for each matrix product of numpy, while several episodes are computed at once."""
+"""One thread for each matrix product of numpy, while several episodes are computed at once.
+
+threadpoolctl does the same, but lets only the first thread of a process that limits OpenBLAS do so from then on (3.8);
+scans may begin in any thread.
+"""
 
 from __future__ import annotations
 
