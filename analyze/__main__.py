@@ -11,7 +11,7 @@ from pathlib import Path
 
 from vla_attention.analyze.commands import COMMANDS, DEFAULT_COMMAND
 from vla_attention.schemas.command_line import run_command
-from vla_attention.schemas.errors import UnknownName, UserError, did_you_mean, listing
+from vla_attention.schemas.errors import BadArgument, UnknownName, UserError, did_you_mean, listing
 from vla_attention.schemas.threads import use_threads
 
 #: Episodes are measured in threads (`stores.parallel`); matrix products that start threads too make them slower.
@@ -31,6 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(name: str, arguments: Sequence[str]) -> int:
+    if any(argument.partition("=")[0] == "--seed" for argument in arguments):
+        raise BadArgument("Intervals have no random draws any more: leave --seed out.")
     if not name:
         _refuse_misspelt_command(arguments)
     command = import_module(f"vla_attention.analyze.{name or DEFAULT_COMMAND}.command")

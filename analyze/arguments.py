@@ -104,7 +104,7 @@ def add_sink_rule(parser: argparse._ArgumentGroup) -> None:
         "--sink-mass",
         type=float,
         metavar="M",
-        help="or on average more than this part of a row (default: 0.3)",
+        help="or on average more than this part of a row, and more than twice its uniform share (default: 0.3)",
     )
     parser.add_argument(
         "--sink-heads",

@@ -27,7 +27,8 @@ _EXAMPLES = """examples:
   vla-analyze heads runs/libero_10.zarr --no-rows     (masses only: a moment, also for large stores)
 
 A sink of a head is a key that takes more than --sink-factor times its uniform share in at least --sink-share of the
-head's rows, or more than --sink-mass of a row on average; sinks are found task by task.
+head's rows, or more than --sink-mass of a row on average (then also more than twice its uniform share); sinks are
+found task by task.
 """
 
 

@@ -288,12 +288,12 @@ def sinks_text(search: SinkSearch, rule: SinkRule) -> str:
     if sinks.is_empty():
         nearest = keys.sort("largest_mass", descending=True).row(0, named=True)
         text = (
-            f"No key takes {rule}. The key that comes nearest, {nearest['description']} ({nearest['role']}), takes "
-            f"{format_percent(nearest['largest_mass'])} of the rows of a head of task {nearest['task_id']}, and "
-            f"{format_number(nearest['times_uniform'])} x its uniform share on average over the heads. {beyond} Other "
-            "rules: --sink-factor, --sink-share, --sink-mass."
+            f"No key takes {rule}. The key that comes nearest, {nearest['description']} ({nearest['role']}), takes on "
+            f"average {format_percent(nearest['largest_mass'])} of a row in one head of task {nearest['task_id']}, and "
+            f"{format_number(nearest['times_uniform'])} x its uniform share over all heads."
         )
-        return "\n".join(wrap(text))
+        others = "Other rules: --sink-factor, --sink-share, --sink-mass."
+        return "\n".join(wrap(" ".join(filter(None, (text, beyond, others)))))
     merged = merged_sinks(sinks)
     header = ["key", "role", "tasks", "heads", "by mass", "mass", "x uniform", "most", "values"]
     rows = [

@@ -155,7 +155,7 @@ def _without_faulty(
         for store, episode in chosen:
             faults = episode_faults(store, episode)
             if faults:
-                skipped.append(f"{episode.name} of {store.path} is left out: {faults[0].problem}")
+                skipped.append(f"{episode.name} of {store.path} is left out: {faults[0].problem.rstrip('.')}")
             elif episode.attributes.num_replans == 0:
                 skipped.append(f"{episode.name} of {store.path} is left out: it holds no replan")
             else:

@@ -76,7 +76,7 @@ class SinkRule:
     def __str__(self) -> str:
         return (
             f"more than {self.factor:g} x the uniform share in at least {self.share:.0%} of a head's rows, or on "
-            f"average more than {self.mass:.0%} of a row"
+            f"average more than {self.mass:.0%} of a row (then also more than twice its uniform share)"
         )
 
 
@@ -320,7 +320,10 @@ def describe_sinks(sinks: pl.DataFrame, num_tasks: int, rule: SinkRule, num_vali
     left = sinks.height - out.height
     also = ""
     if left:
-        also = f" Sinks of fewer heads stay: {plural(left, 'key')} of tasks (--sink-heads takes them out)."
+        also = (
+            f" Sinks of fewer heads stay in: {plural(left, 'key')}, counted in every task by itself (a smaller "
+            "--sink-heads takes them out too)."
+        )
     of_rule = f"{rule}, in at least {rule.heads:.0%} of the layers' heads"
     also += f" {cannot_fire(num_valid, rule)}".rstrip()
     if out.is_empty():

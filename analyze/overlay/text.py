@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from vla_attention.analyze.overlay.overlay_data import orientation_note
 from vla_attention.analyze.overlay.overlay_study import OverlayStudy
-from vla_attention.analyze.show.headings import wrap
+from vla_attention.analyze.show.headings import wrap, wrap_all
 from vla_attention.analyze.show.numbers import format_number
 from vla_attention.analyze.show.patch_pictures import upright
 from vla_attention.analyze.show.text_table import text_table
@@ -36,11 +36,11 @@ def overlay_text(study: OverlayStudy) -> str:
         rows.append(cells)
     item = overlay.item
     lines = [
-        *study.question.remarks,
-        f"{item.store.suite} {item.episode.name}: {visible(item.episode.attributes.instruction)}",
+        *wrap_all(study.question.remarks),
+        *wrap(f"{item.store.suite} {item.episode.name}: {visible(item.episode.attributes.instruction)}"),
         text_table(header, rows),
         *wrap(_LEGEND),
         "",
-        orientation_note(overlay),
+        *wrap(orientation_note(overlay)),
     ]
     return "\n".join(lines)

@@ -173,8 +173,8 @@ def _baseline(rows: pl.DataFrame, spread: Spread) -> list[str]:
     word, of_uniform = verdict(spread.mean), verdict(uniform)
     same = "the same: here the word means nothing" if word == of_uniform else f"'{of_uniform}'"
     return wrap(
-        f"Uniform attention: {format_number(uniform)} ({keys} keys), which the guide calls {same}. Ratio / uniform: "
-        f"{format_number(lift)}.",
+        f"Uniform attention: {format_number(uniform)} ({keys} keys), which the guide calls {same}. Mean of ratio / "
+        f"uniform: {format_number(lift)} (arithmetic, as the mean above; the lift of vla-analyze is a geometric mean).",
         first="    ",
         rest="    ",
     )

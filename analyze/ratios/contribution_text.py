@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import polars as pl
@@ -10,18 +10,18 @@ import polars as pl
 from vla_attention.analyze.measures.contribution_ratios import contribution_rows
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables
 from vla_attention.analyze.measures.group_contributions import norms_by_layer, ratios_by_layer
-from vla_attention.analyze.show.headings import heading, wrap
+from vla_attention.analyze.show.headings import WIDTH, heading, wrap
 from vla_attention.analyze.show.numbers import format_number, interval_name, row_interval
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL, Estimand
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
 
-_RATIO_HEADER = ("ratio", interval_name(DEFAULT_LEVEL), "uniform", "lift", "interval", "of means", "mean")
+_RATIO_HEADER = ("ratio", interval_name(DEFAULT_LEVEL), "uniform", "lift", "interval", "of means")
 _RATIO_NOTE = (
     "ratio, uniform, lift: geometric means; lift is ratio / uniform. uniform: the ratio that the same values would "
     "give if attention were shared out between the segments as uniform attention is. of means: mean norm / mean "
-    "norm. mean: of the episodes' mean ratios."
+    "norm."
 )
 _HOW = (
     "Value-weighted, through output projection and gate; root mean square over action queries, mean over replans and "
@@ -76,19 +76,30 @@ def group_contributions_section(
         note = f"{_HOW} {note}".strip()
     norms = norms_by_layer(tables)
     ratios = ratios_by_layer(tables.cells, estimand)
-    rows = []
+    layers, of_norms, of_ratios = [], [], []
     for layer in (*tables.cells["layer"].unique(maintain_order=True).cast(pl.String), LAYERS_AVG):
-        cells = [layer, *(format_number(norms[layer, name]) for name in shown)]
-        if layer in ratios:
-            cells += _ratio_cells(ratios[layer])
-        rows.append(cells)
-    header = ["layer", *(f"|{name}|" for name in shown), *(_RATIO_HEADER if ratios else [])]
+        layers.append(layer)
+        of_norms.append([format_number(norms[layer, name]) for name in shown])
+        of_ratios.append(_ratio_cells(ratios[layer]) if layer in ratios else [])
+    header = [f"|{name}|" for name in shown]
+    table = _beside(layers, (header, of_norms), (list(_RATIO_HEADER), of_ratios)) if ratios else ""
+    if not ratios or max(map(len, table.splitlines())) > WIDTH:
+        table = _beside(layers, (header, of_norms))
+        if ratios:
+            table += "\n\n" + _beside(layers, (list(_RATIO_HEADER), of_ratios))
     note = f"{_RATIO_NOTE if ratios else ''} {note}".strip()
-    lines = [heading(title), text_table(header, rows, left=(0,))]
+    lines = [heading(title), table]
     return "\n".join([*lines, *(["", *wrap(note)] if note else []), ""])
+
+
+def _beside(layers: Sequence[str], *parts: tuple[list[str], list[list[str]]]) -> str:
+    """One table of parts (header, cells of every layer) that stand beside one another."""
+    header = ["layer", *(name for names, _ in parts for name in names)]
+    rows = [[layer, *(cell for _, cells in parts for cell in cells[i])] for i, layer in enumerate(layers)]
+    return text_table(header, rows, left=(0,))
 
 
 def _ratio_cells(row: Mapping[str, Any]) -> list[str]:
     cells = [format_number(row["geometric_mean"]), row_interval(row, "geometric_mean")]
     cells += [format_number(row["uniform_ratio"]), format_number(row["ratio_lift"]), row_interval(row, "ratio_lift")]
-    return [*cells, format_number(row["ratio_of_means"]), format_number(row["ratio_mean"])]
+    return [*cells, format_number(row["ratio_of_means"])]

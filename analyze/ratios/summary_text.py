@@ -19,8 +19,10 @@ from vla_attention.analyze.statistics.intervals import Estimand
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
 
-#: With fewer episodes of a task, the summary warns that the interval of the task is wide.
+#: With fewer episodes of a task, the summary warns that the width of the task's interval says little.
 FEW_EPISODES = 5
+#: Relative difference below which the uniform ratio reads as the quotient of the mean numbers of keys.
+_SAME_QUOTIENT = 0.005
 
 
 @dataclass(frozen=True)
@@ -153,6 +155,8 @@ def _baseline_sentence(grouping: Grouping, uniform: float | None, level: Tables)
         f"Uniform attention alone gives ratio = {format_number(uniform)}, because there are on average "
         f"{format_number(above)} keys on one side and {format_number(below)} on the other"
     )
+    if abs(above - uniform * below) > _SAME_QUOTIENT * above:
+        baseline += " (a geometric mean over episodes and tasks, and not the quotient of these two means)"
     if not grouping.compares_modalities:
         return f"{baseline}: read the ratio beside it, or read the lift."
     return (
@@ -258,8 +262,8 @@ def _across_section(run: AnalysedRun, grouping: Grouping, tasks: Tables, scope: 
     fewest = rows["num_episodes"].min()
     if grouping.ratio and scope == "task" and isinstance(fewest, int) and 1 < fewest < FEW_EPISODES:
         warning = (
-            f"Intervals over fewer than {FEW_EPISODES} episodes of a task are wide, because so few show little of how "
-            "much episodes differ; more episodes narrow them quickly."
+            "The interval of a task with n episodes rests on n - 1 degrees of freedom. With fewer than "
+            f"{FEW_EPISODES} episodes its width varies much by chance: a narrow one is no sign of certainty."
         )
         table = "\n".join([table, *wrap(warning)])
     return "\n".join([heading(f"PER {name.upper()}{of}  {what}, {shown}"), table])

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import polars as pl
 
+from vla_attention.analyze.show.headings import wrap
 from vla_attention.analyze.show.numbers import of_tasks, plural
 from vla_attention.analyze.stores.selection import select_episodes
 from vla_attention.schemas.errors import listing
@@ -28,6 +29,8 @@ _EPISODE_COLUMNS = (
     "num_steps",
     "num_replans",
 )
+#: Column in which the texts of `describe_store` begin.
+_TEXT_COLUMN = 13
 
 
 def episodes_table(stores: Sequence[Store]) -> pl.DataFrame:
@@ -70,7 +73,8 @@ def header_lines(stores: Sequence[Store]) -> list[str]:
 def describe_store(store: Store, tasks: Sequence[int] | None = None) -> str:
     """Describe a store: run, recorded axes, spans and roles of every site, tasks with their words, objects."""
     episodes = select_episodes(store, tasks)
-    return "\n".join(_lines(store, episodes))
+    # Texts stand in columns: what continues on a further line stands below its own.
+    return "\n".join(part for line in _lines(store, episodes) for part in wrap(line, rest=" " * _TEXT_COLUMN))
 
 
 def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
@@ -120,7 +124,7 @@ def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
             yield f"  {attributes.task_id:>3}  {visible(attributes.instruction)}  {held}"
     yield "Selectors"
     for name, kind in SELECTOR_KINDS.items():
-        yield f"  {name + ':':<9} {kind.takes}"
+        yield f"  {name + ':':<10} {kind.takes}"
 
 
 def _describe_span(span: Span, tokens: EpisodeTokens) -> str:

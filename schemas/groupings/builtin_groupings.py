@@ -179,8 +179,13 @@ def find_grouping(name_or_file: str, vocabulary: Vocabulary) -> Grouping:
     path = Path(name_or_file)
     if path.suffix == ".toml" or path.exists():
         return read_grouping_file(path)
+    if name_or_file.startswith("reference:"):
+        raise GroupingNotFound(
+            f"Unknown grouping '{name_or_file}'; expected 'reference:N' with a whole number N of text keys, or "
+            "'reference'."
+        )
     raise GroupingNotFound(
         f"Unknown grouping '{name_or_file}'.{did_you_mean(name_or_file, BUILTIN_GROUPINGS)} "
-        f"Built in: {listing(BUILTIN_GROUPINGS)}; "
+        f"Built in: {listing(BUILTIN_GROUPINGS)} (also reference:N); "
         "anything else is taken as a TOML file, and there is none of that name."
     )

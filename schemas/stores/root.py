@@ -11,6 +11,7 @@ from vla_attention.schemas.jsonable import MalformedDocument, from_json
 from vla_attention.schemas.stores.digest import run_digest
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
+    FORMAT_NAME,
     RootAttributes,
     StoreError,
     StoreNotFound,
@@ -43,11 +44,25 @@ def read_run(path: Path) -> tuple[RootAttributes, str]:
         raise StoreError(f"{path} is not a store: it has no zarr.json.") from None
     except (OSError, ValueError) as error:
         raise StoreError(f"The store {path} cannot be read: {error}.") from None
+    _refuse_inside(path, attributes)
     check_format(attributes, path)
     try:
         return from_json(RootAttributes, attributes), run_digest(attributes)
     except (MalformedDocument, ValueError) as error:
         raise StoreError(f"The store {path} cannot be read: {error}") from None
+
+
+def _refuse_inside(path: Path, attributes: dict[str, Any]) -> None:
+    """Raise `StoreError` for a group inside of a store, and name the store's folder."""
+    if attributes.get("format") == FORMAT_NAME:
+        return
+    for above in path.absolute().parents:
+        try:
+            found = group_attributes((above / "zarr.json").read_bytes())
+        except (OSError, ValueError):
+            return  # the store's groups are all above one another
+        if found.get("format") == FORMAT_NAME:
+            raise StoreError(f"{path} is a group inside of a store; give the folder above, {above}.")
 
 
 def episode_folders(path: Path) -> list[Path]:

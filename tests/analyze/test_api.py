@@ -190,7 +190,7 @@ def test_an_empty_store_can_be_opened_and_says_that_it_is_empty(tmp_path):
         run.ratios()
 
 
-def test_the_guide_names_every_column(run, tmp_path):
+def test_the_guide_names_every_column(run, other, tmp_path):
     guide = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
     levels = ("steps", "replans", "episodes", "tasks")
     tables = [ask(level) for level in levels for ask in (run.ratios, run.masses)]
@@ -199,11 +199,49 @@ def test_the_guide_names_every_column(run, tmp_path):
     run_with_norms = va.open(write_store(tmp_path / "a.zarr", contributions=True))
     tables += [run_with_norms.contributions(), run.sinks(), run.sinks("heads")]
     tables += [run.objects(name) for name in ("objects", "summary", "times", "pointing", "iou")]
+    tables += [run.words(name) for name in ("summary", "episodes")]
+    tables += [run.time(name) for name in ("course", "closing", "change", "outcomes", "autocorrelation")]
+    tables += [run.compare(other, name) for name in ("differences", "estimates", "pairs", "unpaired")]
+    tables += [run.groups(name) for name in ("groups", "words", "overlaps")]
+    norms = run.analysis().group_contributions
+    assert norms is not None
+    tables += [norms.cells, norms.groups, run.overlay()]
     ends = ("_low", "_high", "_episodes")
     missing = {
         name for table in tables for name in table.columns if f"`{name}`" not in guide and not name.endswith(ends)
     }
     assert missing == set()
+
+
+def test_the_guide_names_every_table_file(store, other, tmp_path, monkeypatch):
+    guide = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    for command in ("ratios", "heads", "words", "objects", "time"):
+        assert main([command, str(store), "--no-plots"]) == 0
+    assert main(["groups", str(store), "--no-plots"]) == 0
+    assert main(["compare", f"a={store}", f"b={other}", "--no-plots"]) == 0
+    names = {path.stem for path in tmp_path.rglob("*.parquet")}
+    assert len(names) > 20
+    levels = {name.removesuffix("_groups") for name in names} & {"steps", "replans", "episodes", "tasks"}
+    own = {name for name in names if name.removesuffix("_groups") not in levels}
+    missing = {name for name in own if f"`{name}`" not in guide and f"`{name}.parquet`" not in guide}
+    assert missing == set()
+
+
+def test_a_group_inside_of_a_store_leads_to_the_store(store, capsys):
+    for inside in (store / "episodes", store / "episodes" / "task000_episode000"):
+        assert main(["verify", str(inside)]) == 2
+        assert f"is a group inside of a store; give the folder above, {store}." in capsys.readouterr().err
+
+
+def test_what_was_a_seed_of_intervals_can_be_left_out(store, capsys):
+    assert main([str(store), "--seed", "3"]) == 2
+    assert capsys.readouterr().err == "vla-analyze: Intervals have no random draws any more: leave --seed out.\n"
+
+
+def test_the_description_is_a_page_wide(run):
+    lines = [line for line in run.describe().splitlines() if not line.startswith("Store ")]
+    assert max(map(len, lines)) <= 100
 
 
 def test_the_guides_examples(tmp_path, monkeypatch):

@@ -247,7 +247,7 @@ def test_a_sink_of_some_heads_is_found_and_taken_out_where_it_is_widespread(tmp_
     strict = SinkRule(heads=0.5)
     kept = without_sinks(question, search_sinks(question, strict).sinks, strict)
     assert not any(item.without for item in kept.selected)
-    assert "Sinks of fewer heads stay: 2 keys of tasks" in kept.notes[-1]
+    assert "Sinks of fewer heads stay in: 2 keys, counted in every task by itself" in kept.notes[-1]
 
 
 def few_keys(replans: int) -> EpisodeTokens:

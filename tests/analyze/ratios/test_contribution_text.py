@@ -59,6 +59,10 @@ def test_groups_that_are_both_sides_have_their_ratio_once(store):
     assert analysis.summary.count("CONTRIBUTIONS") == 1
     assert "CONTRIBUTIONS OF GROUPS" in analysis.summary
     assert "root mean square over action queries" in " ".join(analysis.summary.split())
+    # Six groups and the ratio do not fit beside one another: the ratio stands below.
+    assert max(map(len, analysis.summary.splitlines())) <= 100
+    section = analysis.summary.split("CONTRIBUTIONS OF GROUPS")[1]
+    assert section.count("layers_avg") == 2
 
 
 def test_a_store_without_contributions_has_no_section(tmp_path):

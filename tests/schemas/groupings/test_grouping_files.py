@@ -77,6 +77,8 @@ def test_finding_a_grouping(tmp_path):
     assert find_grouping("default", replace(VOCABULARY, roles=("image", "blank"))).ratio is None
     with pytest.raises(GroupingNotFound, match="Did you mean 'cameras'"):
         find_grouping("camera", VOCABULARY)
+    with pytest.raises(GroupingNotFound, match="expected 'reference:N' with a whole number N of text keys"):
+        find_grouping("reference:x", VOCABULARY)
     with pytest.raises(GroupingNotFound, match="Cannot read grouping file"):
         find_grouping(str(tmp_path / "none.toml"), VOCABULARY)
 
