@@ -64,7 +64,10 @@ def test_when_every_episode_is_damaged_nothing_is_left_to_analyse(tmp_path, caps
     for episode in ("task000_episode000", "task000_episode001"):
         damage_rows(path, episode)
     assert main([str(path), "--skip-corrupt", "--no-plots"]) == 2
-    assert "None of the 2 selected episodes can be used" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "None of the 2 selected episodes can be used" in said
+    assert ". Capture them again." in said
+    assert ".. " not in said
 
 
 def test_an_episode_without_replans_is_named_and_left_out_only_when_asked(tmp_path):
