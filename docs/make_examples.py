@@ -19,7 +19,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.null_stores import EPISODES, OPTIONS, REPLANS, TASKS, Rows, close_half_way, normalised, plant_of
+from benchmarks.null_stores import EPISODES, REPLANS, TASKS, Rows, close_half_way, normalised, plant_of
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.testing.stores import StoreSpec, write_store
@@ -54,7 +54,7 @@ def printed(*arguments: str) -> str:
     output = io.StringIO()
     with contextlib.redirect_stdout(output):
         plots = () if arguments[0] == "groups" else ("--no-plots", "--output", "out")
-        code = analyze([*arguments, *OPTIONS.get(arguments[0], ()), *plots])
+        code = analyze([*arguments, *plots])
     if code:
         raise SystemExit(f"vla-analyze {' '.join(arguments)} failed")
     return output.getvalue()

@@ -19,7 +19,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.compare.runs import Run, RunArgument, check_comparable, noted_differences, open_runs
-from vla_attention.analyze.measures.aggregate import episode_tables, overall_layer, replans_of
+from vla_attention.analyze.measures.aggregate import baseline_logs, episode_tables, overall_layer, replans_of
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables, float_values
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.statistics.effect_sizes import contrast, standardised_mean
@@ -145,7 +145,7 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
         pairs=pl.concat(pairs),
         unpaired=pl.concat(unpaired),
         notes=tuple(notes),
-        ignores_seed="seed" in allowed,
+        ignores_seed="seed" in allowed and len({run.stores[0].attributes.protocol.seed for run in runs}) > 1,
     )
 
 
@@ -371,7 +371,8 @@ def _estimates(run: str, table: pl.DataFrame, quantities: Sequence[str], estiman
             low, high = ends(one.interval())
             row = {**names, **counts, "quantity": name, "value": one.value, "low": low, "high": high}
             if name == "ratio":
-                baseline = geometric_mean_over_episodes(np.log(_numbers(part, "uniform_ratio")))
+                logs = baseline_logs(_numbers(part, "uniform_ratio"), _numbers(part, "log_ratio_mean"))
+                baseline = geometric_mean_over_episodes(logs)
                 row["uniform_ratio"] = estimates([baseline], tasks, estimand)[0].value
                 row["episodes_without_ratio"] = statistic.num_left_out
                 row["num_nonfinite"] = int(part["num_nonfinite"].sum())

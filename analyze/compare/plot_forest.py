@@ -57,7 +57,7 @@ def plot_forest(
     if not comparison.differences["paired"].all():
         note += " Not every run is paired with the first one: those differences hold differences between scenes."
     if rows["low"].null_count():
-        note += " No bar where fewer than two episodes take part."
+        note += " No bar where there can be none (one episode, no spread)."
     title(figure, f"Runs side by side: {named(comparison.grouping)}, {which}", note)
     if rows["value"].null_count() == rows.height:
         explain(figure.subplots(), "No run has an episode with a finite ratio.")

@@ -26,7 +26,7 @@ from vla_attention.analyze.show.numbers import (
 )
 from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.show.text_table import text_table
-from vla_attention.analyze.statistics.effect_sizes import FEWEST_EPISODES
+from vla_attention.analyze.statistics.effect_sizes import FEWEST_EPISODES, FEWEST_TASKS
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.stores.store_format import episode_name
@@ -82,7 +82,7 @@ def _estimates_section(comparison: Comparison, layer: str) -> str:
             cells += [format_number(row["uniform_ratio"]), format_number(of["ratio_lift"]["value"])]
         body.append(cells + [format_percent(of[name]["value"]) for name in fractions])
     note = (
-        "ratio: geometric mean over episodes; uniform: what uniform attention gives; lift: ratio / uniform."
+        "ratio: geometric mean over tasks; uniform: what uniform attention gives; lift: ratio / uniform."
         if ratio
         else ""
     )
@@ -121,15 +121,19 @@ def _difference_section(comparison: Comparison, name: str, layer: str) -> str:
             ]
         )
     lines.append(text_table(header, body, left=(0,)))
-    lines += wrap(f"{_factor(rows)}{findings(rows['q'], rows['quantity'].to_list(), 'quantity', 'differ', _SENTENCES)}")
+    named = findings(
+        rows["q"].to_list(), rows["quantity"].to_list(), "quantity", "a difference", _num_sentences(comparison)
+    )
+    lines += wrap(f"{_factor(comparison, name, rows)}{named}")
     meaning = (
         "d_z: mean / standard deviation of the paired differences (Cohen)"
         if paired
         else "g: Hedges' g, difference in standard deviations"
     )
     lines += wrap(
-        f"{meaning}, corrected for small samples; none below {FEWEST_EPISODES} pairs or episodes. q: p of no "
-        f"difference, adjusted for {plural(rows.height, 'quantity')} (Benjamini-Hochberg)."
+        f"{meaning}, all weighing the same, corrected for small samples; none below {FEWEST_EPISODES} pairs or "
+        f"episodes, or {FEWEST_TASKS} tasks where tasks are the units. q: p of no difference, adjusted for the number "
+        "of quantities (Benjamini-Hochberg)."
     )
     return "\n".join(lines)
 
@@ -156,15 +160,23 @@ def _pairing(comparison: Comparison, name: str, rows: pl.DataFrame) -> list[str]
     return wrap(text)
 
 
+def _num_sentences(comparison: Comparison) -> int:
+    return _SENTENCES * (len(comparison.names) - 1)
+
+
 def _pairing_keys(comparison: Comparison) -> str:
     return "suite, task and initial state" if comparison.ignores_seed else "suite, task, initial state and seed"
 
 
-def _factor(rows: pl.DataFrame) -> str:
+def _factor(comparison: Comparison, name: str, rows: pl.DataFrame) -> str:
     ratio = rows.filter(pl.col("quantity") == LOG2_RATIO)
     if ratio.is_empty() or ratio["difference"][0] is None:
         return ""
-    return f"The ratio changes by a factor of {format_number(2.0 ** ratio['difference'][0])} (2 to the difference). "
+    row = ratio.row(0, named=True)
+    bounds = {end: None if row[end] is None else 2.0 ** row[end] for end in ("low", "high")}
+    interval = row_interval(bounds)
+    factor = f"{format_number(2.0 ** row['difference'])}{'' if interval == '-' else f' {interval}'}"
+    return f"Ratio of {name} / ratio of {comparison.names[0]}: {factor} (2 to the difference). "
 
 
 def _tasks_section(comparison: Comparison, name: str, layer: str) -> str:
@@ -180,7 +192,7 @@ def _tasks_section(comparison: Comparison, name: str, layer: str) -> str:
             str(row["num_pairs"]) if row["paired"] else f"{row['num_first']}/{row['num_other']}",
             format_signed(row["difference"]),
             format_interval(row["low"], row["high"]),
-            format_number(row["q"]),
+            format_number(row["q"] if row["scope"] == "task" else None),
         ]
         for row in rows.iter_rows(named=True)
     ]
@@ -189,7 +201,8 @@ def _tasks_section(comparison: Comparison, name: str, layer: str) -> str:
         f"{row['suite']} {row['task_id']}" if several else f"task {row['task_id']}"
         for row in tasks.iter_rows(named=True)
     ]
-    said = wrap(f"q: adjusted for the number of tasks. {findings(tasks['q'], labels, 'task', 'differ', _SENTENCES)}")
+    named = findings(tasks["q"].to_list(), labels, "task", "a difference", _num_sentences(comparison))
+    said = wrap(f"{named} q: p of no difference, adjusted for the number of tasks (Benjamini-Hochberg).")
     texts = [row["instruction"] or "" for row in rows.iter_rows(named=True)]
     table = text_table(header, body, left=(0,), last="instruction", texts=texts, width=WIDTH)
     return "\n".join([heading(f"PER TASK  {quantity}, {name} minus {comparison.names[0]}"), table, *said])
@@ -220,5 +233,5 @@ def _layers_section(comparison: Comparison) -> str:
         else ""
     )
     per_layer = f"PER LAYER  {comparison.quantities[0]}, run minus {comparison.names[0]}{more}"
-    note = f"q: adjusted for {plural(len(layers), 'block')} (Benjamini-Hochberg)."
+    note = "q: p of no difference, adjusted for the number of blocks (Benjamini-Hochberg)."
     return "\n".join([heading(per_layer), text_table(header, body, left=(0,)), note])

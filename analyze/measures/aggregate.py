@@ -73,9 +73,10 @@ def replan_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Ta
 
     Masses are averaged over denoise steps and heads first; fractions, lifts and ratios follow from these means.
 
-    In "layers_avg", as the published scripts define it, masses are means over the layers, fractions and lifts follow
-    from these means, and the ratio is the mean of the layers' finite ratios (null when none is finite; the published
-    scripts write 0 there).
+    In "layers_avg", as the published scripts define it, masses are means over the layers, fractions and lifts of groups
+    follow from these means, and the ratio is the mean of the layers' finite ratios (null when none is finite; the
+    published scripts write 0 there). `log2_ratio` and `ratio_lift`, from which the headline is made, are those of the
+    geometric mean of the layers' finite positive ratios: the inverse ratio then has the inverse mean.
 
     Returns:
         cells: `EPISODE_KEYS`, replan, env_step, layer, layer_number, block, row_sum, valid_mass, num_valid; with a
@@ -107,7 +108,8 @@ def _episode_replans(measured: MeasuredEpisode, grouping: Grouping) -> Tables:
         uniform = uniform_ratio(measured.num_keys, grouping)[:, None]
         cells |= {"numerator_mass": above, "denominator_mass": below, "uniform_ratio": uniform, "ratio": value}
         cells["nonfinite_layers"] = layers.with_average(left_out.astype(np.int64), mean=np.sum)
-        cells |= relative_to_uniform(value, uniform)
+        # The mean of logarithms over layers has no preference for either side; the published mean of ratios has.
+        cells |= relative_to_uniform(layers.with_average(of_layers, mean=_finite_geometric_mean), uniform)
     axes = [replan_axis(item), layers.columns]
     return Tables(
         long_table(item, axes, cells, EPISODE_KEYS),
@@ -281,8 +283,9 @@ def _task_row(
         row["episodes_without_ratio"] = spread.num_nonfinite
         row |= {name: int(part[name].sum()) for name in ("num_nonfinite", "geometric_left_out", "nonfinite_layers")}
         plain |= {name: mean_over_episodes(values(name)) for name in ("numerator_mass", "denominator_mass")}
-        # With the mean of the headline, so that ratio / uniform ratio is the lift.
-        plain["uniform_ratio"] = geometric_mean_over_episodes(_logs(values("uniform_ratio")))
+        uniform = values("uniform_ratio")
+        # With the mean and the episodes of the headline, so that ratio / uniform ratio is the lift.
+        plain["uniform_ratio"] = geometric_mean_over_episodes(baseline_logs(uniform, values("log_ratio_mean")))
         bounded["ratio_mean"] = mean_over_episodes(values("ratio_mean"), POSITIVE)
         bounded["ratio_of_means"] = ratio_of_means_over_episodes(values("numerator_mass"), values("denominator_mass"))
         bounded["geometric_mean"] = geometric_mean_over_episodes(values("log_ratio_mean"))
@@ -305,6 +308,18 @@ def _task_row(
         for i, name in enumerate(grouping.names)
     ]
     return row, of_groups
+
+
+def baseline_logs(uniform: NDArray[np.float64], log_ratios: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Logarithms of uniform ratios (episode,) of the episodes that have a ratio; of all where none has."""
+    having = np.isfinite(log_ratios)
+    return np.where(having | ~having.any(), _logs(uniform), np.nan)
+
+
+def _finite_geometric_mean(values: NDArray[np.float64], axis: int | tuple[int, ...] = 0) -> NDArray[np.float64]:
+    """Geometric mean over the finite positive values along an axis; NaN where there is none."""
+    logs: NDArray[np.float64] = np.exp(finite_mean(_logs(values), axis))
+    return logs
 
 
 def _named(

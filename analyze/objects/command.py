@@ -6,6 +6,7 @@ import argparse
 
 from vla_attention.analyze.arguments import (
     add_episode,
+    add_intervals,
     add_output,
     add_selection,
     add_stores,
@@ -41,6 +42,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add_stores(parser)
     selection = add_selection(parser)
+    add_intervals(parser)
     selection.add_argument("--per-head", action="store_true", help="keep heads apart instead of averaging their maps")
     maps = parser.add_argument_group("maps and masks")
     maps.add_argument(

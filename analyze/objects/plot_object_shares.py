@@ -20,12 +20,12 @@ from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure
 from vla_attention.analyze.show.plot_text import shortened, title
 from vla_attention.analyze.statistics.intervals import (
     DEFAULT_LEVEL,
+    POSITIVE,
     SHARE,
     EpisodeStatistic,
     Estimand,
     estimates,
     mean_over_episodes,
-    ratio_of_means_over_episodes,
 )
 from vla_attention.schemas.safe_text import visible
 
@@ -140,9 +140,9 @@ def _draw_classes(
             continue
         share, area, tasks = _by_phase(part)
         shares = _with_intervals([mean_over_episodes(column, SHARE) for column in share.T], tasks, estimand)
-        enrichments = _with_intervals(
-            [ratio_of_means_over_episodes(*columns) for columns in zip(share.T, area.T, strict=True)], tasks, estimand
-        )
+        with np.errstate(divide="ignore", invalid="ignore"):  # where the object is out of view
+            of_episodes = [mean_over_episodes(column, POSITIVE) for column in (share / area).T]
+        enrichments = _with_intervals(of_episodes, tasks, estimand)
         covered, color = area.mean(axis=0), CLASS_COLORS[name]
         label = name if len(tasks) == whole.select(EPISODE_ID).unique().height else f"{name} (n = {len(tasks)})"
         axes.plot(_PHASES, 100 * covered, color=color, linestyle="--", linewidth=1.0)

@@ -21,12 +21,12 @@ _MOST_ROWS = 28
 #: Names that the text could print: an object, a layer of an object, a layer that finds them.
 _NAMES = 3
 _SHARES_NOTE = (
-    "share: of the attention on all cameras' patches. area: covered part of the picture. enrichment: mean share of the "
-    "picture's attention / mean area (1: attention that is uniform over the picture). over control: mean enrichment / "
-    "mean enrichment of the same maps on the object's masks of other episodes of the task (1: attention that does not "
-    f"depend on where the object is). cannot tell: these masks overlap with the object's by {STILL_OVERLAP:.0%} or "
-    "more, because it hardly moves; -: there are no other masks. q: p of 1 over control, adjusted for the number of "
-    "classes or objects (Benjamini-Hochberg)."
+    "share: of the attention on all cameras' patches. area: covered part of the picture. enrichment: share of the "
+    "picture's attention / area, quotients of an episode's means, mean over episodes (1: attention that is uniform over "
+    "the picture). over control: mean enrichment / mean enrichment of the same maps on the object's masks of other "
+    "episodes of the task (1: attention that does not depend on where the object is). cannot tell: these masks overlap "
+    f"with the object's by {STILL_OVERLAP:.0%} or more, because it hardly moves; -: there are no other masks. q: p of 1 "
+    "over control, adjusted for the number of classes or objects (Benjamini-Hochberg)."
 )
 
 
@@ -40,19 +40,19 @@ def objects_text(study: ObjectStudy) -> str:
 
 def _shares(study: ObjectStudy) -> list[str]:
     several = study.question.num_tasks > 1
-    lines: list[str] = []
+    lines = ["", *wrap(followed_sentence(study))]
     for camera in study.summary["camera"].unique(maintain_order=True):
         part = _printed(study.summary.filter(pl.col("camera") == camera))
         if camera == ALL_CAMERAS:
             lines += ["", "all cameras", _shares_table(part.head(_MOST_ROWS), several), *_more(part)]
         else:
             classes = part.filter(pl.col("kind") == "class")
-            lines += ["", f"camera {camera}", _shares_table(classes, several)]
+            lines += ["", f"camera {camera}", _shares_table(classes, several, shares=False)]
     about = study.question.settings.intervals.words
-    return [*lines, "", *wrap(f"{_SHARES_NOTE} {interval_note(DEFAULT_LEVEL, about)}"), "", *wrap(_followed(study))]
+    return [*lines, "", *wrap(f"{_SHARES_NOTE} {interval_note(DEFAULT_LEVEL, about)}")]
 
 
-def _followed(study: ObjectStudy) -> str:
+def followed_sentence(study: ObjectStudy) -> str:
     """Which object, and which layer of an object, surely exceeds its control more than all the others do."""
     leaders = study.followed
     about = study.question.settings.intervals.words
@@ -66,7 +66,7 @@ def _followed(study: ObjectStudy) -> str:
         return f"{'; '.join(named)} (each difference tested at {NAMED_AT:g} / {_NAMES}, about {about})."
     if not leaders:
         return "There are no two objects whose control can tell."
-    return "No object, and no layer of an object, is surely followed more than all the others."
+    return f"No object, and no layer of an object, is shown to be followed more than all the others (about {about})."
 
 
 def _finding(study: ObjectStudy) -> list[str]:
@@ -122,14 +122,14 @@ def _more(part: pl.DataFrame) -> list[str]:
     return [f"and {plural(left, 'object')} more, in the tables"] if left > 0 else []
 
 
-def _shares_table(part: pl.DataFrame, several_tasks: bool) -> str:
+def _shares_table(part: pl.DataFrame, several_tasks: bool, shares: bool = True) -> str:
     rows = part.to_dicts()
     heading, counts = episode_counts(rows, several_tasks)
     body = [
         [
             item_name(row),
             count,
-            format_number(row["share"]),
+            *([format_number(row["share"])] if shares else []),
             format_number(row["area_share"]),
             format_number(row["enrichment"]),
             format_interval(row["enrichment_low"], row["enrichment_high"]),
@@ -137,7 +137,8 @@ def _shares_table(part: pl.DataFrame, several_tasks: bool) -> str:
         ]
         for row, count in zip(rows, counts, strict=True)
     ]
-    header = ["object", heading, "share", "area", "enrichment", "interval", "over control", "interval", "q"]
+    header = ["object", heading, *(["share"] if shares else []), "area", "enrichment", "interval"]
+    header += ["over control", "interval", "q"]
     return text_table(header, body, left=(0,))
 
 

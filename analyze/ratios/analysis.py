@@ -147,7 +147,8 @@ class Analysis:
         name = f"{policy.name}{', untrained' if untrained else ''} ({shortened(policy.checkpoint, 60)})"
         suites = sorted(self.episodes.cells["suite"].unique())
         layers, steps = len(set(question.selection.blocks)), question.selection.denoise_steps
-        found = [run_sentence(name, row, suites, layers, steps, question.site)]
+        solved = sum(item.episode.attributes.success for item in question.selected)
+        found = [run_sentence(name, row, solved, suites, layers, steps, question.site)]
         if headline is not None:
             found.append(ratio_sentence(headline))
         return [*found, conclusion(headline, untrained, row["num_tasks"], row["num_episodes"])]

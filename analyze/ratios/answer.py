@@ -64,10 +64,9 @@ def headline_of(row: Mapping[str, Any], what: str, name: str, about: str, untrai
 
 
 def run_sentence(
-    policy: str, row: Mapping[str, Any], suites: list[str], layers: int, steps: tuple[int, ...], site: str
+    policy: str, row: Mapping[str, Any], solved: int, suites: list[str], layers: int, steps: tuple[int, ...], site: str
 ) -> str:
     """What was run: policy, episodes, tasks, and which attention was measured."""
-    solved = round(row["success_rate"] * row["num_episodes"])
     return (
         f"{policy} in {listing(suites, 4)}: {of_tasks(row['num_episodes'], row['num_tasks'])}, {solved} solved; "
         f"attention of the action queries at {plural(row['num_replans'], 'replan')}, {plural(layers, 'layer')}, "
@@ -106,7 +105,7 @@ def conclusion(headline: Headline | None, untrained: bool, num_tasks: int, num_e
     if headline.reading == UNDECIDED:
         return f"Without an interval, nobody knows whether it differs from uniform attention.{limits}"
     if headline.reading == AS_UNIFORM:
-        return f"An interval holds uniform attention: the attention looks as uniform attention does.{limits}"
+        return f"The lift's interval holds 1: the attention looks as uniform attention does.{limits}"
     above, _, below = headline.what.partition(" / ")
     more = "more" if headline.lift > 1 else "less"
     return (

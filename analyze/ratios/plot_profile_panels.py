@@ -116,4 +116,4 @@ def _positions(axes: Axes, labels: Sequence[str]) -> None:
 
 
 def _interval(low: np.ndarray, level: float) -> str:
-    return interval_name(level) if np.isfinite(low).any() else "no interval (one episode)"
+    return interval_name(level) if np.isfinite(low).any() else "no interval"

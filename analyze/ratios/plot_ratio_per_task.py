@@ -171,5 +171,5 @@ def _counts(rows: pl.DataFrame, dots: pl.DataFrame) -> str:
     if left_out:
         text += f" {left_out} of {int(dots['num_replans'].sum())} ratios are not finite and not in any mean."
     if rows["geometric_mean_low"].null_count() and rows["geometric_mean"].is_not_null().any():
-        text += " No interval where fewer than two episodes have a ratio."
+        text += " No interval where there can be none (one episode, no spread)."
     return text

@@ -87,8 +87,9 @@ def _layers(analysis: Analysis) -> list[str]:
         rows["|v| / |l|"] = [format_number(norms[layer][HEADLINE]) for layer in layers]
         whole = norms[LAYERS_AVG]
         bounds = row_interval(whole, HEADLINE)
-        below = "CONTRIBUTIONS  |v| / |l|, norms of what visual and linguistic keys add: "
+        below = "CONTRIBUTIONS  |v| / |l|, norms of what all image and all text keys add, whatever the grouping: "
         below += f"{format_number(whole[HEADLINE])}{'' if bounds == '-' else f' {bounds}'}"
+        below += f"; uniform {format_number(whole['uniform_ratio'])}, lift {format_number(whole['ratio_lift'])}"
     return [title, *_beside_each_other("layer", layers, rows), *wrap(below, rest="  ")]
 
 

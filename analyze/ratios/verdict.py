@@ -20,7 +20,7 @@ VISUAL_ABOVE, LINGUISTIC_BELOW = 1.5, 0.67
 UNTRAINED, AS_UNIFORM, UNDECIDED = "untrained", "as uniform", "undecided"
 _MEANINGS = {
     UNTRAINED: "the weights are random, so a word would be about nothing",
-    AS_UNIFORM: "looks as uniform attention does: the ratio's interval holds the uniform ratio, or the lift's holds 1",
+    AS_UNIFORM: "looks as uniform attention does: the lift's interval holds 1",
     UNDECIDED: "without an interval, nobody knows whether it differs from uniform attention",
 }
 
@@ -45,11 +45,10 @@ def reading(row: Mapping[str, Any], untrained: bool) -> str:
     word, uniform = verdict(row["geometric_mean"]), row["uniform_ratio"]
     if word == "undefined" or uniform is None or not math.isfinite(uniform):
         return word
-    if row["geometric_mean_low"] is None:
+    if row["ratio_lift_low"] is None:
         return UNDECIDED
-    of_ratio = row["geometric_mean_low"] <= uniform <= row["geometric_mean_high"]
-    of_lift = row["ratio_lift_low"] is not None and row["ratio_lift_low"] <= 1.0 <= row["ratio_lift_high"]
-    return AS_UNIFORM if of_ratio or of_lift else word
+    # The lift decides: prompts differ in length between tasks, so the ratio's interval over tasks is wide anyway.
+    return AS_UNIFORM if row["ratio_lift_low"] <= 1.0 <= row["ratio_lift_high"] else word
 
 
 def meanings(readings: list[str]) -> str:
@@ -66,10 +65,10 @@ def verdict_sentence(grouping: Grouping, row: Mapping[str, Any], untrained: bool
     if word == UNTRAINED:
         return "The weights are untrained: the ratio says nothing about seeing or reading."
     if word == AS_UNIFORM:
-        bounds = format_interval(row["geometric_mean_low"], row["geometric_mean_high"])
+        bounds = format_interval(row["ratio_lift_low"], row["ratio_lift_high"])
         return (
             f"The attention looks as uniform attention does, whose ratio is {format_number(uniform)}: the interval of "
-            f"the ratio, {bounds}, holds it, or that of the lift holds 1."
+            f"the lift, {bounds}, holds 1."
         )
     if word == UNDECIDED:
         return (

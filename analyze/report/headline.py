@@ -48,7 +48,8 @@ def headline_section(analysis: Analysis, notes: Sequence[Caveat]) -> Section:
     """The numbers over all selected tasks; `notes` are the caveats of this analysis."""
     row, ratio = analysis.overall, analysis.grouping.ratio
     boxes = _fraction_boxes(analysis) if ratio is None else _ratio_boxes(row, ratio.numerator, ratio.denominator)
-    note = f"of {plural(row['num_tasks'], 'task')}; {format_percent(row['success_rate'], 0)} solved; "
+    solved = sum(item.episode.attributes.success for item in analysis.question.selected)
+    note = f"of {plural(row['num_tasks'], 'task')}; {solved} solved; "
     boxes.append(Box("episodes", str(row["num_episodes"]), note + plural(row["num_replans"], "replan")))
     parts: list[Part] = [Headline([caveat for caveat in notes if caveat.grave], boxes)]
     if ratio is not None:
@@ -62,6 +63,8 @@ def headline_section(analysis: Analysis, notes: Sequence[Caveat]) -> Section:
             )
         ]
         other.append(f"median of the episodes {format_number(row['ratio_median'])}")
+        if row["num_tasks"] > 1:
+            other.append(f"intervals are about {analysis.question.settings.intervals.words}")
         parts.append(Paragraph(f"{', '.join(other)}.", quiet=True))
     return Section("headline", "Headline", parts)
 
@@ -87,7 +90,7 @@ def _ratio_boxes(row: Mapping[str, Any], numerator: Sequence[str], denominator: 
 def _interval(row: Mapping[str, Any], column: str) -> str:
     low, high = row[f"{column}_low"], row[f"{column}_high"]
     if low is None:
-        return "no interval from fewer than two episodes"
+        return "no interval"
     return f"{interval_name(DEFAULT_LEVEL)} {format_interval(low, high)}"
 
 

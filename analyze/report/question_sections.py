@@ -15,6 +15,7 @@ from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_study import ObjectStudy
 from vla_attention.analyze.objects.object_views import ALL_CAMERAS
 from vla_attention.analyze.objects.plot_object_shares import plot_object_shares
+from vla_attention.analyze.objects.text import followed_sentence
 from vla_attention.analyze.ratios.analysis import Analysis
 from vla_attention.analyze.report.pictures import diagram_of, drawn
 from vla_attention.analyze.report.section_parts import (
@@ -32,6 +33,7 @@ from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.analyze.time.plot_time_course import plot_time_courses
 from vla_attention.analyze.time.time_courses import time_courses
 from vla_attention.analyze.words.plot_word_bars import plot_word_bars
+from vla_attention.analyze.words.text import leading_sentence
 from vla_attention.analyze.words.word_study import study_words
 from vla_attention.schemas.errors import UserError
 
@@ -54,7 +56,7 @@ def time_section(analysis: Analysis, folder: Path) -> Section | None:
         own = [path for path in files if path.stem == stem]
         if own:
             alternative = f"Lines with bands for their intervals: {what[0].lower()}{what[1:]}"
-            caption = f"{what} Bands are pointwise {_INTERVAL}s over tasks and episodes."
+            caption = f"{what} Bands are pointwise {_INTERVAL}s."
             diagrams.append(diagram_of(own, alternative, caption))
     return Section("time", "Over time", diagrams)
 
@@ -119,13 +121,15 @@ def word_section(question: Question, folder: Path) -> Section:
             count_cell(row["num_episodes"]),
             number_cell(row["lift"]),
             interval_cell(row["lift_low"], row["lift_high"]),
+            number_cell(row["lift_q"]),
             percent_cell(row["mass"]),
             percent_cell(row["share"]),
         ]
         for row in of_words.iter_rows(named=True)
     ]
-    header = ["word", "class", "episodes", "lift", _INTERVAL, "mass %", "of the text %"]
-    return Section("words", "Words", [diagram, Table("Words of the instructions", header, rows)])
+    header = ["word", "class", "episodes", "lift", _INTERVAL, "q", "mass %", "of the text %"]
+    caption = "Words of the instructions. q: p of lift 1, adjusted for the number of words (Benjamini-Hochberg)"
+    return Section("words", "Words", [diagram, Paragraph(leading_sentence(study)), Table(caption, header, rows)])
 
 
 def object_section(question: Question, folder: Path) -> Section | None:
@@ -161,14 +165,19 @@ def object_section(question: Question, folder: Path) -> Section | None:
             interval_cell(row["enrichment_low"], row["enrichment_high"]),
             number_cell(row["enrichment_over_control"]),
             interval_cell(row["enrichment_over_control_low"], row["enrichment_over_control_high"]),
+            number_cell(row["enrichment_over_control_q"]),
         ]
         for row in whole.head(_MOST_ROWS).iter_rows(named=True)
     ]
     header = ["object", "kind", "episodes", "share %", _INTERVAL, "area %", "enrichment", _INTERVAL]
-    header += ["over control", _INTERVAL]
+    header += ["over control", _INTERVAL, "q"]
     more = f" (the first {_MOST_ROWS}; vla-analyze objects has all)" if whole.height > _MOST_ROWS else ""
-    table = Table(f"Objects, all cameras together{more}", header, rows)
-    return Section("objects", "Objects", [diagram, table])
+    caption = (
+        f"Objects, all cameras together{more}. No value over control: there is none, or it cannot tell because the "
+        "object hardly moves. q: p of 1 over control, adjusted (Benjamini-Hochberg)"
+    )
+    table = Table(caption, header, rows)
+    return Section("objects", "Objects", [diagram, Paragraph(followed_sentence(study)), table])
 
 
 def _named(summary: pl.DataFrame, measure: str) -> str:

@@ -47,14 +47,14 @@ def task_section(analysis: Analysis, folder: Path) -> Section:
     groups = analysis.present_groups[: _GROUPS_ALONE if ratio is None else _GROUPS_BESIDE_RATIO]
     header = ["task", *(["suite"] if several else []), "instruction", "episodes", "solved %"]
     if ratio is not None:
-        header += ["mean ratio", _INTERVAL, "of means", "geom.", "uniform", "lift", "not finite"]
+        header += ["ratio", _INTERVAL, "uniform", "lift", "of means", "mean", "not finite"]
     header += [f"{group} %" for group in groups]
     body = []
     for row in chosen.cells.iter_rows(named=True):
         cells = [count_cell(row["task_id"]), *([text_cell(row["suite"])] if several else [])]
         cells += [text_cell(row["instruction"]), count_cell(row["num_episodes"]), percent_cell(row["success_rate"])]
         if ratio is not None:
-            cells += _ratio_cells(row, "ratio_of_means", "geometric_mean", "uniform_ratio", "ratio_lift")
+            cells += _ratio_cells(row, "uniform_ratio", "ratio_lift", "ratio_of_means", "ratio_mean")
         cells += [percent_cell(of_group[row["suite"], row["task_id"], group]["fraction"]) for group in groups]
         body.append(cells)
     caption = (
@@ -68,7 +68,7 @@ def task_section(analysis: Analysis, folder: Path) -> Section:
 
 
 def _ratio_cells(row: dict[str, Any], *columns: str) -> list[Cell]:
-    """The mean ratio with its interval, further columns, and how many replans have no finite ratio."""
+    """The geometric mean ratio with its interval, further columns, and how many replans have no finite ratio."""
     interval = interval_cell(row["geometric_mean_low"], row["geometric_mean_high"])
     numbers = [number_cell(row[column]) for column in columns]
     return [number_cell(row["geometric_mean"]), interval, *numbers, count_cell(row["num_nonfinite"])]
@@ -153,7 +153,7 @@ def _layer_tables(analysis: Analysis) -> list[Table]:
         block = "" if row["block"] is None or str(row["block"]) == layer else f" (block {row['block']})"
         name = Cell(f"{layer}{block}", row["layer_number"])
         if analysis.grouping.ratio is not None:
-            columns = ("ratio_median", "ratio_of_means", "geometric_mean", "uniform_ratio", "ratio_lift")
+            columns = ("uniform_ratio", "ratio_lift", "ratio_of_means", "ratio_mean", "ratio_median")
             ratios.append([name, *_ratio_cells(row, *columns)])
         fractions = [percent_cell(of_group[layer, group]["fraction"]) for group in groups]
         shares.append([name, *fractions, *(number_cell(of_group[layer, group]["lift"]) for group in groups)])
@@ -163,7 +163,7 @@ def _layer_tables(analysis: Analysis) -> list[Table]:
     )
     tables = [Table(caption, ["layer", *(f"{g} %" for g in groups), *(f"{g} lift" for g in groups)], shares)]
     if ratios:
-        header = ["layer", "mean ratio", _INTERVAL, "median", "of means", "geom.", "uniform", "lift", "not finite"]
+        header = ["layer", "ratio", _INTERVAL, "uniform", "lift", "of means", "mean", "median", "not finite"]
         tables.insert(0, Table("Ratio per layer", header, ratios))
     return tables
 

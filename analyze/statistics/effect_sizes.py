@@ -5,10 +5,10 @@ means. Where some tasks are solved more often than others, it also contains the 
 `within_tasks` does not: it is the mean over the tasks with both classes of the difference inside the task.
 
 Their intervals are those of `intervals`: tasks are the units where both classes have several, else episodes. Effect
-sizes are over all episodes of a class, without regard to tasks; their standard errors come from leaving out one unit
-after the other (jackknife: Efron & Tibshirani 1993, chapter 11), with Student's t. Fewer than `FEWEST_EPISODES` in
-either class show too little of their own spread, and have no such interval. Pure numpy functions of one value per
-episode.
+sizes are over all episodes of a class, which weigh the same whatever their task; their standard errors come from
+leaving out one unit after the other (jackknife: Efron & Tibshirani 1993, chapter 11), with Student's t. Fewer than
+`FEWEST_EPISODES` in either class show too little of their own spread, and have no such interval. Pure numpy functions
+of one value per episode.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from vla_attention.analyze.statistics.intervals import (
     Estimand,
     Estimate,
     named_interval,
+    strata_error,
     to_scale,
     welch_degrees,
 )
@@ -144,7 +145,8 @@ def contrast(
         note = f"{sizes[0]} against {sizes[1]} episodes: at least {FEWEST} of either are needed"
         return Contrast(sizes[0], sizes[1], means[0], means[1], note=note)
     both = (cells[0].size > 0) & (cells[1].size > 0)
-    within = _difference(cells[0].part(both), cells[1].part(both), estimand) if both.any() else UNKNOWN
+    several = bool(((cells[0].size > 0) | (cells[1].size > 0)).sum() > 1)
+    within = _difference(cells[0].part(both), cells[1].part(both), estimand, several) if both.any() else UNKNOWN
 
     def standardised(weights: NDArray[np.float64]) -> NDArray[np.float64]:
         first, second = (_moments(weights, x, member) for member in classes)
@@ -158,7 +160,7 @@ def contrast(
         num_second=sizes[1],
         mean_first=means[0],
         mean_second=means[1],
-        difference=_difference(cells[0], cells[1], estimand),
+        difference=_difference(cells[0], cells[1], estimand, several),
         within_tasks=within,
         num_tasks_with_both=int(both.sum()),
         hedges_g=_jackknife(standardised, task_of, classes, estimand),
@@ -176,7 +178,8 @@ def mean_difference(
     task_of = np.unique(np.asarray(tasks), return_inverse=True)[1]
     x = np.where(finite, sample, 0.0)
     first, second = (_TaskCells.of(x, finite & member, task_of) for member in (chosen, ~chosen))
-    return _difference(first, second, estimand) if first.num_tasks and second.num_tasks else UNKNOWN
+    several = bool(((first.size > 0) | (second.size > 0)).sum() > 1)
+    return _difference(first, second, estimand, several) if first.num_tasks and second.num_tasks else UNKNOWN
 
 
 @dataclass(frozen=True)
@@ -209,8 +212,11 @@ class _TaskCells:
         return float(self.means.sum() / self.num_tasks)
 
 
-def _difference(first: _TaskCells, second: _TaskCells, estimand: Estimand) -> Estimate:
-    """Difference of the means of two classes, with tasks or the episodes of every (class, task) as units."""
+def _difference(first: _TaskCells, second: _TaskCells, estimand: Estimand, several: bool) -> Estimate:
+    """Difference of the means of two classes, with tasks or the episodes of every (class, task) as units.
+
+    Where there are `several` tasks and the tasks should be the units, one task shows nothing about others: no error.
+    """
     value = first.mean - second.mean
     sides = (first, second)
     if estimand == Estimand.TASKS_LIKE_THESE and min(side.num_tasks for side in sides) > 1:
@@ -224,12 +230,13 @@ def _difference(first: _TaskCells, second: _TaskCells, estimand: Estimand) -> Es
         if not ((first.size > 0) & (second.size > 0)).any():
             of_side = np.array([(share**2).sum() for share in shares])
             degrees = float(welch_degrees(of_side, np.array([side.num_tasks - 1.0 for side in sides])))
+    elif estimand == Estimand.TASKS_LIKE_THESE and several:
+        return Estimate(value)
     else:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            parts = [(side.squares / (side.size - 1) / side.size / side.num_tasks**2)[side.size > 0] for side in sides]
-        strata = np.concatenate(parts)
-        variance = float(strata.sum())  # not a number where a task has a single episode
-        degrees = float(welch_degrees(strata, np.concatenate([side.size[side.size > 0] - 1 for side in sides])))
+        squares, sizes = (np.concatenate([getattr(side, name) for side in sides]) for name in ("squares", "size"))
+        divisors = np.repeat([float(side.num_tasks) for side in sides], [len(side.size) for side in sides])
+        found, freedom = strata_error(squares, sizes, divisors)
+        variance, degrees = float(found), float(freedom)  # not a number where a stratum has a single episode
     largest = max(float(np.abs(side.means).max()) for side in sides)
     if not variance > (1e-12 * largest) ** 2 or degrees < 1:
         return Estimate(value)

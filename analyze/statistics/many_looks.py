@@ -17,7 +17,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import ArrayLike, NDArray
 
-from vla_attention.analyze.statistics.effect_sizes import mean_difference
+from vla_attention.analyze.statistics.effect_sizes import FEWEST_TASKS, mean_difference
 from vla_attention.analyze.statistics.intervals import Estimand, Estimate, estimates, mean_over_episodes
 
 #: What identifies an episode in a table.
@@ -67,7 +67,8 @@ class Leader:
 def leader(values: ArrayLike, tasks: ArrayLike, estimand: Estimand = Estimand.TASKS_LIKE_THESE) -> Leader | None:
     """The item with the highest mean over tasks, and how surely it is above every other item.
 
-    Two items are compared within the episodes that have both; where there are none, between episodes.
+    Two items are compared within the episodes that have both; where there are none, between episodes. About tasks like
+    these, items of fewer than `fewest_tasks` take no part: an item of one task shows nothing about others.
 
     Args:
         values: (episode, item); not finite where an episode lacks the item.
@@ -79,20 +80,23 @@ def leader(values: ArrayLike, tasks: ArrayLike, estimand: Estimand = Estimand.TA
     """
     table, task_of = np.asarray(values, dtype=np.float64), np.asarray(tasks)
     means = [one.value for one in estimates([mean_over_episodes(column) for column in table.T], task_of, estimand)]
-    known = [i for i, mean in enumerate(means) if mean is not None]
+    fewest = fewest_tasks(task_of, estimand)
+    tasks_of_items = [len(np.unique(task_of[np.isfinite(column)])) for column in table.T]
+    known = [i for i, mean in enumerate(means) if mean is not None and tasks_of_items[i] >= fewest]
     if len(known) < 2:
         return None
-    highest = np.array([np.nan if mean is None else mean for mean in means])
+    highest = np.array([means[i] if i in known else np.nan for i in range(len(means))], dtype=np.float64)
     first = int(np.nanargmax(highest))
     others = [i for i in known if i != first]
     gaps = table[:, [first]] - table[:, others]
     paired = estimates([mean_over_episodes(gap) for gap in gaps.T], task_of, estimand)
-    p_values = [
-        _one_above(
-            gap if gap.value is not None else _between_episodes(table[:, first], table[:, other], task_of, estimand)
+    p_values = []
+    for column, gap, other in zip(gaps.T, paired, others, strict=True):
+        shared = len(np.unique(task_of[np.isfinite(column)]))
+        within = (
+            gap if shared >= min(fewest, 2) else _between_episodes(table[:, first], table[:, other], task_of, estimand)
         )
-        for gap, other in zip(paired, others, strict=True)
-    ]
+        p_values.append(_one_above(within))
     missing = any(p is None for p in p_values)
     p_value = None if missing else max(p for p in p_values if p is not None)
     return Leader(first, float(highest[first]), p_value, len(known))
@@ -115,6 +119,11 @@ def leader_of_table(
     tasks = episodes.select(pl.struct("suite", "task_id").rank("dense")).to_series().to_numpy()
     found = leader(wide, tasks, estimand)
     return None if found is None else (names.row(found.item, named=True), found)
+
+
+def fewest_tasks(tasks: ArrayLike, estimand: Estimand) -> int:
+    """In how many tasks an item must occur to take part in `leader`: in all of up to three, if tasks are the units."""
+    return min(FEWEST_TASKS, len(np.unique(np.asarray(tasks)))) if estimand == Estimand.TASKS_LIKE_THESE else 1
 
 
 def _one_above(difference: Estimate) -> float | None:

@@ -8,6 +8,8 @@ from statistics import NormalDist
 
 #: Beyond this many degrees of freedom Student's t is the normal distribution to three digits.
 _MANY = 2000
+#: p-values below this are not computed: the difference of two numbers near 1 has no more digits.
+_SMALLEST = 1e-16
 
 
 @functools.lru_cache(maxsize=4096)
@@ -26,8 +28,8 @@ def student_quantile(level: float, degrees: int) -> float:
 def two_sided_p(t: float, degrees: int) -> float:
     """P(|T| > |t|) for Student's t with `degrees` degrees of freedom (a whole number from 1)."""
     if degrees > _MANY:
-        return math.erfc(abs(t) / math.sqrt(2))
-    return max(0.0, 1.0 - _share_within(math.atan(abs(t) / math.sqrt(degrees)), degrees))
+        return max(_SMALLEST, math.erfc(abs(t) / math.sqrt(2)))
+    return max(_SMALLEST, 1.0 - _share_within(math.atan(abs(t) / math.sqrt(degrees)), degrees))
 
 
 def _share_within(angle: float, degrees: int) -> float:

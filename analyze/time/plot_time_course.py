@@ -179,5 +179,5 @@ def _note(courses: TimeCourses, alignment: str, level: float) -> str:
     if courses.num_nonfinite:
         text += f" {courses.num_nonfinite} replans have no finite ratio and are not in its course."
     if courses.course.filter(pl.col("alignment") == alignment)["low"].null_count():
-        text += " No band where fewer than two episodes take part."
+        text += " No band where there can be none (one episode, no spread)."
     return text

@@ -75,7 +75,10 @@ def _course_section(courses: TimeCourses, settings: TimeSettings) -> str:
             cells += [format_number(of[RATIO]["value"]), row_interval(of[RATIO]), format_number(of[RATIO]["uniform"])]
         body.append(cells + [format_percent(of[name]["value"]) for name in groups])
     every = f" (one bin in {stride}; all are in the table)" if stride > 1 else ""
-    note = "The ratio is a geometric mean over episodes, fractions are means; a value holds until the next replan."
+    ratio = (
+        "The ratio is a geometric mean over episodes, fractions are means; a" if RATIO in courses.quantities else "A"
+    )
+    note = f"{ratio} value holds until the next replan."
     if courses.num_nonfinite:
         note += f" {courses.num_nonfinite} replans without a finite ratio take no part in its course."
     return "\n".join(
@@ -112,14 +115,17 @@ def _gripper_section(courses: TimeCourses, settings: TimeSettings) -> str:
         for row in courses.change.iter_rows(named=True)
     ]
     note = (
-        f"change: mean over the {settings.window + 1} replans from the closing on, against the {settings.window} "
-        "before it, within each episode; a factor for the ratio, a difference of fractions for groups. No causal "
-        "claim: much else changes then. q: p of no change, adjusted for the number of quantities (Benjamini-Hochberg)."
+        f"change: mean over at most {settings.window + 1} replans from the closing on, against at most "
+        f"{settings.window} before it, within each episode; a factor for the ratio, a difference of fractions for "
+        "groups. No causal claim: much else changes then. q: p of no change, adjusted for the number of quantities "
+        "(Benjamini-Hochberg)."
     )
     if not courses.change["num_episodes"].max():
         return "\n".join([above, *wrap(f"{rule} No episode shows both sides of a closing.")])
     table = text_table(["quantity", "change", "interval", "q", "episodes"], body, left=(0,))
-    named = findings(courses.change["q"], courses.change["quantity"].to_list(), "quantity", "change", _SENTENCES)
+    named = findings(
+        courses.change["q"].to_list(), courses.change["quantity"].to_list(), "quantity", "a change", _SENTENCES
+    )
     return "\n".join([above, *wrap(rule), table, *wrap(named), *wrap(note)])
 
 
@@ -153,7 +159,9 @@ def outcomes_section(outcomes: pl.DataFrame) -> str:
         "difference, adjusted for the number of quantities (Benjamini-Hochberg). The table also has Hedges' g and "
         "Cliff's delta."
     )
-    named = findings(outcomes["within_tasks_q"], outcomes["quantity"].to_list(), "quantity", "differ", _SENTENCES)
+    named = findings(
+        outcomes["within_tasks_q"].to_list(), outcomes["quantity"].to_list(), "quantity", "a difference", _SENTENCES
+    )
     table = text_table(header, body, left=(0,))
     said = f"Inside tasks: {named[0].lower()}{named[1:]}"
     return "\n".join([above, table, *wrap(said), *wrap(note), *(w for n in notes for w in wrap(n))])

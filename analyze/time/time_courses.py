@@ -23,6 +23,7 @@ from vla_attention.analyze.statistics.effect_sizes import contrast, contrast_row
 from vla_attention.analyze.statistics.intervals import (
     DEFAULT_LEVEL,
     SHARE,
+    UNKNOWN,
     EpisodeStatistic,
     Estimand,
     ends,
@@ -168,7 +169,7 @@ def _episode(item: SelectedEpisode, level: Tables, quantities: Sequence[str], ha
         part["log2_ratio"] * np.log(2.0) if quantity == RATIO else level.of_group(quantity)["fraction"]
         for quantity in quantities
     ]
-    uniform = part["uniform_ratio"].cast(pl.Float64).mean() if RATIO in quantities else None
+    uniform = part["uniform_ratio"].cast(pl.Float64).log().mean() if RATIO in quantities else None
     actions = item.episode.read("actions") if has_actions else None
     return _Episode(
         identity=part.select(EPISODE_KEYS).row(0),
@@ -213,16 +214,19 @@ def _course(
     rows: list[tuple[object, ...]] = []
     if episodes:
         tasks = _task_numbers(episodes)
-        statistics = _statistics(np.stack(aligned), quantities)
+        timed = np.stack(aligned)
+        statistics = _statistics(timed, quantities)
         found = estimates(statistics, tasks, estimand)
         # Bonferroni over the points of one curve: all of it lies within, at the level of a single point.
         together = 1.0 - (1.0 - DEFAULT_LEVEL) / len(places)
         known = np.array([episode.uniform for episode in episodes])
         for number, (statistic, one) in enumerate(zip(statistics, found, strict=True)):
             quantity, position = quantities[number // len(places)], number % len(places)
-            # The baseline is known also where no ratio is finite.
-            of = statistic.used if statistic.used.any() else np.isfinite(known)
-            uniform = estimates([mean_over_episodes(known[of])], tasks[of])[0].value if quantity == RATIO else None
+            there = np.isfinite(timed[:, position]).any(axis=1)
+            # The baseline of the episodes that the point is of, also where none of their ratios is finite.
+            of = statistic.used if statistic.used.any() else there & np.isfinite(known)
+            baseline = estimates([geometric_mean_over_episodes(known[of])], tasks[of])[0] if of.any() else UNKNOWN
+            uniform = baseline.value if quantity == RATIO else None
             num_tasks = len(np.unique(tasks[statistic.used]))
             rows.append(
                 (

@@ -10,7 +10,7 @@ from vla_attention.analyze.show.headings import interval_note, wrap
 from vla_attention.analyze.show.numbers import format_interval, format_number
 from vla_attention.analyze.show.text_table import episode_counts, text_table
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
-from vla_attention.analyze.statistics.many_looks import NAMED_AT
+from vla_attention.analyze.statistics.many_looks import NAMED_AT, fewest_tasks
 from vla_attention.analyze.words.word_study import WordStudy
 
 _NOTE = (
@@ -26,6 +26,8 @@ def words_text(study: WordStudy) -> str:
         *study.question.header("WORDS: which words of the instruction are read", study.layer),
         *([f"Instruction: {study.instruction}"] if study.instruction else []),
         "",
+        *wrap(leading_sentence(study)),
+        "",
         _table(study.summary.filter(pl.col("kind") == "word"), several),
         "",
         "for scale",
@@ -34,30 +36,35 @@ def words_text(study: WordStudy) -> str:
         *wrap(_NOTE),
     ]
     lines += wrap(interval_note(DEFAULT_LEVEL, study.question.settings.intervals.words))
-    return "\n".join([*lines, "", *wrap(_leading(study))])
+    return "\n".join(lines)
 
 
-def _leading(study: WordStudy) -> str:
+def leading_sentence(study: WordStudy) -> str:
     """Which word, and which layer of a word, is surely above all the others."""
     leaders = study.leaders
     about = study.question.settings.intervals.words
+    fewest = fewest_tasks(range(study.question.num_tasks), study.question.settings.intervals)
+    some = f" of at least {fewest} tasks" if fewest > 1 else ""
     said = [
         f"{_cell(row)} has a higher lift ({format_number(found.value)}) than each of the other {found.num_items - 1} "
-        f"{'words' if 'layer' not in row else 'pairs of word and layer'}"
+        f"{'words' if 'layer' not in row else 'pairs of word and layer'}{some}"
         for row, found in leaders
         if found.is_named(len(leaders))
     ]
     if said:
         return f"{'; '.join(said)} (each difference tested at {NAMED_AT:g} / {len(leaders)}, about {about})."
     if not leaders:
-        return "There are no two words to compare."
-    return "No word, and no layer of a word, is surely read more than all the others: the order may be due to chance."
+        return f"There are no two words{some} to compare."
+    return (
+        f"No word, and no layer of a word, is shown to be read more than all the others{some} (about {about}"
+        f"{'; --intervals these-tasks compares all' if some else ''})."
+    )
 
 
 def _table(summary: pl.DataFrame, several_tasks: bool) -> str:
     rows = summary.to_dicts()
     heading, counts = episode_counts(rows, several_tasks)
-    header = ["word", "class", "pieces", heading, "mass", "lift", "interval", "q", "share", "interval"]
+    header = ["word", "class", "pieces", heading, "mass", "lift", "interval", "q", "share"]
     body = [
         [
             row["item"],
@@ -69,7 +76,6 @@ def _table(summary: pl.DataFrame, several_tasks: bool) -> str:
             format_interval(row["lift_low"], row["lift_high"]),
             format_number(row["lift_q"]),
             format_number(row["share"]),
-            format_interval(row["share_low"], row["share_high"]),
         ]
         for row, count in zip(rows, counts, strict=True)
     ]
