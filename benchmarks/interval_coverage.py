@@ -73,6 +73,9 @@ CASES = (
     Case((5,) * 5, 0.3, 0.25),
     Case((5,) * 5, 0.3, 0.6),
     Case((2, 3, 5, 10, 30), 0.3, 0.6),
+    Case((2, 50, 50, 50, 50), 0.3, 0.6),
+    Case((2, 10, 10, 10, 10), 0.3, 0.6),
+    Case((2,) * 10, 0.3, 0.25),
     Case((3,) * 10, 0.3, 0.25),
     Case((5,) * 10, 0.0, 0.25),
     Case((5,) * 10, 0.1, 0.25),
@@ -239,7 +242,7 @@ def main() -> None:
         )
     if arguments.on_disk:
         print(f"\nthe same through {arguments.on_disk} stores on disk of 10 x 5")
-        print(line(CASES[9], through_files(CASES[9], arguments.on_disk, arguments.seed)))
+        print(line(CASES[12], through_files(CASES[12], arguments.on_disk, arguments.seed)))
 
 
 if __name__ == "__main__":

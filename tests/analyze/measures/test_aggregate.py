@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import polars as pl
 import pytest
@@ -14,6 +16,7 @@ from vla_attention.analyze.measures.aggregate import (
     task_tables,
 )
 from vla_attention.analyze.measures.frames import LAYERS_AVG
+from vla_attention.schemas.groupings.grouping import Ratio
 
 GROUPING = default_grouping()
 STEPS = make_steps(num_tasks=3, num_episodes=4, heads=(0, 3), no_denominator=0.1)
@@ -97,6 +100,31 @@ def test_layers_avg_without_a_finite_ratio_is_null_not_zero():
     assert average["nonfinite_layers"].unique().to_list() == [3]
 
 
+def test_the_average_over_layers_prefers_neither_side():
+    """The mean of the layers' ratios is above that of either side alone; the mean of logarithms is not."""
+    inverse = replace(GROUPING, ratio=Ratio(GROUPING.ratio.denominator, GROUPING.ratio.numerator))
+    tables = []
+    for grouping in (GROUPING, inverse):
+        episodes = episode_tables(made_up_steps.replans_of(make_steps(), grouping), grouping)
+        tables.append(task_tables(episodes, grouping).cells.filter(layer=LAYERS_AVG, scope="all"))
+    for column in ("geometric_mean", "ratio_lift", "uniform_ratio"):
+        forward, backward = (table[column][0] for table in tables)
+        assert forward * backward == pytest.approx(1.0)
+    assert tables[0]["ratio_mean"][0] * tables[1]["ratio_mean"][0] > 1.01
+
+
+def test_ratio_over_uniform_is_the_lift_also_where_a_task_has_no_finite_ratio():
+    steps = make_steps()
+    steps = steps.with_columns(
+        pl.when(pl.col("task_id") == 1).then(0.0).otherwise(pl.col("linguistic_mass")).alias("linguistic_mass"),
+        pl.when(pl.col("task_id") == 1).then(60.0).otherwise(pl.col("linguistic_keys")).alias("linguistic_keys"),
+    )
+    row = task_tables(episode_tables(replans_of(steps), GROUPING), GROUPING).cells.row(
+        by_predicate=(pl.col("scope") == "all") & (pl.col("layer") == LAYERS_AVG), named=True
+    )
+    assert row["geometric_mean"] / row["uniform_ratio"] == pytest.approx(row["ratio_lift"])
+
+
 def test_episode_statistics_are_those_of_numpy():
     replans = flat(replans_of(STEPS))
     episodes = flat(episode_tables(replans_of(STEPS), GROUPING))
@@ -111,7 +139,8 @@ def test_episode_statistics_are_those_of_numpy():
         expected = (finite.mean(), finite.std(), np.median(finite), finite.min(), finite.max())
         names = ("mean", "std", "median", "min", "max")
         assert tuple(row[f"ratio_{name}"] for name in names) == pytest.approx(expected)
-        assert row["geometric_mean"] == pytest.approx(np.exp(np.log(finite).mean()))
+        logs = part["log2_ratio"].fill_null(np.nan).to_numpy()
+        assert row["geometric_mean"] == pytest.approx(2 ** logs[np.isfinite(logs)].mean())
         of_means = part["visual_mass"].to_numpy().mean() / part["linguistic_mass"].to_numpy().mean()
         assert row["ratio_of_means"] == pytest.approx(of_means)
         assert row["visual_mass_std"] == pytest.approx(part["visual_mass"].to_numpy().std())

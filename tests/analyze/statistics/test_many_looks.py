@@ -62,6 +62,18 @@ def test_items_that_share_no_episode_are_compared_between_episodes():
     assert found.is_named()
 
 
+def test_an_item_of_one_task_leads_nothing_about_tasks_like_these():
+    generator = np.random.default_rng(4)
+    tasks = np.repeat(np.arange(5), 6)
+    values = generator.normal(1.0, 0.05, (30, 3))
+    values[:, 2] = np.where(tasks == 0, 3.0 + generator.normal(0, 0.05, 30), np.nan)
+    assert leader(values, tasks).item != 2
+    assert leader(values, tasks).num_items == 2
+    found = leader(values, tasks, Estimand.THESE_TASKS)
+    assert (found.item, found.num_items) == (2, 3)
+    assert found.is_named()
+
+
 def test_one_item_has_nothing_to_lead():
     assert leader(np.ones((4, 1)), np.zeros(4)) is None
     assert leader(np.stack([np.ones(4), np.full(4, np.nan)], axis=1), np.zeros(4)) is None

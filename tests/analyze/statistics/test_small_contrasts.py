@@ -98,6 +98,25 @@ def test_a_contrast_of_different_tasks_is_the_t_test_between_their_means():
     assert found.within_tasks.value is None
 
 
+def test_one_task_on_one_side_shows_nothing_about_tasks_like_these():
+    generator = np.random.default_rng(3)
+    tasks = np.repeat(np.arange(6), 5)
+    values = generator.normal(0, 2.0, 6)[tasks] + generator.normal(0, 0.2, 30)
+    found = contrast(values, tasks == 0, tasks)
+    assert found.difference.value is not None
+    assert found.difference.interval() is found.difference.p_value(0.0) is None
+    assert contrast(values, tasks == 0, tasks, Estimand.THESE_TASKS).difference.interval() is not None
+
+
+def test_two_failures_beside_many_solved_seldom_exclude_zero():
+    generator = np.random.default_rng(5)
+    excluded = 0
+    for _ in range(400):
+        values, is_first = both(generator.normal(size=20), generator.normal(size=2))
+        excluded += contrast(values, is_first, np.zeros(22)).difference.p_value(0.0) <= 0.05
+    assert excluded / 400 <= 0.083  # their own variance alone: 15 %
+
+
 def test_effect_sizes_have_the_jackknifes_standard_error():
     values, is_first = both(FIRST, SECOND)
     found = contrast(values, is_first, np.zeros(len(values)))
