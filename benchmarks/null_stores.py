@@ -73,7 +73,7 @@ def plant_of(kind: str, seed: int, planted: bool) -> Callable[[int, int, Episode
             assert tokens.prompt_index is not None
             for piece in tokens.prompts[tokens.prompt_index[0]].pieces:
                 if piece.text.strip() == "the":
-                    factor[:, piece.key] = FACTOR**2
+                    factor[:, piece.key] = FACTOR**4
         elif kind == "objects":
             for span in tokens.layout.spans:
                 if span.camera in (tokens.coverage or {}):

@@ -194,7 +194,9 @@ def groups_with_valid_keys(items: Sequence[SelectedEpisode], resolved: Sequence[
     """The groups that have a valid key in an episode; only these have an entropy."""
     having: set[int] = set()
     for item, groups in zip(items, resolved, strict=True):
-        having |= set(np.flatnonzero(groups.weights.max(axis=0)[item.valid.any(axis=0)].any(axis=0)).tolist())
+        # At the same replan: a key of the prompt may be in the group at one replan and valid at another only.
+        there = ((groups.weights > 0) & item.valid[:, :, None]).any(axis=(0, 1))
+        having |= set(np.flatnonzero(there).tolist())
     return tuple(name for i, name in enumerate(resolved[0].names) if i in having)
 
 

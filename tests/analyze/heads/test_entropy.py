@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -60,6 +61,13 @@ def test_top_masses_do_not_depend_on_the_order_of_their_numbers():
     rows = np.random.default_rng(0).dirichlet(np.full(20, 0.2), (2, 3)).astype(np.float32)
     valid = np.ones((1, 20), bool)
     np.testing.assert_array_equal(top_mass(rows, valid, (5, 1)), top_mass(rows, valid, (1, 5))[..., ::-1])
+
+
+def test_a_group_needs_a_key_that_is_in_it_and_valid_at_the_same_replan():
+    item = SimpleNamespace(valid=np.array([[True, False], [False, True]]))
+    never = SimpleNamespace(names=("never", "once"), weights=np.zeros((2, 2, 2)))
+    never.weights[0, 1, 0] = never.weights[1, 0, 0] = never.weights[1, 1, 1] = 1.0
+    assert groups_with_valid_keys([item], [never]) == ("once",)
 
 
 @FEW

@@ -57,7 +57,7 @@ addEventListener("load", function () {
   const table = document.querySelector("#tasks table.sortable");
   const heads = Array.from(table.tHead.rows[0].cells);
   found.sorted = {};
-  for (const name of ["instruction", "mean ratio"]) {
+  for (const name of ["instruction", "ratio"]) {
     const head = heads.find((cell) => cell.textContent === name);
     for (const turn of ["ascending", "descending"]) {
       head.querySelector("button").click();
@@ -135,7 +135,7 @@ def test_the_slider_changes_the_picture_the_curve_and_the_words(found: dict[str,
 
 
 def test_tables_sort_by_words_and_by_numbers_in_both_directions(found: dict[str, Any]) -> None:
-    for column, key in (("instruction", str), ("mean ratio", float)):
+    for column, key in (("instruction", str), ("ratio", float)):
         for turn, reverse in (("ascending", False), ("descending", True)):
             result = found["sorted"][f"{column} {turn}"]
             assert result["said"] == turn
