@@ -22,11 +22,14 @@ def write_plots(analysis: Analysis, folder: Path, every_episode: bool) -> list[P
     Pictures of ratios are drawn when the grouping has one; `every_episode` adds one per episode and layer.
     """
     grouping, note = analysis.grouping, f"Mean over {analysis.denoise}."
+    if analysis.question.untrained:
+        note += " UNTRAINED weights."
+    about = f"{note} Intervals over tasks: about {analysis.question.settings.intervals.words}."
     written = plot_attention_fractions(analysis.tasks, grouping, folder, note=note)
     if grouping.ratio is not None:
         written += plot_ratio_distribution(analysis.replans.cells, grouping, folder, note=note)
-        written += plot_ratio_per_task(analysis.episodes.cells, analysis.tasks.cells, grouping, folder, note=note)
-    written += plot_layer_profile(analysis.tasks, grouping, folder, note=note)
+        written += plot_ratio_per_task(analysis.episodes.cells, analysis.tasks.cells, grouping, folder, note=about)
+    written += plot_layer_profile(analysis.tasks, grouping, folder, note=about)
     if every_episode:
         pictures = analysis.episodes.cells.height
         with progress_bar(pictures, "pictures") as advance:
