@@ -64,8 +64,8 @@ def plant_of(kind: str, seed: int, planted: bool) -> Callable[[int, int, Episode
     """The rows of one store."""
 
     def plant(task: int, episode: int, tokens: EpisodeTokens, rows: Rows) -> Rows:
-        # Tasks, and keys in them, differ too: about tasks like these, that is noise.
-        of_task = np.random.default_rng([seed, task, 10**6]).normal(0, 0.15, rows.shape[-1])
+        # Tasks differ too, which is noise about tasks like these; both runs of a comparison share it.
+        of_task = np.random.default_rng([seed // 2, task, 10**6]).normal(0, 0.15, rows.shape[-1])
         made = scattered(np.random.default_rng([seed, task, episode]), rows) * np.exp(of_task)
         factor = np.ones((len(made), made.shape[-1]))
         image = tokens.key_role == Role.IMAGE
