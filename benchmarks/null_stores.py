@@ -11,7 +11,7 @@ In a null store every key's attention is the same in expectation; episodes and k
     compare   two runs of the same distribution, paired by initial state
 
 A planted store differs in one place: the attention to the word "the", to the first object, after the gripper closed,
-or of the second run, is a third higher.
+or of the second run, is higher, by `FACTOR` or a power of it.
 """
 
 from __future__ import annotations
@@ -94,23 +94,22 @@ def close_half_way(task: int, episode: int, num_replans: int) -> NDArray[np.floa
     return actions
 
 
+SPEC = StoreSpec(
+    tasks=tuple(range(TASKS)),
+    episodes=EPISODES,
+    replans=REPLANS,
+    layers=(0, 1, 2),
+    heads=(0, 1),
+    denoise_steps=(9,),
+    plant_actions=close_half_way,
+    plant_success=lambda task, episode: episode % 2 == 0,
+    prompts="same",
+)
+
+
 def printed(kind: str, number: int, planted: bool, folder: Path) -> str:
     """The whole text of the command about one store, or about two."""
-    spec = StoreSpec(
-        tasks=tuple(range(TASKS)),
-        episodes=EPISODES,
-        replans=REPLANS,
-        layers=(0, 1, 2),
-        heads=(0, 1),
-        denoise_steps=(9,),
-        frames=False,
-        coverage=kind == "objects",
-        plant_actions=close_half_way,
-        plant_success=lambda task, episode: episode % 2 == 0,
-        mantissa_bits=23,
-        prompts="same",
-        seed=number,
-    )
+    spec = replace(SPEC, frames=False, coverage=kind == "objects", mantissa_bits=23, seed=number)
     paths = []
     for run in range(2 if kind == "compare" else 1):
         own = replace(spec, plant_rows=plant_of(kind, 2 * number + run, planted))

@@ -19,25 +19,15 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.null_stores import EPISODES, REPLANS, TASKS, Rows, close_half_way, normalised, plant_of
+from benchmarks.null_stores import SPEC as NULL_STORE
+from benchmarks.null_stores import Rows, normalised, plant_of
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
-from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.stores import write_store
 
 FOLDER = Path(__file__).parent / "examples"
 COMMANDS = ("ratios", "groups", "heads", "words", "objects", "time", "overlay")
-SPEC = StoreSpec(
-    tasks=tuple(range(TASKS)),
-    episodes=EPISODES,
-    replans=REPLANS,
-    layers=(0, 1, 2),
-    heads=(0, 1),
-    denoise_steps=(9,),
-    plant_actions=close_half_way,
-    plant_success=lambda task, episode: episode % 2 == 0,
-    contributions=True,
-    prompts="same",
-)
+SPEC = replace(NULL_STORE, contributions=True)
 
 
 def plant_all(task: int, episode: int, tokens: EpisodeTokens, rows: Rows) -> Rows:

@@ -23,6 +23,7 @@ from vla_attention.analyze.measures.aggregate import baseline_logs, episode_tabl
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables, float_values
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.statistics.effect_sizes import contrast, standardised_mean
+from vla_attention.analyze.statistics.episode_intervals import task_number
 from vla_attention.analyze.statistics.intervals import (
     SHARE,
     Estimand,
@@ -121,7 +122,7 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
     filled = [name for name in grouping.names if name in having]
     tables = [_episode_values(run, level, filled, "seed" in allowed) for run, level in zip(runs, levels, strict=True)]
     quantities = ((LOG2_RATIO,) if grouping.ratio else ()) + tuple(f"{name}_fraction" for name in filled) + (SUCCESS,)
-    estimates = pl.concat(
+    of_runs = pl.concat(
         [_estimates(run.name, table, quantities, estimand) for run, table in zip(runs, tables, strict=True)]
     )
     differences, pairs, unpaired = [], [], []
@@ -140,7 +141,7 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
         runs=tuple(runs),
         grouping=grouping,
         quantities=quantities,
-        estimates=estimates,
+        estimates=of_runs,
         differences=_with_adjusted(pl.concat(differences)),
         pairs=pl.concat(pairs),
         unpaired=pl.concat(unpaired),
@@ -390,7 +391,7 @@ _ESTIMATE_SCHEMA = {
 
 
 def _tasks(part: pl.DataFrame) -> NDArray[np.int64]:
-    return part.select(pl.struct("suite", "task_id").rank("dense").cast(pl.Int64)).to_series().to_numpy()
+    return part.select(task_number()).to_series().to_numpy()
 
 
 def _numbers(part: pl.DataFrame, column: str) -> NDArray[np.float64]:

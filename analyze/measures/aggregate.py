@@ -40,6 +40,7 @@ from vla_attention.analyze.measures.masses import (
 )
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.steps import MeasuredEpisode, measure_episodes
+from vla_attention.analyze.statistics.episode_intervals import task_number
 from vla_attention.analyze.statistics.intervals import (
     DEFAULT_LEVEL,
     POSITIVE,
@@ -197,8 +198,7 @@ def task_tables(
     """
     # NaN instead of null, once: there can be thousands of (task, layer) pairs, and numpy has no null.
     cells = _sorted(episodes.cells).with_columns(pl.col(pl.Float64).fill_null(float("nan")))
-    # Task ids repeat between suites; a task is a pair of both.
-    cells = cells.with_columns(pl.struct("suite", "task_id").rank("dense").cast(pl.Int64).alias(_TASK))
+    cells = cells.with_columns(task_number().alias(_TASK))
     ordered = Tables(cells, _sorted(episodes.groups))
     values = {name: ordered.values(name) for name in ("mass", "keys", "density", "lift", "fraction")}
     rows, group_rows = [], []

@@ -18,7 +18,7 @@ from vla_attention.analyze.objects.control_masks import STILL_OVERLAP
 from vla_attention.analyze.objects.object_attention import ObjectTables, object_tables
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_views import ALL_CAMERAS, CLASSES, site_of_pictures
-from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
+from vla_attention.analyze.statistics.episode_intervals import means_with_intervals, task_number
 from vla_attention.analyze.statistics.intervals import POSITIVE, SHARE, Estimand, quotient_by_episode
 from vla_attention.analyze.statistics.many_looks import Leader, adjusted_p_values, leader_of_table
 from vla_attention.schemas.stores.reader import Store
@@ -192,7 +192,7 @@ def followed_objects(
 
 def _linearised(of_item: pl.DataFrame) -> pl.DataFrame:
     """With a column `enrichment_over_control` whose mean is the quotient of the means of one item."""
-    tasks = of_item.select(pl.struct("suite", "task_id").rank("dense")).to_series().to_numpy()
+    tasks = of_item.select(task_number()).to_series().to_numpy()
     values = quotient_by_episode(of_item["enrichment"].to_numpy(), of_item["control_balanced"].to_numpy(), tasks)
     return of_item.with_columns(pl.Series(_OVER_CONTROL, values))
 

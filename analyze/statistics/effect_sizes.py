@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from vla_attention.analyze.statistics.intervals import (
     DEFAULT_LEVEL,
     NO_LIMITS,
+    ROUNDING,
     UNKNOWN,
     Estimand,
     Estimate,
@@ -133,20 +134,15 @@ def contrast(
         tasks: (episode,) labels of the episodes' tasks.
         estimand: what the intervals are about.
     """
-    sample, chosen = np.asarray(values, dtype=np.float64), np.asarray(is_first, dtype=bool)
-    finite = np.isfinite(sample)
-    task_of = np.unique(np.asarray(tasks), return_inverse=True)[1]
-    classes = (finite & chosen, finite & ~chosen)
+    split = _Classes.of(values, is_first, tasks)
+    x, task_of, classes, cells = split.x, split.task_of, split.members, split.cells
     sizes = [int(member.sum()) for member in classes]
-    x = np.where(finite, sample, 0.0)
-    cells = [_TaskCells.of(x, member, task_of) for member in classes]
     means = [cell.mean if size else None for cell, size in zip(cells, sizes, strict=True)]
     if min(sizes) < FEWEST:
         note = f"{sizes[0]} against {sizes[1]} episodes: at least {FEWEST} of either are needed"
         return Contrast(sizes[0], sizes[1], means[0], means[1], note=note)
     both = (cells[0].size > 0) & (cells[1].size > 0)
-    several = bool(((cells[0].size > 0) | (cells[1].size > 0)).sum() > 1)
-    within = _difference(cells[0].part(both), cells[1].part(both), estimand, several) if both.any() else UNKNOWN
+    within = _difference(cells[0].part(both), cells[1].part(both), estimand, split.several) if both.any() else UNKNOWN
 
     def standardised(weights: NDArray[np.float64]) -> NDArray[np.float64]:
         first, second = (_moments(weights, x, member) for member in classes)
@@ -160,7 +156,7 @@ def contrast(
         num_second=sizes[1],
         mean_first=means[0],
         mean_second=means[1],
-        difference=_difference(cells[0], cells[1], estimand, several),
+        difference=_difference(cells[0], cells[1], estimand, split.several),
         within_tasks=within,
         num_tasks_with_both=int(both.sum()),
         hedges_g=_jackknife(standardised, task_of, classes, estimand),
@@ -173,13 +169,9 @@ def mean_difference(
     values: ArrayLike, is_first: ArrayLike, tasks: ArrayLike, estimand: Estimand = Estimand.TASKS_LIKE_THESE
 ) -> Estimate:
     """`Contrast.difference` alone; unknown where a class has no finite value."""
-    sample, chosen = np.asarray(values, dtype=np.float64), np.asarray(is_first, dtype=bool)
-    finite = np.isfinite(sample)
-    task_of = np.unique(np.asarray(tasks), return_inverse=True)[1]
-    x = np.where(finite, sample, 0.0)
-    first, second = (_TaskCells.of(x, finite & member, task_of) for member in (chosen, ~chosen))
-    several = bool(((first.size > 0) | (second.size > 0)).sum() > 1)
-    return _difference(first, second, estimand, several) if first.num_tasks and second.num_tasks else UNKNOWN
+    split = _Classes.of(values, is_first, tasks)
+    first, second = split.cells
+    return _difference(first, second, estimand, split.several) if first.num_tasks and second.num_tasks else UNKNOWN
 
 
 @dataclass(frozen=True)
@@ -212,6 +204,36 @@ class _TaskCells:
         return float(self.means.sum() / self.num_tasks)
 
 
+@dataclass(frozen=True)
+class _Classes:
+    """The episodes of two classes that have a finite value.
+
+    Attributes:
+        x: values (episode,), 0 where not finite.
+        task_of: number of each episode's task (episode,).
+        members: (episode,) bool of either class.
+        cells: either class by task.
+    """
+
+    x: NDArray[np.float64]
+    task_of: NDArray[np.intp]
+    members: tuple[NDArray[np.bool_], NDArray[np.bool_]]
+    cells: tuple[_TaskCells, _TaskCells]
+
+    @classmethod
+    def of(cls, values: ArrayLike, is_first: ArrayLike, tasks: ArrayLike) -> _Classes:
+        sample, chosen = np.asarray(values, dtype=np.float64), np.asarray(is_first, dtype=bool)
+        finite = np.isfinite(sample)
+        x, task_of = np.where(finite, sample, 0.0), np.unique(np.asarray(tasks), return_inverse=True)[1]
+        first, second = finite & chosen, finite & ~chosen
+        return cls(x, task_of, (first, second), (_TaskCells.of(x, first, task_of), _TaskCells.of(x, second, task_of)))
+
+    @property
+    def several(self) -> bool:
+        """Whether the classes have several tasks together."""
+        return bool(((self.cells[0].size > 0) | (self.cells[1].size > 0)).sum() > 1)
+
+
 def _difference(first: _TaskCells, second: _TaskCells, estimand: Estimand, several: bool) -> Estimate:
     """Difference of the means of two classes, with tasks or the episodes of every (class, task) as units.
 
@@ -238,7 +260,7 @@ def _difference(first: _TaskCells, second: _TaskCells, estimand: Estimand, sever
         found, freedom = strata_error(squares, sizes, divisors)
         variance, degrees = float(found), float(freedom)  # not a number where a stratum has a single episode
     largest = max(float(np.abs(side.means).max()) for side in sides)
-    if not variance > (1e-12 * largest) ** 2 or degrees < 1:
+    if not variance > (ROUNDING * largest) ** 2 or degrees < 1:
         return Estimate(value)
     return Estimate(value, math.sqrt(variance), int(degrees))
 

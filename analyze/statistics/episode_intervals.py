@@ -22,6 +22,11 @@ from vla_attention.analyze.statistics.intervals import (
 _TASK = "_task_of_suite"
 
 
+def task_number() -> pl.Expr:
+    """The number of each row's task; task ids repeat between suites, so a task is a pair of both."""
+    return pl.struct("suite", "task_id").rank("dense").cast(pl.Int64)
+
+
 def means_with_intervals(
     table: pl.DataFrame,
     by: Sequence[str],
@@ -51,7 +56,7 @@ def means_with_intervals(
         those in `nulls` also `V_p`, the p-value of that null, not adjusted for the number of items.
     """
     nulls = nulls or {}
-    task = pl.concat_str("suite", "task_id", separator="\t").rank("dense").cast(pl.Int64).alias(_TASK)
+    task = task_number().alias(_TASK)
     rows = []
     for key, part in table.with_columns(task).group_by(by, maintain_order=True):
         tasks = part[_TASK].to_numpy()

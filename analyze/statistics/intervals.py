@@ -43,7 +43,7 @@ SHARE = (0.0, 1.0)
 #: that strata of equal spread cover 95 to 97 %.
 _FEW, _SMALL_STRATUM = 5, 0.85
 #: A spread below this share of the values is rounding. Values without spread have no interval.
-_ROUNDING = 1e-12
+ROUNDING = 1e-12
 
 
 class Estimand(StrEnum):
@@ -255,7 +255,7 @@ def welch_degrees(variances: NDArray[np.float64], degrees: NDArray[np.float64]) 
 def _estimate(quotient: float, variance: float, degrees: float, size: float, statistic: EpisodeStatistic) -> Estimate:
     value = None if math.isnan(quotient) else _exp(quotient) if statistic.exponentiate else quotient
     low, high = statistic.limits
-    spread = math.isfinite(variance) and variance > (_ROUNDING * size) ** 2 and low < quotient < high
+    spread = math.isfinite(variance) and variance > (ROUNDING * size) ** 2 and low < quotient < high
     if value is None or not spread or not degrees >= 1:
         return Estimate(value)
     _, slope = to_scale(quotient, statistic.limits)

@@ -18,6 +18,7 @@ import polars as pl
 from numpy.typing import ArrayLike, NDArray
 
 from vla_attention.analyze.statistics.effect_sizes import FEWEST_TASKS, mean_difference
+from vla_attention.analyze.statistics.episode_intervals import task_number
 from vla_attention.analyze.statistics.intervals import Estimand, Estimate, estimates, mean_over_episodes
 
 #: What identifies an episode in a table.
@@ -116,7 +117,7 @@ def leader_of_table(
     wide[numbered["_episode"].to_numpy(), numbered["_item"].to_numpy()] = (
         numbered[value].cast(pl.Float64).fill_null(np.nan).to_numpy()
     )
-    tasks = episodes.select(pl.struct("suite", "task_id").rank("dense")).to_series().to_numpy()
+    tasks = episodes.select(task_number()).to_series().to_numpy()
     found = leader(wide, tasks, estimand)
     return None if found is None else (names.row(found.item, named=True), found)
 
