@@ -23,18 +23,19 @@ NAME.zarr/                            attributes: `RootAttributes`
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.layout import Prompt, SiteLayout
 from vla_attention.schemas.safe_text import check_inner_path, check_name, check_text
 from vla_attention.schemas.segments import Segment
 
 FORMAT_NAME = "vla-attention"
 #: A whole number. A reader accepts versions from `OLDEST_VERSION` to its own.
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 #: Seals of version 1 bind metadata only: files that were exchanged between episodes would be read without an error.
 OLDEST_VERSION = 2
 STORE_SUFFIX = ".zarr"
@@ -166,15 +167,16 @@ class PolicyIdentity:
 
     def __post_init__(self) -> None:
         """Check that names and addresses are text of one line."""
-        for field in ("name", "family", "checkpoint", "checkpoint_format", "digest"):
-            check_text(f"policy's {field}", getattr(self, field))
+        for name in ("name", "family", "checkpoint", "checkpoint_format", "digest"):
+            check_text(f"policy's {name}", getattr(self, name))
 
 
 @dataclass(frozen=True)
 class RootAttributes:
     """Attributes of the store's root group: the run's identity. The same for every process that adds episodes.
 
-    All of it is the run's configuration, except the fields in `JOB_RECORDS`.
+    All of it is the run's configuration, except the fields in `JOB_RECORDS`. `interventions` says what the run changed
+    in the policy and its input, `rerun_of` which store's policy calls it repeated. Version 2 has neither of the two.
     """
 
     format: str
@@ -184,6 +186,8 @@ class RootAttributes:
     recording: Recording
     sites: tuple[SiteLayout, ...]
     provenance: dict[str, str]
+    interventions: Interventions = field(default_factory=Interventions)
+    rerun_of: RerunSource | None = None
 
 
 #: Paths of the fields of `RootAttributes` that describe the job which made the store, not the run's configuration:

@@ -14,7 +14,10 @@ from numcodecs import blosc
 from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
 
 from tests.kit.attacks import exchange, files_of, with_checksum
+from tests.kit.paths import GOLDEN
+from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.root import read_run
 from vla_attention.schemas.stores.store_format import (
     FORMAT_VERSION,
     CorruptEpisode,
@@ -191,6 +194,15 @@ def test_a_later_format(path):
     expected = f"format version {FORMAT_VERSION + 1}, and this program reads up to version {FORMAT_VERSION}; install"
     with pytest.raises(FormatTooNew, match=expected):
         open_store(path)
+
+
+def test_a_store_of_version_2():
+    old = GOLDEN / "stores" / "version2.zarr"
+    attributes, run = read_run(old)
+    assert (attributes.format_version, attributes.interventions, attributes.rerun_of) == (2, Interventions(), None)
+    # The digest is over the attributes as they stand in the file, to which its episodes were sealed.
+    assert run == "7a4af44f6975fa886850346966b95c1ec3c46b2db61a2303358361a0b6a0b983"
+    assert open_store(old).episodes[0].read("joint/rows").shape[0] == StoreSpec().replans
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,93 @@
+"""What an intervention is: its checks, its words, and its way through JSON."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.interventions import (
+    AttentionScale,
+    AttentionUniform,
+    ImageChange,
+    Interventions,
+    KeyKnockout,
+    NoiseChange,
+    PromptChange,
+    RerunSource,
+)
+from vla_attention.schemas.jsonable import from_json, to_json
+
+EVERYTHING = Interventions(
+    name="all of it",
+    keys=(
+        KeyKnockout("word:bowl | camera:base", layers=(0, 3), denoise_steps=(9,), weight=0.5),
+        KeyKnockout("camera:base", keep=True, queries="all", random_seed=3, heads=(1,)),
+        KeyKnockout("role:image", queries="prefix", query_selector="role:instruction"),
+    ),
+    attention=(AttentionUniform("camera:base"), AttentionScale("role:image", 0.25)),
+    prompt=PromptChange("synonyms", synonyms={"bowl": "dish"}),
+    images=(ImageChange("base", "shifted", rows=3, columns=-2), ImageChange("base", "masked", object="bowl_1")),
+    noise=NoiseChange(4),
+)
+
+
+def test_json_and_back():
+    document = json.loads(json.dumps(to_json(EVERYTHING)))
+    assert from_json(Interventions, document) == EVERYTHING
+    assert from_json(Interventions, {}) == Interventions()
+
+
+def test_what_counts_as_none():
+    assert Interventions().is_none
+    assert Interventions(name="base").is_none
+    assert Interventions().describe() == "none"
+    for changes in (
+        {"keys": EVERYTHING.keys},
+        {"attention": EVERYTHING.attention},
+        {"prompt": EVERYTHING.prompt},
+        {"images": EVERYTHING.images},
+        {"noise": EVERYTHING.noise},
+    ):
+        assert not Interventions(**changes).is_none
+
+
+def test_in_words():
+    assert EVERYTHING.describe() == (
+        "the keys of 'word:bowl | camera:base' knocked out with the weight 0.5 for the action queries, layers 0, 3, "
+        "denoise steps 9; random keys (seed 3), as many as all keys but 'camera:base' knocked out for all queries, "
+        "heads 1; the keys of 'role:image' knocked out for the prefix's queries of 'role:instruction'; attention made "
+        "uniform inside 'camera:base'; attention to 'role:image' times 0.25; 1 words replaced by synonyms; camera "
+        "'base' shifted by 3, -2 pixels; camera 'base' masked 'bowl_1'; the noise of seed 4"
+    )
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: KeyKnockout(" "), "has no selector"),
+        (lambda: KeyKnockout("word:a\nb"), "control characters"),
+        (lambda: KeyKnockout("word:a", weight=1.5), "the weight 1.5; expected 0 to 1"),
+        (lambda: KeyKnockout("word:a", weight=float("nan")), "the weight nan; expected 0 to 1"),
+        (lambda: KeyKnockout("word:a", layers=()), "the layers none"),
+        (lambda: KeyKnockout("word:a", heads=(3, 1)), "the heads 3, 1; expected different numbers"),
+        (lambda: KeyKnockout("word:a", denoise_steps=(-1,)), "the denoise steps -1"),
+        (lambda: KeyKnockout("word:a", random_seed=-1), "random control is -1"),
+        (lambda: KeyKnockout("word:a", query_selector="role:text"), "goes with the queries 'prefix', not 'action'"),
+        (lambda: AttentionScale("word:a", -0.5), "the factor -0.5; expected 0 or more"),
+        (lambda: AttentionScale("word:a", float("inf")), "the factor inf"),
+        (lambda: AttentionUniform(""), "has no selector"),
+        (lambda: PromptChange("task"), "'task' has the task None"),
+        (lambda: PromptChange("empty", task_id=3), "'empty' has the task 3"),
+        (lambda: PromptChange("synonyms"), "'synonyms' has 0 synonyms"),
+        (lambda: ImageChange("base", "masked"), "names the object ''"),
+        (lambda: ImageChange("base", "blank", object="bowl_1"), "names the object 'bowl_1'"),
+        (lambda: ImageChange("a/b", "blank"), "'a/b' cannot be the name of a camera"),
+        (lambda: NoiseChange(-1), "the noise is -1"),
+        (lambda: RerunSource("ab\x1b", "a.zarr"), "control characters"),
+    ],
+)
+def test_bad_values(make, message):
+    with pytest.raises(BadArgument, match=message):
+        make()
