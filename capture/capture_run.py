@@ -219,6 +219,8 @@ def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int, n
     say(f"A policy call gives {identity.action_horizon} actions, of which {protocol.replan_steps} are executed.")
     grids = [camera_grid(policy.sites, camera.name) for camera in policy.cameras]
     pictures = [grid.image_height * grid.image_width * 3 for grid in grids]
+    if policy.needs_camera_frames:
+        pictures += [protocol.image_size**2 * 3] * len(grids)
     say(
         f"Recording {len(recording.layers)} layers, denoise steps {listing(recording.denoise_steps)}, "
         f"{len(recording.heads)} heads, {_QUERIES[recording.queries]} {recording.num_action_queries} action queries, "

@@ -19,7 +19,7 @@ _EXAMPLES = """examples:
   vla-analyze copy libero_10.zarr slim.zarr --without frames objects contributions
   vla-analyze copy libero_10.zarr slim.zarr --without frames    again: adds what was captured meanwhile
 
-frames: the cameras' pictures (overlays need them). objects: what each patch shows (object: groups need it).
+frames: the cameras' pictures (overlays and reruns need them). objects: what each patch shows (object: groups need it).
 contributions: norms of what keys add. Rows, and everything else that groupings of keys, words, cameras and
 roles need, are always copied. The copy passes verify, and its provenance names the omitted parts.
 """

@@ -45,7 +45,7 @@ class Part:
 
 #: The parts that may be omitted. Rows, atoms, roles and the small arrays are always copied.
 PARTS: dict[str, Part] = {
-    "frames": Part("the cameras' pictures; overlays need them", r"^frames/"),
+    "frames": Part("the cameras' pictures; overlays and reruns need them", r"^(camera_)?frames/"),
     "objects": Part("what each patch shows; object: groups need it", r"^objects/"),
     "contributions": Part("value-weighted contributions; their norms need them", r"/contribution(/|$)"),
 }

@@ -7,7 +7,7 @@ simulator, to episodes or to files.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -28,6 +28,7 @@ class PolicyInput:
 
     frames: camera -> (height, width, 3) uint8, the images as the model sees them. key_role: site -> (key,) uint8 codes
     of `Role`. state: (state dim,) float64, not normalised. tensors: the model's inputs by its own names, batch 1.
+    camera_frames: camera -> (height, width, 3) uint8, the cameras' own pictures, if the policy `needs_camera_frames`.
     """
 
     frames: Mapping[str, NDArray[np.uint8]]
@@ -35,6 +36,27 @@ class PolicyInput:
     prompt: Prompt
     state: NDArray[np.float64]
     tensors: Mapping[str, Tensor]
+    camera_frames: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+
+    @property
+    def given(self) -> GivenInputs:
+        """What this input was made of; `Policy.prepare_again` makes the same input of it."""
+        return GivenInputs(self.frames, self.camera_frames, self.state, self.prompt.instruction_text)
+
+
+@dataclass(frozen=True)
+class GivenInputs:
+    """What a policy call was given, as a store keeps it. It may be changed before the input is prepared again.
+
+    frames: camera -> (height, width, 3) uint8, the images as the model sees them. camera_frames: camera -> the camera's
+    own picture. Where there is one, the model's image is made of it, and `frames` is not used: a changed picture of
+    `frames` needs the camera's own one removed. state: (state dim,) float64, not normalised. instruction: may be empty.
+    """
+
+    frames: Mapping[str, NDArray[np.uint8]]
+    camera_frames: Mapping[str, NDArray[np.uint8]]
+    state: NDArray[np.float64]
+    instruction: str
 
 
 class Policy(Protocol):
@@ -88,6 +110,10 @@ class Policy(Protocol):
     def cameras(self) -> tuple[PolicyCameraView, ...]:
         """The cameras whose pictures reach the model, in key order."""
 
+    @property
+    def needs_camera_frames(self) -> bool:
+        """Whether the model's images have more than whole grey levels, so that stored ones are not exact."""
+
     def query_pools(self) -> NDArray[np.float64]:
         """Return the weights (pool, action query) of the means that stand for single action steps."""
 
@@ -102,6 +128,12 @@ class Policy(Protocol):
 
     def prepare(self, observation: Observation, instruction: str) -> PolicyInput:
         """Turn an observation and an instruction into the model's input."""
+
+    def prepare_again(self, given: GivenInputs) -> PolicyInput:
+        """Turn what a call was given into the model's input; unchanged, it is the same to the bit.
+
+        Other than `prepare` it accepts an empty instruction.
+        """
 
     def act(
         self, policy_input: PolicyInput, noise_seed: int, recorders: Mapping[str, RowCollector] | None = None

@@ -8,18 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import Environment, Observation, Task
 from vla_attention.capture.environments.coverage import patch_coverage
 from vla_attention.capture.environments.episode_protocol import WAIT_ACTION
-from vla_attention.capture.policies.policy import Policy, PolicyInput, camera_frame, camera_grid
-from vla_attention.capture.recording.finite_numbers import NumbersNotFinite, all_finite, describe_origin
-from vla_attention.capture.recording.recorder import make_recorders
+from vla_attention.capture.policies.policy import Policy, camera_frame, camera_grid
+from vla_attention.capture.rollout.policy_call import record_call
 from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
 from vla_attention.capture.store.store_writer import RunStore
-from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.store_format import Protocol
 
 #: Called after the actions of each replan with (environment steps done, replans done).
@@ -135,27 +133,23 @@ def _replan(
     protocol, recording = store.attributes.protocol, store.attributes.recording
     policy_input = policy.prepare(observation, task.instruction)
     seed = policy.replan_noise_seed(protocol.seed, task.task_id, episode_index, len(writer.records))
-    pools = policy.query_pools() if recording.queries == "steps" else None
-    recorders = make_recorders(recording, policy.sites, policy_input.key_role, pools)
-    actions = policy.act(policy_input, seed, recorders)
-    rows = {site: recorder.finish() for site, recorder in recorders.items()}
     where = f"replan {len(writer.records)} (environment step {protocol.wait_steps + step}) of {writer.what}"
-    if not all_finite(actions, rows):
-        raise _not_finite(policy, policy_input, seed, store, where)
+    call = record_call(policy, policy_input, seed, recording, where)
     writer.append(
         ReplanRecord(
             env_step=protocol.wait_steps + step,
             noise_seed=seed,
-            rows=rows,
+            rows=call.rows,
             key_role=policy_input.key_role,
             prompt=policy_input.prompt,
             state=policy_input.state,
-            actions=actions,
+            actions=call.actions,
             frames=policy_input.frames if recording.frames else {},
+            camera_frames=policy_input.camera_frames if recording.frames else {},
             coverage=_coverage(environment, policy, observation, where),
         )
     )
-    return actions
+    return call.actions
 
 
 def _coverage(
@@ -184,22 +178,3 @@ def _coverage(
         except BadArgument as error:
             raise BadArgument(f"Cannot store {where}, camera '{camera.source}': {error}") from None
     return coverage
-
-
-def _not_finite(policy: Policy, policy_input: PolicyInput, seed: int, store: RunStore, where: str) -> NumbersNotFinite:
-    """Return the error of a policy call whose results are not finite; it repeats the call to find where that began."""
-    wrong_inputs = [name for name, values in policy_input.tensors.items() if not torch.isfinite(values).all()]
-    if wrong_inputs:
-        origin = f"The policy's input is not finite already: {listing(wrong_inputs)}"
-    else:
-        origin = describe_origin(
-            policy.model,
-            lambda watch: policy.act(policy_input, seed, watch),
-            tuple(site.name for site in policy.sites),
-        )
-    dtype = store.attributes.policy.config.get("dtype")
-    remedy = "use another checkpoint" if dtype == "float32" else "use --dtype float32, or another checkpoint"
-    return NumbersNotFinite(
-        f"The policy's numbers turned NaN or infinite at {where}. {origin}. Nothing of this episode was kept, and the "
-        f"episodes before it are unharmed; {remedy}, and a new --store."
-    )

@@ -20,6 +20,7 @@ from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import Prompt
 from vla_attention.schemas.stores.content_rules import (
+    camera_picture_problems,
     counter_problems,
     coverage_problems,
     picture_problems,
@@ -48,8 +49,8 @@ class ReplanRecord:
     """Everything stored about one replan.
 
     `rows` and `key_role` are per site. `state` is (state_dim,), `actions` (horizon, action_dim) as given to the
-    environment, `frames` per policy camera (row, column, channel) uint8, `coverage` per policy camera (patch, object)
-    float32.
+    environment, `frames` and `camera_frames` per policy camera (row, column, channel) uint8, `coverage` per policy
+    camera (patch, object) float32.
     """
 
     env_step: int
@@ -60,6 +61,7 @@ class ReplanRecord:
     state: NDArray[np.float64]
     actions: NDArray[np.float64]
     frames: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    camera_frames: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
     coverage: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
 
 
@@ -144,6 +146,8 @@ class EpisodeWriter:
             yield from prompt_problems(sites, record.prompt)
         for camera, frame in record.frames.items():
             yield from picture_problems(sites, camera, frame.shape, frame.dtype)
+        for camera, frame in record.camera_frames.items():
+            yield from camera_picture_problems(sites, camera, frame.shape, frame.dtype)
         for camera, coverage in record.coverage.items():
             yield from coverage_problems(sites, camera, coverage[None], len(self.start.objects), replan)
         steps = [*(earlier.env_step for earlier in self.records[-1:]), record.env_step]
@@ -152,7 +156,7 @@ class EpisodeWriter:
     def _misfits(self, record: ReplanRecord) -> Iterator[str]:
         """Where a replan differs in form from the first one, so that their arrays could not be stacked."""
         first = self.records[0] if self.records else record
-        for what in ("frames", "coverage"):
+        for what in ("frames", "camera_frames", "coverage"):
             given, expected = list(getattr(record, what)), list(getattr(first, what))
             if given != expected:
                 yield f"it has {what} of the cameras {listing(given)}, the first replan of {listing(expected)}"
@@ -229,6 +233,9 @@ class EpisodeWriter:
         for camera in records[0].frames:
             frames = np.stack([record.frames[camera] for record in records])
             self.write(f"frames/{camera}", frames, ("replan", "row", "column", "channel"))
+        for camera in records[0].camera_frames:
+            frames = np.stack([record.camera_frames[camera] for record in records])
+            self.write(f"camera_frames/{camera}", frames, ("replan", "row", "column", "channel"))
         for camera in records[0].coverage:
             coverage = np.stack([record.coverage[camera] for record in records])
             self.write(f"objects/{camera}", coverage, ("replan", "patch", "object"))

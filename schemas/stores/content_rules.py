@@ -200,6 +200,19 @@ def picture_problems(
         yield f"frames/{camera} has pictures of shape {shape} and type {dtype}; expected {expected} and uint8"
 
 
+def camera_picture_problems(
+    sites: Sequence[SiteLayout], camera: str, shape: tuple[int, ...], dtype: np.dtype[Any]
+) -> Iterator[str]:
+    """A camera's own picture (row, column, channel), of any size: of a known camera, uint8, three channels."""
+    if camera not in _grids(sites):
+        yield f"camera_frames/{camera} is of a camera that no site has; existing: {listing(_grids(sites))}"
+    elif len(shape) != 3 or shape[-1] != 3 or dtype != np.dtype(np.uint8):
+        yield (
+            f"camera_frames/{camera} has pictures of shape {shape} and type {dtype}; expected (height, width, 3) and "
+            "uint8"
+        )
+
+
 def coverage_problems(
     sites: Sequence[SiteLayout],
     camera: str,

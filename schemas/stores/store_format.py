@@ -15,7 +15,8 @@ NAME.zarr/                            attributes: `RootAttributes`
     denoise_time                      (denoise,)
     state                             (replan, state_dim)
     actions                           (replan, horizon, action_dim), as given to the environment
-    frames/<camera>                   (replan, row, column, channel) uint8
+    frames/<camera>                   (replan, row, column, channel) uint8, as the model sees it
+    camera_frames/<camera>            the same, as the camera gave it; only where `frames` is a rounded model input
     objects/<camera>                  (replan, patch, object) float32
     seal/                             attributes: `EpisodeSeal`, which binds all of the above
 """

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
 from vla_attention.schemas.stores.content_rules import (
+    camera_picture_problems,
     counter_problems,
     coverage_problems,
     gram_problems,
@@ -174,6 +175,9 @@ def _camera_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[s
         if group == "frames":
             array = episode.array(name)
             yield from picture_problems(root.sites, camera, array.shape[1:], array.dtype)
+        elif group == "camera_frames":
+            array = episode.array(name)
+            yield from camera_picture_problems(root.sites, camera, array.shape[1:], array.dtype)
         elif group == "objects":
             yield from coverage_problems(root.sites, camera, episode.read(name), len(episode.attributes.objects))
 

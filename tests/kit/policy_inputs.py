@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from vla_attention.capture.environments.base import Observation
+from vla_attention.capture.policies.policy import PolicyInput
 from vla_attention.capture.recording.attention import RowCollector
 
 
@@ -51,3 +53,17 @@ class KeepAll(RowCollector):
         """All rows (denoise, layer, batch, head, query, key)."""
         layers, steps = (1 + max(index) for index in zip(*self.rows, strict=True))
         return np.stack([[self.rows[layer, step].numpy() for layer in range(layers)] for step in range(steps)])
+
+
+def assert_same_input(first: PolicyInput, second: PolicyInput) -> None:
+    """Fail unless two inputs of a policy are the same to the bit."""
+    assert (first.prompt, set(first.tensors)) == (second.prompt, set(second.tensors))
+    for name, tensor in first.tensors.items():
+        assert tensor.dtype == second.tensors[name].dtype, name
+        assert torch.equal(tensor, second.tensors[name]), name
+    np.testing.assert_array_equal(first.state, second.state)
+    for what in ("frames", "camera_frames", "key_role"):
+        mine, other = getattr(first, what), getattr(second, what)
+        assert list(mine) == list(other), what
+        for name, values in mine.items():
+            np.testing.assert_array_equal(values, other[name])

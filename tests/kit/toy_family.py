@@ -22,7 +22,7 @@ def make_toy_policy(checkpoint: str, size: int) -> Any:
 
     from vla_attention.capture.policies.identity import PolicySource, describe_policy
     from vla_attention.capture.policies.noise import initial_noise, noise_seed
-    from vla_attention.capture.policies.policy import PolicyInput, camera_frame
+    from vla_attention.capture.policies.policy import GivenInputs, PolicyInput, camera_frame
     from vla_attention.capture.recording.attention import attend
     from vla_attention.schemas.layout import PatchGrid, Piece, Prompt, Role, SiteLayout, Span, roles_from_spans
     from vla_attention.schemas.stores.store_format import PolicyCameraView
@@ -40,6 +40,7 @@ def make_toy_policy(checkpoint: str, size: int) -> Any:
         action_horizon = num_action_queries = size
         default_protocol = OPENPI
         default_replan_steps = 2
+        needs_camera_frames = False
         cameras = (PolicyCameraView("view", source="agentview", upright=True, mirrored=False),)
 
         def query_pools(self):
@@ -57,6 +58,10 @@ def make_toy_policy(checkpoint: str, size: int) -> Any:
 
         def prepare(self, observation, instruction):
             frame = camera_frame(observation, "agentview")[::-1].copy()
+            return self.prepare_again(GivenInputs({"view": frame}, {}, np.zeros(8), instruction))
+
+        def prepare_again(self, given):
+            frame, instruction = given.frames["view"], given.instruction
             words = instruction.split()[:3]
             starts = [instruction.index(word) for word in words]
             pieces = tuple(Piece(4 + i, w, a, a + len(w)) for i, (w, a) in enumerate(zip(words, starts, strict=True)))

@@ -20,7 +20,7 @@ from vla_attention.capture.policies.cosmos.protocol import COSMOS
 from vla_attention.capture.policies.cosmos.sampler import flow_time
 from vla_attention.capture.policies.cosmos.text import TextSource
 from vla_attention.capture.policies.identity import PolicySource, describe_policy
-from vla_attention.capture.policies.policy import PolicyInput, camera_frame
+from vla_attention.capture.policies.policy import GivenInputs, PolicyInput, camera_frame
 from vla_attention.capture.policies.precision import dtype_name
 from vla_attention.capture.policies.weights import weights_digest
 from vla_attention.capture.recording.attention import RowCollector
@@ -77,6 +77,8 @@ class CosmosPolicy:
         self.default_replan_steps = open_loop_steps
         self.num_action_queries = config.tokens_per_frame
         self.cameras = cameras(config)
+        #: The model's images are the stored ones.
+        self.needs_camera_frames = False
 
     @property
     def config(self) -> CosmosConfig:
@@ -129,12 +131,23 @@ class CosmosPolicy:
         state: the 9 numbers of proprioception, not normalised. The prompt's pieces are keys of `cross`. tensors:
         `given` (1, channel, frame, row, column) latents and `text` (1, position, width).
         """
-        config = self.config
         frames = {
-            camera.name: model_picture(upright(camera_frame(observation, camera.source)), config.image_size)
+            camera.name: model_picture(upright(camera_frame(observation, camera.source)), self.config.image_size)
             for camera in self.cameras
         }
         proprio = proprio_of(observation.gripper_qpos, observation.eef_pos, observation.eef_quat)
+        return self._input_of(frames, proprio, instruction)
+
+    def prepare_again(self, given: GivenInputs) -> PolicyInput:
+        """Turn what a call was given into the model's input (batch 1)."""
+        frames = {camera.name: given.frames[camera.name] for camera in self.cameras}
+        return self._input_of(frames, given.state, given.instruction)
+
+    def _input_of(
+        self, frames: Mapping[str, NDArray[np.uint8]], proprio: NDArray[np.float64], instruction: str
+    ) -> PolicyInput:
+        """Return the model's input of pictures in key order, as the model sees them."""
+        config = self.config
         encoded = self.text.encode(instruction)
         expected = (1, config.text_length, config.dit.text_dim)
         if tuple(encoded.embedding.shape) != expected:

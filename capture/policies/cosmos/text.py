@@ -82,7 +82,8 @@ def text_roles(is_real: NDArray[np.bool_], num_pieces: int | None) -> NDArray[np
 class PrecomputedText:
     """Embeddings from a file. T5's tokenizer is optional; without it no position is known as a word.
 
-    With an encoder and the tokenizer, instructions that the file lacks are encoded.
+    With an encoder and the tokenizer, instructions that the file lacks are encoded. An empty instruction that the file
+    lacks is an embedding of zeros.
     """
 
     def __init__(
@@ -96,6 +97,8 @@ class PrecomputedText:
         self._encoded: dict[str, Tensor] = {}
 
     def _embedding(self, instruction: str) -> Tensor:
+        if not instruction and "" not in self.embeddings.by_instruction:
+            return torch.zeros_like(next(iter(self.embeddings.by_instruction.values())))
         if instruction in self.embeddings.by_instruction or self.encoder is None or self.tokenizer is None:
             return self.embeddings.find(instruction)
         if instruction not in self._encoded:

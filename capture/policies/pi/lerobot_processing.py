@@ -78,6 +78,7 @@ class LerobotProcessing:
         self.protocol = LEROBOT
         self.default_replan_steps = config.n_action_steps
         self.cut_long_prompts = pipeline.cut_long_prompts
+        self.whole_grey_levels = False
         self.environment_cameras: Mapping[str, str] = {
             slot: camera for slot, camera in slots(config, pipeline.rename).items() if camera is not None
         }

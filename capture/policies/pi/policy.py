@@ -19,9 +19,9 @@ from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.flow_time import denoise_times
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.preprocess import libero_state, pad_to
-from vla_attention.capture.policies.pi.processing import Processing
+from vla_attention.capture.policies.pi.processing import Processing, image_tensor
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, TokenizedPrompt, check_vocabulary
-from vla_attention.capture.policies.policy import PolicyInput, camera_frame
+from vla_attention.capture.policies.policy import GivenInputs, PolicyInput, camera_frame
 from vla_attention.capture.policies.precision import dtype_name
 from vla_attention.capture.policies.weights import weights_digest
 from vla_attention.capture.recording.attention import RowCollector
@@ -114,15 +114,43 @@ class PiPolicy:
         }
         return describe_policy(self, self.source, self._digest, facts)
 
+    @property
+    def needs_camera_frames(self) -> bool:
+        """Whether the model's images have more than whole grey levels, so that stored ones are not exact."""
+        return not self.processing.whole_grey_levels
+
     def prepare(self, observation: Observation, instruction: str) -> PolicyInput:
         """Turn an observation and an instruction into the model's input (batch 1)."""
-        config, device = self.model.config, self.model.device
-        size = config.siglip.image_size
+        size = self.model.config.siglip.image_size
+        raw = {camera.name: camera_frame(observation, camera.source) for camera in self.cameras}
+        pictures = {camera: self.processing.model_picture(frame, size) for camera, frame in raw.items()}
+        state = libero_state(observation.eef_pos, observation.eef_quat, observation.gripper_qpos)
+        kept = raw if self.needs_camera_frames else {}
+        return self._input_of(pictures, kept, state, instruction, may_be_empty=False)
+
+    def prepare_again(self, given: GivenInputs) -> PolicyInput:
+        """Turn what a call was given into the model's input (batch 1)."""
+        size = self.model.config.siglip.image_size
         pictures = {
-            camera.name: self.processing.model_picture(camera_frame(observation, camera.source), size)
+            camera.name: self.processing.model_picture(given.camera_frames[camera.name], size)
+            if camera.name in given.camera_frames
+            else (given.frames[camera.name], image_tensor(given.frames[camera.name]))
             for camera in self.cameras
         }
-        state = libero_state(observation.eef_pos, observation.eef_quat, observation.gripper_qpos)
+        return self._input_of(pictures, given.camera_frames, given.state, given.instruction, may_be_empty=True)
+
+    def _input_of(
+        self,
+        pictures: Mapping[str, tuple[NDArray[np.uint8], Tensor]],
+        camera_frames: Mapping[str, NDArray[np.uint8]],
+        state: NDArray[np.float64],
+        instruction: str,
+        *,
+        may_be_empty: bool,
+    ) -> PolicyInput:
+        """Return the model's input; pictures: slot -> the stored picture and the model's, as in `model_picture`."""
+        config, device = self.model.config, self.model.device
+        size = config.siglip.image_size
         normalised = self.processing.normalise_state(state)
         layout = self.sites[0]
         prompt_span = layout.span(PROMPT_SPAN)
@@ -133,6 +161,7 @@ class PiPolicy:
             state=normalised,
             prompt_format=self.processing.prompt_format,
             cut=self.processing.cut_long_prompts,
+            may_be_empty=may_be_empty,
         )
         self._warn_of_cut(tokenized, instruction)
         roles = {camera: Role.IMAGE if camera in pictures else Role.MASKED_IMAGE for camera in config.cameras}
@@ -152,7 +181,12 @@ class PiPolicy:
             tensors[f"image_mask:{camera}"] = torch.tensor([camera in pictures], device=device)
         frames = {slot: frame for slot, (frame, _) in pictures.items()}
         return PolicyInput(
-            frames=frames, key_role={layout.name: key_role}, prompt=tokenized.prompt, state=state, tensors=tensors
+            frames=frames,
+            key_role={layout.name: key_role},
+            prompt=tokenized.prompt,
+            state=state,
+            tensors=tensors,
+            camera_frames=camera_frames,
         )
 
     def _warn_of_cut(self, tokenized: TokenizedPrompt, instruction: str) -> None:

@@ -49,6 +49,10 @@ class Processing(Protocol):
     def default_replan_steps(self) -> int:
         """Actions that the ecosystem's own evaluation executes of each chunk."""
 
+    @property
+    def whole_grey_levels(self) -> bool:
+        """Whether the model's image is the stored one, without rounding."""
+
     def model_picture(self, frame: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], Tensor]:
         """Return the model's image of a raw frame: (size, size, 3) uint8 for the store, (1, 3, size, size) in -1..1."""
 
@@ -87,6 +91,7 @@ class OpenpiProcessing:
         self.default_replan_steps = replan_steps
         self.prompt_format: PromptFormat = "task-state-action" if config.discrete_state_input else "instruction-newline"
         self.cut_long_prompts = True
+        self.whole_grey_levels = True
         self.environment_cameras: Mapping[str, str] = {
             slot: CAMERA_OF_SLOT[slot] for slot in config.cameras if slot in CAMERA_OF_SLOT
         }

@@ -6,6 +6,7 @@ offsets, not from a search for token ids, because an instruction may contain the
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,13 +57,12 @@ class _Section:
 
 def clean_instruction(instruction: str) -> str:
     """Return the instruction as openpi cleans it: stripped, with spaces for "_" and newlines."""
-    return _not_empty(instruction.strip().replace("_", " ").replace("\n", " "))
+    return instruction.strip().replace("_", " ").replace("\n", " ")
 
 
-def _not_empty(text: str) -> str:
-    if not text.strip():
-        raise BadArgument(f"The instruction {text!r} is empty: a policy needs at least one word.")
-    return text
+def _check_not_empty(instruction: str) -> None:
+    if not clean_instruction(instruction).strip():
+        raise BadArgument(f"The instruction {instruction!r} is empty: a policy needs at least one word.")
 
 
 def digitise_state(state: NDArray[np.floating]) -> NDArray[np.int64]:
@@ -101,6 +101,7 @@ class PromptTokenizer:
         state: NDArray[np.floating] | None = None,
         prompt_format: PromptFormat | None = None,
         cut: bool = False,
+        may_be_empty: bool = False,
     ) -> TokenizedPrompt:
         """Tokenize an instruction, and the state if the format contains it.
 
@@ -111,7 +112,10 @@ class PromptTokenizer:
             state: (state,) normalised, unpadded.
             prompt_format: None takes openpi's, with the state if there is one.
             cut: cut a longer prompt as the reference implementations do, instead of refusing it as a `BadArgument`.
+            may_be_empty: accept an instruction without words, instead of refusing it as a `BadArgument`.
         """
+        if not may_be_empty:
+            _check_not_empty(instruction)
         if prompt_format is None:
             prompt_format = "instruction-newline" if state is None else "task-state-action"
         sections = _sections(instruction, state, prompt_format)
@@ -136,7 +140,9 @@ class PromptTokenizer:
             Piece(key=first_key + slot, text=token.piece, start=token.start, stop=token.stop)
             for slot, token in enumerate(tokens, start=1)
         )
-        start = role_of_character.index(Role.INSTRUCTION)
+        # The sections before the instruction; an empty instruction has a place, too.
+        before = itertools.takewhile(lambda section: section.role is not Role.INSTRUCTION, sections)
+        start = sum(len(section.text) for section in before)
         prompt = Prompt(text, pieces, (start, start + role_of_character.count(Role.INSTRUCTION)))
         return TokenizedPrompt(ids=ids, mask=mask, roles=roles, prompt=prompt, num_cut=num_cut)
 
@@ -160,9 +166,9 @@ class PromptTokenizer:
 def _sections(instruction: str, state: NDArray[np.floating] | None, prompt_format: PromptFormat) -> list[_Section]:
     if prompt_format == "raw-instruction-newline":
         raw = instruction.removesuffix("\n")
-        return [_Section(_not_empty(raw), Role.INSTRUCTION), _Section("\n", Role.TEMPLATE)]
+        return [_Section(raw, Role.INSTRUCTION), _Section("\n", Role.TEMPLATE)]
     if prompt_format == "raw-instruction":
-        return [_Section(_not_empty(instruction), Role.INSTRUCTION)]
+        return [_Section(instruction, Role.INSTRUCTION)]
     cleaned = _Section(clean_instruction(instruction), Role.INSTRUCTION)
     if prompt_format == "instruction-newline":
         return [cleaned, _Section("\n", Role.TEMPLATE, encode_alone=True)]

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, recorders_of
-from tests.kit.policy_inputs import KeepAll, make_observation
+from tests.kit.policy_inputs import KeepAll, assert_same_input, make_observation
 from vla_attention.capture.policies.cosmos.build import build_cosmos_policy
 from vla_attention.capture.policies.cosmos.calls import select_call
 from vla_attention.capture.policies.cosmos.config import LIBERO_FRAMES, CosmosConfig, FrameConfig
@@ -145,6 +145,19 @@ def test_frames_are_what_the_model_sees(dummy, prepared):
             4,
             64,
         )
+
+
+def test_what_a_call_was_given_gives_the_same_input_again(dummy, prepared):
+    assert not dummy.needs_camera_frames
+    assert_same_input(dummy.prepare_again(prepared.given), prepared)
+
+
+def test_a_changed_picture_and_no_words_reach_the_model(dummy, prepared):
+    grey = {**prepared.frames, "wrist": np.full_like(prepared.frames["wrist"], 51)}
+    changed = dummy.prepare_again(dataclasses.replace(prepared.given, frames=grey, instruction=""))
+    assert not torch.equal(changed.tensors["given"], prepared.tensors["given"])
+    assert Role.INSTRUCTION not in changed.key_role["cross"]
+    assert np.isfinite(dummy.act(changed, 195)).all()
 
 
 def test_frames_are_found_by_name_and_number():

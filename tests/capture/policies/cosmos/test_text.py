@@ -160,6 +160,16 @@ def test_an_empty_text_is_all_null():
         assert encoded.prompt.pieces == ()
 
 
+def test_no_text_is_all_null_unless_the_file_has_an_embedding_of_it():
+    embedding = made_up(2)
+    without = PrecomputedText(TextEmbeddings("made up", {"open the drawer": embedding}, "0" * 64))
+    assert (without.encode("").roles == Role.NULL).all()
+    assert not without.encode("").embedding.any()
+    assert without.encode("").embedding.dtype == embedding.dtype
+    given = PrecomputedText(TextEmbeddings("made up", {"open the drawer": embedding, "": made_up(1)}, "0" * 64))
+    assert (given.encode("").roles[:2] == [Role.TEXT, Role.NULL]).all()
+
+
 def test_zeros_between_real_positions_are_refused():
     holed = made_up(5)
     holed[:, 2] = 0

@@ -1,5 +1,6 @@
 """LeRobot checkpoints: settings from their files, refused features, and preprocessing against LeRobot's numbers."""
 
+import dataclasses
 import json
 import shutil
 
@@ -9,7 +10,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from tests.kit.pi_golden import GOLDEN
-from tests.kit.policy_inputs import make_observation
+from tests.kit.policy_inputs import assert_same_input, make_observation
 from tests.kit.small_tokenizer import train_small_tokenizer
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint, UnsupportedCheckpoint
 from vla_attention.capture.policies.pi.lerobot_config import UnsupportedLerobotFeature, read_lerobot_config
@@ -189,6 +190,21 @@ def test_another_order_of_cameras_steps_and_precision(checkpoint, tokenizer_path
     assert np.isfinite(policy.act(policy.prepare(make_observation(1), INSTRUCTION), 0)).all()
     float32 = load_pi_policy(checkpoint, tokenizer_path, options=CheckpointOptions(dtype=torch.float32))
     assert float32.model.dtype == torch.float32
+
+
+def test_the_cameras_own_pictures_give_the_same_input_again(checkpoint, tokenizer_path):
+    """Pictures that were rounded for the store would not: the model's image was resized in floating point."""
+    policy = load_pi_policy(checkpoint, tokenizer_path)
+    observation = make_observation(0)
+    prepared = policy.prepare(observation, INSTRUCTION)
+    assert policy.needs_camera_frames
+    assert prepared.camera_frames.keys() == prepared.frames.keys()
+    assert_same_input(policy.prepare_again(prepared.given), prepared)
+    rounded = policy.prepare_again(dataclasses.replace(prepared.given, camera_frames={}))
+    for camera in policy.cameras:
+        np.testing.assert_array_equal(prepared.camera_frames[camera.name], observation.images[camera.source])
+        difference = rounded.tensors[f"image:{camera.name}"] - prepared.tensors[f"image:{camera.name}"]
+        assert 0 < difference.abs().max() <= 1.001 / 255
 
 
 def test_renamed_cameras_and_empty_cameras_that_only_a_number_states(checkpoint, tokenizer_path):

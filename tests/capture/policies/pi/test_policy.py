@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import save_file
 
 from tests.kit.pi_golden import GOLDEN
-from tests.kit.policy_inputs import make_observation
+from tests.kit.policy_inputs import assert_same_input, make_observation
 from tests.kit.slow import slow_except
 from vla_attention.capture.environments.base import Observation
 from vla_attention.capture.policies.identity import PolicySource
@@ -98,6 +98,26 @@ def test_frames_are_the_rotated_pictures_of_the_real_cameras(policy, observation
         np.testing.assert_allclose((tensor[0].permute(1, 2, 0).numpy() + 1) * 127.5, expected, atol=1e-4)
     assert (given.tensors["image:right_wrist_0_rgb"] == -1).all()
     assert not given.tensors["image_mask:right_wrist_0_rgb"].any()
+
+
+def test_what_a_call_was_given_gives_the_same_input_again(policy, observation):
+    prepared = policy.prepare(observation, INSTRUCTION)
+    assert not policy.needs_camera_frames
+    assert not prepared.camera_frames
+    assert_same_input(policy.prepare_again(prepared.given), prepared)
+
+
+def test_a_changed_picture_and_no_words_reach_the_model(policy, observation):
+    prepared = policy.prepare(observation, INSTRUCTION)
+    grey = {**prepared.frames, "base_0_rgb": np.full_like(prepared.frames["base_0_rgb"], 51)}
+    changed = policy.prepare_again(dataclasses.replace(prepared.given, frames=grey, instruction=""))
+    assert torch.all(changed.tensors["image:base_0_rgb"] == torch.tensor(np.float32(51) / 255 * 2 - 1))
+    assert torch.equal(changed.tensors["image:left_wrist_0_rgb"], prepared.tensors["image:left_wrist_0_rgb"])
+    assert changed.prompt.instruction_text == ""
+    assert Role.INSTRUCTION not in changed.key_role["joint"]
+    assert np.isfinite(policy.act(changed, 3)).all()
+    with pytest.raises(BadArgument, match="a policy needs at least one word"):
+        policy.prepare(observation, "")
 
 
 def test_roles_agree_with_the_keys_that_get_attention(policy, observation):
