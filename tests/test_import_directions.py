@@ -37,6 +37,7 @@ LEVELS = {
     "capture.rollout": 4,
     "capture": 5,
     "capture.published": 6,
+    "capture.small_policy": 6,
     "testing": 2,
 }
 

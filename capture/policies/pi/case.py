@@ -20,6 +20,9 @@ from vla_attention.capture.policies.pi.formats import CheckpointFormat
 from vla_attention.capture.policies.precision import DTYPES
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 
+#: File of a checkpoint in openpi's PyTorch format that may state the sizes, in the form of a case.json.
+CONFIG_FILE = "config.json"
+
 CaseFormat = Literal["orbax", "openpi", "lerobot"]
 
 #: For each format of a case: the folder of the checkpoint, and the loader's name of the format.
@@ -83,6 +86,18 @@ def read_config(path: Path) -> PiConfig:
             "pi05) and 'config' with paligemma, action_expert, siglip, vocab_size, action_dim, action_horizon, "
             "max_token_len, num_steps."
         ) from error
+
+
+def states_sizes(path: Path) -> bool:
+    """Return whether a checkpoint's config.json states all sizes itself, like a case.json (see `small_policy`)."""
+    content = read_json_object(path)
+    return "model" in content and isinstance(content.get("config"), Mapping)
+
+
+def stated_name(path: Path) -> str | None:
+    """Return the name that a checkpoint's config.json gives its policy, if its sizes are stated there, too."""
+    name = read_json_object(path).get("name")
+    return name if states_sizes(path) and isinstance(name, str) and name else None
 
 
 def _config(content: Mapping[str, Any]) -> PiConfig:

@@ -9,7 +9,7 @@ import torch
 
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.parity_case import CASE_FILE
-from vla_attention.capture.policies.pi.case import read_config
+from vla_attention.capture.policies.pi.case import CONFIG_FILE, read_config, stated_name, states_sizes
 from vla_attention.capture.policies.pi.config import PiConfig, find_config
 from vla_attention.capture.policies.pi.formats import CheckpointFormat, detect_format
 from vla_attention.capture.policies.pi.lerobot import load_lerobot, load_lerobot_weights
@@ -90,8 +90,9 @@ def load_pi_policy(
         processing = OpenpiProcessing(
             model.config, norm_stats, normalisation="quantile" if pi05 else "z-score", relative_actions=not pi05
         )
+    family = "pi05" if model.config.pi05 else "pi0"
     source = PolicySource(
-        name="pi05" if model.config.pi05 else "pi0",
+        name=stated_name(folder / CONFIG_FILE) or family if found == "openpi_torch" else family,
         checkpoint=str(checkpoint),
         checkpoint_format=found,
         untrained=False,
@@ -120,6 +121,8 @@ def choose_config(folder: Path, found: CheckpointFormat, options: CheckpointOpti
     beside = folder.absolute().parent / CASE_FILE
     if beside.is_file():
         return read_config(beside), f"{CASE_FILE} beside the checkpoint"
+    if found == "openpi_torch" and states_sizes(folder / CONFIG_FILE):
+        return read_config(folder / CONFIG_FILE), CONFIG_FILE
     if found == "openpi_jax":
         name = implied_config_name(leaf.path for leaf in list_leaves(folder / "params"))
         return find_config(name), f"openpi's {name} (not stated by the checkpoint)"

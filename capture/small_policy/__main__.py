@@ -1,0 +1,48 @@
+"""`python -m vla_attention.capture.small_policy`: make the small policy, from demonstrations to shipped weights."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from vla_attention.schemas.command_line import OneSentenceParser, command_parser, run_command
+
+PROGRAM = "python -m vla_attention.capture.small_policy"
+
+#: Sub-command -> what it does. Each is a module `<name>_command` here, with `add_arguments(parser)` and
+#: `run(arguments)`, which returns the exit code.
+COMMANDS: dict[str, str] = {
+    "train": "train the policy, or a control, on demonstrations",
+    "export": "write a training's averaged weights as a checkpoint folder for vla-capture pi",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a sub-command; returns the exit code, which is 2 after a mistake in the arguments."""
+    # Set before MuJoCo is imported, because GPU nodes and CI have no display.
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    given = list(sys.argv[1:] if argv is None else argv)
+    parser = command_parser(PROGRAM, "Make the small pi0.5 of the suite cubes.")
+    subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=OneSentenceParser)
+    # Only the chosen command's module is imported, because they need different parts of the installation.
+    for name, title in COMMANDS.items():
+        subparser = subparsers.add_parser(name, help=title, description=title)
+        if name in given[:1]:
+            _module(name).add_arguments(subparser)
+    arguments = parser.parse_args(given)
+    return run_command(
+        f"{PROGRAM} {arguments.command}",
+        lambda: _module(arguments.command).run(arguments),
+        "what was written is kept, continue with --resume.",
+    )
+
+
+def _module(name: str) -> Any:
+    return importlib.import_module(f"vla_attention.capture.small_policy.{name}_command")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

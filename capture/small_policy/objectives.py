@@ -1,0 +1,121 @@
+"""The losses: flow matching of the actions, and two that ask where the named cube is.
+
+Without the second kind a policy learns to reach some cube and ignores the instruction for a long time, with nearly as
+good a flow loss. Their heads are dropped after training.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from vla_attention.capture.policies.pi.flow_time import embed_times
+from vla_attention.capture.policies.pi.gemma import KeysValues, Rotation, rms_normalise
+from vla_attention.capture.policies.pi.model import PiModel
+from vla_attention.capture.small_policy.batches import Batch
+from vla_attention.capture.small_policy.network import CAMERAS
+
+#: Dimensions of an action that decide about success: x, y, z and the gripper. The others turn the hand.
+_MAIN, _REST = (0, 1, 2, 6), (3, 4, 5, 7)
+#: Weights of the parts in the loss.
+WEIGHTS = {"flow": 1.0, "flow_rest": 0.2, "heat": 0.15, "position": 0.6}
+
+
+class Heads(nn.Module):
+    """What is read from the tokens that enter the last block: heat from patches, positions from the last text token."""
+
+    def __init__(self, width: int, seed: int):
+        super().__init__()
+        self.heat = nn.Linear(width, 2)
+        self.position = nn.Linear(width, 4 * 3)
+        generator = torch.Generator().manual_seed(seed)
+        for layer in (self.heat, self.position):
+            nn.init.normal_(layer.weight, std=width**-0.5, generator=generator)
+            nn.init.zeros_(layer.bias)
+
+
+@dataclass(frozen=True)
+class EncodedPrefix:
+    """The prefix pass with gradients. cache: as in `Prefix`; last: (batch, key, width), what enters the last block."""
+
+    cache: tuple[KeysValues, ...]
+    valid: Tensor
+    last: Tensor
+
+
+def encode(model: PiModel, batch: Batch) -> EncodedPrefix:
+    """Run images and text through the vision-language model, as `PiModel.encode_prefix`."""
+    masks = {camera: torch.ones(len(batch.tokens), dtype=torch.bool) for camera in CAMERAS}
+    x, valid = model.embed_prefix(batch.images, masks, batch.tokens, batch.token_mask)
+    rotation = Rotation.at(valid.cumsum(dim=1) - 1, model.config.paligemma.head_dim)
+    cache = []
+    *earlier, last = model.paligemma_with_expert.paligemma.model.language_model.blocks
+    for block in earlier:
+        x, own = block(x, valid[:, None, :], rotation)
+        cache.append(own)
+    cache.append(last.keys_values(x, rotation))
+    return EncodedPrefix(tuple(cache), valid, x)
+
+
+def velocities(model: PiModel, prefix: EncodedPrefix, noisy: Tensor, times: Tensor) -> Tensor:
+    """Return the model's velocity (batch, pair, horizon, action dim) of noisy actions at times (batch, pair)."""
+    batch, pairs, horizon, dim = noisy.shape
+    config = model.config
+    expert = model.paligemma_with_expert.gemma_expert.model
+    waves = embed_times(times.flatten().numpy(), config.action_expert.width, config.time_convention)
+    hidden = model.action_in_proj(noisy.reshape(batch * pairs, horizon, dim))
+    condition = F.silu(model.time_mlp_out(F.silu(model.time_mlp_in(waves))))
+    seen = prefix.valid.repeat_interleave(pairs, dim=0)
+    positions = seen.sum(dim=1, keepdim=True) + torch.arange(horizon)
+    rotation = Rotation.at(positions, config.action_expert.head_dim)
+    mask = F.pad(seen, (0, horizon), value=True)[:, None, :]
+    for block, cached in zip(expert.blocks, prefix.cache, strict=True):
+        before = KeysValues(cached.keys.repeat_interleave(pairs, 0), cached.values.repeat_interleave(pairs, 0))
+        hidden, _ = block(hidden, mask, rotation, before=before, condition=condition)
+    normed, _ = expert.norm(hidden, condition)
+    velocity: Tensor = model.action_out_proj(normed).float()
+    return velocity.reshape(batch, pairs, horizon, dim)
+
+
+def losses(model: PiModel, heads: Heads, batch: Batch) -> dict[str, Tensor]:
+    """Return each part of the loss, by the names in `WEIGHTS`, unweighted."""
+    prefix = encode(model, batch)
+    time = batch.times[..., None, None]
+    actions = batch.actions[:, None]
+    # The model's convention: t = 1 is noise, and a step of sampling subtracts the velocity.
+    predicted = velocities(model, prefix, time * batch.noise + (1.0 - time) * actions, batch.times)
+    error = (predicted - (batch.noise - actions)).square()
+    tokens = rms_normalise(prefix.last)
+    return {
+        "flow": error[..., _MAIN].mean(),
+        "flow_rest": error[..., _REST].mean(),
+        "heat": _heat_loss(heads, tokens, batch, model.config.siglip.num_tokens),
+        "position": _position_loss(heads, tokens, batch),
+    }
+
+
+def _heat_loss(heads: Heads, tokens: Tensor, batch: Batch, patches: int) -> Tensor:
+    images = torch.unflatten(tokens[:, : len(CAMERAS) * patches], 1, (len(CAMERAS), patches))
+    log_heat = heads.heat(images).float().transpose(-1, -2).log_softmax(dim=-1)  # (batch, camera, 2, patch)
+    entropy = -(batch.heat * log_heat).sum(dim=-1)
+    return _mean_where(entropy, batch.has_heat)
+
+
+def _position_loss(heads: Heads, tokens: Tensor, batch: Batch) -> Tensor:
+    text = tokens[:, tokens.shape[1] - batch.tokens.shape[1] :]
+    last = batch.token_mask.sum(dim=1) - 1
+    found = torch.unflatten(heads.position(text[torch.arange(len(last)), last]).float(), -1, (4, 3))
+    error = F.smooth_l1_loss(found, batch.positions, reduction="none", beta=0.5).mean(dim=-1)
+    return _mean_where(error, batch.has_position)
+
+
+def _mean_where(values: Tensor, exists: Tensor) -> Tensor:
+    return (values * exists).sum() / exists.sum().clamp(min=1)
+
+
+def total(parts: dict[str, Tensor]) -> Tensor:
+    """Return the weighted sum that is minimised."""
+    return torch.stack([WEIGHTS[name] * part for name, part in parts.items()]).sum()

@@ -1,0 +1,54 @@
+"""`train`: train the small policy on demonstrations."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from vla_attention.capture.small_policy.dataset import CONTROLS, find_control, read_demonstrations
+from vla_attention.schemas.errors import BadArgument
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    parser.add_argument("demonstrations", type=Path, metavar="DEMONSTRATIONS", help="folder written by `demonstrate`")
+    parser.add_argument("output", type=Path, metavar="OUTPUT", help="folder for checkpoint, log.csv and loss.png")
+    parser.add_argument("--steps", type=int, default=6000, metavar="N", help="optimiser steps (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of weights, batches, noise (default: 0)")
+    parser.add_argument("--threads", type=int, default=2, metavar="T", help="CPU threads (default: %(default)s)")
+    parser.add_argument(
+        "--control",
+        default="words",
+        metavar="NAME",
+        help=f"what the policy can learn from: {', '.join(CONTROLS)} (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--resume", action="store_true", help="go on from OUTPUT's checkpoint, if there is one; --steps may be changed"
+    )
+    parser.add_argument(
+        "--checkpoint-minutes", type=float, default=3.0, metavar="M", help="between checkpoints (default: %(default)s)"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Train; returns the exit code."""
+    control = find_control(arguments.control)
+    if arguments.threads < 1:
+        raise BadArgument(f"--threads is {arguments.threads}; it must be at least 1.")
+    import torch
+
+    from vla_attention.capture.environments.suites import find_suite, list_tasks
+    from vla_attention.capture.small_policy.training import TrainingSettings, train
+
+    torch.set_num_threads(arguments.threads)
+    settings = TrainingSettings(
+        steps=arguments.steps, seed=arguments.seed, control=control, checkpoint_minutes=arguments.checkpoint_minutes
+    )
+    instructions = tuple(task.instruction for task in list_tasks(find_suite("cubes")))
+    demonstrations = read_demonstrations(arguments.demonstrations, _say)
+    train(demonstrations, instructions, arguments.output, settings, resume=arguments.resume, say=_say)
+    return 0
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)

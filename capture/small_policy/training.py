@@ -1,0 +1,262 @@
+"""Train the small policy on demonstrations, from a seed, in a folder from which a killed training goes on."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from vla_attention.capture.policies.pi.config import PiConfig
+from vla_attention.capture.policies.pi.model import PiModel
+from vla_attention.capture.policies.pi.preprocess import Statistics
+from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
+from vla_attention.capture.small_policy.batches import Batches, number_ids
+from vla_attention.capture.small_policy.dataset import Control, Demonstrations, split_scenes, usable_samples
+from vla_attention.capture.small_policy.loss_log import LossLog
+from vla_attention.capture.small_policy.network import initial_model, small_config
+from vla_attention.capture.small_policy.objectives import Heads, losses, total
+from vla_attention.capture.small_policy.vocabulary import make_tokenizer
+from vla_attention.schemas.errors import BadArgument, UserError
+
+CHECKPOINT, TOKENIZER, SETTINGS = "checkpoint.pt", "tokenizer.model", "settings.json"
+
+PEAK_RATE, LAST_RATE, WARM_UP = 1e-3, 3e-5, 50
+BETAS, WEIGHT_DECAY, CLIP = (0.9, 0.95), 0.01, 1.0
+EMA_DECAY = 0.998
+#: Seeds of the streams that are drawn from one seed of the training.
+_HEADS, _HELD_OUT = 1, 2
+#: Batches on which the losses of the held-out scenes are measured; always the same.
+_HELD_OUT_BATCHES = 4
+
+
+class UnusableTraining(UserError, ValueError):
+    """The folder has no training to go on with, or another one than was asked for."""
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """What a training depends on, besides the demonstrations.
+
+    steps: of the schedule. log_every, evaluate_every: steps between two lines of the log, and between two measurements
+    on held-out scenes. checkpoint_minutes: between two checkpoints.
+    """
+
+    steps: int
+    seed: int = 0
+    control: Control = "words"
+    batch_size: int = 64
+    log_every: int = 20
+    evaluate_every: int = 200
+    checkpoint_minutes: float = 3.0
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch_size", "log_every", "evaluate_every"):
+            if getattr(self, name) < 1:
+                raise BadArgument(f"{name} is {getattr(self, name)}; it must be at least 1.")
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What must be equal when a training goes on; the number of steps may be changed on the way."""
+        return {"seed": self.seed, "control": self.control, "batch_size": self.batch_size}
+
+
+def learning_rate(step: int, steps: int) -> float:
+    """Return the rate of a step: linear warm-up to `PEAK_RATE`, then a cosine to `LAST_RATE`."""
+    warm_up = min(WARM_UP, max(1, steps // 10))
+    if step < warm_up:
+        return PEAK_RATE * (step + 1) / warm_up
+    progress = min(1.0, (step - warm_up) / max(1, steps - warm_up))
+    return LAST_RATE + 0.5 * (PEAK_RATE - LAST_RATE) * (1.0 + math.cos(math.pi * progress))
+
+
+def state_statistics(state: np.ndarray) -> Statistics:
+    """Return the statistics of the states (sample, 8) by which they are normalised."""
+    low, high = np.quantile(state.astype(np.float64), (0.01, 0.99), axis=0)
+    return Statistics(
+        mean=state.mean(axis=0, dtype=np.float64), std=state.std(axis=0, dtype=np.float64), q01=low, q99=high
+    )
+
+
+class Training:
+    """A training in memory: the model, its moving average, the heads and the optimiser."""
+
+    def __init__(self, settings: TrainingSettings, config: PiConfig, number_tokens: Iterable[int]):
+        self.settings, self.config = settings, config
+        self.step, self.seconds = 0, 0.0
+        #: numbers of steps that were planned, each from the step on at which it was set
+        self.schedule: list[list[int]] = [[0, settings.steps]]
+        self.model: PiModel = initial_model(config, list(number_tokens), settings.seed)
+        self.heads = Heads(config.paligemma.width, settings.seed + _HEADS)
+        self.average: PiModel = initial_model(config, list(number_tokens), settings.seed).requires_grad_(False)
+        self.average_heads = Heads(config.paligemma.width, settings.seed + _HEADS).requires_grad_(False)
+        self._parameters: list[Tensor] = [*self.model.parameters(), *self.heads.parameters()]
+        self._averages: list[Tensor] = [*self.average.parameters(), *self.average_heads.parameters()]
+        self.optimiser = torch.optim.AdamW(
+            _decay_groups(self.model, self.heads), lr=PEAK_RATE, betas=BETAS, weight_decay=WEIGHT_DECAY, fused=True
+        )
+
+    def advance(self, batches: Batches) -> dict[str, float]:
+        """Take one step; returns the parts of its loss."""
+        rate = learning_rate(self.step, self.settings.steps)
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        batch = batches.draw(self.step)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            parts = losses(self.model, self.heads, batch)
+            loss = total(parts)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self._parameters, CLIP)
+        self.optimiser.step()
+        self.step += 1
+        # Early weights are far from good ones, so the average forgets them faster.
+        decay = min(EMA_DECAY, (1.0 + self.step) / (10.0 + self.step))
+        with torch.no_grad():
+            torch._foreach_lerp_(self._averages, self._parameters, 1.0 - decay)
+        return {"total": float(loss.detach()), **{name: float(part.detach()) for name, part in parts.items()}}
+
+    @torch.no_grad()
+    def measure(self, batches: Batches) -> dict[str, float]:
+        """Return the averaged weights' losses on some batches, always the same."""
+        found = []
+        for number in range(_HELD_OUT_BATCHES):
+            with torch.autocast("cpu", dtype=torch.bfloat16):
+                parts = losses(self.average, self.average_heads, batches.draw(number))
+            found.append({"total": float(total(parts)), **{name: float(part) for name, part in parts.items()}})
+        return {name: float(np.mean([one[name] for one in found])) for name in found[0]}
+
+    def state(self) -> dict[str, Any]:
+        """Return everything that a continuation needs, for `torch.save`."""
+        return {
+            "step": self.step,
+            "seconds": self.seconds,
+            "schedule": self.schedule,
+            "model": self.model.state_dict(),
+            "heads": self.heads.state_dict(),
+            "average": self.average.state_dict(),
+            "average_heads": self.average_heads.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Go back to a `state`; a changed number of steps holds from there on."""
+        self.step, self.seconds, self.schedule = state["step"], state["seconds"], state["schedule"]
+        if self.schedule[-1][1] != self.settings.steps:
+            self.schedule.append([self.step, self.settings.steps])
+        for part in ("model", "heads", "average", "average_heads", "optimiser"):
+            getattr(self, part).load_state_dict(state[part])
+
+
+def _decay_groups(*modules: nn.Module) -> list[dict[str, Any]]:
+    """Return the optimiser's groups: matrices decay; biases, norms and embeddings do not."""
+    named = [(name, parameter) for module in modules for name, parameter in module.named_parameters()]
+    matrices = [p for name, p in named if p.ndim >= 2 and "embed" not in name]
+    others = [p for name, p in named if not (p.ndim >= 2 and "embed" not in name)]
+    return [{"params": matrices}, {"params": others, "weight_decay": 0.0}]
+
+
+def train(
+    demonstrations: Demonstrations,
+    instructions: tuple[str, ...],
+    output: Path,
+    settings: TrainingSettings,
+    *,
+    resume: bool = False,
+    say: Callable[[str], None] = print,
+    stop_at: int | None = None,
+) -> Training:
+    """Train in the folder `output`: checkpoints, log.csv, loss.png and what `export` needs.
+
+    instructions: of each task. resume: go on from the folder's checkpoint, if there is one. stop_at: end before this
+    step, as a kill would after a checkpoint.
+    """
+    output.mkdir(parents=True, exist_ok=True)
+    tokenizer_file = output / TOKENIZER
+    tokenizer_file.write_bytes(make_tokenizer())
+    tokenizer = PromptTokenizer(tokenizer_file)
+    config = small_config(tokenizer.vocab_size)
+    samples = demonstrations.samples
+    training_part, held_out = split_scenes(samples)
+    usable = usable_samples(samples, settings.control)
+    training_part, held_out = training_part[usable[training_part]], held_out[usable[held_out]]
+    statistics = state_statistics(samples.state[training_part])
+    facts = {
+        **settings.identity,
+        "demonstrations": demonstrations.digest,
+        "samples": {"training": len(training_part), "held_out": len(held_out)},
+        "instructions": list(instructions),
+        "state": {name: getattr(statistics, name).tolist() for name in ("mean", "std", "q01", "q99")},
+    }
+    training = Training(settings, config, number_ids(tokenizer).tolist())
+    _begin(training, output, facts, resume=resume, say=say)
+
+    def batches(part: np.ndarray, seed: int, jitter: bool) -> Batches:
+        return Batches(
+            samples, part, instructions, tokenizer, config, statistics, settings.control,
+            batch_size=settings.batch_size, seed=seed, jitter=jitter,
+        )  # fmt: skip
+
+    drawn = batches(training_part, settings.seed, jitter=True)
+    kept_out = batches(held_out, _HELD_OUT, jitter=False)
+    log = LossLog(output, training.step, say)
+    saved_at = began = time.monotonic()
+    seconds_before, last = training.seconds, min(settings.steps, stop_at or settings.steps)
+    while training.step < last:
+        found = training.advance(drawn)
+        log.add(found)
+        step, now = training.step, time.monotonic()
+        training.seconds = seconds_before + now - began
+        if step % settings.log_every == 0 or step == last:
+            measured = training.measure(kept_out) if step % settings.evaluate_every == 0 or step == last else None
+            log.write(step, settings.steps, training.seconds, learning_rate(step - 1, settings.steps), measured)
+        if now - saved_at >= 60.0 * settings.checkpoint_minutes or step == last:
+            save(training, output)
+            log.draw()
+            saved_at = time.monotonic()
+    return training
+
+
+def _begin(
+    training: Training, output: Path, facts: dict[str, Any], *, resume: bool, say: Callable[[str], None]
+) -> None:
+    """Write the settings of a new training, or check them and load the checkpoint of one that goes on."""
+    checkpoint, settings_file = output / CHECKPOINT, output / SETTINGS
+    if checkpoint.is_file() and not resume:
+        raise BadArgument(f"'{output}' already has a training; go on with --resume, or give another folder.")
+    if resume and checkpoint.is_file():
+        before = json.loads(settings_file.read_text(encoding="utf-8"))["training"]
+        changed = [f"{name} was {before.get(name)!r}" for name in facts if before.get(name) != facts[name]]
+        if changed:
+            raise UnusableTraining(
+                f"The training in '{output}' had other settings than these: {'; '.join(changed)[:600]}; give the same "
+                "ones, or another folder."
+            )
+        training.load(torch.load(checkpoint, weights_only=True))
+        say(f"goes on at step {training.step} of {training.settings.steps}")
+    content = {"training": facts, "schedule": training.schedule, "config": asdict(training.config)}
+    settings_file.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def save(training: Training, output: Path) -> None:
+    """Write the checkpoint: complete or not at all."""
+    partial = output / f"{CHECKPOINT}.partial"
+    torch.save(training.state(), partial)
+    os.replace(partial, output / CHECKPOINT)
+
+
+def read_average(output: Path) -> tuple[dict[str, Tensor], int, float, list[list[int]]]:
+    """Return the averaged weights by name, the number of steps, the seconds, and the schedule of a checkpoint."""
+    checkpoint = output / CHECKPOINT
+    if not checkpoint.is_file():
+        raise UnusableTraining(f"'{output}' has no {CHECKPOINT}; train with `train DEMONSTRATIONS {output}` first.")
+    state = torch.load(checkpoint, weights_only=True)
+    return state["average"], state["step"], state["seconds"], state["schedule"]
