@@ -1,6 +1,7 @@
 """The Python API: an opened store whose methods are the commands of `vla-analyze` and return polars frames.
 
-The examples run as tests, with `store` and `other` being paths of small stores and `folder` that of an empty folder.
+The examples run as tests, with `store` and `other` being paths of small stores, `rerun` that of a rerun of `store`, and
+`folder` that of an empty folder.
 """
 
 from __future__ import annotations
@@ -323,6 +324,35 @@ class OpenStores:
         ]
         return _frame(compare_stores(arguments, settings_from_keywords(**settings), allow_mismatch), table)
 
+    def effects(
+        self,
+        reruns: str | Path | Sequence[str | Path],
+        table: Literal["summary", "episodes", "rollouts", "rollout_episodes"] = "summary",
+        dimensions: Sequence[int] | None = None,
+        **settings: Unpack[SettingKeywords],
+    ) -> pl.DataFrame:
+        """How much actions change in reruns of this store, beside its attention, noise and random keys.
+
+        `reruns`: stores of `vla-capture rerun`, rollouts with interventions, or folders of them; this is their base.
+        `dimensions`: those of the action that are compared. "rollouts" compares success and number of steps.
+
+        >>> effects = va.open(store).effects(rerun)
+        >>> effects.filter(scope="all", phase="all").select("condition", "group", "num_episodes").rows()
+        [('without_visual', 'visual', 4)]
+
+        Raises:
+            BadArgument: several stores are open, or a store is no rerun of this one.
+        """
+        from vla_attention.analyze.effects.effect_study import study_effects
+
+        _check_name("table", table, ("summary", "episodes", "rollouts", "rollout_episodes"))
+        if len(self.stores) > 1:
+            raise BadArgument(
+                f"Effects are those of reruns of one store; {len(self.stores)} are open: open one of them."
+            )
+        paths = [Path(reruns)] if isinstance(reruns, (str, Path)) else [Path(path) for path in reruns]
+        return _frame(study_effects(self.stores[0].path, paths, settings_from_keywords(**settings), dimensions), table)
+
     def overlay(
         self,
         task: int | None = None,
@@ -393,7 +423,7 @@ class OpenStores:
         lines = [
             *header_lines(self.stores),
             "ask with .ratios() .masses() .summary() .groups() .heads() .words() .objects() .time() .compare(other)",
-            "         .overlay() .report(path) .to_xarray()",
+            "         .effects(reruns) .overlay() .report(path) .to_xarray()",
         ]
         return "\n  ".join([str(self), *lines])
 

@@ -14,6 +14,7 @@ COMMANDS: dict[str, str] = {
     "words": "which words of the instruction are read",
     "objects": "which objects are looked at: shares, pointing game, IoU with their masks",
     "time": "over the course of an episode: phases, gripper, success against failure",
+    "effects": "how much actions change under interventions, beside attention and noise",
     "overlay": "attention on the stored pictures: strips, GIF or MP4",
     "report": "one self-contained HTML file",
     "export": "tables as CSV or Parquet, masses or rows as NetCDF",

@@ -20,9 +20,10 @@ from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.api import OpenStores
 from vla_attention.analyze.measures.question_settings import AnalysisSettings, SettingKeywords, settings_from_keywords
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.interventions import Interventions, KeyKnockout
 from vla_attention.schemas.precision import mass_error_bound
 from vla_attention.schemas.stores.store_format import StoreError, StoreNotFound
-from vla_attention.testing.stores import write_store
+from vla_attention.testing.stores import StoreSpec, rerun_source, write_store
 from vla_attention.testing.tokens import small_layout
 
 MODULES = (va, vla_attention.analyze.api, vla_attention.analyze.measures.question_settings)
@@ -39,6 +40,13 @@ def other(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def rerun(tmp_path_factory, store) -> Path:
+    knockout = Interventions("without_visual", keys=(KeyKnockout("role:image"),))
+    spec = StoreSpec(interventions=knockout, rerun_of=rerun_source(store), plant_actions=lambda *_: np.ones((3, 5, 7)))
+    return write_store(tmp_path_factory.mktemp("rerun") / "r.zarr", spec=spec)
+
+
+@pytest.fixture(scope="module")
 def run(store) -> OpenStores:
     return va.open(store)
 
@@ -52,8 +60,8 @@ def examples(module: ModuleType) -> list[doctest.DocTest]:
     [test for module in MODULES for test in examples(module)],
     ids=lambda test: test.name,
 )
-def test_examples(test, store, other, tmp_path):
-    test.globs.update(store=store, other=other, folder=tmp_path, va=va, pl=pl)
+def test_examples(test, store, other, rerun, tmp_path):
+    test.globs.update(store=store, other=other, rerun=rerun, folder=tmp_path, va=va, pl=pl)
     result = doctest.DocTestRunner(verbose=False).run(test)
     assert result.failed == 0
     assert result.attempted > 0
@@ -190,7 +198,7 @@ def test_an_empty_store_can_be_opened_and_says_that_it_is_empty(tmp_path):
         run.ratios()
 
 
-def test_the_guide_names_every_column(run, other, tmp_path):
+def test_the_guide_names_every_column(run, other, rerun, tmp_path):
     guide = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
     levels = ("steps", "replans", "episodes", "tasks")
     tables = [ask(level) for level in levels for ask in (run.ratios, run.masses)]
@@ -203,6 +211,7 @@ def test_the_guide_names_every_column(run, other, tmp_path):
     tables += [run.time(name) for name in ("course", "closing", "change", "outcomes", "autocorrelation")]
     tables += [run.compare(other, name) for name in ("differences", "estimates", "pairs", "unpaired")]
     tables += [run.groups(name) for name in ("groups", "words", "overlaps")]
+    tables += [run.effects(rerun, name) for name in ("episodes", "summary", "rollouts", "rollout_episodes")]
     norms = run.analysis().group_contributions
     assert norms is not None
     tables += [norms.cells, norms.groups, run.overlay()]
@@ -213,13 +222,14 @@ def test_the_guide_names_every_column(run, other, tmp_path):
     assert missing == set()
 
 
-def test_the_guide_names_every_table_file(store, other, tmp_path, monkeypatch):
+def test_the_guide_names_every_table_file(store, other, rerun, tmp_path, monkeypatch):
     guide = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     for command in ("ratios", "heads", "words", "objects", "time"):
         assert main([command, str(store), "--no-plots"]) == 0
     assert main(["groups", str(store), "--no-plots"]) == 0
     assert main(["compare", f"a={store}", f"b={other}", "--no-plots"]) == 0
+    assert main(["effects", str(store), str(rerun), "--no-plots"]) == 0
     names = {path.stem for path in tmp_path.rglob("*.parquet")}
     assert len(names) > 20
     levels = {name.removesuffix("_groups") for name in names} & {"steps", "replans", "episodes", "tasks"}

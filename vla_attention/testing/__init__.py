@@ -11,6 +11,7 @@
 - `expected_arrays`, `root_attributes`: what the store must contain.
 - `episode_records`: what a recorder gives to the writer, replan by replan (`vla_attention.capture.store.store_writer`).
 - `small_tokens`, `libero_tokens`, `random_rows`: tokens of an episode, and attention-like rows for them.
+- `rerun_source`: what a rerun of a store says of it (`StoreSpec.rerun_of`).
 - `reseal`: seal an episode anew after changing its files, as a test of checks behind the seal needs.
 - `assert_whole`: read a store back and fail on everything that `vla-analyze verify` would report.
 - `vla_attention.testing.strategies`: random layouts, tokens and groupings for hypothesis (to be installed beside it).
@@ -26,6 +27,7 @@ from vla_attention.testing.stores import (
     StoreSpec,
     episode_records,
     expected_arrays,
+    rerun_source,
     reseal,
     root_attributes,
     write_store,
@@ -39,6 +41,7 @@ __all__ = [
     "expected_arrays",
     "libero_tokens",
     "random_rows",
+    "rerun_source",
     "reseal",
     "root_attributes",
     "small_tokens",

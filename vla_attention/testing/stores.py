@@ -9,7 +9,7 @@ A `StoreSpec` decides every number in its store, so that what a reader must find
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +20,7 @@ from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWrit
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
+from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.precision import round_mantissa
 from vla_attention.schemas.segments import segment_members, segments_of
@@ -53,7 +54,8 @@ class StoreSpec:
     Every episode has `replans` replans. `tokens`, when given, are the tokens of every episode (and decide the number
     of replans); otherwise each episode has those of `small_tokens`. `prompts`: "changing" (state digits, as in pi0.5)
     or "same". `seed` decides all random numbers. `layers` are blocks of `num_layers`; the other fields of the recording
-    are as in `Recording`. The `plant_` functions replace rows, coverage, actions and outcomes; without them rows are
+    are as in `Recording`. `interventions` and `rerun_of` (see `rerun_source`) are what the store says that its run
+    changed and repeated. The `plant_` functions replace rows, coverage, actions and outcomes; without them rows are
     random and episodes of odd numbers are solved.
     """
 
@@ -75,6 +77,8 @@ class StoreSpec:
     coverage: bool = True
     prompts: Literal["changing", "same"] = "changing"
     policy: str = "made-up"
+    interventions: Interventions = field(default_factory=Interventions)
+    rerun_of: RerunSource | None = None
     tokens: EpisodeTokens | None = None
     plant_rows: PlantRows | None = None
     plant_coverage: PlantCoverage | None = None
@@ -185,7 +189,14 @@ def root_attributes(spec: StoreSpec) -> RootAttributes:
         ),
         sites=(spec.layout,),
         provenance={"numpy": np.__version__},
+        interventions=spec.interventions,
+        rerun_of=spec.rerun_of,
     )
+
+
+def rerun_source(path: Path) -> RerunSource:
+    """What a rerun of the store at `path` says of it."""
+    return RerunSource(read_run(path)[1], path.name)
 
 
 def episode_records(spec: StoreSpec, task: int, episode: int) -> tuple[EpisodeStart, list[ReplanRecord]]:

@@ -1,0 +1,93 @@
+"""How far the actions of a rerun are from those of its base. Pure functions on one episode's arrays.
+
+Dimensions of an action have different units (metres, radians, a gripper command). A change is therefore measured in
+units of the base run's own spread: 1 is a change as large as the actions of the base differ from each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.analyze.time.alignment import GRIPPER
+
+Array = NDArray[np.float64]
+
+#: The dimensions of an action that move the hand. Every suite of the capture side drives robosuite's Panda arm.
+TRANSLATION = slice(0, 3)
+#: A dimension with less spread than this part of the largest one is not driven by the policy. Division by its spread
+#: would make what is left of it, rounding or noise of the denoising, as large as a real movement.
+LEAST_SPREAD = 0.01
+
+
+@dataclass(frozen=True)
+class ActionSpread:
+    """The units of changes.
+
+    Attributes:
+        spread: (dimension,) standard deviation over all replans and all steps of their chunks.
+        used: (dimension,) bool, the dimensions that are compared.
+    """
+
+    spread: Array
+    used: NDArray[np.bool_]
+
+    @property
+    def left_out(self) -> tuple[int, ...]:
+        """The dimensions that are not compared."""
+        return tuple(int(i) for i in np.flatnonzero(~self.used))
+
+
+def action_spread(actions: Sequence[Array], dimensions: Sequence[int] | None = None) -> ActionSpread:
+    """The spread of the base run's actions, each (replan, step, dimension); steps may differ in number.
+
+    `dimensions`: only these are compared. A dimension without spread (see `LEAST_SPREAD`) is never compared.
+    """
+    flat = np.concatenate([chunk.reshape(-1, chunk.shape[-1]) for chunk in actions])
+    spread = flat.std(axis=0)
+    used = spread > LEAST_SPREAD * spread.max(initial=0.0)
+    if dimensions is not None:
+        used &= np.isin(np.arange(len(spread)), list(dimensions))
+    return ActionSpread(spread, used)
+
+
+def root_mean_square_change(base: Array, other: Array, spread: ActionSpread, steps: NDArray[np.int64]) -> Array:
+    """Root mean square over the first steps of each chunk, and over dimensions, of the change in units of the spread.
+
+    Args:
+        base, other: actions (replan, step, dimension).
+        spread: the units.
+        steps: (replan,) how many steps of each chunk count, at least 1.
+
+    Returns:
+        (replan,).
+    """
+    change = (other - base)[..., spread.used] / spread.spread[spread.used]
+    squares = (change**2).mean(axis=2)
+    result: Array = np.sqrt((squares * counted(steps, squares.shape[1])).sum(axis=1) / steps)
+    return result
+
+
+def first_angle(base: Array, other: Array) -> Array:
+    """Angle in degrees (replan,) between the translations of the first actions; NaN where one of them is zero."""
+    first, second = base[:, 0, TRANSLATION], other[:, 0, TRANSLATION]
+    lengths = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cosine = (first * second).sum(axis=1) / lengths
+        angle: Array = np.where(lengths > 0, np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))), np.nan)
+    return angle
+
+
+def gripper_flips(base: Array, other: Array, steps: NDArray[np.int64]) -> Array:
+    """Share (replan,) of the first `steps` steps in which the gripper command has the other sign."""
+    flipped = base[..., GRIPPER] * other[..., GRIPPER] < 0
+    share: Array = (flipped * counted(steps, flipped.shape[1])).sum(axis=1) / steps
+    return share
+
+
+def counted(steps: NDArray[np.int64], horizon: int) -> NDArray[np.bool_]:
+    """Which steps count, (replan, horizon) bool: the first `steps` (replan,) of each chunk."""
+    return np.arange(horizon)[None, :] < steps[:, None]

@@ -1,0 +1,98 @@
+"""The answer in a few sentences: how much the action changes without what is seen, and without what is read."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from vla_attention.analyze.effects.conditions import FLOORS, Kind
+from vla_attention.analyze.effects.effect_study import EffectStudy
+from vla_attention.analyze.effects.group_rows import GroupRow, group_rows
+from vla_attention.analyze.ratios.answer import ratio_sentence
+from vla_attention.analyze.show.findings import findings
+from vla_attention.analyze.show.numbers import format_number, row_interval
+from vla_attention.analyze.statistics.many_looks import NAMED_AT
+
+#: Sentences that name conditions after looking at all: beyond noise, and beyond random keys.
+_SENTENCES = 2
+
+
+def answer_lines(study: EffectStudy) -> list[str]:
+    """The sentences, each to be wrapped by itself."""
+    if not study.conditions:
+        return ["No rerun was given, only rollouts: there are no effects on single actions."]
+    grouping = study.analysis.grouping
+    rows = {row.name: row for row in group_rows(study)}
+    sides = [] if grouping.ratio is None else [*grouping.ratio.numerator, *grouping.ratio.denominator]
+    lines = [noise_sentence(study)]
+    lines += [side_sentence(rows[name], name) for name in sides if name in rows]
+    if study.analysis.headline is not None:
+        lines.append(f"Attention in the same replans: {_uncapitalised(ratio_sentence(study.analysis.headline))}")
+    lines.append(beyond(study, "minus_noise", "an effect beyond the noise"))
+    return lines
+
+
+def noise_sentence(study: EffectStudy) -> str:
+    """What another noise seed does on the same inputs; every effect must exceed it."""
+    rows = [study.of(condition) for condition in study.of_kind(Kind.NOISE)]
+    if not rows:
+        return (
+            "No rerun changes the noise seed alone, so nobody knows how much of an effect another noise would give: "
+            f"make one with vla-capture rerun {study.given.base.path} --noise-seed 1."
+        )
+    texts = [f"{format_number(row['effect'])}{_interval(row, 'effect')}" for row in rows]
+    return (
+        f"Another noise seed on the same inputs changes the action by {', '.join(texts)} of its spread: the floor of "
+        "every effect."
+    )
+
+
+def side_sentence(row: GroupRow, name: str) -> str:
+    """What the action does without a group, and with that group alone."""
+    parts = []
+    if row.without is not None:
+        parts.append(f"Without {name} the action changes by {_amount(row.without)}{_verdict(row.without)}")
+    if row.only is not None:
+        start = f"with {name} alone" if parts else f"With {name} alone the action changes"
+        parts.append(f"{start} by {_amount(row.only)}{_verdict(row.only)}")
+    return f"{'; '.join(parts)}."
+
+
+def _amount(row: dict[str, Any]) -> str:
+    factor = row["over_noise"]
+    times = f", {format_number(factor)} times the noise" if factor is not None else ""
+    return f"{format_number(row['effect'])}{_interval(row, 'effect')}{times}"
+
+
+def _verdict(row: dict[str, Any]) -> str:
+    """Said where the effect is not shown to exceed its floor."""
+    floors = []
+    for name, what in (("minus_noise", "the noise"), ("minus_random", "random keys")):
+        if row[name] is None:
+            continue
+        q = row[f"{name}_q"]
+        if row[name] <= 0 or (q is not None and q > NAMED_AT / _SENTENCES):
+            floors.append(f"not shown to exceed {what}")
+        elif q is None:
+            floors.append(f"no interval, so nobody knows whether it exceeds {what}")
+    return f" ({'; '.join(floors)})" if floors else ""
+
+
+def beyond(study: EffectStudy, name: str, what: str) -> str:
+    """Which conditions exceed a floor (`minus_noise`, `minus_random`); empty where there is no such floor."""
+    tested = [condition for condition in study.conditions if condition.kind not in (*FLOORS, Kind.NOTHING)]
+    rows = [(condition.name, study.of(condition)) for condition in tested]
+    rows = [(label, row) for label, row in rows if row[name] is not None]
+    if not rows:
+        return ""
+    # An effect below its floor differs from it, but does not exceed it.
+    q_values = [1.0 if row[name] <= 0 else row[f"{name}_q"] for _, row in rows]
+    return findings(q_values, [label for label, _ in rows], "condition", what, _SENTENCES)
+
+
+def _interval(row: dict[str, Any], name: str) -> str:
+    bounds = row_interval(row, name)
+    return "" if bounds == "-" else f" {bounds}"
+
+
+def _uncapitalised(text: str) -> str:
+    return text[:1].lower() + text[1:]

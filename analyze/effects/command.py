@@ -1,0 +1,74 @@
+"""`vla-analyze effects`: how much actions change under interventions, beside the attention of the same replans."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from vla_attention.analyze.arguments import add_grouping, add_intervals, add_output, add_selection, settings_of
+from vla_attention.analyze.show.output_files import write_csv, write_parquet
+from vla_attention.analyze.show.screen import fitted, write_whole
+from vla_attention.schemas.command_line import command_parser
+
+_EXAMPLES = """examples:
+  vla-analyze effects runs/cubes.zarr reruns/cubes
+  vla-analyze effects runs/cubes.zarr reruns/without_visual.zarr reruns/noise.zarr --layers 0 1 2
+  vla-analyze effects runs/cubes.zarr rollouts/without_language.zarr --intervals these-tasks
+
+An effect is the root mean square over the executed steps of the change of the action, each dimension
+in units of its standard deviation in BASE. Give a rerun with another noise seed (--noise-seed) and one
+with random keys (--random-keys): without them nobody knows how much of an effect is chance.
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of `vla-analyze effects BASE RERUN ...`."""
+    parser = command_parser(
+        "vla-analyze effects",
+        "How much the actions of a run change without what it sees, reads, or any group of keys, beside\n"
+        "its attention to that group in the same replans, another noise seed and random keys.",
+        _EXAMPLES,
+    )
+    parser.add_argument("base", type=Path, metavar="BASE", help="the store whose policy calls were run again")
+    parser.add_argument(
+        "reruns",
+        nargs="+",
+        type=Path,
+        metavar="RERUN",
+        help="stores of vla-capture rerun BASE, rollouts with interventions, or folders of them",
+    )
+    add_grouping(parser)
+    selection = add_selection(parser)
+    selection.add_argument(
+        "--dimensions",
+        type=int,
+        nargs="+",
+        metavar="N",
+        help="dimensions of the action that are compared (default: all that have a spread)",
+    )
+    add_intervals(parser)
+    add_output(parser, "results/BASE/effects")
+    return parser
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the effects; write tables and pictures."""
+    from vla_attention.analyze.effects.effect_study import study_effects
+    from vla_attention.analyze.effects.text import effects_text
+
+    study = study_effects(arguments.base, arguments.reruns, settings_of(arguments), arguments.dimensions)
+    text = effects_text(study)
+    folder = arguments.output or Path("results") / arguments.base.stem / "effects"
+    tables = {"effects": study.episodes, "effects_summary": study.summary}
+    if study.given.rollouts:
+        tables |= {"rollouts": study.rollout_episodes, "rollouts_summary": study.rollouts}
+    files = [*write_parquet(folder, **tables), *write_csv(folder, **tables)]
+    files.append(write_whole(folder, text))
+    if not arguments.no_plots and study.conditions:
+        from vla_attention.analyze.effects.plot_attention_and_effect import plot_attention_and_effect
+        from vla_attention.analyze.effects.plot_effects import plot_effects
+
+        files += plot_effects(study, folder)
+        files += plot_attention_and_effect(study, folder)
+    print(fitted(text, folder, files))
+    return 0

@@ -1,0 +1,140 @@
+"""What each rerun changed, which group of keys that is about, and which other rerun is its control."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+from vla_attention.schemas.interventions import Interventions, KeyKnockout
+from vla_attention.schemas.safe_text import visible
+from vla_attention.schemas.stores.reader import Store
+
+
+class Kind(StrEnum):
+    """The one thing that a run changed."""
+
+    WITHOUT = "without"  # a group of keys is knocked out
+    ONLY = "only"  # all but a group is knocked out
+    RANDOM = "random"  # equally many random keys are knocked out
+    NOISE = "noise"  # another noise seed
+    ATTENTION = "attention"  # attention to a group is scaled or made uniform
+    PROMPT = "prompt"
+    IMAGE = "image"
+    SEVERAL = "several"  # more than one of these
+    NOTHING = "nothing"
+
+
+#: Names of a series' conditions begin with these; what follows is the name of the group.
+_PREFIXES = ("without_", "only_", "random_")
+#: Kinds that others are measured against.
+FLOORS = (Kind.NOISE, Kind.RANDOM)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where attention was changed; None is everywhere."""
+
+    layers: tuple[int, ...] | None = None
+    heads: tuple[int, ...] | None = None
+    denoise_steps: tuple[int, ...] | None = None
+
+
+@dataclass(frozen=True)
+class GroupOfKeys:
+    """The keys that an intervention is about: the union of selectors of the grouping language, and where they count."""
+
+    selectors: tuple[str, ...]
+    place: Place = Place()
+
+    @property
+    def text(self) -> str:
+        """The selectors as one."""
+        return visible(" | ".join(self.selectors))
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A run with interventions: its name in tables, its store, and what it changed."""
+
+    name: str
+    store: Store
+    interventions: Interventions
+
+    @property
+    def kind(self) -> Kind:
+        """The one thing that was changed."""
+        return kind_of(self.interventions)
+
+    @property
+    def description(self) -> str:
+        """What was changed, in words."""
+        return visible(self.interventions.describe())
+
+    @property
+    def group(self) -> GroupOfKeys | None:
+        """The keys that were knocked out, kept or changed; None where it is no group."""
+        return group_of(self.interventions)
+
+    @property
+    def group_name(self) -> str:
+        """The group's name: the end of a name such as `without_visual`, else its selectors."""
+        for prefix in _PREFIXES:
+            if self.name.startswith(prefix) and len(self.name) > len(prefix):
+                return self.name.removeprefix(prefix)
+        return self.group.text if self.group is not None else self.name
+
+    def is_control_of(self, other: Condition) -> bool:
+        """Whether this run knocked out random keys, as many as the other one, and is like it in all else."""
+        return (
+            self.kind == Kind.RANDOM
+            and other.kind in (Kind.WITHOUT, Kind.ONLY)
+            and _not_random(self.interventions) == _not_random(other.interventions)
+        )
+
+    def is_reverse_of(self, other: Condition) -> bool:
+        """Whether one run knocked out what the other one kept, both being alike in all else."""
+        return {self.kind, other.kind} == {Kind.WITHOUT, Kind.ONLY} and (
+            _not_kept(self.interventions) == _not_kept(other.interventions)
+        )
+
+
+def kind_of(interventions: Interventions) -> Kind:
+    """The one thing that interventions change."""
+    given = {
+        Kind.ATTENTION: bool(interventions.attention),
+        Kind.PROMPT: interventions.prompt is not None,
+        Kind.IMAGE: bool(interventions.images),
+        Kind.NOISE: interventions.noise is not None,
+    }
+    changed = [kind for kind, there in given.items() if there]
+    if not interventions.keys:
+        return Kind.NOTHING if not changed else changed[0] if len(changed) == 1 else Kind.SEVERAL
+    kinds = {_kind_of_knockout(knockout) for knockout in interventions.keys}
+    return kinds.pop() if not changed and len(kinds) == 1 else Kind.SEVERAL
+
+
+def _kind_of_knockout(knockout: KeyKnockout) -> Kind:
+    if knockout.random_seed is not None:
+        return Kind.RANDOM
+    return Kind.ONLY if knockout.keep else Kind.WITHOUT
+
+
+def group_of(interventions: Interventions) -> GroupOfKeys | None:
+    """The keys that interventions are about: one union of selectors in one place, else None."""
+    if kind_of(interventions) not in (Kind.WITHOUT, Kind.ONLY, Kind.RANDOM, Kind.ATTENTION):
+        return None
+    changes = (*interventions.keys, *interventions.attention)
+    places = {Place(change.layers, change.heads, change.denoise_steps) for change in changes}
+    if len(places) > 1 or (kind_of(interventions) == Kind.ONLY and len(changes) > 1):
+        return None
+    return GroupOfKeys(tuple(change.selector for change in changes), places.pop())
+
+
+def _not_random(interventions: Interventions) -> Interventions:
+    keys = tuple(replace(knockout, random_seed=None) for knockout in interventions.keys)
+    return replace(interventions, name="", keys=keys)
+
+
+def _not_kept(interventions: Interventions) -> Interventions:
+    keys = tuple(replace(knockout, keep=False) for knockout in interventions.keys)
+    return replace(interventions, name="", keys=keys)

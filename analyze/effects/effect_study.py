@@ -1,0 +1,281 @@
+"""How much actions change in every condition, beside attention, noise and random keys: the tables of the command.
+
+The episode is the unit. Effects of an episode are means over its replans; each is compared, in the same episode, with
+that of another noise seed and with that of equally many random keys.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from vla_attention.analyze.effects.action_changes import ActionSpread, action_spread
+from vla_attention.analyze.effects.conditions import FLOORS, Condition, Kind
+from vla_attention.analyze.effects.group_attention import MEASURES, GroupAttention, group_attention
+from vla_attention.analyze.effects.paired_replans import (
+    ALL,
+    CHANGES,
+    BaseEpisode,
+    Pairing,
+    changes_of,
+    mean_over_phases,
+    pair_episodes,
+)
+from vla_attention.analyze.effects.reruns import BaseAndReruns, open_reruns
+from vla_attention.analyze.effects.rollouts import ROLLOUT_COLUMNS, rollout_pairs, rollout_summary
+from vla_attention.analyze.measures.frames import EPISODE_ID
+from vla_attention.analyze.measures.question import Question, ask
+from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.ratios.analysis import Analysis, analyse
+from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
+from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE, SHARE
+from vla_attention.analyze.statistics.many_looks import adjusted_p_values
+from vla_attention.analyze.stores.parallel import map_episodes
+from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.safe_text import visible
+from vla_attention.schemas.stores.reader import Store
+
+_LIMITS = {"effect": POSITIVE, "effect_chunk": POSITIVE, "angle": POSITIVE, "gripper_flips": SHARE}
+_NAMES = ("condition", "kind", "group", "selector")
+_ID: dict[str, Any] = {"suite": pl.String, "task_id": pl.Int64, "instruction": pl.String, "episode_index": pl.Int64}
+_EPISODE_SCHEMA: dict[str, Any] = {
+    **_ID,
+    **dict.fromkeys(_NAMES, pl.String),
+    "phase": pl.String,
+    "num_replans": pl.Int64,
+    **dict.fromkeys((*CHANGES, *MEASURES), pl.Float64),
+}
+
+
+@dataclass(frozen=True)
+class EffectStudy:
+    """Everything that `effects` computes.
+
+    Attributes:
+        analysis: the base by itself, with the ratio and its lift.
+        given: the stores.
+        spread: the units of changes.
+        attention: the base's attention to the groups of the conditions.
+        episodes: one row per (condition, episode, phase): suite, task_id, instruction, episode_index, condition, kind,
+            group, selector, phase ("all" or a third of the episode), num_replans; `CHANGES`; the base's mass, lift,
+            norm and keys of the group in the same replans; noise (the effect of another noise seed in this episode and
+            phase) and random (of random keys, as many), with minus_noise and minus_random, the effect minus each. Null
+            where there is no such rerun.
+        rollout_episodes: one row per (condition, pair of rollouts), see `rollouts.rollout_pairs`.
+        notes: what was left out, and what is not there.
+    """
+
+    analysis: Analysis
+    given: BaseAndReruns
+    spread: ActionSpread
+    attention: dict[Any, GroupAttention]
+    episodes: pl.DataFrame
+    rollout_episodes: pl.DataFrame
+    notes: tuple[str, ...]
+
+    @property
+    def question(self) -> Question:
+        """The question about the base."""
+        return self.analysis.question
+
+    @property
+    def conditions(self) -> tuple[Condition, ...]:
+        """The reruns, in the order of their files."""
+        return self.given.reruns
+
+    @cached_property
+    def summary(self) -> pl.DataFrame:
+        """Means over episodes with intervals, see `summary_of`."""
+        return summary_of(self.episodes, self.question)
+
+    @cached_property
+    def rollouts(self) -> pl.DataFrame:
+        """Success and length of paired rollouts, see `rollouts.rollout_summary`."""
+        return rollout_summary(self.rollout_episodes, self.question.settings.intervals)
+
+    def of(self, condition: Condition) -> dict[str, Any]:
+        """The row of `summary` over all tasks and replans."""
+        return self.summary.row(
+            by_predicate=(pl.col("scope") == "all")
+            & (pl.col("phase") == ALL)
+            & (pl.col("condition") == condition.name),
+            named=True,
+        )
+
+    def of_kind(self, *kinds: Kind) -> list[Condition]:
+        """The conditions of some kinds."""
+        return [condition for condition in self.conditions if condition.kind in kinds]
+
+
+def study_effects(
+    base: Path, given: Sequence[Path], settings: AnalysisSettings, dimensions: Sequence[int] | None = None
+) -> EffectStudy:
+    """Open a base and its reruns (`reruns.open_reruns`) and measure every pair of replans.
+
+    `dimensions`: the dimensions of the action that are compared; all that have spread unless given.
+
+    Raises:
+        UserError: see `open_reruns`, `question.ask` and `paired_replans.pair_episodes`.
+    """
+    opened = open_reruns(base, given)
+    question = ask([opened.base], settings)
+    members = [BaseEpisode.of(item) for item in question.selected]
+    spread = _spread(opened.base, members, settings, dimensions)
+    names = [episode.name for episode in opened.base.episodes]
+    pairings = [pair_episodes(condition, members, names) for condition in opened.reruns]
+    groups = [condition.group for condition in opened.reruns if condition.group is not None]
+    attention = group_attention(question, groups) if groups else {}
+    parts = [_episodes_of(pairing, spread, attention) for pairing in pairings]
+    episodes = pl.concat(parts) if parts else pl.DataFrame(schema=_EPISODE_SCHEMA)
+    rollouts = [rollout_pairs(condition, question) for condition in opened.rollouts]
+    unpaired = [note for _, note in rollouts if note]
+    return EffectStudy(
+        analysis=analyse(question),
+        given=opened,
+        spread=spread,
+        attention=attention,
+        episodes=with_floors(episodes, opened.reruns),
+        rollout_episodes=pl.concat([table for table, _ in rollouts])
+        if rollouts
+        else pl.DataFrame(schema=ROLLOUT_COLUMNS),
+        notes=(*opened.notes, *(pairing.note for pairing in pairings if pairing.note), *unpaired),
+    )
+
+
+def _spread(
+    base: Store, members: Sequence[BaseEpisode], settings: AnalysisSettings, dimensions: Sequence[int] | None
+) -> ActionSpread:
+    """The units, from every episode of the base: they do not change with --tasks. Damaged episodes are left out."""
+    if settings.skip_corrupt or len(members) == len(base.episodes):
+        actions = [member.actions for member in members]
+    else:
+        actions = [episode.read("actions").astype(np.float64) for episode in base.episodes]
+    number = actions[0].shape[2]
+    for dimension in dimensions or ():
+        if not 0 <= dimension < number:
+            raise BadArgument(
+                f"There is no dimension {dimension} of the action; the actions of {base.path} have the dimensions 0 to "
+                f"{number - 1}."
+            )
+    spread = action_spread(actions, dimensions)
+    if not spread.used.any():
+        which = f"the dimensions {listing(dimensions)} of the actions" if dimensions else "the actions"
+        raise BadArgument(
+            f"In {base.path}, {which} are the same in every replan and step, so a change has no unit; give a base that "
+            "moves, or other --dimensions."
+        )
+    return spread
+
+
+def _episodes_of(pairing: Pairing, spread: ActionSpread, attention: dict[Any, GroupAttention]) -> pl.DataFrame:
+    """The rows of one condition, without floors."""
+    condition = pairing.condition
+    group = condition.group
+    known = attention[group].values if group is not None else {}
+    fixed = {
+        "condition": condition.name,
+        "kind": condition.kind.value,
+        "group": None if group is None else condition.group_name,
+        "selector": None if group is None else group.text,
+    }
+
+    def measure(pair: tuple[BaseEpisode, Any]) -> list[dict[str, object]]:
+        base, rerun = pair
+        changes = changes_of(base, rerun, spread, condition.store.path)
+        values = {name: changes[:, i] for i, name in enumerate(CHANGES)}
+        if base.name in known:
+            values |= {name: known[base.name][:, i] for i, name in enumerate(MEASURES)}
+        attributes = base.item.episode.attributes
+        named = {
+            "suite": base.item.store.suite,
+            "task_id": attributes.task_id,
+            "instruction": visible(attributes.instruction),
+            "episode_index": attributes.episode_index,
+            **fixed,
+            "num_replans": len(changes),
+        }
+        return [{**named, **row} for row in mean_over_phases(base, values)]
+
+    rows = [row for part in map_episodes(measure, pairing.pairs) for row in part]
+    return pl.DataFrame(rows, schema=_EPISODE_SCHEMA)
+
+
+def with_floors(episodes: pl.DataFrame, conditions: Sequence[Condition]) -> pl.DataFrame:
+    """The columns noise, random, minus_noise and minus_random of `EffectStudy.episodes`.
+
+    Several reruns with other noise seeds, or several draws of random keys, are averaged.
+    """
+    place = [*EPISODE_ID, "phase"]
+    effect = pl.col("effect").mean()
+    noise = episodes.filter(pl.col("kind") == Kind.NOISE.value).group_by(place).agg(effect.alias("noise"))
+    controls = []
+    for condition in conditions:
+        names = [other.name for other in conditions if other.is_control_of(condition)]
+        own = episodes.filter(pl.col("condition").is_in(names)).group_by(place).agg(effect.alias("random"))
+        controls.append(own.with_columns(pl.lit(condition.name).alias("condition")))
+    empty = pl.DataFrame(
+        schema={name: episodes.schema[name] for name in place} | {"random": pl.Float64, "condition": pl.String}
+    )
+    random = pl.concat([empty, *controls], how="vertical_relaxed")
+    floor = pl.col("kind").is_in([kind.value for kind in FLOORS])
+    return (
+        episodes.join(noise, on=place, how="left", maintain_order="left")
+        .join(random, on=[*place, "condition"], how="left", maintain_order="left")
+        .with_columns(pl.when(pl.col("kind") != Kind.NOISE.value).then("noise").alias("noise"))
+        .with_columns(
+            minus_noise=pl.col("effect") - pl.col("noise"),
+            minus_random=pl.when(~floor).then(pl.col("effect") - pl.col("random")),
+        )
+    )
+
+
+def summary_of(episodes: pl.DataFrame, question: Question) -> pl.DataFrame:
+    """Means over episodes with intervals; every task weighs the same.
+
+    Returns:
+        One row per (scope, condition, phase): scope "all", or "task" with suite, task_id and instruction; kind, group,
+        selector; num_episodes, num_tasks; `CHANGES`, mass, lift, norm, keys, noise, random, minus_noise, minus_random,
+        over_noise and over_random (mean effect / mean effect of the floor), each with `_low`, `_high` and `_episodes`;
+        minus_noise_q and minus_random_q: p of no difference, adjusted for the number of conditions
+        (Benjamini-Hochberg).
+    """
+    estimand = question.settings.intervals
+    values = {
+        **_LIMITS,
+        **dict.fromkeys((*MEASURES, "noise", "random"), POSITIVE),
+        **dict.fromkeys(("minus_noise", "minus_random"), NO_LIMITS),
+    }
+    quotients = {"over_noise": ("effect", "noise"), "over_random": ("effect", "random")}
+    nulls = {"minus_noise": 0.0, "minus_random": 0.0}
+    whole = means_with_intervals(
+        episodes, [*_NAMES, "phase"], values, estimand, quotients=quotients, nulls=nulls
+    ).select(
+        pl.lit("all").alias("scope"),
+        *(pl.lit(None, dtype=_ID[name]).alias(name) for name in ("suite", "task_id", "instruction")),
+        pl.all(),
+    )
+    of_task = ["suite", "task_id", "instruction"]
+    tasks = means_with_intervals(
+        episodes, [*of_task, *_NAMES, "phase"], values, estimand, quotients=quotients, nulls=nulls
+    ).select(pl.lit("task").alias("scope"), pl.all())
+    return _with_adjusted(pl.concat([whole, tasks.select(whole.columns)]))
+
+
+def _with_adjusted(summary: pl.DataFrame) -> pl.DataFrame:
+    """p-values of differences to a floor become q, over the conditions that are no floor themselves."""
+    floor = pl.col("kind").is_in([kind.value for kind in FLOORS])
+    numbered = summary.with_columns(pl.int_range(pl.len()).alias("_row"))
+    for name in ("minus_noise", "minus_random"):
+        q_values: list[float | None] = [None] * numbered.height
+        looks = numbered.filter(~floor).partition_by("scope", "suite", "task_id", "phase", maintain_order=True)
+        for part in looks:
+            for row, q in zip(part["_row"], adjusted_p_values(part[f"{name}_p"].to_list()), strict=True):
+                q_values[row] = q
+        numbered = numbered.with_columns(pl.Series(f"{name}_q", q_values, dtype=pl.Float64)).drop(f"{name}_p")
+    return numbered.drop("_row")

@@ -1,0 +1,158 @@
+"""The base run's attention to the groups that reruns are about, replan by replan."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.analyze.effects.conditions import GroupOfKeys
+from vla_attention.analyze.measures.contribution_ratios import joint_norm, selected_gram
+from vla_attention.analyze.measures.group_contributions import whole_segments
+from vla_attention.analyze.measures.masses import group_measures
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, resolve_all, vocabulary_of
+from vla_attention.analyze.measures.steps import MeasuredEpisode, measure_episodes
+from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.groupings.grouping import Grouping
+from vla_attention.schemas.groupings.resolve import ResolvedGrouping, check_names
+
+Array = NDArray[np.float64]
+
+#: The columns of `GroupAttention.values`.
+MEASURES = ("mass", "lift", "norm", "keys")
+
+
+@dataclass(frozen=True)
+class GroupAttention:
+    """The base's attention to one group of keys.
+
+    Attributes:
+        site: the softmax family whose rows it is of; None where no site has such keys.
+        values: by the name of an episode, (replan, measure) in the order of `MEASURES`; NaN where there is none.
+        note: why there is no attention, or nothing.
+    """
+
+    site: str | None
+    values: dict[str, Array]
+    note: str = ""
+
+
+def group_attention(question: Question, groups: Sequence[GroupOfKeys]) -> dict[GroupOfKeys, GroupAttention]:
+    """Attention of a question's episodes to groups, each in the layers, heads and denoise steps where it was changed.
+
+    A group is read at the question's site, or where it has no keys there and the user chose no site, at the next one
+    that has. `lift` is mass per key / mass per valid key, `norm` that of the group's contribution where the group is
+    made of whole segments and contributions were recorded.
+    """
+    names = [site.name for site in question.stores[0].attributes.sites]
+    others = [] if question.settings.site is not None else [name for name in names if name != question.site]
+    found: dict[GroupOfKeys, GroupAttention] = {}
+    left = list(dict.fromkeys(groups))
+    for site in (question.site, *others):
+        if not left:
+            break
+        here = question if site == question.site else _at_site(question, site)
+        fitting, notes = _fitting(here, left)
+        found |= {group: GroupAttention(None, {}, note) for group, note in notes.items() if group not in found}
+        if fitting:
+            found |= _measured(here, fitting)
+        left = [group for group in left if group not in found or found[group].site is None]
+    return found
+
+
+def _at_site(question: Question, site: str) -> Question:
+    selected = tuple(load_tokens(question.episodes, site))
+    return replace(question, site=site, selected=selected, vocabulary=vocabulary_of(selected))
+
+
+def _grouping(groups: Sequence[GroupOfKeys]) -> Grouping:
+    """One grouping of all groups. A selector alone in its group would mean the rest where it is '*': it gets brackets.
+
+    Groups share keys: each is measured by itself.
+    """
+    members = {f"g{i}": tuple(f"({text})" for text in group.selectors) for i, group in enumerate(groups)}
+    return Grouping("conditions", members, overlap=True, allow_empty=tuple(members))
+
+
+def _fitting(question: Question, groups: Sequence[GroupOfKeys]) -> tuple[list[GroupOfKeys], dict[GroupOfKeys, str]]:
+    """The groups that have keys at a site, and why the others have none."""
+    fitting, notes = [], {}
+    for group in groups:
+        try:
+            grouping = _grouping([group])
+            check_names(grouping, question.vocabulary, question.selected[0].tokens.layout)
+            resolved = resolve_all(grouping, question.selected, question.vocabulary)
+        except UserError as error:
+            notes[group] = str(error)
+            continue
+        if any(one.num_keys.any() for one in resolved):
+            fitting.append(group)
+        else:
+            notes[group] = f"'{group.text}' has no key at site '{question.site}'."
+    return fitting, notes
+
+
+def _measured(question: Question, groups: Sequence[GroupOfKeys]) -> dict[GroupOfKeys, GroupAttention]:
+    grouping = _grouping(groups)
+    resolved = resolve_all(grouping, question.selected, question.vocabulary)
+    per_head = any(group.place.heads is not None for group in groups)
+    measured = measure_episodes(replace(question, grouping=grouping), resolved, per_head=per_head)
+    with_norms = all(store.attributes.recording.contributions for store in question.stores)
+    values: dict[GroupOfKeys, dict[str, Array]] = {group: {} for group in groups}
+    for item, weights, one in zip(question.selected, resolved, measured, strict=True):
+        parts = whole_segments(item, weights, question.site) if with_norms else {}
+        for i, group in enumerate(groups):
+            norm = _norm(item, one, group, parts[f"g{i}"], question.site) if f"g{i}" in parts else None
+            values[group][item.episode.name] = _of_group(one, weights, group, i, norm)
+    return {group: GroupAttention(question.site, values[group]) for group in groups}
+
+
+def _places(chosen: Sequence[int], wanted: Sequence[int] | None) -> list[int]:
+    """Positions of the wanted numbers among the chosen ones; all positions where all are wanted."""
+    return [i for i, number in enumerate(chosen) if wanted is None or number in wanted]
+
+
+def _of_group(
+    measured: MeasuredEpisode, resolved: ResolvedGrouping, group: GroupOfKeys, number: int, norm: Array | None
+) -> Array:
+    """`MEASURES` of one group (replan, measure). Masses are averaged over layers, denoise steps and heads first."""
+    selection, place = measured.selection, group.place
+    layers = [i for i in _places(selection.blocks, place.layers) if selection.is_first_of_block(i)]
+    denoise = _places(selection.denoise_steps, place.denoise_steps)
+    # Heads are apart only where a group asks for some of them.
+    apart = selection.per_head
+    heads = _places(selection.head_numbers, place.heads) if apart else [0]
+    replans = len(measured.mass)
+    if not (layers and denoise and heads):
+        return np.full((replans, len(MEASURES)), np.nan)
+    cells = np.ix_(range(replans), layers, denoise, heads)
+    mass = measured.mass[..., number][cells].mean(axis=(1, 2, 3))
+    valid = measured.valid_mass[cells].mean(axis=(1, 2, 3))
+    keys = resolved.num_keys[:, number : number + 1]
+    found = group_measures(mass[:, None], valid, keys, measured.num_valid)
+    columns = (
+        mass,
+        found.lift[:, 0],
+        np.full(replans, np.nan) if norm is None else norm,
+        np.broadcast_to(keys[:, 0], replans),
+    )
+    return np.stack(columns, axis=1)
+
+
+def _norm(
+    item: SelectedEpisode, measured: MeasuredEpisode, group: GroupOfKeys, taken: NDArray[np.bool_], site: str
+) -> Array | None:
+    """Norm of the group's contribution (replan,), mean over its layers and denoise steps; contributions have no heads.
+
+    None where the intervention was at some heads only, or at nothing that is selected.
+    """
+    selection, place = measured.selection, group.place
+    layers = [i for i in _places(selection.blocks, place.layers) if selection.is_first_of_block(i)]
+    denoise = _places(selection.denoise_steps, place.denoise_steps)
+    if place.heads is not None or not (layers and denoise):
+        return None
+    gram = selected_gram(item, site, selection)[:, layers][:, :, denoise]
+    return np.asarray(joint_norm(gram, taken).mean(axis=(1, 2)))

@@ -1,0 +1,150 @@
+"""A base's episode and its rerun, replan by replan: the changes of the actions, and their means over phases."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.analyze.effects.action_changes import (
+    ActionSpread,
+    first_angle,
+    gripper_flips,
+    root_mean_square_change,
+)
+from vla_attention.analyze.effects.conditions import Condition
+from vla_attention.analyze.measures.masses import finite_mean
+from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.time.alignment import on_episode_time, replan_starts
+from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.stores.reader import StoredEpisode
+from vla_attention.schemas.stores.store_format import StoreError
+
+Array = NDArray[np.float64]
+
+#: What is measured of a pair of replans: over the executed steps, over the whole chunk, the angle in degrees between
+#: the first actions' translations, the share of executed steps whose gripper command has the other sign.
+CHANGES = ("effect", "effect_chunk", "angle", "gripper_flips")
+#: Parts of an episode's time, by name. `ALL` is the mean over replans.
+PHASES = ("first third", "middle third", "last third")
+ALL = "all"
+
+
+@dataclass(frozen=True)
+class BaseEpisode:
+    """What is read of a base's episode once, for all reruns.
+
+    Attributes:
+        item: the episode.
+        actions: (replan, step, dimension).
+        env_step: (replan,).
+        starts: (replan,) policy steps before each replan.
+        executed: (replan,) how many steps of each chunk were executed.
+    """
+
+    item: SelectedEpisode
+    actions: Array
+    env_step: NDArray[np.int64]
+    starts: NDArray[np.int64]
+    executed: NDArray[np.int64]
+
+    @property
+    def name(self) -> str:
+        """The name of the episode's group."""
+        return self.item.episode.name
+
+    @classmethod
+    def of(cls, item: SelectedEpisode) -> BaseEpisode:
+        """Read an episode's actions."""
+        attributes, wait = item.episode.attributes, item.store.attributes.protocol.wait_steps
+        actions = item.episode.read("actions").astype(np.float64)
+        env_step = item.episode.read("env_step").astype(np.int64)
+        starts = replan_starts(env_step, wait, attributes.num_steps, item.episode.name)
+        executed = np.diff(np.append(starts, attributes.num_steps))
+        return cls(item, actions, env_step, starts, np.minimum(executed, actions.shape[1]))
+
+    def over_phases(self, values: Array) -> dict[str, Array]:
+        """Means of values (replan, quantity) over the replans (`ALL`) and over the thirds of the episode's time."""
+        timed = on_episode_time(values, self.starts, self.item.episode.attributes.num_steps, len(PHASES))
+        return {ALL: finite_mean(values), **dict(zip(PHASES, timed, strict=True))}
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """The episodes of a condition: pairs of a base's and its own, and the names of those without a partner."""
+
+    condition: Condition
+    pairs: tuple[tuple[BaseEpisode, StoredEpisode], ...]
+    missing: tuple[str, ...]
+    unknown: tuple[str, ...]
+
+    @property
+    def note(self) -> str:
+        """Which episodes have no partner; empty when all have one."""
+        parts = []
+        if self.missing:
+            parts.append(f"lacks {listing(self.missing, 6)} of the base, which are in none of its numbers")
+        if self.unknown:
+            parts.append(f"has {listing(self.unknown, 6)}, which the base lacks")
+        return f"{self.condition.name} {' and '.join(parts)}." if parts else ""
+
+
+def pair_episodes(condition: Condition, base: Sequence[BaseEpisode], all_names: Sequence[str]) -> Pairing:
+    """Pair a rerun's episodes with the selected ones of its base, by name.
+
+    `all_names`: the base's episodes, selected or not.
+
+    Raises:
+        BadArgument: they share none.
+        StoreError: an episode has other replans than in the base.
+    """
+    own = {episode.name: episode for episode in condition.store.episodes}
+    pairs = tuple((one, own[one.name]) for one in base if one.name in own)
+    if not pairs:
+        raise BadArgument(
+            f"The rerun {condition.store.path} holds none of the {len(base)} selected episodes of its base "
+            f"({listing([one.name for one in base], 3)}); it holds {listing(own, 3)}: let vla-capture rerun finish, or "
+            "choose other --tasks."
+        )
+    missing = tuple(one.name for one in base if one.name not in own)
+    return Pairing(condition, pairs, missing, tuple(name for name in own if name not in all_names))
+
+
+def changes_of(base: BaseEpisode, rerun: StoredEpisode, spread: ActionSpread, store: object) -> Array:
+    """`CHANGES` of every replan of an episode, (replan, change). `store` is the rerun's path, for messages.
+
+    Raises:
+        StoreError: the rerun has other replans, or actions of another shape.
+    """
+    actions = rerun.read("actions").astype(np.float64)
+    steps = rerun.read("env_step").astype(np.int64)
+    if not np.array_equal(steps, base.env_step) or actions.shape != base.actions.shape:
+        raise StoreError(
+            f"{base.name} of {store} has {len(steps)} replans and actions of the shape {actions.shape}, and in its "
+            f"base {len(base.env_step)} and {base.actions.shape}: these are not the same replans; make the rerun again."
+        )
+    whole = np.full(len(actions), actions.shape[1])
+    return np.stack(
+        (
+            root_mean_square_change(base.actions, actions, spread, base.executed),
+            root_mean_square_change(base.actions, actions, spread, whole),
+            first_angle(base.actions, actions),
+            gripper_flips(base.actions, actions, base.executed),
+        ),
+        axis=1,
+    )
+
+
+def mean_over_phases(base: BaseEpisode, values: Mapping[str, Array]) -> list[dict[str, object]]:
+    """One row per phase with the mean of every value (replan,); None where there is none."""
+    names = list(values)
+    phases = base.over_phases(np.stack([values[name] for name in names], axis=1))
+    return [
+        {
+            "phase": phase,
+            **{name: float(x) if np.isfinite(x) else None for name, x in zip(names, row, strict=True)},
+        }
+        for phase, row in phases.items()
+    ]

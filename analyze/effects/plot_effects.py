@@ -1,0 +1,187 @@
+"""`effects_by_condition`: the change of the action in every condition, beside noise and attention."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import polars as pl
+
+from vla_attention.analyze.effects.conditions import Condition, Kind
+from vla_attention.analyze.effects.effect_study import EffectStudy
+from vla_attention.analyze.effects.group_rows import group_rows
+from vla_attention.analyze.show.numbers import format_number, interval_name, of_tasks, row_interval
+from vla_attention.analyze.show.plot_axes import legend_above, note_at_row, ratio_axis, uniform_line
+from vla_attention.analyze.show.plot_colours import NOTE_COLOR, STRIPE_COLOR
+from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
+from vla_attention.analyze.show.plot_text import explain, shortened, title
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+STEM = "effects_by_condition"
+#: Colour, marker and filling of each kind of point: told apart without colour, too.
+_STYLES: dict[str, dict[str, Any]] = {
+    "without": {"color": "#D55E00", "marker": "o", "label": "without it"},
+    "only": {"color": "#0072B2", "marker": "s", "markerfacecolor": "white", "label": "with it alone"},
+    "random": {"color": "#4D4D4D", "marker": "x", "label": "random keys, as many"},
+    "other": {"color": "#009E73", "marker": "D", "label": "other change"},
+}
+#: Points of one row stand a little apart.
+_OFFSETS = {"without": -0.16, "only": 0.16, "random": 0.0, "other": 0.0}
+_NOISE_COLOR = "#C9B8D8"
+#: Rows in the picture; the tables have all.
+_MOST = 40
+
+
+@dataclass(frozen=True)
+class _Row:
+    """One row of the picture: its label, its points by kind, and the lift of its group."""
+
+    label: str
+    points: dict[str, dict[str, Any]]
+    lift: dict[str, Any] | None
+
+
+@drawn_in_our_style
+def plot_effects(study: EffectStudy, folder: Path) -> list[Path]:
+    """Draw every condition; returns the paths of png, pdf and csv."""
+    rows, noise = _rows(study), [study.of(condition) for condition in study.of_kind(Kind.NOISE)]
+    shown = rows[:_MOST]
+    figure = new_figure(9.4, 1.9 + 0.34 * max(len(shown), 3))
+    _title(figure, study, len(rows))
+    table = _table(rows, noise)
+    if not shown:
+        explain(figure.subplots(), "The only reruns change the noise: there is nothing to hold against it.")
+        return save_figure(figure, folder, STEM, table)
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=[2.4, 1])
+    _effects_panel(left, shown, noise)
+    _lift_panel(right, shown)
+    left.set_yticks(range(len(shown)), [row.label for row in shown])
+    left.set_ylim(len(shown) - 0.4, -0.6)
+    for axes in (left, right):
+        axes.tick_params(axis="y", length=0)
+        for place in range(1, len(shown), 2):
+            axes.axhspan(place - 0.5, place + 0.5, color=STRIPE_COLOR, zorder=-2, linewidth=0)
+    return save_figure(figure, folder, STEM, table)
+
+
+def _title(figure: Figure, study: EffectStudy, num_rows: int) -> None:
+    overall = study.analysis.overall
+    note = (
+        f"n = {of_tasks(overall['num_episodes'], overall['num_tasks'])}. Bars: {interval_name(DEFAULT_LEVEL)}s, about "
+        f"{study.question.settings.intervals.words}; none where there can be none."
+    )
+    headline = study.analysis.headline
+    if headline is not None and headline.value is not None:
+        bounds = row_interval({"low": headline.lift_low, "high": headline.lift_high})
+        lift = f"lift {format_number(headline.lift)}{'' if bounds == '-' else f' {bounds}'}"
+        note += f" The base's ratio {headline.what}: {format_number(headline.value)}, {lift}."
+    if num_rows > _MOST:
+        note += f" The first {_MOST} of {num_rows} rows."
+    title(figure, "What the action does without a group of keys, or with it alone; effects do not add up", note)
+
+
+def _rows(study: EffectStudy) -> list[_Row]:
+    rows = []
+    for group in group_rows(study):
+        points = {"without": group.without, "only": group.only, "random": _random_of(study, group.condition)}
+        known = next(row for row in (group.without, group.only) if row is not None)
+        rows.append(_Row(shortened(group.name, 30), {k: row for k, row in points.items() if row is not None}, known))
+    floor = (Kind.WITHOUT, Kind.ONLY, Kind.RANDOM, Kind.NOISE)
+    for condition in study.conditions:
+        if condition.kind not in floor:
+            row = study.of(condition)
+            rows.append(_Row(shortened(condition.name, 30), {"other": row}, row))
+    return rows
+
+
+def _random_of(study: EffectStudy, condition: Condition) -> dict[str, Any] | None:
+    """The floor of random keys of a condition; it has an interval where there is one such rerun."""
+    controls = [other for other in study.conditions if other.is_control_of(condition)]
+    if len(controls) == 1:
+        return study.of(controls[0])
+    row = study.of(condition)
+    return None if row["random"] is None else {
+        "effect": row["random"], "effect_low": row["random_low"], "effect_high": row["random_high"],
+        "num_episodes": row["random_episodes"], "condition": f"random keys for {condition.name}",
+    }  # fmt: skip
+
+
+def _effects_panel(axes: Axes, rows: list[_Row], noise: list[dict[str, Any]]) -> None:
+    for floor in noise:
+        low, high = floor["effect_low"], floor["effect_high"]
+        if low is not None and high is not None:
+            axes.axvspan(low, high, color=_NOISE_COLOR, alpha=0.55, linewidth=0, zorder=-1)
+        axes.axvline(floor["effect"], color="#6A4C93", linewidth=1.1, linestyle=":", zorder=1)
+    for place, row in enumerate(rows):
+        for kind, point in row.points.items():
+            _point(axes, place + _OFFSETS[kind], kind, point)
+        first = next(iter(row.points.values()))
+        note_at_row(axes, place, f"n = {first['num_episodes']}")
+    axes.set_xlim(left=0)
+    axes.set_xlabel("effect: change of the action in standard deviations of the base's actions")
+    axes.grid(axis="x")
+    _legend(axes, {kind for row in rows for kind in row.points}, bool(noise))
+
+
+def _point(axes: Axes, place: float, kind: str, row: dict[str, Any]) -> None:
+    style = {name: value for name, value in _STYLES[kind].items() if name != "label"}
+    if row["effect_low"] is not None and row["effect_high"] is not None:
+        axes.plot([row["effect_low"], row["effect_high"]], [place, place], color=style["color"], linewidth=1.6)
+    axes.plot(row["effect"], place, markersize=6, linestyle="none", zorder=3, **style)
+
+
+def _legend(axes: Axes, kinds: set[str], with_noise: bool) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles: list[Any] = [Line2D([], [], linestyle="none", **style) for kind, style in _STYLES.items() if kind in kinds]
+    if with_noise:
+        handles.append(Patch(color=_NOISE_COLOR, alpha=0.55, label="another noise seed"))
+    legend_above(axes, len(handles), handles, columnspacing=1.2, handletextpad=0.3)
+
+
+def _lift_panel(axes: Axes, rows: list[_Row]) -> None:
+    known = [(place, row.lift) for place, row in enumerate(rows) if row.lift is not None and row.lift["lift"]]
+    if not known:
+        explain(axes, "no attention to show")
+        return
+    bounds = [row[name] for _, row in known for name in ("lift", "lift_low", "lift_high") if row[name]]
+    ratio_axis(axes.xaxis, np.array([*bounds, 1.0]))
+    for place, row in known:
+        if row["lift_low"] is not None and row["lift_high"] is not None:
+            axes.plot([row["lift_low"], row["lift_high"]], [place, place], color=NOTE_COLOR, linewidth=1.6)
+        axes.plot(row["lift"], place, "o", color=NOTE_COLOR, markersize=5)
+    uniform_line(axes, along="x")
+    axes.set_xlabel("lift of its attention (log; 1: uniform)")
+    axes.grid(axis="x")
+
+
+def _table(rows: list[_Row], noise: list[dict[str, Any]]) -> pl.DataFrame:
+    """What is drawn, one row per point."""
+    columns = ("effect", "effect_low", "effect_high")
+    lifts = ("mass", "lift", "lift_low", "lift_high")
+    found = [
+        {"row": row.label, "point": kind, "condition": point["condition"], "num_episodes": point["num_episodes"]}
+        | {name: point[name] for name in columns}
+        | {name: None if row.lift is None else row.lift[name] for name in lifts}
+        for row in rows
+        for kind, point in row.points.items()
+    ]
+    found += [
+        {"row": "noise", "point": "noise", "condition": row["condition"], "num_episodes": row["num_episodes"]}
+        | {name: row[name] for name in columns}
+        for row in noise
+    ]
+    text = dict.fromkeys(("row", "point", "condition"), pl.String)
+    schema: dict[str, Any] = {
+        **text,
+        "num_episodes": pl.Int64,
+        **dict.fromkeys((*columns, *lifts), pl.Float64),
+    }
+    return pl.DataFrame(found, schema=schema)
