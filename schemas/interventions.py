@@ -26,16 +26,17 @@ class KeyKnockout:
     Attributes:
         selector: the keys, in the grouping language; each key has its weight in the group, 0 to 1.
         keep: knock out the rest instead, with 1 minus the weight in the group. The rest is of the valid keys (no
-            padding, no masked camera) of every site where the selector names something, without its action keys.
+            padding, no masked camera) of every site where the group has keys, without the action keys.
         queries: whose attention changes. `action`: the action queries. `all`: every query that could carry the
-            information on. In pi these are the queries of the prefix (a token of the prefix still reads itself) and the
-            state query too; in Cosmos all tokens. `prefix`: the queries of pi's prefix only.
+            information on, which still read their own key: in pi also those of the prefix and of the state, in Cosmos
+            all tokens. `prefix`: the queries of pi's prefix only.
         query_selector: with `prefix`, the tokens of the prefix whose queries change, in the grouping language; empty
             for all of them.
         weight: factor of the weights, 0 to 1.
         layers, heads, denoise_steps: where attention changes; None is everywhere.
         random_seed: instead of the group, knock out equally many (its sum of weights, rounded) keys outside of it,
-            drawn for every replan from the valid keys that are no action keys. The control of the group.
+            drawn for every replan from the valid keys that are no action keys. The control of the group. Padding does
+            not count.
     """
 
     selector: str

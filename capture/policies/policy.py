@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from vla_attention.capture.environments.base import Observation
 from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
-from vla_attention.capture.recording.attention import RowCollector
+from vla_attention.capture.recording.attention import AttentionEditor, RowCollector
 from vla_attention.schemas.errors import unknown_name
 from vla_attention.schemas.layout import PatchGrid, Prompt, SiteLayout
 from vla_attention.schemas.stores.store_format import PolicyCameraView, PolicyIdentity
@@ -103,6 +103,10 @@ class Policy(Protocol):
         """Actions of a chunk that the published evaluation executes before the next policy call."""
 
     @property
+    def has_prefix(self) -> bool:
+        """Whether some keys are made in a pass before the denoise steps, in which their tokens read each other."""
+
+    @property
     def num_action_queries(self) -> int:
         """Action queries of every recorded call."""
 
@@ -136,11 +140,15 @@ class Policy(Protocol):
         """
 
     def act(
-        self, policy_input: PolicyInput, noise_seed: int, recorders: Mapping[str, RowCollector] | None = None
+        self,
+        policy_input: PolicyInput,
+        noise_seed: int,
+        recorders: Mapping[str, RowCollector] | None = None,
+        editors: Mapping[str, AttentionEditor] | None = None,
     ) -> NDArray[np.float64]:
         """Return the action chunk (horizon, 7) for the environment. A seed gives the same noise on every machine.
 
-        recorders: the row collector of each recorded site.
+        recorders: the row collector of each recorded site. editors: the editor of each site whose attention changes.
         """
 
 

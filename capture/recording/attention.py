@@ -17,6 +17,9 @@ from vla_attention.capture.recording.contributions import Projection
 #: The reference's replacement for the logits of masked keys: so low that their probability is exactly 0.
 MASKED_LOGIT = -2.3819763e38
 
+#: Takes the logits (batch, head, query, key) of a call, float32 with masked keys at `MASKED_LOGIT`, and returns them
+#: changed.
+LogitChange = Callable[[Tensor], Tensor]
 #: Takes the rows (batch, head, query, key) of a call.
 RowSink = Callable[[Tensor], None]
 #: Takes the values (batch, kv_head, key, dim) of a call, its projection to the residual stream, and its update of the
@@ -25,7 +28,14 @@ UpdateSink = Callable[[Tensor, Projection, Tensor], None]
 
 
 def attend(
-    query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None, scale: float, *, rows_to: RowSink | None = None
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    mask: Tensor | None,
+    scale: float,
+    *,
+    change: LogitChange | None = None,
+    rows_to: RowSink | None = None,
 ) -> Tensor:
     """Return softmax(scale · query · keyᵀ, masked) · value, and pass the probabilities to `rows_to`.
 
@@ -40,6 +50,7 @@ def attend(
         mask: (batch, query or 1, key) bool, True for allowed keys, or None. A masked key gets exactly 0. A query
             without any allowed key gets a uniform row, as in the reference.
         scale: factor of the logits.
+        change: an intervention on the logits, after the mask; None leaves them as they are.
         rows_to: called once with the float32 probabilities (batch, head, query, key).
 
     Returns:
@@ -57,6 +68,8 @@ def attend(
     logits = torch.matmul(stacked, key.float().transpose(-1, -2)).view(batch, heads, queries, keys)
     if mask is not None:
         logits.masked_fill_(~mask[:, None], MASKED_LOGIT)
+    if change is not None:
+        logits = change(logits)
     rows = torch.softmax(logits, dim=-1)
     if rows_to is not None:
         rows_to(rows)
@@ -81,3 +94,24 @@ class RowCollector(Protocol):
     def update_sink(self, layer: int, denoise_step: int, action_queries: slice) -> UpdateSink | None:
         """Return the function that takes the update of this call after its rows, or None if it is not wanted."""
         return None
+
+
+class AttentionEditor(Protocol):
+    """Changes the attention of one site during one replan. A model asks it for a change at every block."""
+
+    def step_change(
+        self, layer: int, denoise_step: int, action_queries: slice, own_keys: slice | None
+    ) -> LogitChange | None:
+        """Return the change of a call of a denoise step, or None if nothing changes there.
+
+        action_queries: positions of the action queries on the query axis. own_keys: the keys of the tokens that the
+        queries belong to, in their order; None if these tokens are no keys of the site.
+        """
+        ...
+
+    def prefix_change(self, layer: int, tokens: Tensor) -> LogitChange | None:
+        """Return the change of a call before the first denoise step, whose queries and keys are the same tokens.
+
+        tokens: the keys of the site that these tokens are at the denoise steps, (token,) int64.
+        """
+        ...

@@ -147,6 +147,12 @@ def cell_coverage(tokens: EpisodeTokens) -> NDArray[np.float32]:
     return area
 
 
+def weights_of(selector: Selector, tokens: EpisodeTokens) -> NDArray[np.float32]:
+    """Weight of each key in the group of one selector, shape (replan or 1, key), 0..1."""
+    member = _evaluate(selector, tokens)
+    return _weights(member, cell_coverage(tokens) if member.shape[2] > 1 else None)
+
+
 def _weights(member: Membership, cells: NDArray[np.float32] | None) -> NDArray[np.float32]:
     if member.shape[2] == 1 or cells is None:
         return member[:, :, 0].astype(np.float32)

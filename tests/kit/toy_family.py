@@ -41,6 +41,7 @@ def make_toy_policy(checkpoint: str, size: int) -> Any:
         default_protocol = OPENPI
         default_replan_steps = 2
         needs_camera_frames = False
+        has_prefix = False
         cameras = (PolicyCameraView("view", source="agentview", upright=True, mirrored=False),)
 
         def query_pools(self):
@@ -71,12 +72,14 @@ def make_toy_policy(checkpoint: str, size: int) -> Any:
             keys = torch.cat([patches, torch.tensor([len(word) / 10 for word in words])])
             return PolicyInput({"view": frame}, {"joint": roles}, prompt, np.zeros(8), {"keys": keys})
 
-        def act(self, policy_input, noise_seed, recorders=None):
+        def act(self, policy_input, noise_seed, recorders=None, editors=None):
             keys = policy_input.tensors["keys"].expand(1, 1, 1, -1).transpose(-1, -2).expand(1, 1, 7, 4)
             query = torch.from_numpy(initial_noise(noise_seed, (1, 2, size, 4)))
             collector = (recorders or {}).get("joint")
             rows_to = collector.sink(0, 0, slice(0, size)) if collector is not None else None
-            mixed = attend(query, keys, keys, None, 0.5, rows_to=rows_to)
+            editor = (editors or {}).get("joint")
+            change = editor.step_change(0, 0, slice(0, size), None) if editor is not None else None
+            mixed = attend(query, keys, keys, None, 0.5, change=change, rows_to=rows_to)
             return np.repeat(mixed[0, 0, :, :1].numpy().astype(np.float64), 7, axis=1)
 
     return ToyPolicy()

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from vla_attention.capture.policies.cosmos.config import DitConfig
 from vla_attention.capture.policies.heads import join_heads, split_heads
-from vla_attention.capture.recording.attention import RowSink, attend
+from vla_attention.capture.recording.attention import LogitChange, RowSink, attend
 
 NORM_EPS = 1e-6
 
@@ -40,6 +40,13 @@ class BlockObserver(Protocol):
 
     def updates(self, layer: int, updates: dict[str, Tensor], gates: dict[str, Tensor], block_input: Tensor) -> None:
         """Take the gated updates of one block; gates are (batch, frame, 1, width)."""
+
+
+class BlockEditor(Protocol):
+    """Changes the attention inside a block. The model asks it for every site and frame of queries."""
+
+    def change(self, site: str, layer: int, frame: int) -> LogitChange | None:
+        """Return the change of the logits (batch, head, query of the frame, key), or None."""
 
 
 class RMSNorm(nn.Module):
@@ -123,6 +130,7 @@ class Attention(nn.Module):
         rotary: tuple[Tensor, Tensor] | None,
         layer: int,
         observer: BlockObserver | None,
+        editor: BlockEditor | None,
     ) -> Tensor:
         """Return the update (batch, frame, token, width) of the tokens x, before the gate.
 
@@ -141,7 +149,8 @@ class Attention(nn.Module):
         for frame in range(frames):
             part = query[:, :, frame * tokens : (frame + 1) * tokens]
             sink = observer.rows(self.site, layer, frame, self, value) if observer is not None else None
-            mixed.append(attend(part, key, value, None, self.scale, rows_to=sink))
+            change = editor.change(self.site, layer, frame) if editor is not None else None
+            mixed.append(attend(part, key, value, None, self.scale, change=change, rows_to=sink))
         update = self.output_proj(join_heads(torch.cat(mixed, dim=2)))
         return torch.unflatten(update, 1, (frames, tokens))
 
@@ -195,6 +204,7 @@ class Block(nn.Module):
         rotary: tuple[Tensor, Tensor],
         layer: int,
         observer: BlockObserver | None,
+        editor: BlockEditor | None,
     ) -> Tensor:
         """Return the tokens (batch, frame, token, width) after the block; time, modulation: (batch, frame, ...)."""
         modulations = {
@@ -209,9 +219,9 @@ class Block(nn.Module):
             shift, scale, gate = (layers(time) + shared_modulation)[:, :, None].chunk(3, dim=-1)
             modulated = modulate(x, shift, scale)
             if name == "self":
-                update = self.self_attn(modulated, None, rotary, layer, observer)
+                update = self.self_attn(modulated, None, rotary, layer, observer, editor)
             elif name == "cross":
-                update = self.cross_attn(modulated, text, None, layer, observer)
+                update = self.cross_attn(modulated, text, None, layer, observer, editor)
             else:
                 update = self.mlp(modulated)
             gates[name], updates[name] = gate, gate * update
@@ -325,6 +335,7 @@ class Dit(nn.Module):
         padding_mask: Tensor,
         text: Tensor,
         observer: BlockObserver | None = None,
+        editor: BlockEditor | None = None,
     ) -> Tensor:
         """Return the network's output (batch, channel, frame, row, column) in the model's dtype.
 
@@ -338,6 +349,7 @@ class Dit(nn.Module):
             padding_mask: (batch, 1, pixel row, pixel column), resized to the latent's size.
             text: (batch, position, text width).
             observer: gets rows and updates; the output does not depend on it.
+            editor: changes the attention.
         """
         frames, height, width = latents.shape[2:]
         rows, columns = self.config.grid(height, width)
@@ -354,7 +366,7 @@ class Dit(nn.Module):
         for layer, block in enumerate(self.blocks):
             if observer is not None:
                 observer.begin_block(layer)
-            x = block(x, time, shared_modulation, text, rotary, layer, observer)
+            x = block(x, time, shared_modulation, text, rotary, layer, observer, editor)
         features = self.final_layer(x, time, shared_modulation)
         size = self.config.patch_size
         cut = torch.unflatten(features, -1, (size, size, -1))

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from vla_attention.capture.policies.cosmos.config import CosmosConfig
-from vla_attention.capture.policies.cosmos.dit import BlockObserver, Dit
+from vla_attention.capture.policies.cosmos.dit import BlockEditor, BlockObserver, Dit
 from vla_attention.capture.policies.cosmos.latents import condition_mask, fill_frame
 from vla_attention.capture.policies.cosmos.layout import cross_layout, self_layout
-from vla_attention.capture.policies.cosmos.observer import CallObserver
+from vla_attention.capture.policies.cosmos.observer import CallEditor, CallObserver
 from vla_attention.capture.policies.cosmos.preprocess import pixels
 from vla_attention.capture.policies.cosmos.sampler import flow_time, noise_levels, sample, seeded_noise
 from vla_attention.capture.policies.cosmos.vae import CausalEncoder
-from vla_attention.capture.recording.attention import RowCollector
+from vla_attention.capture.recording.attention import AttentionEditor, RowCollector
 
 PROPRIO_FRAME = "proprio"
 
@@ -36,10 +36,14 @@ class CallTrace:
 
 @dataclass(frozen=True)
 class Recorders:
-    """The row collector of each site, and the latent frame whose queries they get. Sampling does not depend on them."""
+    """The row collector of each site, and the latent frame whose queries they get. Sampling does not depend on them.
+
+    editors: the editor of each site whose attention changes; for them the queries of that frame are the action queries.
+    """
 
     rows: Mapping[str, RowCollector] = field(default_factory=dict)
     query_frame: int = 4
+    editors: Mapping[str, AttentionEditor] = field(default_factory=dict)
 
 
 class CosmosModel(nn.Module):
@@ -93,6 +97,7 @@ class CosmosModel(nn.Module):
         text: Tensor,
         observer: BlockObserver | None = None,
         trace: CallTrace | None = None,
+        editor: BlockEditor | None = None,
     ) -> Tensor:
         """Return the estimate of the clean latents (float32) from latents with noise `sigma`; given frames are kept."""
         t = torch.tensor(flow_time(sigma), dtype=torch.float32, device=noisy.device)
@@ -100,7 +105,7 @@ class CosmosModel(nn.Module):
         times = t * (1 - mask[:, 0, :, 0, 0])
         size = self.config.image_size
         padding = torch.zeros(len(noisy), 1, size, size, device=noisy.device)
-        net_output = self.dit(net_input, times, mask, padding, text, observer).float()
+        net_output = self.dit(net_input, times, mask, padding, text, observer, editor).float()
         clean: Tensor = (1 - t) * noisy - t * net_output
         clean = mask * given + (1 - mask) * clean
         if trace is not None:
@@ -126,7 +131,8 @@ class CosmosModel(nn.Module):
         text = text.to(self.device)
 
         def denoise(noisy: Tensor, sigma: float, step: int) -> Tensor:
-            return self.denoise(noisy, sigma, given, mask, text, self._observer(recorders, step), trace)
+            observer, editor = self._observer(recorders, step), self._editor(recorders, step)
+            return self.denoise(noisy, sigma, given, mask, text, observer, trace, editor)
 
         return sample(denoise, noise, self.levels)
 
@@ -138,4 +144,14 @@ class CosmosModel(nn.Module):
             query_frame=recorders.query_frame,
             tokens_per_frame=self.config.tokens_per_frame,
             recorders=recorders.rows,
+        )
+
+    def _editor(self, recorders: Recorders | None, step: int) -> CallEditor | None:
+        if recorders is None or not recorders.editors:
+            return None
+        return CallEditor(
+            denoise_step=step,
+            query_frame=recorders.query_frame,
+            tokens_per_frame=self.config.tokens_per_frame,
+            editors=recorders.editors,
         )

@@ -1,4 +1,4 @@
-"""Observer of one network evaluation: rows of the recorded frame's queries, and their updates."""
+"""Observer of one network evaluation (rows of the recorded frame's queries, and their updates), and its editor."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from vla_attention.capture.policies.cosmos.dit import Attention
-from vla_attention.capture.recording.attention import RowCollector, RowSink, UpdateSink
+from vla_attention.capture.policies.cosmos.layout import SELF
+from vla_attention.capture.recording.attention import AttentionEditor, LogitChange, RowCollector, RowSink, UpdateSink
 from vla_attention.capture.recording.contributions import Projection
 
 
@@ -67,3 +68,26 @@ class CallObserver:
         for site, sink in self._update_sinks(layer).items():
             value, weight = self._seen.pop(site)
             sink(value, projection(weight, gates[site][0, self.query_frame]), updates[site][:, self.query_frame])
+
+
+@dataclass(frozen=True)
+class CallEditor:
+    """Asks the editors of the sites for the changes of one network evaluation.
+
+    The queries of `query_frame` are the action queries. At `self`, every token is a key too.
+    """
+
+    denoise_step: int
+    query_frame: int
+    tokens_per_frame: int
+    editors: Mapping[str, AttentionEditor]
+
+    def change(self, site: str, layer: int, frame: int) -> LogitChange | None:
+        """Return the change of the logits (batch, head, query of the frame, key), or None."""
+        editor = self.editors.get(site)
+        if editor is None:
+            return None
+        count = self.tokens_per_frame
+        action_queries = slice(0, count if frame == self.query_frame else 0)
+        own_keys = slice(frame * count, (frame + 1) * count) if site == SELF else None
+        return editor.step_change(layer, self.denoise_step, action_queries, own_keys)

@@ -23,7 +23,7 @@ from vla_attention.capture.policies.identity import PolicySource, describe_polic
 from vla_attention.capture.policies.policy import GivenInputs, PolicyInput, camera_frame
 from vla_attention.capture.policies.precision import dtype_name
 from vla_attention.capture.policies.weights import weights_digest
-from vla_attention.capture.recording.attention import RowCollector
+from vla_attention.capture.recording.attention import AttentionEditor, RowCollector
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.store_format import PolicyIdentity
 
@@ -44,6 +44,9 @@ class CosmosPolicy:
     query_frame: the latent frame whose tokens' rows are recorded: `action`, `curr_last`, `frameN` or a frame's name.
     open_loop_steps: actions of a chunk that are executed before the next policy call.
     """
+
+    #: Every key is computed anew at every denoise step.
+    has_prefix = False
 
     def __init__(
         self,
@@ -172,19 +175,21 @@ class CosmosPolicy:
         policy_input: PolicyInput,
         noise_seed: int,
         recorders: Mapping[str, RowCollector] | None = None,
+        editors: Mapping[str, AttentionEditor] | None = None,
     ) -> NDArray[np.float64]:
         """Return the action chunk (horizon, 7) for the environment; it does not depend on the recorders."""
-        return self.predict(policy_input, noise_seed, recorders).actions
+        return self.predict(policy_input, noise_seed, recorders, editors).actions
 
     def predict(
         self,
         policy_input: PolicyInput,
         noise_seed: int,
         recorders: Mapping[str, RowCollector] | None = None,
+        editors: Mapping[str, AttentionEditor] | None = None,
     ) -> Prediction:
         """Return the action chunk and the expected value."""
         config = self.config
-        wanted = Recorders(recorders or {}, config.frames.index(self.query_frame))
+        wanted = Recorders(recorders or {}, config.frames.index(self.query_frame), editors or {})
         tensors = policy_input.tensors
         clean = self.model.sample_latents(tensors["given"], tensors["text"], noise_seed, wanted)[0].cpu()
         frame = clean[:, config.frames.index(ACTION_FRAME)]

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from vla_attention.capture.policies.heads import join_heads, split_heads
 from vla_attention.capture.policies.pi.config import GemmaConfig
-from vla_attention.capture.recording.attention import RowSink, UpdateSink, attend
+from vla_attention.capture.recording.attention import LogitChange, RowSink, UpdateSink, attend
 from vla_attention.capture.recording.contributions import Projection
 
 RMS_NORM_EPS = 1e-6
@@ -125,11 +125,17 @@ class GemmaAttention(nn.Module):
         return KeysValues(rotation.apply(keys), values)
 
     def forward(
-        self, x: Tensor, seen: KeysValues, mask: Tensor | None, rotation: Rotation, rows_to: RowSink | None
+        self,
+        x: Tensor,
+        seen: KeysValues,
+        mask: Tensor | None,
+        rotation: Rotation,
+        change: LogitChange | None,
+        rows_to: RowSink | None,
     ) -> Tensor:
         """Attend from the tokens (batch, token, width) to all `seen` keys, mask (batch, token or 1, key)."""
         query = rotation.apply(split_heads(self.q_proj(x), self.head_dim))
-        mixed = attend(query, seen.keys, seen.values, mask, self.scale, rows_to=rows_to)
+        mixed = attend(query, seen.keys, seen.values, mask, self.scale, change=change, rows_to=rows_to)
         update: Tensor = self.o_proj(join_heads(mixed))
         return update
 
@@ -177,6 +183,7 @@ class GemmaBlock(nn.Module):
         *,
         before: KeysValues | None = None,
         condition: Tensor | None = None,
+        change: LogitChange | None = None,
         rows_to: RowSink | None = None,
         update_to: UpdateSink | None = None,
     ) -> tuple[Tensor, KeysValues]:
@@ -188,7 +195,7 @@ class GemmaBlock(nn.Module):
         normed, gate = self.input_layernorm(x, condition)
         own = self.self_attn.keys_values(normed, rotation)
         seen = own if before is None else before.then(own)
-        branch = self.self_attn(normed, seen, mask, rotation, rows_to)
+        branch = self.self_attn(normed, seen, mask, rotation, change, rows_to)
         if update_to is not None:
             update_to(seen.values, self._projection(gate), gated(branch, gate))
         x = add_branch(x, branch, gate)

@@ -18,7 +18,7 @@ from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.flow_time import denoise_times, embed_times
 from vla_attention.capture.policies.pi.gemma import GemmaModel, KeysValues, Rotation
 from vla_attention.capture.policies.pi.siglip import Projector, VisionTower
-from vla_attention.capture.recording.attention import RowCollector
+from vla_attention.capture.recording.attention import AttentionEditor, RowCollector
 
 
 @dataclass(frozen=True)
@@ -145,24 +145,31 @@ class PiModel(nn.Module):
         valid = [image_masks[camera][:, None].expand(batch, self.config.siglip.num_tokens) for camera in cameras]
         return torch.cat([*patches.unbind(0), text], dim=1), torch.cat([*valid, token_mask], dim=1)
 
-    def encode_prefix(self, embedded: Tensor, valid: Tensor) -> Prefix:
+    def encode_prefix(
+        self, embedded: Tensor, valid: Tensor, editor: AttentionEditor | None = None, tokens: Tensor | None = None
+    ) -> Prefix:
         """Run images and text through the vision-language model once; all keys are cached, also the invalid ones.
 
         Positions count valid keys only. Only keys and values of the prefix are used later, so the last block stops
         after them. With a batch of one, invalid tokens are left out of the computation, which saves nearly half of it
         in LIBERO. Their cached keys are zeros; no query attends to them.
+
+        editor: changes the attention of every block but the last, where no token of the prefix reads. tokens: the keys
+        that the embedded tokens are, (prefix key,); None counts them from 0.
         """
         if embedded.shape[0] == 1 and not bool(valid.all()):
             real = valid[0].nonzero()[:, 0]
-            dense = self.encode_prefix(embedded[:, real], valid[:, real])
+            dense = self.encode_prefix(embedded[:, real], valid[:, real], editor, real)
             return Prefix(tuple(entry.spread(real, valid.shape[1]) for entry in dense.cache), valid)
         rotation = Rotation.at(valid.cumsum(dim=1) - 1, self.config.paligemma.head_dim)
         mask = None if embedded.shape[0] == 1 else valid[:, None, :]
         x = embedded
         cache = []
         *earlier, last = self._vlm.blocks
-        for block in earlier:
-            x, own = block(x, mask, rotation)
+        keys = torch.arange(embedded.shape[1], device=embedded.device) if tokens is None else tokens
+        for layer, block in enumerate(earlier):
+            change = editor.prefix_change(layer, keys) if editor is not None else None
+            x, own = block(x, mask, rotation, change=change)
             cache.append(own)
         cache.append(last.keys_values(x, rotation))
         return Prefix(cache=tuple(cache), valid=valid)
@@ -200,6 +207,7 @@ class PiModel(nn.Module):
         noise: Tensor,
         num_steps: int | None = None,
         recorder: RowCollector | None = None,
+        editor: AttentionEditor | None = None,
     ) -> Tensor:
         """Integrate the flow from noise to actions by Euler steps x ← x − v(x, t)/num_steps.
 
@@ -212,17 +220,20 @@ class PiModel(nn.Module):
             num_steps: number of denoise steps; None takes the configuration's.
             recorder: receives the rows of every block and denoise step of the expert, with all suffix queries and the
                 positions of the action queries among them.
+            editor: changes the attention of prefix pass and denoise steps; the recorded rows are the changed ones.
 
         Returns:
             (batch, horizon, action dim) float32, still normalised.
         """
         config = self.config
-        prefix = self.encode_prefix(*self.embed_prefix(images, image_masks, tokens, token_mask))
+        prefix = self.encode_prefix(*self.embed_prefix(images, image_masks, tokens, token_mask), editor)
         suffix_positions = torch.arange(config.suffix_len, device=noise.device)
         positions = prefix.valid.sum(dim=1, keepdim=True) + suffix_positions
         rotation = Rotation.at(positions, config.action_expert.head_dim)
         mask = self._suffix_mask(prefix.valid)
         action_queries = slice(config.first_action_query, config.suffix_len)
+        prefix_len = prefix.valid.shape[1]
+        suffix_keys = slice(prefix_len, prefix_len + config.suffix_len)
 
         steps = config.num_denoise_steps if num_steps is None else num_steps
         all_waves = embed_times(
@@ -245,6 +256,7 @@ class PiModel(nn.Module):
                     rotation,
                     before=prefix.cache[layer],
                     condition=condition,
+                    change=editor.step_change(layer, step, action_queries, suffix_keys) if editor is not None else None,
                     rows_to=recorder.sink(layer, step, action_queries) if recorder is not None else None,
                     update_to=recorder.update_sink(layer, step, action_queries) if recorder is not None else None,
                 )

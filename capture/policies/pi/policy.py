@@ -24,7 +24,7 @@ from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, Tokeniz
 from vla_attention.capture.policies.policy import GivenInputs, PolicyInput, camera_frame
 from vla_attention.capture.policies.precision import dtype_name
 from vla_attention.capture.policies.weights import weights_digest
-from vla_attention.capture.recording.attention import RowCollector
+from vla_attention.capture.recording.attention import AttentionEditor, RowCollector
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, roles_from_spans
 from vla_attention.schemas.stores.store_format import PolicyCameraView, PolicyIdentity
 
@@ -60,6 +60,9 @@ def patch_grid(config: PiConfig) -> PatchGrid:
 
 class PiPolicy:
     """A pi0 or pi0.5 model with its tokenizer and its processing, for LIBERO-like observations."""
+
+    #: Pictures and prompt read each other once, before the denoise steps.
+    has_prefix = True
 
     def __init__(self, model: PiModel, tokenizer: PromptTokenizer, processing: Processing, source: PolicySource):
         config = model.config
@@ -205,7 +208,11 @@ class PiPolicy:
         )
 
     def act(
-        self, policy_input: PolicyInput, noise_seed: int, recorders: Mapping[str, RowCollector] | None = None
+        self,
+        policy_input: PolicyInput,
+        noise_seed: int,
+        recorders: Mapping[str, RowCollector] | None = None,
+        editors: Mapping[str, AttentionEditor] | None = None,
     ) -> NDArray[np.float64]:
         """Return the action chunk (horizon, 7) for the environment; the noise depends on `noise_seed` only."""
         config, tensors = self.model.config, policy_input.tensors
@@ -218,5 +225,6 @@ class PiPolicy:
             state=tensors["state"],
             noise=torch.from_numpy(noise).to(self.model.device),
             recorder=(recorders or {}).get(self.sites[0].name),
+            editor=(editors or {}).get(self.sites[0].name),
         )
         return self.processing.environment_actions(sampled[0].cpu().numpy(), policy_input.state)

@@ -1,0 +1,84 @@
+"""The weights of one selector on the keys of each site, for interventions.
+
+A policy may have several sites, and a name may exist at one of them only: Cosmos reads words at `cross` and pictures at
+`self`. A part of a selector takes no key at a site that does not have its name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.groupings.resolve import weights_of
+from vla_attention.schemas.groupings.selector_parser import (
+    Atom,
+    Everything,
+    Operation,
+    Selector,
+    atoms_of,
+    parse_selector,
+)
+from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS, SelectorError
+from vla_attention.schemas.groupings.vocabulary import NO_COVERAGE, NO_WORDS, EpisodeTokens, Vocabulary
+
+#: What the problem of a name says at a site without any keys of its kind.
+_NO_SUCH_KEYS = (NO_WORDS, NO_COVERAGE, "Existing: none")
+#: A selector that takes no key.
+_NOTHING = Operation("-", Everything(), Everything())
+
+
+def check_selector(text: str, vocabularies: Mapping[str, Vocabulary]) -> None:
+    """Raise `SelectorError` for a selector that cannot be read, or for its first name that no site has.
+
+    vocabularies: site -> the names at that site.
+    """
+    for atom in atoms_of(parse_selector(text)):
+        problems = [_problem(atom, vocabulary) for vocabulary in vocabularies.values()]
+        found = [problem for problem in problems if problem]
+        if len(found) == len(problems):
+            # A site with such keys says which names exist; the others only that they have none.
+            telling = [problem for problem in found if not any(words in problem for words in _NO_SUCH_KEYS)]
+            raise SelectorError(f"Selector '{text}': {(telling or found)[0]}")
+
+
+def selector_weights(
+    text: str, tokens: Mapping[str, EpisodeTokens], vocabularies: Mapping[str, Vocabulary]
+) -> dict[str, NDArray[np.float64]]:
+    """Weight of every key in a selector's group, by site: (replan or 1, key) in 0..1.
+
+    A site that has none of the selector's names gets no key, whatever `*` would take. Raises as `check_selector`.
+
+    Args:
+        text: the selector.
+        tokens: site -> the episode's (or one replan's) tokens.
+        vocabularies: site -> names that exist in the run; a name that these replans lack gives a group without keys.
+    """
+    check_selector(text, vocabularies)
+    selector = parse_selector(text)
+    weights: dict[str, NDArray[np.float64]] = {}
+    for site, there in tokens.items():
+        known = [atom for atom in atoms_of(selector) if not _problem(atom, vocabularies[site])]
+        if known or not atoms_of(selector):
+            weights[site] = weights_of(_only(selector, known), there).astype(np.float64)
+        else:
+            weights[site] = np.zeros((1, there.layout.num_keys))
+    return weights
+
+
+def _problem(atom: Atom, vocabulary: Vocabulary) -> str | None:
+    if vocabulary.layout is None:
+        raise ValueError("a vocabulary needs its site's layout")
+    try:
+        return SELECTOR_KINDS[atom.kind].problem(atom.argument, vocabulary, vocabulary.layout)
+    except UserError as error:
+        return str(error)
+
+
+def _only(selector: Selector, known: list[Atom]) -> Selector:
+    """The selector with `_NOTHING` in place of the parts that are not known."""
+    if isinstance(selector, Operation):
+        return Operation(selector.operator, _only(selector.left, known), _only(selector.right, known))
+    return selector if isinstance(selector, Everything) or selector in known else _NOTHING
