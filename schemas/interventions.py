@@ -165,9 +165,9 @@ class PromptChange:
 class ImageChange:
     """Another picture of one camera of the policy, in the model's picture.
 
-    `blank`: grey. `noise`: uniform noise, drawn from `seed`. `rotated`: by half a turn. `shifted`: by `rows` down and
-    `columns` to the right. `masked`: the patches that `object` covers are grey. `filled`: they are filled from their
-    surroundings.
+    `blank`: grey. `noise`: uniform noise, drawn from `seed`. `rotated`: by half a turn. `shifted`: by `rows` patches
+    down and `columns` patches to the right. `masked`: the patches that `object` covers are grey. `filled`: they are
+    filled from their surroundings.
     """
 
     camera: str
@@ -191,7 +191,7 @@ class ImageChange:
     def describe(self) -> str:
         """The intervention in words."""
         detail = f" '{self.object}'" if self.object else ""
-        detail += f" by {self.rows}, {self.columns} pixels" if self.kind == "shifted" else ""
+        detail += f" by {self.rows}, {self.columns} patches" if self.kind == "shifted" else ""
         return f"camera '{self.camera}' {self.kind}{detail}"
 
 
