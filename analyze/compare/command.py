@@ -15,7 +15,8 @@ _EXAMPLES = """examples:
   vla-analyze compare base=runs/b_spatial.zarr,runs/b_goal.zarr tuned=runs/t_spatial.zarr,runs/t_goal.zarr
   vla-analyze compare runs/libero_spatial.zarr runs/libero_goal.zarr --allow-mismatch suite
 
-Episodes pair when suite, task, initial state and seed are equal. Everything but the weights and their
+Episodes pair when suite, task, initial state and seed are equal, and a rerun of the first run (vla-capture
+rerun) at every replan; vla-analyze effects tells how its actions change. Everything but the weights and their
 names must agree, or be allowed by name: family, suite, seed, protocol, image_size, wait_steps, replan_steps, max_steps,
 layers, denoise_steps, heads, queries, depth, layout, cameras, processing, simulator.
 """

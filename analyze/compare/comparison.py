@@ -4,6 +4,9 @@ Two episodes are a pair when suite, task, initial state (by its digest) and seed
 noise, other weights. Differences within pairs do not contain differences between scenes. The first run is what the
 others are compared with; every difference is other run minus first run.
 
+A rerun of the first run (`vla-capture rerun`) repeats its policy calls: it pairs by episode and replan, and ratios are
+compared in the replans where both have one.
+
 Quantities, one value per episode: `log2_ratio` (mean over replans of log2 of the ratio: 1 more is twice the ratio),
 `{group}_fraction` (mean over replans), and `success` (0 or 1).
 """
@@ -18,6 +21,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.compare.replan_pairs import intervention_notes, is_rerun, with_paired_replans
 from vla_attention.analyze.compare.runs import Run, RunArgument, check_comparable, noted_differences, open_runs
 from vla_attention.analyze.measures.aggregate import baseline_logs, episode_tables, overall_layer, replans_of
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables, float_values
@@ -85,6 +89,11 @@ class Comparison:
         return tuple(run.name for run in self.runs)
 
     @property
+    def reruns(self) -> tuple[str, ...]:
+        """The runs that repeat the policy calls of the first one: they pair replan by replan."""
+        return tuple(run.name for run in self.runs[1:] if is_rerun(self.runs[0], run))
+
+    @property
     def overall_layer(self) -> str:
         """The layer that numbers over all tasks are about, see `aggregate.overall_layer`."""
         return overall_layer(self.estimates.select("layer", pl.col("block").alias("layer_number")))
@@ -114,10 +123,12 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
         MixedPolicies, RunsDiffer: see `runs.check_comparable`.
     """
     notes = [*check_comparable(runs, allowed), *noted_differences(runs)]
+    notes += [line for run in runs[1:] for line in intervention_notes(runs[0], run)]
     notes += dict.fromkeys(line for run in runs for line in run.question.remarks)
     grouping = runs[0].question.grouping
     estimand = runs[0].question.settings.intervals
-    levels = [episode_tables(replans_of(run.question), run.question.grouping) for run in runs]
+    replans = [replans_of(run.question) for run in runs]
+    levels = [episode_tables(of_run, grouping) for of_run in replans]
     having = {name for level in levels for name in level.groups_with_mass()}
     filled = [name for name in grouping.names if name in having]
     tables = [_episode_values(run, level, filled, "seed" in allowed) for run, level in zip(runs, levels, strict=True)]
@@ -126,8 +137,15 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
         [_estimates(run.name, table, quantities, estimand) for run, table in zip(runs, tables, strict=True)]
     )
     differences, pairs, unpaired = [], [], []
-    for run, table in zip(runs[1:], tables[1:], strict=True):
+    for run, table, of_run in zip(runs[1:], tables[1:], replans[1:], strict=True):
         joined = _pair(tables[0], table, quantities)
+        if is_rerun(runs[0], run):
+            sides = with_paired_replans(replans[0], of_run, run.name)
+            first, other = (
+                _episode_values(one, episode_tables(side, grouping), filled, False)
+                for one, side in zip((runs[0], run), sides, strict=True)
+            )
+            joined = _pair(first, other, quantities, same_episode=True)
         pairs.append(_pairs_table(run.name, joined, quantities))
         unpaired += [_without_partner(tables[0], joined, "first", runs[0].name, run.name)]
         unpaired += [_without_partner(table, joined, "other", run.name, runs[0].name)]
@@ -197,8 +215,13 @@ def _episode_values(run: Run, episodes: Tables, groups: Sequence[str], ignore_se
     )
 
 
-def _pair(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str]) -> pl.DataFrame:
-    """Pairs (pair, layer) with `X_first`, `X_other` and `X_difference`, and both episode indices."""
+def _pair(
+    first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str], same_episode: bool = False
+) -> pl.DataFrame:
+    """Pairs (pair, layer) with `X_first`, `X_other` and `X_difference`, and both episode indices.
+
+    `same_episode`: the other run is a rerun, whose episodes have the same numbers; it may lack some.
+    """
     # A seed that was allowed to differ is null, and null equals nothing in a join.
     keys = [*(key for key in PAIR_KEYS if key != "seed" or first["seed"].null_count() == 0), "layer"]
 
@@ -206,7 +229,11 @@ def _pair(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str]) -
         values = (pl.col(quantity).alias(f"{quantity}_{name}") for quantity in quantities)
         return table.select(*keys, *more, pl.col("episode_index").alias(f"episode_{name}"), *values)
 
-    joined = side(first, "first", "instruction", "block").join(side(other, "other"), on=keys, how="inner")
+    mine, theirs = side(first, "first", "instruction", "block"), side(other, "other")
+    if same_episode:
+        theirs = theirs.drop("occurrence").with_columns(pl.col("episode_other").alias("episode_first"))
+        keys = ["episode_first" if key == "occurrence" else key for key in keys]
+    joined = mine.join(theirs, on=keys, how="inner")
     return joined.with_columns(
         (pl.col(f"{q}_other") - pl.col(f"{q}_first")).alias(f"{q}_difference") for q in quantities
     ).sort("suite", "task_id", "episode_first", "block", nulls_last=True)

@@ -151,6 +151,8 @@ def _pairing(comparison: Comparison, name: str, rows: pl.DataFrame) -> list[str]
         )
     pairs = comparison.pairs.filter(pl.col("run") == name).select("suite", "task_id", "episode_first").unique().height
     text = f"{plural(pairs, 'pair')} of episodes with the same {_pairing_keys(comparison)}."
+    if name in comparison.reruns:
+        text = f"{plural(pairs, 'pair')} of episodes, replan by replan: {name} is a rerun of {first}, the same calls."
     if comparison.ignores_seed:
         text += " Their seeds may differ: environment and noise are not the same in both runs."
     for run, table in alone.items():

@@ -39,7 +39,7 @@ from vla_attention.analyze.statistics.many_looks import adjusted_p_values
 from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.safe_text import visible
-from vla_attention.schemas.stores.reader import Store
+from vla_attention.schemas.stores.reader import Store, open_store
 
 _LIMITS = {"effect": POSITIVE, "effect_chunk": POSITIVE, "angle": POSITIVE, "gripper_flips": SHARE}
 _NAMES = ("condition", "kind", "group", "selector")
@@ -123,10 +123,15 @@ def study_effects(
     Raises:
         UserError: see `open_reruns`, `question.ask` and `paired_replans.pair_episodes`.
     """
-    opened = open_reruns(base, given)
-    question = ask([opened.base], settings)
+    opened = open_reruns(open_store(base), given)
+    return study_of(analyse(ask([opened.base], settings)), opened, dimensions)
+
+
+def study_of(analysis: Analysis, opened: BaseAndReruns, dimensions: Sequence[int] | None = None) -> EffectStudy:
+    """As `study_effects`, of a base that was analysed already."""
+    question = analysis.question
     members = [BaseEpisode.of(item) for item in question.selected]
-    spread = _spread(opened.base, members, settings, dimensions)
+    spread = _spread(opened.base, members, question.settings, dimensions)
     names = [episode.name for episode in opened.base.episodes]
     pairings = [pair_episodes(condition, members, names) for condition in opened.reruns]
     groups = [condition.group for condition in opened.reruns if condition.group is not None]
@@ -136,7 +141,7 @@ def study_effects(
     rollouts = [rollout_pairs(condition, question) for condition in opened.rollouts]
     unpaired = [note for _, note in rollouts if note]
     return EffectStudy(
-        analysis=analyse(question),
+        analysis=analysis,
         given=opened,
         spread=spread,
         attention=attention,

@@ -33,29 +33,29 @@ class BaseAndReruns:
     notes: tuple[str, ...]
 
 
-def open_reruns(base: Path, given: Sequence[Path]) -> BaseAndReruns:
-    """Open a base and what is compared with it: stores, or folders of stores.
+def open_reruns(base: Store, given: Sequence[Path]) -> BaseAndReruns:
+    """Open what is compared with a base: stores, or folders of stores.
 
     Raises:
         BadArgument: a store that was given by its own path belongs to another base or changes nothing, a folder holds
             nothing of this base, or a rollout is of another policy or suite.
         StoreNotFound, StoreError: see `vla_attention.schemas.stores.reader.open_store`.
     """
-    store = open_store(base)
     if not given:
         raise BadArgument(
-            f"No rerun of {base} was given; expected stores or a folder of vla-capture rerun {base} --series default."
+            f"No rerun of {base.path} was given; expected stores, or a folder of vla-capture rerun {base.path} "
+            "--series default."
         )
     reruns, rollouts, notes = [], [], []
     for path, named in _paths(given):
         other = open_store(path)
-        if path.resolve() == base.resolve():
+        if path.resolve() == base.path.resolve():
             if named:
                 raise BadArgument(f"The store {path} is given as the base and as its rerun; give reruns of it.")
             continue
-        problem = _problem(store, other)
+        problem = _problem(base, other)
         if problem and named:
-            raise BadArgument(f"{path} {problem}; {_what_fits(base)}.")
+            raise BadArgument(f"{path} {problem}; {_what_fits(base.path)}.")
         if problem:
             notes.append(f"{path} is left out: it {problem}.")
         elif other.attributes.rerun_of is not None:
@@ -64,15 +64,15 @@ def open_reruns(base: Path, given: Sequence[Path]) -> BaseAndReruns:
             rollouts.append(other)
     if not reruns and not rollouts:
         raise BadArgument(
-            f"{listing(given)} {'holds' if len(given) == 1 else 'hold'} no rerun of {base} "
-            f"({notes[0] if notes else 'only the base itself'}); {_what_fits(base)}."
+            f"{listing(given)} {'holds' if len(given) == 1 else 'hold'} no rerun of {base.path} "
+            f"({notes[0] if notes else 'only the base itself'}); {_what_fits(base.path)}."
         )
     names = _names([*reruns, *rollouts])
     conditions = [
         Condition(name, other, other.attributes.interventions)
         for name, other in zip(names, [*reruns, *rollouts], strict=True)
     ]
-    return BaseAndReruns(store, tuple(conditions[: len(reruns)]), tuple(conditions[len(reruns) :]), tuple(notes))
+    return BaseAndReruns(base, tuple(conditions[: len(reruns)]), tuple(conditions[len(reruns) :]), tuple(notes))
 
 
 def _what_fits(base: Path) -> str:

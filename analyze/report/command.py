@@ -13,6 +13,7 @@ _EXAMPLES = """examples:
   vla-analyze report runs/libero_10.zarr --grouping instruction --layers 9 13 17 --output paper/report.html
   vla-analyze report runs/a.zarr runs/b.zarr --episodes 8 --replans 10 --output results/both
   vla-analyze report runs/cosmos.zarr --site self
+  vla-analyze report runs/cubes.zarr --effects reruns/cubes
 
 The file needs no network and nothing beside it: open it with a double click, mail it, print it.
 """
@@ -47,6 +48,14 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="N",
         help="replans of each, at most (default: %(default)s)",
     )
+    content.add_argument(
+        "--effects",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="RERUN",
+        help="reruns of the store with interventions (vla-capture rerun), or folders of them",
+    )
     content.add_argument("--quick", action="store_true", help="leave out what reads every row: sinks, words, objects")
     output = parser.add_argument_group("output")
     output.add_argument(
@@ -67,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
     from vla_attention.analyze.show.numbers import plural
     from vla_attention.schemas.stores.reader import open_store
 
-    settings = ReportSettings(arguments.episodes, arguments.replans, rows=not arguments.quick)
+    settings = ReportSettings(arguments.episodes, arguments.replans, not arguments.quick, tuple(arguments.effects))
     path = report_file(arguments.output or Path("results") / arguments.stores[0].stem)
     question = ask([open_store(store) for store in arguments.stores], settings_of(arguments))
     write_report(question, path, settings)

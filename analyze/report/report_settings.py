@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from vla_attention.schemas.errors import BadArgument
 
@@ -15,6 +16,7 @@ class ReportSettings:
         episodes: number of episodes with overlays.
         replans: number of replans of each, at most.
         rows: include sinks, words and objects, which need every row to be read.
+        effects: reruns of the store, or folders of them (`effects.reruns`).
 
     Raises `BadArgument` for fewer than 0 episodes or 1 replan.
     """
@@ -22,6 +24,7 @@ class ReportSettings:
     episodes: int = 4
     replans: int = 24
     rows: bool = True
+    effects: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
         if self.episodes < 0 or self.replans < 1:

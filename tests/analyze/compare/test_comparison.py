@@ -21,8 +21,9 @@ from vla_attention.analyze.compare.runs import (
 from vla_attention.analyze.compare.text import comparison_text
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.schemas.errors import BadArgument, UnknownName
+from vla_attention.schemas.interventions import Interventions, KeyKnockout, PromptChange
 from vla_attention.schemas.layout import Role
-from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.stores import StoreSpec, rerun_source, write_store
 
 TASKS, EPISODES = (0, 1, 2, 5), 4
 
@@ -336,3 +337,61 @@ def test_without_a_ratio_fractions_are_compared(stores, tmp_path):
     assert main(["compare", str(stores["base"]), str(stores["higher"]), *words]) == 0
     table = pl.read_parquet(tmp_path / "comparison.parquet")
     assert table["quantity"].unique(maintain_order=True).to_list() == ["base_fraction", "rest_fraction", "success"]
+
+
+def test_a_rerun_pairs_at_every_replan(stores, tmp_path):
+    """The rerun has no ratio in the first replan of episodes of odd number, and lacks an episode."""
+
+    def plant(task, episode, tokens, rows):
+        rows = planting(1)(task, episode, tokens, rows).copy()
+        if episode % 2:
+            visual = tokens.key_role[0] == Role.IMAGE
+            rows[0] = np.where(visual, 0.0, rows[0])
+            rows[0] /= rows[0].sum(axis=-1, keepdims=True)
+        return rows
+
+    spec = replace(PLAIN, plant_rows=plant, rerun_of=rerun_source(stores["base"]), tasks=(1, 2, 5))
+    known = {**stores, "rerun": write_store(tmp_path / "rerun.zarr", spec=spec)}
+    found = compare(opened(known, "base", "rerun"))
+    pairs = found.pairs.filter(quantity="log2_ratio", layer="0")
+    assert pairs.height == 12
+    for row in pairs.iter_rows(named=True):
+        task, episode = row["task_id"], row["episode_first"]
+        assert row["episode_other"] == episode
+        wanted = (log_ratio(1, task, episode) - log_ratio(0, task, episode)) / np.log(2)
+        assert row["difference"] == pytest.approx(wanted, rel=1e-3)
+    text = " ".join(comparison_text(found).split())
+    assert "12 pairs of episodes, replan by replan: rerun is a rerun of base, the same calls." in text
+    assert "Of base, 4 have no partner" in text
+    assert found.reruns == ("rerun",)
+
+
+def test_a_rerun_without_any_ratio_has_its_fractions_compared(stores, tmp_path):
+    def plant(task, episode, tokens, rows):
+        rows = planting(0)(task, episode, tokens, rows) * (tokens.key_role != Role.IMAGE)[:, None, None, None, None]
+        return rows / rows.sum(axis=-1, keepdims=True)
+
+    knockout = Interventions("without_visual", keys=(KeyKnockout("role:image"),))
+    spec = replace(PLAIN, plant_rows=plant, rerun_of=rerun_source(stores["base"]), interventions=knockout)
+    known = {**stores, "rerun": write_store(tmp_path / "rerun.zarr", spec=spec)}
+    found = compare(opened(known, "base", "rerun"))
+    row = one(found.differences, scope="all", layer="layers_avg", quantity="visual_fraction")
+    assert (row["mean_other"], row["num_pairs"]) == (0.0, 16)
+    text = " ".join(comparison_text(found).split())
+    assert "every replan is a pair. It changed: the keys of 'role:image' knocked out for the action queries." in text
+
+
+def test_a_rerun_with_other_replans_is_refused(stores, tmp_path):
+    spec = replace(PLAIN, plant_rows=planting(1), rerun_of=rerun_source(stores["base"]), replans=1, tasks=(0,))
+    known = {**stores, "rerun": write_store(tmp_path / "rerun.zarr", spec=spec)}
+    with pytest.raises(
+        RunsDiffer, match=r"task000_episode000, .* of the rerun rerun has other replans than in its base"
+    ):
+        compare(opened(known, "base", "rerun", allowed=("max_steps",)), ("max_steps",))
+
+
+def test_other_interventions_are_noted(stores, tmp_path):
+    spec = replace(PLAIN, plant_rows=planting(1), interventions=Interventions("empty", prompt=PromptChange("empty")))
+    known = {**stores, "empty": write_store(tmp_path / "empty.zarr", spec=spec)}
+    found = compare(opened(known, "base", "empty"))
+    assert "base and empty differ in their interventions (none; the instruction empty)." in found.notes

@@ -14,6 +14,7 @@ import pytest
 
 import vla_attention.testing.stores as kit
 from tests.kit.questions import question_about
+from tests.kit.reruns import write_base, write_series
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.measures.role_masses import role_masses
 from vla_attention.analyze.ratios.analysis import Analysis, analyse
@@ -287,3 +288,18 @@ def test_the_curve_of_the_ratio_has_gaps_where_no_ratio_is_finite() -> None:
     assert [mark.text for mark in curve.marks] == ["4", "1"]
     assert "lowest 1, highest 4" in curve.description
     assert ratio_curve(np.array([np.inf, np.nan, 0.0]), None, np.arange(3)) is None
+
+
+def test_effects_of_reruns_have_a_section(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    base = write_base(tmp_path)
+    series = write_series(tmp_path / "series", base, ("noise", "without_visual", "only_visual"))
+    given = ["report", str(base), "--quick", "--episodes", "0", "--output", str(tmp_path / "page.html")]
+    assert main([*given, "--effects", str(series)]) == 0
+    page = Page((tmp_path / "page.html").read_text(encoding="utf-8"))
+    assert "Without visual the action changes by 1.2" in page.text
+    assert [section for section in page.of("section") if section.get("id") == "effects"]
+    assert main(given) == 0
+    assert "Interventions" not in Page((tmp_path / "page.html").read_text(encoding="utf-8")).text
+    capsys.readouterr()
+    assert main([*given, "--effects", str(base)]) == 2
+    assert "is given as the base and as its rerun" in capsys.readouterr().err
