@@ -1,0 +1,141 @@
+"""The interventions of a run, applied to the attention of one policy call after another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.capture.interventions.attention_edits import SiteEditor
+from vla_attention.capture.interventions.resolution import (
+    ReplanPlace,
+    check_not_empty,
+    check_selectors,
+    empty_replans,
+    episode_vocabularies,
+    make_editors,
+    run_vocabularies,
+    selectors_of,
+    site_tokens,
+)
+from vla_attention.capture.policies.policy import PolicyInput
+from vla_attention.schemas.groupings.resolve import EmptyGroup
+from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
+from vla_attention.schemas.groupings.vocabulary import SceneObject, Vocabulary
+from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.layout import SiteLayout
+from vla_attention.schemas.stores.reader import Store
+
+
+@dataclass
+class AttentionChanges:
+    """Makes the editors of every policy call of a run.
+
+    Attributes:
+        interventions: what is changed; layer numbers are block indices (`interventions_for`).
+        instructions: all instructions of the run; their words may be named.
+        allow_empty: leave a replan unchanged where a group has no key, and count it, instead of raising `EmptyGroup`.
+        num_replans, num_empty: replans so far, and those in which some group had no key.
+    """
+
+    interventions: Interventions
+    instructions: Sequence[str]
+    allow_empty: bool = False
+    num_replans: int = field(default=0, init=False)
+    num_empty: int = field(default=0, init=False)
+
+    def check_names(self, sites: Sequence[SiteLayout]) -> None:
+        """Raise `SelectorError` for what is known to be wrong before the run: everything but names of objects."""
+        check_selectors(self.interventions, self._vocabularies(sites, self._named_objects()))
+
+    def editors(
+        self,
+        sites: Sequence[SiteLayout],
+        policy_input: PolicyInput,
+        objects: Sequence[SceneObject],
+        coverage: Mapping[str, NDArray[np.float32]],
+        place: ReplanPlace,
+    ) -> dict[str, SiteEditor] | None:
+        """Return the editors of one policy call by site, or None where nothing changes.
+
+        Args:
+            sites: the policy's sites.
+            policy_input: what the call is given, after changes of prompt and pictures.
+            objects, coverage: the scene's objects, and how much of each patch each covers, camera -> (patch, object).
+            place: the call.
+
+        Raises:
+            SelectorError: a name does not exist here.
+            EmptyGroup: a group has no key, unless `allow_empty`.
+        """
+        if not self.interventions.changes_attention:
+            return None
+        self.num_replans += 1
+        tokens = site_tokens(sites, policy_input.key_role, policy_input.prompt, objects, coverage)
+        # Where empty groups are allowed, an object may also be one of another task's scene.
+        known = [*objects, *self._named_objects()] if self.allow_empty else objects
+        vocabularies = self._vocabularies(sites, known, policy_input.prompt.instruction_text)
+        if not self.allow_empty:
+            check_not_empty(self.interventions, tokens, vocabularies, place)
+        elif any(empty.any() for empty in empty_replans(self.interventions, tokens, vocabularies).values()):
+            self.num_empty += 1
+        return make_editors(self.interventions, tokens, vocabularies, place) or None
+
+    def describe_empty(self) -> str | None:
+        """Return a line that says how many replans had an empty group; None if there was none."""
+        if not self.num_empty:
+            return None
+        return (
+            f"In {self.num_empty} of {self.num_replans} replans a group of an intervention had no key, and nothing was "
+            "changed for it."
+        )
+
+    def _vocabularies(
+        self, sites: Sequence[SiteLayout], objects: Sequence[SceneObject], *further: str
+    ) -> dict[str, Vocabulary]:
+        return run_vocabularies(sites, [*self.instructions, *further], objects)
+
+    def _named_objects(self) -> list[SceneObject]:
+        atoms = [atom for text in selectors_of(self.interventions) for atom in atoms_of(parse_selector(text))]
+        names = dict.fromkeys(atom.argument for atom in atoms if atom.kind == "object")
+        return [SceneObject(name, "object", of_interest=False) for name in names]
+
+
+def check_stored_replans(interventions: Interventions, store: Store, *, allow_empty: bool = False) -> int:
+    """Check selectors on every replan of a store's episodes, before these are run again.
+
+    Returns the number of replans in which some group has no key. The prompts are the stored ones: with another prompt,
+    words can be checked at each call only.
+
+    Raises:
+        SelectorError: a name exists in no episode.
+        EmptyGroup: a group has no key in some replans, unless `allow_empty`; names the first of them, and how many.
+    """
+    sites: list[str] = [site.name for site in store.attributes.sites]
+    tokens = {
+        episode.name: {site: episode.tokens(store.attributes, site) for site in sites} for episode in store.episodes
+    }
+    vocabularies = episode_vocabularies(list(tokens.values()))
+    if not interventions.changes_attention or not vocabularies:
+        return 0
+    check_selectors(interventions, vocabularies)
+    first: dict[str, str] = {}
+    counts: dict[str, int] = {}
+    any_empty = total = 0
+    for name, there in tokens.items():
+        empty = empty_replans(interventions, there, vocabularies)
+        for selector, replans in empty.items():
+            counts[selector] = counts.get(selector, 0) + int(replans.sum())
+            if replans.any():
+                first.setdefault(selector, f"replan {int(np.argmax(replans))} of {name}")
+        some = np.any(list(empty.values()), axis=0)
+        any_empty, total = any_empty + int(some.sum()), total + some.size
+    if first and not allow_empty:
+        selector, where = next(iter(first.items()))
+        raise EmptyGroup(
+            f"The group '{selector}' of an intervention has no key in {counts[selector]} of {total} replans, the first "
+            f"is {where}; add --allow-empty to leave such replans unchanged, or choose episodes by --task-id."
+        )
+    return any_empty

@@ -1,0 +1,86 @@
+"""The interventions of a run: names before it, empty groups in it, and a check of all stored replans."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.kit.policy_inputs import make_observation
+from vla_attention.capture.interventions.resolution import ReplanPlace
+from vla_attention.capture.interventions.run_changes import AttentionChanges, check_stored_replans
+from vla_attention.capture.policies.pi.embedded import dummy_policy
+from vla_attention.schemas.groupings.resolve import EmptyGroup
+from vla_attention.schemas.groupings.selectors import SelectorError
+from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.testing import write_store
+
+BOWL = SceneObject("bowl_1", "object", True)
+
+
+def changes(*selectors: str, **fields) -> AttentionChanges:
+    interventions = Interventions(keys=tuple(KeyKnockout(selector) for selector in selectors))
+    return AttentionChanges(interventions, ["pick up the bowl", "open the drawer"], **fields)
+
+
+@pytest.fixture(scope="module")
+def policy():
+    return dummy_policy()
+
+
+def editors(given: AttentionChanges, policy, covered: float = 0.0, replan: int = 0):
+    policy_input = policy.prepare(make_observation(0), "pick up the bowl")
+    camera = policy.cameras[0].name
+    coverage = {camera: np.array([[covered], [0], [0], [0]], dtype=np.float32)}
+    return given.editors(policy.sites, policy_input, [BOWL], coverage, ReplanPlace(0, 0, replan))
+
+
+def test_names_before_the_run(policy):
+    changes("object:anything", "word:drawer", "role:image").check_names(policy.sites)
+    with pytest.raises(SelectorError, match="no instruction has the word 'mug'"):
+        changes("word:mug").check_names(policy.sites)
+    with pytest.raises(SelectorError, match="no object 'plate_1'"):
+        editors(changes("object:plate_1"), policy)
+
+
+def test_without_attention_there_are_no_editors(policy):
+    given = AttentionChanges(Interventions(noise=NoiseChange(3)), ["pick up the bowl"])
+    given.check_names(policy.sites)
+    assert editors(given, policy) is None
+
+
+def test_an_object_out_of_view(policy):
+    strict = changes("object:bowl_1")
+    assert list(editors(strict, policy, 0.5)) == ["joint"]
+    with pytest.raises(EmptyGroup, match=r"'object:bowl_1' .* no key at replan 4 of task000_episode000"):
+        editors(strict, policy, replan=4)
+    lax = changes("object:bowl_1", allow_empty=True)
+    assert editors(lax, policy, 0.5) is not None
+    assert lax.describe_empty() is None
+    assert editors(lax, policy) is None
+    assert editors(changes("object:of_another_scene", allow_empty=True), policy) is None
+    assert lax.describe_empty() == (
+        "In 1 of 2 replans a group of an intervention had no key, and nothing was changed for it."
+    )
+
+
+def test_the_word_of_another_task(policy):
+    with pytest.raises(EmptyGroup, match="'word:drawer'"):
+        editors(changes("word:drawer"), policy)
+
+
+def test_all_stored_replans(tmp_path):
+    store = open_store(write_store(tmp_path / "a.zarr", tasks=(0, 1), episodes=2, replans=3))
+    tokens = store.episodes[0].tokens(store.attributes, "joint")
+    camera = tokens.layout.cameras[0]
+    assert check_stored_replans(Interventions(keys=(KeyKnockout(f"camera:{camera}"),)), store) == 0
+    assert check_stored_replans(Interventions(), store) == 0
+    with pytest.raises(SelectorError, match="camera 'nowhere'"):
+        check_stored_replans(Interventions(keys=(KeyKnockout("camera:nowhere"),)), store)
+    nothing = Interventions(keys=(KeyKnockout(f"camera:{camera} & role:action"),))
+    with pytest.raises(
+        EmptyGroup, match="no key in 12 of 12 replans, the first is replan 0 of task000_episode000; add"
+    ):
+        check_stored_replans(nothing, store)
+    assert check_stored_replans(nothing, store, allow_empty=True) == 12
