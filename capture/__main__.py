@@ -18,7 +18,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str], termination: Termination) -> int:
     from vla_attention.capture.arguments import build_parser
 
-    arguments = build_parser().parse_args(argv)
+    arguments = build_parser(argv).parse_args(argv)
     exit_code: int = arguments.command(arguments, termination)
     return exit_code
 

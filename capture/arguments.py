@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 from vla_attention.capture.capture_command import run_capture_of_family
@@ -12,10 +13,11 @@ from vla_attention.capture.parity_command import run_parity_command
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
 from vla_attention.capture.policies.model_arguments import add_threads
+from vla_attention.capture.recording_arguments import add_recording_arguments
+from vla_attention.capture.rerun.arguments import RERUN_EXAMPLES, add_rerun_arguments
 from vla_attention.capture.tasks_command import run_tasks_command
 from vla_attention.schemas.command_line import OneSentenceParser
 from vla_attention.schemas.errors import listing
-from vla_attention.schemas.precision import DEFAULT_MANTISSA_BITS
 
 _FURTHER_EXAMPLES = """\
   vla-capture status runs/libero_10.zarr                     what is there, what is missing, who is writing
@@ -25,8 +27,11 @@ _FURTHER_EXAMPLES = """\
 _VERIFY_HELP = "read every byte, instead of only seals, presence and sizes of files"
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Return the parser of `vla-capture`. In parsed arguments, `command` is the function to call."""
+def build_parser(given: Sequence[str] = ()) -> argparse.ArgumentParser:
+    """Return the parser of `vla-capture`. In parsed arguments, `command` is the function to call.
+
+    given: what will be parsed; `rerun` takes the model options of the family whose store is among it.
+    """
     families = policy_families()
     examples = "".join(family.examples for family in families)
     parser = OneSentenceParser(
@@ -61,6 +66,16 @@ def build_parser() -> argparse.ArgumentParser:
         "damaged episode is left in a store.",
     )
     _add_repair_arguments(repair)
+    rerun = commands.add_parser(
+        "rerun",
+        help="make the policy calls of a store again, unchanged or with interventions",
+        description="Give the policy of a store the same pictures, state, prompt and noise again, without a simulator. "
+        "First the calls of one episode are made again unchanged, and their distance from the stored ones is printed. "
+        "With interventions, or with --store, the calls of all episodes go into a store like any other.",
+        epilog=f"examples:\n{RERUN_EXAMPLES}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_rerun_arguments(rerun, given if "rerun" in given[:1] else ())
     status = commands.add_parser(
         "status",
         help="what a store holds, what is missing, and who is writing",
@@ -120,7 +135,10 @@ def _add_capture_arguments(
     """Add all options of a capture with one policy family; `script`: of a published script instead."""
     family.add_arguments(parser)
     _add_evaluation_arguments(parser, family, script)
-    _add_recording_arguments(parser, family, script)
+    which = "block indices (default: all)"
+    if script:
+        which = f"layers to analyse; all are recorded (default: {' '.join(map(str, script.layers))})"
+    add_recording_arguments(parser, which + family.layers_note)
     _add_output_arguments(parser, family, script)
 
 
@@ -161,43 +179,6 @@ def _add_evaluation_arguments(
     group.add_argument(
         "--libero-assets", type=Path, metavar="PATH", help="LIBERO asset folder (or set VLA_LIBERO_ASSETS)"
     )
-
-
-def _add_recording_arguments(
-    parser: argparse.ArgumentParser, family: PolicyFamily, script: PublishedScript | None
-) -> None:
-    group = parser.add_argument_group("what is recorded")
-    which = "block indices (default: all)"
-    if script:
-        which = f"layers to analyse; all are recorded (default: {' '.join(map(str, script.layers))})"
-    group.add_argument("--layers", type=int, nargs="+", metavar="N", help=which + family.layers_note)
-    group.add_argument(
-        "--denoise-steps",
-        nargs="+",
-        default=["first", "last"],
-        metavar="STEP",
-        help="numbers, first, last or all (default: first last)",
-    )
-    group.add_argument("--heads", type=int, nargs="+", metavar="N", help="attention heads (default: all)")
-    group.add_argument(
-        "--queries",
-        default="mean",
-        help="mean over the action queries (default), steps (one mean per action step), or all",
-    )
-    group.add_argument(
-        "--precision",
-        default=str(DEFAULT_MANTISSA_BITS),
-        metavar="BITS",
-        help=f"mantissa bits kept of each probability, or 'exact' (default: {DEFAULT_MANTISSA_BITS}, "
-        "which bounds the error of every ratio by 0.1 %%)",
-    )
-    group.add_argument(
-        "--contributions",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="also record what each part of the keys adds to the residual stream, value-weighted (default: yes)",
-    )
-    group.add_argument("--no-frames", action="store_true", help="do not store the model's input images")
 
 
 def _add_output_arguments(

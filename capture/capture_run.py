@@ -20,7 +20,7 @@ from vla_attention.capture.jobs.worker_records import (
     planned_tasks,
     read_records,
 )
-from vla_attention.capture.policies.policy import Policy, camera_grid
+from vla_attention.capture.policies.policy import Policy, stored_picture_sizes
 from vla_attention.capture.provenance import describe_machine
 from vla_attention.capture.rollout.episode import EpisodeResult, check_protocol, max_replans
 from vla_attention.capture.rollout.episode_loop import EpisodeLoop
@@ -217,15 +217,12 @@ def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int, n
         f"pixels, {protocol.wait_steps} waiting steps, at most {protocol.max_steps} steps after them."
     )
     say(f"A policy call gives {identity.action_horizon} actions, of which {protocol.replan_steps} are executed.")
-    grids = [camera_grid(policy.sites, camera.name) for camera in policy.cameras]
-    pictures = [grid.image_height * grid.image_width * 3 for grid in grids]
-    if policy.needs_camera_frames:
-        pictures += [protocol.image_size**2 * 3] * len(grids)
     say(
         f"Recording {len(recording.layers)} layers, denoise steps {listing(recording.denoise_steps)}, "
         f"{len(recording.heads)} heads, {_QUERIES[recording.queries]} {recording.num_action_queries} action queries, "
         f"{', '.join(str(site.num_keys) for site in store.attributes.sites)} keys."
     )
+    pictures = stored_picture_sizes(policy, protocol.image_size)
     estimate = estimate_disk(recording, store.attributes.sites, pictures, max_replans(protocol), num_todo)
     say(describe(estimate, store.path))
     if num_todo < num_wanted:

@@ -1,4 +1,4 @@
-"""Provenance of an episode: versions of code and libraries, and the hardware."""
+"""Provenance of an episode: versions of code and libraries, the hardware, and the number of threads."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _LIBRARIES = ("torch", "numpy", "mujoco", "robosuite", "hf-libero", "zarr", "num
 
 
 def describe_machine(device: str) -> dict[str, str]:
-    """Return code version, library versions, processor and GPU; nothing that identifies a person or a host."""
+    """Return versions of code and libraries, processor, GPU and threads; nothing that identifies a person or a host."""
     import torch
 
     facts = {"code": code_version(), "python": platform.python_version(), "processor": platform.machine()}
@@ -22,6 +22,8 @@ def describe_machine(device: str) -> dict[str, str]:
         except metadata.PackageNotFoundError:
             facts[name] = "absent"
     facts["device"] = torch.cuda.get_device_name(device) if device.startswith("cuda") else device
+    # Sums over other numbers of threads may differ in their last bits.
+    facts["threads"] = str(torch.get_num_threads())
     return facts
 
 

@@ -83,15 +83,20 @@ def run_settings(arguments: argparse.Namespace) -> RunSettings:
         verify=arguments.verify,
         mode="overwrite" if arguments.overwrite else "resume" if arguments.resume else "new",
         libero_assets=arguments.libero_assets,
-        recording=RecordingSettings(
-            layers=None if arguments.layers is None else tuple(arguments.layers),
-            denoise_steps=tuple(arguments.denoise_steps),
-            heads=None if arguments.heads is None else tuple(arguments.heads),
-            queries=arguments.queries,
-            mantissa_bits=parse_precision(arguments.precision),
-            frames=not arguments.no_frames,
-            contributions=arguments.contributions,
-        ),
+        recording=recording_settings(arguments),
+    )
+
+
+def recording_settings(arguments: argparse.Namespace) -> RecordingSettings:
+    """Return what the options of `recording_arguments.py` say."""
+    return RecordingSettings(
+        layers=None if arguments.layers is None else tuple(arguments.layers),
+        denoise_steps=tuple(arguments.denoise_steps),
+        heads=None if arguments.heads is None else tuple(arguments.heads),
+        queries=arguments.queries,
+        mantissa_bits=parse_precision(arguments.precision),
+        frames=not arguments.no_frames,
+        contributions=arguments.contributions,
     )
 
 

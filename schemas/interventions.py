@@ -166,8 +166,8 @@ class ImageChange:
     """Another picture of one camera of the policy, in the model's picture.
 
     `blank`: grey. `noise`: uniform noise, drawn from `seed`. `rotated`: by half a turn. `shifted`: by `rows` patches
-    down and `columns` patches to the right. `masked`: the patches that `object` covers are grey. `filled`: they are
-    filled from their surroundings.
+    down and `columns` patches to the right. `masked`: the patches that show some of `object` get the mean colour
+    of the others. `filled`: they are filled from their surroundings.
     """
 
     camera: str

@@ -15,6 +15,7 @@ from vla_attention.capture.environments.episode_protocol import OPENPI, Evaluati
 
 if TYPE_CHECKING:
     from vla_attention.capture.policies.policy import Policy
+    from vla_attention.schemas.stores.store_format import PolicyIdentity
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,11 @@ def no_arguments(arguments: argparse.Namespace) -> list[str]:
     return []
 
 
+def stored_checkpoint(identity: PolicyIdentity) -> dict[str, Any]:
+    """Return the path of the checkpoint: the family's other options have their defaults."""
+    return {"checkpoint": identity.checkpoint}
+
+
 @dataclass(frozen=True)
 class PolicyFamily:
     """One policy family on the command line."""
@@ -84,3 +90,7 @@ class PolicyFamily:
     analysis_arguments: Callable[[argparse.Namespace], list[str]] = no_arguments
     parity: ParityCases | None = None
     published: PublishedScript | None = None
+    #: The kinds of its policies, as stores name them (`PolicyIdentity.family`); empty for the family's name alone.
+    kinds: tuple[str, ...] = ()
+    #: The identity in a store -> parsed arguments with which `build` makes this policy again.
+    rebuild: Callable[[PolicyIdentity], dict[str, Any]] = stored_checkpoint

@@ -159,6 +159,13 @@ def camera_frame(observation: Observation, camera: str) -> NDArray[np.uint8]:
     return observation.images[camera]
 
 
+def stored_picture_sizes(policy: Policy, image_size: int) -> list[int]:
+    """Return the bytes of every picture that is stored of a call; image_size: side of the cameras' own pictures."""
+    grids = [camera_grid(policy.sites, camera.name) for camera in policy.cameras]
+    sizes = [grid.image_height * grid.image_width * 3 for grid in grids]
+    return sizes + [image_size**2 * 3] * len(grids) * policy.needs_camera_frames
+
+
 def camera_grid(sites: Sequence[SiteLayout], camera: str) -> PatchGrid:
     """Return how the patches of a camera tile its model image, from the site that has the camera's keys."""
     for site in sites:

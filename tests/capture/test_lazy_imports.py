@@ -7,7 +7,15 @@ import pytest
 from tests.kit.lazy_imports import help_without_libraries
 from vla_attention.capture.policies.families import policy_families
 
-COMMANDS = [[], *([family.name] for family in policy_families()), ["parity"], ["repair"], ["status"], ["tasks"]]
+COMMANDS = [
+    [],
+    *([family.name] for family in policy_families()),
+    ["parity"],
+    ["repair"],
+    ["rerun"],
+    ["status"],
+    ["tasks"],
+]
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)

@@ -13,6 +13,7 @@ from vla_attention.schemas.errors import BadArgument
 
 if TYPE_CHECKING:
     from vla_attention.capture.policies.cosmos.policy import CosmosPolicy
+    from vla_attention.schemas.stores.store_format import PolicyIdentity
 
 _CHECKPOINT = "nvidia/Cosmos-Policy-LIBERO-Predict2-2B"
 _EXAMPLES = f"""\
@@ -96,6 +97,22 @@ def _analysis_arguments(arguments: argparse.Namespace) -> list[str]:
     return ["--site", "self", *groups, "--ratio", f"{above}/{below}", "--denoise", arguments.prefer_call]
 
 
+def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
+    facts = {
+        "query_frame": identity.config["query_frame"],
+        "num_denoising_steps_action": identity.config["config"]["sampler"]["num_steps"],
+        "chunk_size": identity.action_horizon,
+    }
+    if identity.checkpoint_format == "seeded":
+        return {"checkpoint": identity.name, **facts}
+    return {
+        "checkpoint": identity.checkpoint,
+        "config_name": identity.config["configuration"],
+        "dtype": identity.config["dtype"],
+        **facts,
+    }
+
+
 def _is_cosmos_case(content: Mapping[str, Any]) -> bool:
     return isinstance(content.get("kind"), str)
 
@@ -128,4 +145,5 @@ FAMILY = PolicyFamily(
         layers=(25, 26, 27),
         variables={"QUERY_FRAME": "--query-frame", "VISUAL_FRAME": "--visual-frame", "TEXT_FRAME": "--text-frame"},
     ),
+    rebuild=_rebuild,
 )

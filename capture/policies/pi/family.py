@@ -13,6 +13,7 @@ from vla_attention.capture.policies.model_arguments import UNTRAINED, add_model_
 
 if TYPE_CHECKING:
     from vla_attention.capture.policies.pi.policy import PiPolicy
+    from vla_attention.schemas.stores.store_format import PolicyIdentity
 
 _EXAMPLES = """\
   vla-capture pi                                             embedded untrained policy, built-in tasks
@@ -71,6 +72,17 @@ def _build(arguments: argparse.Namespace, device: str) -> PiPolicy:
     )
 
 
+def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
+    if identity.checkpoint_format == "seeded":
+        return {"checkpoint": identity.name}
+    settings = {"checkpoint": identity.checkpoint, "dtype": identity.config["dtype"]}
+    if identity.checkpoint_format in ("openpi_torch", "openpi_jax", "lerobot"):
+        settings["checkpoint_format"] = identity.checkpoint_format
+    if identity.checkpoint_format.startswith("openpi"):
+        settings["discrete_state_input"] = identity.config["config"].get("discrete_state_input", False)
+    return settings
+
+
 def _is_pi_case(content: Mapping[str, Any]) -> bool:
     return "model" in content or "config" in content
 
@@ -105,4 +117,6 @@ FAMILY = PolicyFamily(
         layers=(25, 26, 27),
         variables={"PROTOCOL": "--protocol"},
     ),
+    kinds=("pi0", "pi05"),
+    rebuild=_rebuild,
 )

@@ -1,0 +1,1 @@
+"""Running stored policy calls again, without a simulator: unchanged, or with interventions."""

@@ -1,0 +1,106 @@
+"""The arguments of `vla-capture rerun`. The model's options are those of the family whose policy the store has."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vla_attention.capture.jobs.termination import Termination
+from vla_attention.capture.policies.families import family_of_kind
+from vla_attention.capture.recording_arguments import add_recording_arguments
+from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.threads import use_threads
+
+if TYPE_CHECKING:
+    from vla_attention.schemas.stores.store_format import RootAttributes
+
+RERUN_EXAMPLES = """\
+  vla-capture rerun runs/libero_10.zarr                      how far the calls of one episode are from the stored ones
+  vla-capture rerun runs/libero_10.zarr --store again.zarr --layers 0 1 2 --queries all    record more of the same calls
+"""
+
+
+def add_rerun_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -> None:
+    """Add all options. given: what will be parsed; a store among it decides the model's options and the defaults."""
+    parser.add_argument(
+        "base", type=_existing_store, metavar="STORE", help="NAME.zarr; with it, --help lists the model's options too"
+    )
+    root = _root_among(given)
+    if root is not None:
+        family = family_of_kind(root.policy.family)
+        family.add_arguments(parser)
+        parser.set_defaults(**family.rebuild(root.policy), family=family)
+    _add_selection_arguments(parser)
+    add_recording_arguments(parser, "block indices", rerun=True)
+    if root is not None:
+        _take_recording_of(root, parser)
+    _add_output_arguments(parser)
+    parser.set_defaults(command=_run)
+
+
+def _existing_store(text: str) -> Path:
+    from vla_attention.schemas.stores.root import read_root
+
+    try:
+        read_root(Path(text))
+    except UserError as error:
+        raise argparse.ArgumentTypeError(str(error).removesuffix(".")) from None
+    return Path(text)
+
+
+def _root_among(given: Sequence[str]) -> RootAttributes | None:
+    """Return the attributes of the first store among the words of a command line; None if there is none."""
+    for word in given:
+        if not word.startswith("-") and (Path(word) / "zarr.json").is_file():
+            from vla_attention.schemas.stores.root import read_root
+
+            try:
+                return read_root(Path(word))
+            except UserError:
+                continue  # the argument's own error says why
+    return None
+
+
+def _take_recording_of(root: RootAttributes, parser: argparse.ArgumentParser) -> None:
+    recording = root.recording
+    parser.set_defaults(
+        layers=list(recording.layer_labels),
+        denoise_steps=[str(step) for step in recording.denoise_steps],
+        heads=list(recording.heads),
+        queries=recording.queries,
+        precision=str(recording.mantissa_bits),
+        contributions=recording.contributions,
+    )
+
+
+def _add_selection_arguments(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("which policy calls")
+    group.add_argument("--task-id", type=int, nargs="+", metavar="N", help="one or several tasks (default: all)")
+    group.add_argument("--num-episodes", type=int, metavar="N", help="the first N episodes of each task (default: all)")
+    group.add_argument(
+        "--check",
+        type=int,
+        metavar="N",
+        help="policy calls of the first episode that are made again unchanged before anything else (default: all of "
+        "them; 0: none)",
+    )
+
+
+def _add_output_arguments(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("output")
+    group.add_argument(
+        "--store", type=Path, metavar="OUT.zarr", help="store to write (default: with the base's name, beside it)"
+    )
+    existing = group.add_mutually_exclusive_group()
+    existing.add_argument("--resume", action="store_true", help="continue an existing store with what is missing")
+    existing.add_argument("--overwrite", action="store_true", help="delete an existing store first")
+
+
+def _run(arguments: argparse.Namespace, termination: Termination) -> int:
+    threads = use_threads(arguments.threads)  # before torch is loaded
+
+    from vla_attention.capture.rerun.command import run_rerun
+
+    return run_rerun(arguments, threads, termination)

@@ -1,0 +1,46 @@
+"""One stored policy call, made again: the same input and noise, or those that interventions make of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from vla_attention.capture.interventions.changed_inputs import changed_inputs
+from vla_attention.capture.policies.policy import Policy, PolicyInput
+from vla_attention.capture.rerun.stored_calls import StoredCalls
+from vla_attention.capture.rollout.policy_call import RecordedCall, record_call
+from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.stores.store_format import Recording
+
+
+@dataclass(frozen=True)
+class Repeater:
+    """Makes stored policy calls again.
+
+    interventions: what is changed. instructions: of the store's tasks, by task id.
+    """
+
+    policy: Policy
+    recording: Recording
+    interventions: Interventions = field(default_factory=Interventions)
+    instructions: Mapping[int, str] = field(default_factory=dict)
+
+    def prepare(self, calls: StoredCalls, replan: int) -> PolicyInput:
+        """Return the model's input of a call."""
+        given, policy = calls.given(replan), self.policy
+        if self.interventions.changes_input:
+            context = calls.context(replan, self.instructions)
+            given = changed_inputs(given, self.interventions, policy.sites, context)
+        return policy.prepare_again(given)
+
+    def noise_seed(self, calls: StoredCalls, replan: int) -> int:
+        """Return the seed of a call's noise."""
+        noise, attributes = self.interventions.noise, calls.attributes
+        if noise is None:
+            return int(calls.noise_seed[replan])
+        return self.policy.replan_noise_seed(noise.seed, attributes.task_id, attributes.episode_index, replan)
+
+    def call(self, calls: StoredCalls, replan: int, policy_input: PolicyInput) -> RecordedCall:
+        """Call the policy."""
+        where = f"replan {replan} (environment step {calls.env_step[replan]}) of the rerun of {calls.episode.name}"
+        return record_call(self.policy, policy_input, self.noise_seed(calls, replan), self.recording, where)

@@ -1,0 +1,102 @@
+"""`vla-capture rerun`: check that stored policy calls come out as they did, and make them again into a store."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from vla_attention.capture.capture_run import plan_recording
+from vla_attention.capture.command_line import check_writable
+from vla_attention.capture.device import load_torch
+from vla_attention.capture.jobs.termination import Termination
+from vla_attention.capture.policies.family import PolicyFamily
+from vla_attention.capture.provenance import describe_machine
+from vla_attention.capture.rerun.base_store import check_may_change, open_base
+from vla_attention.capture.rerun.fidelity import check_fidelity
+from vla_attention.capture.rerun.progress import RerunProgress
+from vla_attention.capture.rerun.rerun_store import Rerun
+from vla_attention.capture.rerun.same_policy import check_same_policy
+from vla_attention.capture.rerun.stored_calls import check_has_inputs, read_calls
+from vla_attention.capture.rollout.progress import say
+from vla_attention.capture.run_settings import recording_settings
+from vla_attention.capture.store.store_writer import WriteMode, refuse_existing
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.safe_text import file_part
+from vla_attention.schemas.stores.reader import Store
+from vla_attention.schemas.stores.store_format import STORE_SUFFIX
+from vla_attention.schemas.threads import Threads
+
+
+def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Termination) -> int:
+    """Run `vla-capture rerun` on parsed arguments; returns the exit code."""
+    base = open_base(arguments.base, arguments.task_id, arguments.num_episodes)
+    interventions = Interventions()
+    check_may_change(base, interventions)
+    target = _target(arguments, base, interventions)
+    mode: WriteMode = "overwrite" if arguments.overwrite else "resume" if arguments.resume else "new"
+    if target is not None:
+        # An existing store or an unwritable place is an error now, before the minutes for loading a model.
+        if mode == "new" and target.exists():
+            refuse_existing(target)
+        check_writable(target.parent, "--store")
+    rerun = _prepare(arguments, base, threads, termination)
+    _check(rerun, arguments.check)
+    if target is None:
+        return 0
+    added = rerun.write(target, mode, interventions)
+    say(f"{added} episodes added. Store: {target}")
+    say(f"Next: vla-analyze {target}")
+    return 0
+
+
+def _target(arguments: argparse.Namespace, base: Store, interventions: Interventions) -> Path | None:
+    """Return the store to write; None if only the check was asked for."""
+    if arguments.store is not None:
+        target = Path(arguments.store)
+    elif interventions.is_none:
+        return None
+    else:
+        target = base.path.with_name(f"{base.path.stem}_{file_part(interventions.name)}{STORE_SUFFIX}")
+    if target.resolve() == base.path.resolve():
+        raise BadArgument(f"Cannot write the rerun of {base.path} into the store itself; give another --store.")
+    return target
+
+
+def _prepare(arguments: argparse.Namespace, base: Store, threads: Threads, termination: Termination) -> Rerun:
+    """Load the policy, and check that it is the store's."""
+    say(threads.describe())
+    device = load_torch(arguments.device, threads.number)
+    family: PolicyFamily = arguments.family
+    policy = family.build(arguments, device)
+    identity = policy.identity()
+    check_same_policy(base, identity, policy.sites)
+    check_has_inputs(base, policy)
+    recording, note = plan_recording(recording_settings(arguments), policy)
+    if note:
+        say(note)
+    say(f"Policy: {identity.name} ({identity.checkpoint_format}: {identity.checkpoint}), weights as in {base.path}.")
+    return Rerun(policy, base, recording, describe_machine(device), termination)
+
+
+def _check(rerun: Rerun, limit: int | None) -> None:
+    """Make the calls of the first episode again without any change, and print how far they are from the stored ones."""
+    if limit is not None and limit < 0:
+        raise BadArgument(f"Cannot use --check {limit}; expected 0 or more policy calls.")
+    if limit == 0:
+        say("No policy call was checked, as --check 0 says.")
+        return
+    calls = read_calls(rerun.base.episodes[0])
+    count = calls.num_replans if limit is None else min(limit, calls.num_replans)
+    progress = RerunProgress(1, count)
+    progress.begin(calls.episode.name)
+
+    def report(done: int) -> None:
+        rerun.termination.check()
+        progress.update(done, count)
+
+    try:
+        result = check_fidelity(rerun.unchanged, rerun.base.attributes.recording, calls, count, rerun.machine, report)
+    finally:
+        progress.close()
+    say(result.describe())

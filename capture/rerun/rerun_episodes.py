@@ -1,0 +1,93 @@
+"""Reruns of whole episodes into a store, which is like any other: rows, actions, roles and pictures of every replan."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from vla_attention.capture.jobs.termination import Termination
+from vla_attention.capture.rerun.calls import Repeater
+from vla_attention.capture.rerun.progress import RerunProgress
+from vla_attention.capture.rerun.stored_calls import StoredCalls, read_calls
+from vla_attention.capture.store.episode_writer import EpisodeStart, ReplanRecord
+from vla_attention.capture.store.store_writer import RunStore
+from vla_attention.schemas.stores.reader import StoredEpisode
+from vla_attention.schemas.stores.store_format import parse_episode_name
+
+
+def rerun_episodes(
+    repeater: Repeater,
+    store: RunStore,
+    episodes: Sequence[StoredEpisode],
+    machine: Mapping[str, str],
+    progress: RerunProgress,
+    termination: Termination,
+) -> int:
+    """Rerun the episodes that the store lacks; returns their number.
+
+    Raises:
+        Terminated: SIGTERM was received; the episode in progress was dropped.
+        CorruptEpisode: an episode is damaged. Those before it stay.
+    """
+    done, added = store.committed(), 0
+    for episode in episodes:
+        if parse_episode_name(episode.name) in done:
+            continue
+        termination.check()
+        with termination.only_at_checks():
+            rerun_episode(repeater, store, read_calls(episode), machine, progress, termination)
+        added += 1
+    return added
+
+
+def rerun_episode(
+    repeater: Repeater,
+    store: RunStore,
+    calls: StoredCalls,
+    machine: Mapping[str, str],
+    progress: RerunProgress,
+    termination: Termination,
+) -> Path:
+    """Rerun one episode and commit it; returns its folder.
+
+    Outcome, number of steps, environment steps and object coverage are those of the stored episode: nothing is
+    executed.
+    """
+    attributes, recording = calls.attributes, store.attributes.recording
+    start = EpisodeStart(
+        task_id=attributes.task_id,
+        task_name=attributes.task_name,
+        instruction=attributes.instruction,
+        episode_index=attributes.episode_index,
+        initial_state_index=attributes.initial_state_index,
+        initial_state_digest=attributes.initial_state_digest,
+        objects=attributes.objects,
+        provenance=dict(machine),
+    )
+    denoise_times = repeater.policy.denoise_times()[list(recording.denoise_steps)]
+    progress.begin(calls.episode.name)
+    with store.episode(start, np.asarray(denoise_times), calls.num_replans) as writer:
+        for replan in range(calls.num_replans):
+            termination.check()
+            policy_input = repeater.prepare(calls, replan)
+            call = repeater.call(calls, replan, policy_input)
+            writer.append(
+                ReplanRecord(
+                    env_step=int(calls.env_step[replan]),
+                    noise_seed=repeater.noise_seed(calls, replan),
+                    rows=call.rows,
+                    key_role=policy_input.key_role,
+                    prompt=policy_input.prompt,
+                    state=policy_input.state,
+                    actions=call.actions,
+                    frames=policy_input.frames if recording.frames else {},
+                    camera_frames=policy_input.camera_frames if recording.frames else {},
+                    coverage=calls.coverage_of(replan),
+                )
+            )
+            progress.update(replan + 1, calls.num_replans)
+        folder = writer.commit(attributes.success, attributes.num_steps)
+    progress.end(calls.num_replans)
+    return folder

@@ -1,0 +1,121 @@
+"""The policy calls of a stored episode: what each was given, its noise, and what it gave."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.capture.interventions.changed_inputs import CallContext
+from vla_attention.capture.policies.policy import GivenInputs, Policy
+from vla_attention.schemas.errors import listing
+from vla_attention.schemas.stores.reader import Store, StoredEpisode
+from vla_attention.schemas.stores.store_format import EpisodeAttributes, StoreError
+
+
+class StoreWithoutInputs(StoreError):
+    """A store that lacks what the policy calls were given."""
+
+
+@dataclass(frozen=True)
+class StoredCalls:
+    """The policy calls of one episode.
+
+    frames, camera_frames: camera -> (replan, height, width, 3) uint8. coverage: camera -> (replan, patch, object).
+    state: (replan, state dim). noise_seed, env_step, prompt_index: (replan,). actions: (replan, horizon, action dim).
+    """
+
+    episode: StoredEpisode
+    frames: Mapping[str, NDArray[np.uint8]]
+    camera_frames: Mapping[str, NDArray[np.uint8]]
+    coverage: Mapping[str, NDArray[np.float32]]
+    state: NDArray[np.float64]
+    noise_seed: NDArray[np.int64]
+    env_step: NDArray[np.int32]
+    prompt_index: NDArray[np.int32]
+    actions: NDArray[np.float64]
+
+    @property
+    def attributes(self) -> EpisodeAttributes:
+        """The episode's attributes."""
+        return self.episode.attributes
+
+    @property
+    def num_replans(self) -> int:
+        """Number of policy calls."""
+        return self.attributes.num_replans
+
+    def given(self, replan: int) -> GivenInputs:
+        """Return what a policy call was given."""
+        prompt = self.attributes.prompts[self.prompt_index[replan]]
+        return GivenInputs(
+            frames={camera: frames[replan] for camera, frames in self.frames.items()},
+            camera_frames={camera: frames[replan] for camera, frames in self.camera_frames.items()},
+            state=self.state[replan],
+            instruction=prompt.instruction_text,
+        )
+
+    def context(self, replan: int, instructions: Mapping[int, str]) -> CallContext:
+        """Return the place of a policy call and its scene. instructions: of the store's tasks."""
+        return CallContext(
+            task_id=self.attributes.task_id,
+            episode_index=self.attributes.episode_index,
+            replan=replan,
+            instructions=instructions,
+            objects=self.attributes.objects,
+            coverage=self.coverage_of(replan),
+        )
+
+    def coverage_of(self, replan: int) -> dict[str, NDArray[np.float32]]:
+        """Return how much of each patch each object covers, camera -> (patch, object)."""
+        return {camera: coverage[replan] for camera, coverage in self.coverage.items()}
+
+
+def read_calls(episode: StoredEpisode) -> StoredCalls:
+    """Read the policy calls of an episode; `CorruptEpisode` when its bytes are not those that were sealed."""
+
+    def by_camera(group: str) -> dict[str, NDArray[Any]]:
+        names = [name for name in episode.attributes.arrays if name.startswith(f"{group}/")]
+        return {name.removeprefix(f"{group}/"): episode.read(name) for name in names}
+
+    return StoredCalls(
+        episode=episode,
+        frames=by_camera("frames"),
+        camera_frames=by_camera("camera_frames"),
+        coverage=by_camera("objects"),
+        state=episode.read("state"),
+        noise_seed=episode.read("noise_seed"),
+        env_step=episode.read("env_step"),
+        prompt_index=episode.read("prompt_index"),
+        actions=episode.read("actions"),
+    )
+
+
+def check_has_inputs(store: Store, policy: Policy) -> None:
+    """Raise `StoreWithoutInputs` unless every episode has the pictures that the policy's input is made of."""
+    # A picture that an intervention changed is the model's picture, to the bit.
+    changed = {change.camera for change in store.attributes.interventions.images}
+    for episode in store.episodes:
+        arrays = episode.attributes.arrays
+        missing = [camera.name for camera in policy.cameras if f"frames/{camera.name}" not in arrays]
+        if missing:
+            raise StoreWithoutInputs(
+                f"Cannot rerun {store.path}: episode {episode.name} has no pictures of {listing(missing)}, which the "
+                "policy needs; capture without --no-frames, or use the store that was copied with all parts."
+            )
+        if not policy.needs_camera_frames:
+            continue
+        inexact = [
+            camera.name
+            for camera in policy.cameras
+            if camera.name not in changed and f"camera_frames/{camera.name}" not in arrays
+        ]
+        if inexact:
+            raise StoreWithoutInputs(
+                f"Cannot rerun {store.path}: this policy resizes pictures in floating point, and episode "
+                f"{episode.name} has only the rounded ones of {listing(inexact)}; stores that were captured with this "
+                "version also hold the cameras' own pictures."
+            )

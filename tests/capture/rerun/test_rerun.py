@@ -1,0 +1,169 @@
+"""Stored policy calls, made again without a simulator: bit-equal, into a store like any other, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.capture.rerun.conftest import capture
+from vla_attention.capture.__main__ import main
+from vla_attention.capture.policies.pi.embedded import dummy_policy
+from vla_attention.capture.rerun.calls import Repeater
+from vla_attention.capture.rerun.fidelity import InputsDiffer, check_fidelity
+from vla_attention.capture.rerun.stored_calls import read_calls
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.verify import verify_store
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    """The sentence with which a command ends; exit code 2."""
+    try:
+        code = main([str(word) for word in words])
+    except SystemExit as end:
+        code = end.code
+    said = capsys.readouterr().err
+    assert code == 2, said
+    assert said.count("\n") == 1, said
+    return said
+
+
+@pytest.mark.parametrize("family", ["pi", "cosmos"])
+def test_a_store_is_made_again_to_the_bit(family, request, tmp_path, capsys):
+    """All arrays have the same values; the new store names its base, and a second run finds it complete."""
+    base_path, again_path = request.getfixturevalue(f"{family}_store"), tmp_path / "again.zarr"
+    assert main(["rerun", str(base_path), "--store", str(again_path)]) == 0
+    assert (
+        "made again without any change: bit-equal, actions and rows (stored with 10 bits)." in capsys.readouterr().out
+    )
+    base, again = open_store(base_path), open_store(again_path)
+    assert verify_store(again) == []
+    assert again.attributes.rerun_of.run == base.run
+    assert again.attributes.rerun_of.name == base_path.name
+    assert again.attributes.interventions.is_none
+    assert again.attributes.policy == base.attributes.policy
+    assert again.attributes.recording == base.attributes.recording
+    assert [episode.name for episode in again.episodes] == [episode.name for episode in base.episodes]
+    for old, new in zip(base.episodes, again.episodes, strict=True):
+        assert new.attributes.arrays == old.attributes.arrays  # shapes and digests of all values
+        assert replace(new.attributes, provenance={}) == replace(old.attributes, provenance={})
+    assert main(["rerun", str(base_path), "--store", str(again_path), "--resume", "--check", "0"]) == 0
+    assert "4 of 4 episodes are complete already; 0 to run." in capsys.readouterr().out
+
+
+def test_more_of_the_same_calls_can_be_recorded(pi_store, tmp_path):
+    """Rows of all queries and denoise steps; their means are those of the store. A half-finished rerun goes on."""
+    target = tmp_path / "more.zarr"
+    arguments = ["rerun", str(pi_store), "--store", str(target), "--check", "1", "--layers", "2", "--queries", "all"]
+    arguments += ["--denoise-steps", "all", "--no-contributions", "--precision", "exact", "--task-id", "1"]
+    assert main([*arguments, "--num-episodes", "1"]) == 0
+    assert main([*arguments, "--resume"]) == 0
+    base, more = open_store(pi_store), open_store(target)
+    assert [episode.name for episode in more.episodes] == ["task001_episode000", "task001_episode001"]
+    stored = base.episodes[2].read("joint/rows")[:, 2, 0]
+    again = more.episodes[0].read("joint/rows")
+    assert again.shape[1:3] == (1, 3)
+    np.testing.assert_allclose(again[:, 0, 0].mean(axis=2, keepdims=True), stored, rtol=2**-10, atol=1e-9)
+    np.testing.assert_array_equal(more.episodes[0].read("actions"), base.episodes[2].read("actions"))
+
+
+def test_without_a_store_to_write_only_the_check_is_made(pi_store, capsys):
+    before = sorted(path.name for path in pi_store.parent.iterdir())
+    assert main(["rerun", str(pi_store), "--check", "2"]) == 0
+    said = capsys.readouterr().out
+    assert "Check: 2 policy calls of task000_episode000, made again without any change: bit-equal" in said
+    assert sorted(path.name for path in pi_store.parent.iterdir()) == before
+
+
+def test_another_result_is_measured_and_the_machines_are_compared(pi_store):
+    base = open_store(pi_store)
+    calls, policy = read_calls(base.episodes[0]), dummy_policy()
+    recording = base.attributes.recording
+    machine = {**base.episodes[0].attributes.provenance, "torch": "0.1", "device": "an abacus"}
+    repeater = Repeater(policy, recording)
+    same = check_fidelity(repeater, recording, calls, 2, machine)
+    assert same.bit_equal
+    moved = replace(calls, actions=calls.actions + np.array([0, 0.5, 0, 0, 0, 0, 0]))
+    result = check_fidelity(repeater, recording, moved, 2, machine)
+    assert not result.bit_equal
+    assert result.actions == pytest.approx(0.5)
+    assert result.actions_relative == pytest.approx(0.5 / calls.actions[..., 1].std())
+    assert result.rows == 0
+    said = result.describe()
+    assert "NOT bit-equal. Actions differ by at most 0.5 of the environment's units" in said
+    assert "then, 0.1 now" in said
+    assert "device cpu then, an abacus now" in said
+
+
+def test_rows_of_other_noise_are_measured(pi_store):
+    base = open_store(pi_store)
+    calls, policy = read_calls(base.episodes[0]), dummy_policy()
+    other = replace(calls, noise_seed=calls.noise_seed + 1)
+    result = check_fidelity(Repeater(policy, base.attributes.recording), base.attributes.recording, other, 9, {})
+    assert result.replans == 3
+    assert 0 < result.rows < 1
+    assert 0 < result.rows_changed <= 1
+    assert "differ: nothing that the store knows of." in result.describe()
+
+
+def test_another_state_than_the_prompts_is_an_error(pi_store):
+    """The tiny policy writes its state into the prompt."""
+    base = open_store(pi_store)
+    calls = read_calls(base.episodes[0])
+    moved = replace(calls, state=calls.state + 0.5)
+    with pytest.raises(InputsDiffer, match=r"Replan 0 of task000_episode000 gets the prompt 'Task: lift the red cube"):
+        check_fidelity(Repeater(dummy_policy(), base.attributes.recording), base.attributes.recording, moved, 1, {})
+
+
+def test_wrong_stores_and_settings_are_one_sentence(pi_store, tmp_path, capsys):
+    assert "There is no store at" in refused(capsys, "rerun", tmp_path / "nothing.zarr", "--checkpoint", "dummy")
+    assert "into the store itself" in refused(capsys, "rerun", pi_store, "--store", pi_store, "--overwrite")
+    assert "no episode of task 7; it has tasks 0, 1" in refused(capsys, "rerun", pi_store, "--task-id", "7")
+    assert "--num-episodes 0" in refused(capsys, "rerun", pi_store, "--num-episodes", "0")
+    assert "--check -1" in refused(capsys, "rerun", pi_store, "--check", "-1")
+    assert "its weights have the digest" in refused(capsys, "rerun", pi_store, "--checkpoint", "embedded")
+    assert "expected block indices" in refused(capsys, "rerun", pi_store, "--layers", "9")
+    assert "unrecognized arguments: --t5-tokenizer" in refused(capsys, "rerun", pi_store, "--t5-tokenizer", "x")
+
+
+def test_other_settings_of_the_same_weights_are_named(cosmos_store, capsys):
+    said = refused(capsys, "rerun", cosmos_store, "--num-denoising-steps-action", "2")
+    assert "its policy has the num_denoise_steps 3, and this one has 1" in said
+
+
+def test_stores_without_pictures_are_refused(tmp_path, pi_store, capsys):
+    bare = capture(tmp_path / "bare.zarr", "pi", "--no-frames")
+    assert "it has no pictures (it was captured with --no-frames" in refused(capsys, "rerun", bare)
+
+
+def test_a_damaged_episode_is_refused(pi_store, tmp_path, capsys):
+    damaged = tmp_path / "damaged.zarr"
+    shutil.copytree(pi_store, damaged)
+    (damaged / "episodes/task001_episode000/state/zarr.json").unlink()
+    said = refused(capsys, "rerun", damaged)
+    assert "Cannot rerun" in said
+    assert "task001_episode000" in said
+    assert "vla-capture repair" in said
+    # Bytes that were changed are found when they are read.
+    frame = next((damaged / "episodes/task000_episode000/frames").rglob("c/*"))
+    while frame.is_dir():
+        frame = next(frame.iterdir())
+    content = bytearray(frame.read_bytes())
+    content[len(content) // 2] ^= 1
+    frame.write_bytes(bytes(content))
+    said = refused(capsys, "rerun", damaged, "--task-id", "0")
+    assert "frames" in said
+    assert "task000_episode000" in said
+
+
+def test_an_existing_store_is_not_overwritten_by_chance(pi_store, tmp_path, capsys):
+    target = tmp_path / "again.zarr"
+    arguments = ("rerun", pi_store, "--store", target, "--check", "0", "--num-episodes", "1")
+    assert main([str(word) for word in arguments]) == 0
+    assert "add --resume to continue it" in refused(capsys, *arguments)
+    assert "recording.layers" in refused(capsys, *arguments, "--resume", "--layers", "1")
+    assert main([str(word) for word in (*arguments, "--overwrite", "--layers", "1")]) == 0
+    assert json.loads((target / "zarr.json").read_text())["attributes"]["recording"]["layers"] == [1]
