@@ -1,0 +1,139 @@
+"""The options of interventions: what they mean, and one sentence for each mistake."""
+
+from __future__ import annotations
+
+import argparse
+
+import pytest
+
+from vla_attention.capture.interventions.arguments import add_intervention_arguments, read_interventions
+from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.interventions import (
+    AttentionScale,
+    AttentionUniform,
+    ImageChange,
+    Interventions,
+    KeyKnockout,
+    NoiseChange,
+    PromptChange,
+)
+
+
+def read(*words: str) -> Interventions:
+    parser = argparse.ArgumentParser()
+    add_intervention_arguments(parser)
+    return read_interventions(parser.parse_args(words))
+
+
+def test_nothing():
+    assert read() == Interventions()
+    assert read().is_none
+
+
+def test_knockouts():
+    given = read(
+        *("--knockout", "camera:base", "--knockout", "word:bowl | word:plate", "--keep", "role:image"),
+        *("--knockout-queries", "all", "--knockout-layers", "3", "1", "3", "--knockout-heads", "0"),
+        *("--knockout-weight", "0.5", "--random-keys", "4"),
+    )
+    places = {"queries": "all", "layers": (1, 3), "heads": (0,), "weight": 0.5, "random_seed": 4}
+    assert given.keys == (
+        KeyKnockout("camera:base", **places),
+        KeyKnockout("word:bowl | word:plate", **places),
+        KeyKnockout("role:image", keep=True, **places),
+    )
+
+
+def test_queries_of_the_prefix():
+    given = read("--knockout", "role:image", "--knockout-queries", "prefix:span:prompt - word:bowl")
+    assert given.keys == (KeyKnockout("role:image", queries="prefix", query_selector="span:prompt - word:bowl"),)
+
+
+def test_attention():
+    given = read(
+        "--attention", "word:bowl=0.5", "--attention", "keys:1-4 = uniform", "--knockout-steps", "9", "--allow-empty"
+    )
+    assert given.attention == (
+        AttentionScale("word:bowl", 0.5, denoise_steps=(9,)),
+        AttentionUniform("keys:1-4", denoise_steps=(9,)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("empty", PromptChange("empty")),
+        ("shuffled", PromptChange("shuffled")),
+        ("shuffled:3", PromptChange("shuffled", seed=3)),
+        ("task:7", PromptChange("task", task_id=7)),
+        ("text:close the drawer: now", PromptChange("text", text="close the drawer: now")),
+    ],
+)
+def test_prompts(text, expected):
+    assert read("--prompt", text).prompt == expected
+
+
+def test_synonyms(tmp_path):
+    file = tmp_path / "words.json"
+    file.write_text('{"bowl": "dish"}')
+    assert read("--prompt", f"synonyms:{file}").prompt == PromptChange("synonyms", synonyms={"bowl": "dish"})
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("base=blank", ImageChange("base", "blank")),
+        ("base=noise", ImageChange("base", "noise")),
+        ("base=noise:5", ImageChange("base", "noise", seed=5)),
+        ("base=rotated", ImageChange("base", "rotated")),
+        ("base=shifted:2,-1", ImageChange("base", "shifted", rows=2, columns=-1)),
+        ("base=masked:bowl_1", ImageChange("base", "masked", object="bowl_1")),
+        ("base=filled:bowl_1", ImageChange("base", "filled", object="bowl_1")),
+    ],
+)
+def test_images(text, expected):
+    assert read("--image", text, "--image", "wrist=blank").images == (expected, ImageChange("wrist", "blank"))
+
+
+def test_noise():
+    assert read("--noise-seed", "8").noise == NoiseChange(8)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--knockout", " "], "has no selector"),
+        (["--knockout", "a:b", "--knockout-queries", "some"], "'some'; expected one of action, all, prefix"),
+        (["--knockout", "a:b", "--knockout-queries", "all:role:text"], "'all:role:text'; expected one of"),
+        (["--knockout", "a:b", "--knockout-weight", "2"], "the weight 2.0; expected 0 to 1"),
+        (["--knockout", "a:b", "--knockout-layers", "-1"], "the layers -1"),
+        (["--random-keys", "3"], "--random-keys has nothing to act on; give --knockout or --keep too"),
+        (["--attention", "a:b=0", "--random-keys", "3"], "--random-keys has nothing to act on"),
+        (["--knockout-weight", "0.5"], "--knockout-weight has nothing to act on"),
+        (["--knockout-queries", "all"], "--knockout-queries has nothing to act on; give --knockout or --attention"),
+        (["--knockout-heads", "1"], "--knockout-heads has nothing to act on"),
+        (["--allow-empty"], "--allow-empty has nothing to act on"),
+        (["--attention", "word:bowl"], "'word:bowl'; expected SELECTOR=FACTOR"),
+        (["--attention", "=2"], "'=2'; expected SELECTOR=FACTOR"),
+        (["--attention", "word:bowl=much"], "'word:bowl=much'; expected SELECTOR=FACTOR"),
+        (["--attention", "word:bowl=-1"], "the factor -1.0; expected 0 or more"),
+        (["--attention", "a:b=1", "--knockout-queries", "prefix:role:text"], "prefix:SELECTOR with --attention"),
+        (["--prompt", "emty"], r"'emty'. Did you mean 'empty'\? Expected one of empty, shuffled"),
+        (["--prompt", "task:x"], "'task:x'"),
+        (["--prompt", "synonyms:nowhere.json"], "nowhere.json"),
+        (["--image", "base"], "'base'; expected CAMERA= and one of blank, noise"),
+        (["--image", "=blank"], "'=blank'; expected CAMERA="),
+        (["--image", "base=shifted:2"], "'base=shifted:2'; expected"),
+        (["--image", "base=masked:"], "'base=masked:'; expected"),
+        (["--image", "base=blank:3"], "'base=blank:3'; expected"),
+        (["--noise-seed", "-2"], "the noise is -2"),
+    ],
+)
+def test_mistakes(words, message):
+    with pytest.raises(UserError, match=message):
+        read(*words)
+
+
+def test_mistakes_are_bad_arguments():
+    with pytest.raises(BadArgument):
+        read("--prompt", "nothing")
