@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vla_attention.capture.interventions.attention_edits import SiteEditor
+from vla_attention.capture.interventions.changed_inputs import CallContext
+from vla_attention.capture.interventions.prompts import changed_instruction
 from vla_attention.capture.interventions.resolution import (
     ReplanPlace,
     check_not_empty,
@@ -35,36 +36,36 @@ class AttentionChanges:
 
     Attributes:
         interventions: what is changed; layer numbers are block indices (`interventions_for`).
-        instructions: all instructions of the run; their words may be named.
+        instructions: the instructions of the suite's or store's tasks, by task id; their words may be named.
         allow_empty: leave a replan unchanged where a group has no key, and count it, instead of raising `EmptyGroup`.
         num_replans, num_empty: replans so far, and those in which some group had no key.
     """
 
     interventions: Interventions
-    instructions: Sequence[str]
+    instructions: Mapping[int, str]
     allow_empty: bool = False
     num_replans: int = field(default=0, init=False)
     num_empty: int = field(default=0, init=False)
 
     def check_names(self, sites: Sequence[SiteLayout]) -> None:
         """Raise `SelectorError` for what is known to be wrong before the run: everything but names of objects."""
-        check_selectors(self.interventions, self._vocabularies(sites, self._named_objects()))
+        prompt, instructions = self.interventions.prompt, self.instructions
+        changed = [
+            changed_instruction(text, prompt, task_id=task_id, episode_index=0, instructions=instructions)
+            for task_id, text in instructions.items()
+            if prompt is not None
+        ]
+        check_selectors(self.interventions, self._vocabularies(sites, self._named_objects(), *changed))
 
     def editors(
-        self,
-        sites: Sequence[SiteLayout],
-        policy_input: PolicyInput,
-        objects: Sequence[SceneObject],
-        coverage: Mapping[str, NDArray[np.float32]],
-        place: ReplanPlace,
+        self, sites: Sequence[SiteLayout], policy_input: PolicyInput, context: CallContext
     ) -> dict[str, SiteEditor] | None:
         """Return the editors of one policy call by site, or None where nothing changes.
 
         Args:
             sites: the policy's sites.
             policy_input: what the call is given, after changes of prompt and pictures.
-            objects, coverage: the scene's objects, and how much of each patch each covers, camera -> (patch, object).
-            place: the call.
+            context: the call's place in the run, and its scene's objects with their coverage.
 
         Raises:
             SelectorError: a name does not exist here.
@@ -73,7 +74,8 @@ class AttentionChanges:
         if not self.interventions.changes_attention:
             return None
         self.num_replans += 1
-        tokens = site_tokens(sites, policy_input.key_role, policy_input.prompt, objects, coverage)
+        objects, place = context.objects, ReplanPlace(context.task_id, context.episode_index, context.replan)
+        tokens = site_tokens(sites, policy_input.key_role, policy_input.prompt, objects, context.coverage)
         # Where empty groups are allowed, an object may also be one of another task's scene.
         known = [*objects, *self._named_objects()] if self.allow_empty else objects
         vocabularies = self._vocabularies(sites, known, policy_input.prompt.instruction_text)
@@ -95,7 +97,7 @@ class AttentionChanges:
     def _vocabularies(
         self, sites: Sequence[SiteLayout], objects: Sequence[SceneObject], *further: str
     ) -> dict[str, Vocabulary]:
-        return run_vocabularies(sites, [*self.instructions, *further], objects)
+        return run_vocabularies(sites, [*self.instructions.values(), *further], objects)
 
     def _named_objects(self) -> list[SceneObject]:
         atoms = [atom for text in selectors_of(self.interventions) for atom in atoms_of(parse_selector(text))]

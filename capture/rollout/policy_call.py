@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from vla_attention.capture.policies.policy import Policy, PolicyInput
+from vla_attention.capture.recording.attention import AttentionEditor
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite, all_finite, describe_origin
 from vla_attention.capture.recording.recorder import make_recorders
 from vla_attention.capture.store.recorded_rows import RecordedRows
@@ -26,23 +27,32 @@ class RecordedCall:
 
 
 def record_call(
-    policy: Policy, policy_input: PolicyInput, noise_seed: int, recording: Recording, where: str
+    policy: Policy,
+    policy_input: PolicyInput,
+    noise_seed: int,
+    recording: Recording,
+    where: str,
+    editors: Mapping[str, AttentionEditor] | None = None,
 ) -> RecordedCall:
     """Call the policy once, and record what `recording` says.
+
+    editors: the editor of each site whose attention changes; the rows are the changed ones.
 
     Raises:
         NumbersNotFinite: actions or rows are NaN or infinite; `where` names the replan in the sentence.
     """
     pools = policy.query_pools() if recording.queries == "steps" else None
     recorders = make_recorders(recording, policy.sites, policy_input.key_role, pools)
-    actions = policy.act(policy_input, noise_seed, recorders)
+    actions = policy.act(policy_input, noise_seed, recorders, editors)
     rows = {site: recorder.finish() for site, recorder in recorders.items()}
     if not all_finite(actions, rows):
-        raise _not_finite(policy, policy_input, noise_seed, where)
+        raise _not_finite(policy, policy_input, noise_seed, where, editors)
     return RecordedCall(actions, rows)
 
 
-def _not_finite(policy: Policy, policy_input: PolicyInput, seed: int, where: str) -> NumbersNotFinite:
+def _not_finite(
+    policy: Policy, policy_input: PolicyInput, seed: int, where: str, editors: Mapping[str, AttentionEditor] | None
+) -> NumbersNotFinite:
     """Return the error of a policy call whose results are not finite; it repeats the call to find where that began."""
     wrong_inputs = [name for name, values in policy_input.tensors.items() if not torch.isfinite(values).all()]
     if wrong_inputs:
@@ -50,7 +60,7 @@ def _not_finite(policy: Policy, policy_input: PolicyInput, seed: int, where: str
     else:
         origin = describe_origin(
             policy.model,
-            lambda watch: policy.act(policy_input, seed, watch),
+            lambda watch: policy.act(policy_input, seed, watch, editors),
             tuple(site.name for site in policy.sites),
         )
     dtype = policy.identity().config.get("dtype")

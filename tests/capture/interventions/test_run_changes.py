@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from tests.kit.policy_inputs import make_observation
-from vla_attention.capture.interventions.resolution import ReplanPlace
+from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.interventions.run_changes import AttentionChanges, check_stored_replans
 from vla_attention.capture.policies.pi.embedded import dummy_policy
 from vla_attention.schemas.groupings.resolve import EmptyGroup
 from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.groupings.vocabulary import SceneObject
-from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange
+from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange, PromptChange
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing import write_store
 
@@ -21,7 +21,7 @@ BOWL = SceneObject("bowl_1", "object", True)
 
 def changes(*selectors: str, **fields) -> AttentionChanges:
     interventions = Interventions(keys=tuple(KeyKnockout(selector) for selector in selectors))
-    return AttentionChanges(interventions, ["pick up the bowl", "open the drawer"], **fields)
+    return AttentionChanges(interventions, {0: "pick up the bowl", 4: "open the drawer"}, **fields)
 
 
 @pytest.fixture(scope="module")
@@ -33,19 +33,21 @@ def editors(given: AttentionChanges, policy, covered: float = 0.0, replan: int =
     policy_input = policy.prepare(make_observation(0), "pick up the bowl")
     camera = policy.cameras[0].name
     coverage = {camera: np.array([[covered], [0], [0], [0]], dtype=np.float32)}
-    return given.editors(policy.sites, policy_input, [BOWL], coverage, ReplanPlace(0, 0, replan))
+    return given.editors(policy.sites, policy_input, CallContext(0, 0, replan, objects=[BOWL], coverage=coverage))
 
 
 def test_names_before_the_run(policy):
     changes("object:anything", "word:drawer", "role:image").check_names(policy.sites)
     with pytest.raises(SelectorError, match="no instruction has the word 'mug'"):
         changes("word:mug").check_names(policy.sites)
+    mug = Interventions(keys=(KeyKnockout("word:mug"),), prompt=PromptChange("text", text="take the mug"))
+    AttentionChanges(mug, {0: "pick up the bowl"}).check_names(policy.sites)
     with pytest.raises(SelectorError, match="no object 'plate_1'"):
         editors(changes("object:plate_1"), policy)
 
 
 def test_without_attention_there_are_no_editors(policy):
-    given = AttentionChanges(Interventions(noise=NoiseChange(3)), ["pick up the bowl"])
+    given = AttentionChanges(Interventions(noise=NoiseChange(3)), {0: "pick up the bowl"})
     given.check_names(policy.sites)
     assert editors(given, policy) is None
 

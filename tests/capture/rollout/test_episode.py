@@ -87,7 +87,9 @@ class FakePolicy:
         frames = {"base": np.zeros((4, 2, 3), dtype=np.uint8)}
         return PolicyInput(frames, {"joint": ROLES}, prompt, np.zeros(8), {})
 
-    def act(self, policy_input: PolicyInput, noise_seed: int, recorders: dict[str, Any]) -> np.ndarray:
+    def act(
+        self, policy_input: PolicyInput, noise_seed: int, recorders: dict[str, Any], editors: Any = None
+    ) -> np.ndarray:
         for step in range(2):
             take = recorders["joint"].sink(0, step, slice(0, 1))
             if take is not None:
