@@ -7,13 +7,14 @@ that of another noise seed and with that of equally many random keys.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from vla_attention.analyze.effects.action_changes import ActionSpread, action_spread
 from vla_attention.analyze.effects.conditions import FLOORS, Condition, Kind
@@ -66,7 +67,8 @@ class EffectStudy:
             group, selector, phase ("all" or a third of the episode), num_replans; `CHANGES`; the base's mass, lift,
             norm and keys of the group in the same replans; noise (the effect of another noise seed in this episode and
             phase) and random (of random keys, as many), with minus_noise and minus_random, the effect minus each. Null
-            where there is no such rerun.
+            where there is no such rerun. Replans in which the group has no keys in the base, such as a word that is in
+            other instructions, are left out, and episodes of which nothing is left.
         rollout_episodes: one row per (condition, pair of rollouts), see `rollouts.rollout_pairs`.
         notes: what was left out, and what is not there.
     """
@@ -149,7 +151,7 @@ def study_of(analysis: Analysis, opened: BaseAndReruns, dimensions: Sequence[int
         rollout_episodes=pl.concat([table for table, _ in rollouts])
         if rollouts
         else pl.DataFrame(schema=ROLLOUT_COLUMNS),
-        notes=(*opened.notes, *(pairing.note for pairing in pairings if pairing.note), *unpaired),
+        notes=(*opened.notes, *_notes(pairings, attention), *unpaired),
     )
 
 
@@ -193,6 +195,10 @@ def _episodes_of(pairing: Pairing, spread: ActionSpread, attention: dict[Any, Gr
     def measure(pair: tuple[BaseEpisode, Any]) -> list[dict[str, object]]:
         base, rerun = pair
         changes = changes_of(base, rerun, spread, condition.store.path)
+        there = _has_keys(known.get(base.name), len(changes))
+        if not there.any():
+            return []
+        changes[~there] = np.nan
         values = {name: changes[:, i] for i, name in enumerate(CHANGES)}
         if base.name in known:
             values |= {name: known[base.name][:, i] for i, name in enumerate(MEASURES)}
@@ -203,12 +209,32 @@ def _episodes_of(pairing: Pairing, spread: ActionSpread, attention: dict[Any, Gr
             "instruction": visible(attributes.instruction),
             "episode_index": attributes.episode_index,
             **fixed,
-            "num_replans": len(changes),
+            "num_replans": int(there.sum()),
         }
         return [{**named, **row} for row in mean_over_phases(base, values)]
 
     rows = [row for part in map_episodes(measure, pairing.pairs) for row in part]
     return pl.DataFrame(rows, schema=_EPISODE_SCHEMA)
+
+
+def _has_keys(attention: NDArray[np.float64] | None, replans: int) -> NDArray[np.bool_]:
+    """Replans (replan,) in which a group has keys in the base: a word is in some instructions only.
+
+    Where it has none nothing was changed, and the effect is not 0 but missing.
+    """
+    return np.ones(replans, dtype=bool) if attention is None else attention[:, MEASURES.index("keys")] > 0
+
+
+def _notes(pairings: Sequence[Pairing], attention: dict[Any, GroupAttention]) -> list[str]:
+    """Which episodes have no partner. A rerun may lack those in which its group has no keys."""
+    notes = []
+    for pairing in pairings:
+        group = pairing.condition.group
+        known = attention[group].values if group is not None else {}
+        empty = [name for name in pairing.missing if name in known and not _has_keys(known[name], 1).any()]
+        kept = replace(pairing, missing=tuple(name for name in pairing.missing if name not in empty))
+        notes += [kept.note] if kept.note else []
+    return notes
 
 
 def with_floors(episodes: pl.DataFrame, conditions: Sequence[Condition]) -> pl.DataFrame:

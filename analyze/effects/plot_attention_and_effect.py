@@ -5,13 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import polars as pl
 
 from vla_attention.analyze.effects.conditions import Kind
 from vla_attention.analyze.effects.effect_study import EffectStudy
 from vla_attention.analyze.effects.group_rows import GroupRow, group_rows
+from vla_attention.analyze.effects.plot_effects import bounded_axis
 from vla_attention.analyze.show.numbers import interval_name, of_tasks
-from vla_attention.analyze.show.plot_axes import ratio_axis, uniform_line
+from vla_attention.analyze.show.plot_axes import uniform_line
 from vla_attention.analyze.show.plot_colours import DATA_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, shortened, title
@@ -23,8 +25,8 @@ if TYPE_CHECKING:
 STEM = "attention_and_effect"
 _NOISE_COLOR = "#C9B8D8"
 _LABELS = {"mass": "mass of its attention (log)", "lift": "lift of its attention (log; 1: uniform)"}
-#: More names would cover each other.
-_MOST_NAMES = 24
+#: Sizes of the names, in widths and heights of the axes: of a character, of the gap to a point, of a line.
+_CHARACTER, _GAP, _LINE = 0.0155, 0.014, 0.042
 
 
 @drawn_in_our_style
@@ -37,7 +39,7 @@ def plot_attention_and_effect(study: EffectStudy, folder: Path) -> list[Path]:
     note = (
         f"Each point: a group of keys that was knocked out; n = {n}. Bars: {interval_name(DEFAULT_LEVEL)}s, about "
         f"{study.question.settings.intervals.words}. Attention is the base's, in the same replans. "
-        "Larger groups have more mass by their size alone."
+        "Larger groups have more mass by their size alone. Names stand where there is room."
     )
     title(figure, "Attention to a group, and what the action does without it", note)
     table = _table(rows)
@@ -49,6 +51,8 @@ def plot_attention_and_effect(study: EffectStudy, folder: Path) -> list[Path]:
         _panel(axes, rows, measure, [study.of(one) for one in study.of_kind(Kind.NOISE)])
     panels[0].set_ylabel("effect without it (standard deviations)")
     panels[0].set_ylim(bottom=0)
+    for axes, measure in zip(panels, ("mass", "lift"), strict=True):
+        _name_points(axes, [row for row in rows if row.attention[measure]], measure)
     return save_figure(figure, folder, STEM, table)
 
 
@@ -57,8 +61,7 @@ def _panel(axes: Axes, rows: list[GroupRow], measure: str, noise: list[dict[str,
     if not shown:
         explain(axes, f"no group has a {measure}")
         return
-    ends = [row[f"{measure}{end}"] for row in shown for end in ("", "_low", "_high") if row[f"{measure}{end}"]]
-    ratio_axis(axes.xaxis, [*ends, 1.0] if measure == "lift" else ends)
+    bounded_axis(axes.xaxis, shown, measure, *([1.0] if measure == "lift" else []))
     for row in noise:
         if row["effect_low"] is not None and row["effect_high"] is not None:
             axes.axhspan(row["effect_low"], row["effect_high"], color=_NOISE_COLOR, alpha=0.55, linewidth=0, zorder=-1)
@@ -71,7 +74,6 @@ def _panel(axes: Axes, rows: list[GroupRow], measure: str, noise: list[dict[str,
                 x, y = ([low, high], along) if across else (along, [low, high])
                 axes.plot(x, y, color=DATA_COLOR, linewidth=0.9, alpha=0.6)
         axes.plot(row[measure], row["effect"], "o", color=DATA_COLOR, markersize=5)
-    _name_points(axes, [row for row in rows if row.without is not None and row.without[measure]], measure)
     if measure == "lift":
         uniform_line(axes, along="x")
     if noise and measure == "mass":
@@ -81,21 +83,22 @@ def _panel(axes: Axes, rows: list[GroupRow], measure: str, noise: list[dict[str,
 
 
 def _name_points(axes: Axes, rows: list[GroupRow], measure: str) -> None:
-    """Names to the right of points, or to the left of those in the right half."""
-    low, high = axes.get_xlim()
-    middle = (low * high) ** 0.5
-    for row in rows[:_MOST_NAMES]:
-        assert row.without is not None
-        x, y = row.without[measure], row.without["effect"]
-        right = x > middle
-        axes.annotate(
-            shortened(row.name, 20),
-            (x, y),
-            xytext=(-5 if right else 5, 4),
-            textcoords="offset points",
-            ha="right" if right else "left",
-            size=7,
-        )
+    """Names beside points where there is room, those of larger effects first."""
+    (left, right), (bottom, top) = np.log(axes.get_xlim()), axes.get_ylim()
+    taken: list[tuple[float, float, float, float]] = []
+    points = [(row.name, row.without[measure], row.without["effect"]) for row in rows if row.without is not None]
+    for name, value, effect in sorted(points, key=lambda point: -point[2]):
+        x, y = (np.log(value) - left) / (right - left), (effect - bottom) / (top - bottom)
+        text = shortened(name, 20)
+        width = _CHARACTER * len(text)
+        for align, start, up in (("left", x + _GAP, 0.0), ("right", x - _GAP - width, 0.0), ("left", x + _GAP, _LINE)):
+            box = (start, start + width, y + up - _LINE / 2, y + up + _LINE / 2)
+            free = all(box[1] < o[0] or box[0] > o[1] or box[3] < o[2] or box[2] > o[3] for o in taken)
+            if free and box[0] >= 0 and box[1] <= 1:
+                where = start if align == "left" else start + width
+                axes.text(where, y + up, text, transform=axes.transAxes, ha=align, va="center", size=7)
+                taken.append(box)
+                break
 
 
 def _table(rows: list[GroupRow]) -> pl.DataFrame:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,6 +37,10 @@ _OFFSETS = {"without": -0.16, "only": 0.16, "random": 0.0, "other": 0.0}
 _NOISE_COLOR = "#C9B8D8"
 #: Rows in the picture; the tables have all.
 _MOST = 40
+#: An interval of an attention that reaches further than this factor beyond all values is cut.
+_MOST_REACH = 3.0
+#: The same of effects.
+_MOST_EFFECT = 1.5
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,7 @@ def _title(figure: Figure, study: EffectStudy, num_rows: int) -> None:
     overall = study.analysis.overall
     note = (
         f"n = {of_tasks(overall['num_episodes'], overall['num_tasks'])}. Bars: {interval_name(DEFAULT_LEVEL)}s, about "
-        f"{study.question.settings.intervals.words}; none where there can be none."
+        f"{study.question.settings.intervals.words}; none where there can be none, and very long ones are cut."
     )
     headline = study.analysis.headline
     if headline is not None and headline.value is not None:
@@ -123,7 +128,10 @@ def _effects_panel(axes: Axes, rows: list[_Row], noise: list[dict[str, Any]]) ->
             _point(axes, place + _OFFSETS[kind], kind, point)
         first = next(iter(row.points.values()))
         note_at_row(axes, place, f"n = {first['num_episodes']}")
-    axes.set_xlim(left=0)
+    points = [point for row in rows for point in row.points.values()]
+    most = max(point["effect"] for point in [*points, *noise])
+    ends = [min(point["effect_high"] or 0.0, _MOST_EFFECT * most) for point in points]
+    axes.set_xlim(0, 1.05 * max([most, *ends]) or 1.0)
     axes.set_xlabel("effect: change of the action in standard deviations of the base's actions")
     axes.grid(axis="x")
     _legend(axes, {kind for row in rows for kind in row.points}, bool(noise))
@@ -151,8 +159,7 @@ def _lift_panel(axes: Axes, rows: list[_Row]) -> None:
     if not known:
         explain(axes, "no attention to show")
         return
-    bounds = [row[name] for _, row in known for name in ("lift", "lift_low", "lift_high") if row[name]]
-    ratio_axis(axes.xaxis, np.array([*bounds, 1.0]))
+    bounded_axis(axes.xaxis, [row for _, row in known], "lift", 1.0)
     for place, row in known:
         if row["lift_low"] is not None and row["lift_high"] is not None:
             axes.plot([row["lift_low"], row["lift_high"]], [place, place], color=NOTE_COLOR, linewidth=1.6)
@@ -160,6 +167,16 @@ def _lift_panel(axes: Axes, rows: list[_Row]) -> None:
     uniform_line(axes, along="x")
     axes.set_xlabel("lift of its attention (log; 1: uniform)")
     axes.grid(axis="x")
+
+
+def bounded_axis(axis: Any, rows: Sequence[Mapping[str, Any]], name: str, *more: float) -> None:
+    """A logarithmic axis around the values of a column and its intervals, of which wide ones run over its ends."""
+    values = np.array([row[name] for row in rows])
+    ends = [row[f"{name}{end}"] for row in rows for end in ("_low", "_high") if row[f"{name}{end}"]]
+    within = np.clip(ends, values.min() / _MOST_REACH, values.max() * _MOST_REACH)
+    ratio_axis(axis, np.array([*values, *within, *more]))
+    if name == "mass":
+        axis.axes.set_xlim(right=min(axis.axes.get_xlim()[1], 1.0))
 
 
 def _table(rows: list[_Row], noise: list[dict[str, Any]]) -> pl.DataFrame:

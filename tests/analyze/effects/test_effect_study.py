@@ -291,3 +291,15 @@ def test_actions_that_never_change_have_no_unit(tmp_path):
     rerun = write_rerun(tmp_path / "rerun.zarr", base, PLANTED["noise"], tasks=(0,))
     with pytest.raises(BadArgument, match="the actions are the same in every replan and step"):
         study_effects(base, [rerun], AnalysisSettings())
+
+
+def test_replans_without_the_word_are_in_no_effect(folder, tmp_path):
+    """'bowl' is in the instruction of task 0 only; a rerun need not hold the other tasks."""
+    planted = PlantedRerun(knockout("without_bowl", "word:bowl"), 0.3)
+    write_rerun(tmp_path / "a.zarr", folder / "base.zarr", planted)
+    write_rerun(tmp_path / "b.zarr", folder / "base.zarr", planted, tasks=(0,))
+    for name in ("a", "b"):
+        study = study_effects(folder / "base.zarr", [tmp_path / f"{name}.zarr"], AnalysisSettings())
+        assert study.episodes["task_id"].unique().to_list() == [0]
+        assert row_of(study, "without_bowl")["num_episodes"] == EPISODES
+        assert study.notes == ()
