@@ -6,17 +6,15 @@ good a flow loss. Their heads are dropped after training.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from vla_attention.capture.policies.pi.flow_time import embed_times
-from vla_attention.capture.policies.pi.gemma import KeysValues, Rotation, rms_normalise
+from vla_attention.capture.policies.pi.gemma import rms_normalise
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.small_policy.batches import Batch
 from vla_attention.capture.small_policy.network import CAMERAS
+from vla_attention.capture.small_policy.training_pass import encode, velocities
 
 #: Dimensions of an action that decide about success: x, y, z and the gripper. The others turn the hand.
 _MAIN, _REST = (0, 1, 2, 6), (3, 4, 5, 7)
@@ -35,49 +33,6 @@ class Heads(nn.Module):
         for layer in (self.heat, self.position):
             nn.init.normal_(layer.weight, std=width**-0.5, generator=generator)
             nn.init.zeros_(layer.bias)
-
-
-@dataclass(frozen=True)
-class EncodedPrefix:
-    """The prefix pass with gradients. cache: as in `Prefix`; last: (batch, key, width), what enters the last block."""
-
-    cache: tuple[KeysValues, ...]
-    valid: Tensor
-    last: Tensor
-
-
-def encode(model: PiModel, batch: Batch) -> EncodedPrefix:
-    """Run images and text through the vision-language model, as `PiModel.encode_prefix`."""
-    masks = {camera: torch.ones(len(batch.tokens), dtype=torch.bool) for camera in CAMERAS}
-    x, valid = model.embed_prefix(batch.images, masks, batch.tokens, batch.token_mask)
-    rotation = Rotation.at(valid.cumsum(dim=1) - 1, model.config.paligemma.head_dim)
-    cache = []
-    *earlier, last = model.paligemma_with_expert.paligemma.model.language_model.blocks
-    for block in earlier:
-        x, own = block(x, valid[:, None, :], rotation)
-        cache.append(own)
-    cache.append(last.keys_values(x, rotation))
-    return EncodedPrefix(tuple(cache), valid, x)
-
-
-def velocities(model: PiModel, prefix: EncodedPrefix, noisy: Tensor, times: Tensor) -> Tensor:
-    """Return the model's velocity (batch, pair, horizon, action dim) of noisy actions at times (batch, pair)."""
-    batch, pairs, horizon, dim = noisy.shape
-    config = model.config
-    expert = model.paligemma_with_expert.gemma_expert.model
-    waves = embed_times(times.flatten().numpy(), config.action_expert.width, config.time_convention)
-    hidden = model.action_in_proj(noisy.reshape(batch * pairs, horizon, dim))
-    condition = F.silu(model.time_mlp_out(F.silu(model.time_mlp_in(waves))))
-    seen = prefix.valid.repeat_interleave(pairs, dim=0)
-    positions = seen.sum(dim=1, keepdim=True) + torch.arange(horizon)
-    rotation = Rotation.at(positions, config.action_expert.head_dim)
-    mask = F.pad(seen, (0, horizon), value=True)[:, None, :]
-    for block, cached in zip(expert.blocks, prefix.cache, strict=True):
-        before = KeysValues(cached.keys.repeat_interleave(pairs, 0), cached.values.repeat_interleave(pairs, 0))
-        hidden, _ = block(hidden, mask, rotation, before=before, condition=condition)
-    normed, _ = expert.norm(hidden, condition)
-    velocity: Tensor = model.action_out_proj(normed).float()
-    return velocity.reshape(batch, pairs, horizon, dim)
 
 
 def losses(model: PiModel, heads: Heads, batch: Batch) -> dict[str, Tensor]:

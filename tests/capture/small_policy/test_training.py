@@ -11,16 +11,18 @@ from tests.capture.small_policy.test_dataset import make_batches
 from tests.kit.made_up_demonstrations import INSTRUCTIONS
 from vla_attention.capture.policies.pi.build import build_pi_policy
 from vla_attention.capture.policies.pi.flow_time import denoise_times
+from vla_attention.capture.policies.pi.gemma import RMSNorm
 from vla_attention.capture.small_policy.batches import number_ids
 from vla_attention.capture.small_policy.export import export
 from vla_attention.capture.small_policy.network import CAMERAS, initial_model, small_config
-from vla_attention.capture.small_policy.objectives import Heads, encode, losses, velocities
+from vla_attention.capture.small_policy.objectives import Heads, losses
 from vla_attention.capture.small_policy.training import (
     TrainingSettings,
     UnusableTraining,
     learning_rate,
     train,
 )
+from vla_attention.capture.small_policy.training_pass import _RmsNorm, encode, velocities
 from vla_attention.schemas.errors import BadArgument
 
 SETTINGS = TrainingSettings(steps=8, batch_size=4, log_every=2, evaluate_every=4)
@@ -80,6 +82,15 @@ def test_pairs_do_not_see_each_other(model, demonstrations, tokenizer):
         together = velocities(model, prefix, batch.noise, batch.times)
         alone = velocities(model, prefix, batch.noise[:, 2:3], batch.times[:, 2:3])
     torch.testing.assert_close(together[:, 2:3], alone, atol=1e-5, rtol=1e-5)
+
+
+def test_the_short_gradient_of_the_norm_is_that_of_the_norm():
+    torch.manual_seed(0)
+    x, norm = torch.randn(2, 5, 16, dtype=torch.float64), RMSNorm(16)
+    torch.nn.init.normal_(norm.weight)
+    weight = norm.weight.detach().double()
+    assert torch.autograd.gradcheck(_RmsNorm.apply, (x.requires_grad_(), weight.requires_grad_()))
+    torch.testing.assert_close(_RmsNorm.apply(x.float(), norm.weight), norm(x.float(), None)[0])
 
 
 def test_every_part_of_the_model_gets_a_gradient(model, demonstrations, tokenizer):
