@@ -31,13 +31,14 @@ BACKGROUND = "background"
 class Suite:
     """A set of tasks and the limits of their evaluation. `suites.py` lists all suites.
 
-    kind: the simulator. "libero" needs the LIBERO package and its assets; "robosuite" needs no download.
+    kind: the simulator. "libero" needs the LIBERO package and its assets; "robosuite" (its own tasks) and "cubes"
+        (language-conditioned tasks on robosuite) need no download.
     max_steps: policy steps after which an episode counts as failed, as in openpi's evaluation. Other protocols may have
         other numbers (`episode_protocol.py`).
     """
 
     name: str
-    kind: Literal["libero", "robosuite"]
+    kind: Literal["libero", "robosuite", "cubes"]
     num_tasks: int
     max_steps: int
     initial_states_per_task: int

@@ -7,6 +7,7 @@ A new suite of an existing simulator is one line in `SUITES`. A new simulator is
 from __future__ import annotations
 
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Suite, Task, check_task_id
+from vla_attention.capture.environments.cubes.tasks import list_cube_tasks
 from vla_attention.schemas.errors import BadArgument, unknown_name
 
 #: Every suite. The numbers of steps are openpi's (see `episode_protocol.py`).
@@ -17,6 +18,7 @@ SUITES: tuple[Suite, ...] = (
     Suite("libero_10", "libero", num_tasks=10, max_steps=520, initial_states_per_task=50),
     Suite("libero_90", "libero", num_tasks=90, max_steps=400, initial_states_per_task=50),
     Suite("robosuite", "robosuite", num_tasks=8, max_steps=200, initial_states_per_task=50),
+    Suite("cubes", "cubes", num_tasks=23, max_steps=150, initial_states_per_task=50),
 )
 #: `--task-suite all` stands for these, in this order: the standard suites of LIBERO.
 ALL_SUITES = "all"
@@ -37,6 +39,8 @@ def list_tasks(suite: Suite) -> tuple[Task, ...]:
         from vla_attention.capture.environments.libero_installation import list_libero_tasks
 
         return list_libero_tasks(suite)
+    if suite.kind == "cubes":
+        return list_cube_tasks(suite)
     from vla_attention.capture.environments.robosuite_tasks import list_robosuite_tasks
 
     return list_robosuite_tasks(suite)
@@ -57,6 +61,10 @@ def make_environment(suite: Suite, task_id: int, settings: EnvironmentSettings) 
         from vla_attention.capture.environments.libero import LiberoEnvironment
 
         return LiberoEnvironment(task, settings)
+    if suite.kind == "cubes":
+        from vla_attention.capture.environments.cubes.environment import CubesEnvironment
+
+        return CubesEnvironment(task, settings)
     from vla_attention.capture.environments.robosuite_tasks import RobosuiteEnvironment
 
     return RobosuiteEnvironment(task, settings)

@@ -1,0 +1,146 @@
+"""The simulated table with cubes: a robosuite environment. Imports robosuite; load it when a simulator is needed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from robosuite.environments.manipulation.single_arm_env import SingleArmEnv
+from robosuite.models.arenas import TableArena
+from robosuite.models.objects import BoxObject
+from robosuite.models.tasks import ManipulationTask
+
+from vla_attention.capture.environments.cubes.scene import HALF_SIZE, TABLE_HEIGHT, Scene, find_target
+from vla_attention.capture.environments.cubes.tasks import COLOURS, CubeTask
+
+_TABLE_SIZE = (0.8, 0.8, 0.05)
+_FRICTION = (1.0, 5e-3, 1e-4)
+_RGB = {"red": (0.85, 0.1, 0.1), "green": (0.1, 0.65, 0.15), "blue": (0.1, 0.2, 0.85), "yellow": (0.9, 0.8, 0.1)}
+
+#: Height in metres over its rest at which a cube counts as lifted, and the way after which it counts as pushed.
+LIFTED, PUSHED = 0.04, 0.05
+
+
+class CubeTable(SingleArmEnv):  # type: ignore[misc]  # robosuite has no types
+    """Cubes of different colours on a table.
+
+    `scene` and `task` can be set before a reset. After every control step the environment knows which cube the gripper touched first
+    in the episode.
+    """
+
+    def __init__(self, task: CubeTask, **options: Any) -> None:
+        self.task = task
+        self.scene: Scene | None = None
+        self.first_touched: int | None = None
+        self.target = 0
+        self.destination: int | None = None
+        super().__init__(mount_types="default", initialization_noise="default", hard_reset=False, **options)
+
+    def _load_model(self) -> None:
+        super()._load_model()
+        robot_model = self.robots[0].robot_model
+        robot_model.set_base_xpos(robot_model.base_xpos_offset["table"](_TABLE_SIZE[0]))
+        arena = TableArena(
+            table_full_size=_TABLE_SIZE, table_friction=_FRICTION, table_offset=np.array((0.0, 0.0, TABLE_HEIGHT))
+        )
+        arena.set_origin([0, 0, 0])
+        size = [HALF_SIZE] * 3
+        self._cubes = [
+            BoxObject(name=f"{colour}_cube", size_min=size, size_max=size, rgba=[*_RGB[colour], 1.0])
+            for colour in COLOURS[: self.task.num_cubes]
+        ]
+        self.model = ManipulationTask(
+            mujoco_arena=arena, mujoco_robots=[robot.robot_model for robot in self.robots], mujoco_objects=self._cubes
+        )
+
+    def _initialize_sim(self, *arguments: Any, **options: Any) -> None:
+        super()._initialize_sim(*arguments, **options)
+        # Mirror images in the floor and the table are half of the cost of a picture.
+        self.sim.model.mat_reflectance[:] = 0.0
+
+    def _setup_references(self) -> None:
+        super()._setup_references()
+        model = self.sim.model
+        self._bodies = [model.body_name2id(cube.root_body) for cube in self._cubes]
+        self._cube_of_geom = {
+            model.geom_name2id(name): index for index, cube in enumerate(self._cubes) for name in cube.contact_geoms
+        }
+        gripper = self.robots[0].gripper
+        self._gripper_geoms = {model.geom_name2id(name) for name in gripper.contact_geoms}
+
+    def _reset_internal(self) -> None:
+        super()._reset_internal()
+        # The model is not loaded again at a reset, and robosuite's gripper would go on with the action it had.
+        gripper = self.robots[0].gripper
+        gripper.current_action = np.zeros(gripper.dof)
+        scene = self.scene
+        if scene is None:  # robosuite resets once while it is constructed
+            count = self.task.num_cubes
+            scene = Scene(np.stack([np.zeros(count), np.linspace(-0.15, 0.15, count)], axis=1), np.zeros(count))
+        for cube, (x, y), yaw in zip(self._cubes, scene.positions, scene.yaws, strict=True):
+            pose = [x, y, TABLE_HEIGHT + HALF_SIZE + 0.001, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
+            self.sim.data.set_joint_qpos(cube.joints[0], np.array(pose))
+        self._beginning = np.column_stack([scene.positions, np.full(len(scene.positions), TABLE_HEIGHT + HALF_SIZE)])
+        self.begin_task()
+
+    def begin_task(self) -> None:
+        """Begin the task: which cube it means depends on the places at the beginning of the episode."""
+        places, task = self._beginning, self.task
+        self.first_touched = None
+        self.target = find_target(task.target, places)
+        self.destination = None if task.destination is None else find_target(task.destination, places)
+
+    def _post_action(self, action: NDArray[np.float64]) -> Any:
+        result = super()._post_action(action)
+        if self.first_touched is None:
+            touched = self.touched_cubes()
+            if touched:
+                # Of two that are touched in the same control step, the wrong one counts.
+                self.first_touched = next((cube for cube in touched if cube != self.target), self.target)
+        return result
+
+    def touched_cubes(self) -> list[int]:
+        """Return the cubes that the gripper touches now."""
+        contacts = self.sim.data.contact[: self.sim.data.ncon]
+        pairs = [(contact.geom1, contact.geom2) for contact in contacts]
+        return sorted(
+            {
+                self._cube_of_geom[cube]
+                for one, other in pairs
+                for cube, geom in ((one, other), (other, one))
+                if cube in self._cube_of_geom and geom in self._gripper_geoms
+            }
+        )
+
+    def cubes_touch(self, one: int, other: int) -> bool:
+        """Return whether two cubes touch each other."""
+        owners = self._cube_of_geom
+        contacts = self.sim.data.contact[: self.sim.data.ncon]
+        return any({owners.get(contact.geom1), owners.get(contact.geom2)} == {one, other} for contact in contacts)
+
+    def cube_positions(self) -> NDArray[np.float64]:
+        """Return the cubes' centres, (cube, 3) in metres, world frame."""
+        return np.array(self.sim.data.body_xpos[self._bodies])
+
+    def reward(self, action: NDArray[np.float64] | None = None) -> float:
+        """Return 1 if the task is solved, else 0."""
+        return float(self._check_success())
+
+    def _check_success(self) -> bool:
+        """Return whether the task is solved now."""
+        position = self.cube_positions()[self.target]
+        moved = position - self._beginning[self.target]
+        verb = self.task.verb
+        if verb == "touch":
+            return self.first_touched == self.target
+        if verb == "lift":
+            return bool(moved[2] >= LIFTED)
+        if verb == "push_left":
+            return bool(moved[1] >= PUSHED)
+        if verb == "push_right":
+            return bool(moved[1] <= -PUSHED)
+        assert self.destination is not None
+        released = self.target not in self.touched_cubes()
+        above = position[2] - self.cube_positions()[self.destination][2] > HALF_SIZE
+        return bool(released and above and self.cubes_touch(self.target, self.destination))

@@ -1,0 +1,83 @@
+"""`demonstrate`: record demonstrations with several processes. Parts that exist are kept."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+from dataclasses import asdict
+from pathlib import Path
+
+from tqdm import tqdm
+
+from vla_attention.capture.small_policy.demonstrations import (
+    SETTINGS_FILE,
+    DemonstrationSettings,
+    Demonstrator,
+    part_path,
+    settings_content,
+    write_part,
+)
+from vla_attention.schemas.errors import BadArgument
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `demonstrate`."""
+    parser.add_argument("demonstrations", type=Path, help="folder for the demonstrations")
+    parser.add_argument("--parts", type=int, default=75, metavar="N", help="files of 20 episodes each (default: 75)")
+    parser.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default: 2)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the demonstrations (default: 0)")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Record what is missing; returns the exit code."""
+    folder: Path = arguments.demonstrations
+    if arguments.parts < 1 or arguments.workers < 1:
+        raise BadArgument(f"Cannot use --parts {arguments.parts} --workers {arguments.workers}; expected at least 1.")
+    settings = DemonstrationSettings(seed=arguments.seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    _check_same(folder, settings)
+    missing = [number for number in range(arguments.parts) if not part_path(folder, number).exists()]
+    shares = [missing[worker :: arguments.workers] for worker in range(arguments.workers)]
+    context = multiprocessing.get_context("spawn")  # an OpenGL context does not survive a fork
+    done = context.Queue()
+    workers = [
+        context.Process(target=_record, args=(folder, settings, share, done), daemon=True) for share in shares if share
+    ]
+    for worker in workers:
+        worker.start()
+    samples = 0
+    with tqdm(total=arguments.parts, initial=arguments.parts - len(missing), unit="part", disable=None) as bar:
+        while any(worker.is_alive() for worker in workers) or not done.empty():
+            while not done.empty():
+                samples += done.get()
+                bar.update()
+            for worker in workers:
+                worker.join(0.5 / len(workers))
+    failed = [worker.exitcode for worker in workers if worker.exitcode]
+    size = sum(file.stat().st_size for file in folder.glob("part_*.npz"))
+    print(f"{samples} samples added; {folder} has {size / 1e6:.0f} MB.")
+    return 1 if failed else 0
+
+
+def _record(folder: Path, settings: DemonstrationSettings, parts: list[int], done: "multiprocessing.Queue[int]") -> None:
+    demonstrator = Demonstrator(settings)
+    try:
+        for number in parts:
+            arrays = demonstrator.part(number)
+            write_part(folder, number, arrays)
+            done.put(len(arrays["task"]))
+    finally:
+        demonstrator.close()
+
+
+def _check_same(folder: Path, settings: DemonstrationSettings) -> None:
+    """Write the settings into a new folder; raise `BadArgument` if the folder has those of other demonstrations."""
+    path, content = folder / SETTINGS_FILE, settings_content(settings)
+    if not path.exists():
+        path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        return
+    if json.loads(path.read_text(encoding="utf-8")) != json.loads(json.dumps(content)):
+        raise BadArgument(
+            f"'{folder}' has demonstrations with other settings than {asdict(settings)}; give another folder."
+        )

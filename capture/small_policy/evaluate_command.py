@@ -1,0 +1,155 @@
+"""`evaluate`: how often a policy solves the tasks of the suite `cubes`, in several processes, without recording."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from vla_attention.capture.environments.cubes.environment import CubesEnvironment
+from vla_attention.capture.environments.base import EnvironmentSettings
+from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS
+from vla_attention.capture.environments.suites import find_suite, list_tasks
+from vla_attention.capture.small_policy.rollouts import CONDITIONS, Condition, Outcome, run_episode
+from vla_attention.schemas.errors import BadArgument, unknown_name
+
+Job = tuple[int, int]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `evaluate`."""
+    parser.add_argument("checkpoint", help="pi05_cubes, or a folder written by export")
+    parser.add_argument("--suite", default="cubes", help="cubes (default), or the suite of a control")
+    parser.add_argument("--task-id", type=int, nargs="+", metavar="N", help="tasks (default: all)")
+    parser.add_argument("--episodes", type=int, default=50, metavar="N", help="initial states per task (default: 50)")
+    parser.add_argument("--condition", default="normal", help=f"one of {', '.join(CONDITIONS)} (default: normal)")
+    parser.add_argument("--replan-steps", type=int, metavar="N", help="actions per policy call (default: the policy's)")
+    parser.add_argument("--max-steps", type=int, metavar="N", help="steps of an episode (default: the suite's)")
+    parser.add_argument("--seed", type=int, default=7, metavar="N", help="seed of the policy's noise (default: 7)")
+    parser.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default: 2)")
+    parser.add_argument("--output", type=Path, metavar="FILE", help="JSON file with every episode; kept ones are not run again")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the missing episodes, print the rates; returns the exit code."""
+    suite = find_suite(arguments.suite)
+    if suite.kind != "cubes":
+        raise BadArgument(f"Cannot evaluate in the suite '{suite.name}'; expected one of cubes.")
+    if arguments.condition not in CONDITIONS:
+        raise unknown_name("condition", arguments.condition, CONDITIONS)
+    numbers = arguments.task_id if arguments.task_id is not None else range(suite.num_tasks)
+    outcomes = _read(arguments.output)
+    known = {(outcome.task, outcome.state, outcome.condition) for outcome in outcomes}
+    jobs = [
+        (task, state)
+        for task in numbers
+        for state in range(arguments.episodes)
+        if (task, state, arguments.condition) not in known
+    ]
+    # All tasks of one number of cubes share a simulator, so neighbours in this order need no other one.
+    jobs.sort(key=lambda job: (CUBE_TASKS[job[0]].num_cubes, job[1], job[0]))
+    context = multiprocessing.get_context("spawn")  # an OpenGL context does not survive a fork
+    results = context.Queue()
+    workers = [
+        context.Process(target=_evaluate, args=(vars(arguments), jobs[worker :: arguments.workers], results), daemon=True)
+        for worker in range(arguments.workers)
+    ]
+    for worker in workers:
+        worker.start()
+    with tqdm(total=len(jobs), unit="episode", disable=None) as bar:
+        while any(worker.is_alive() for worker in workers) or not results.empty():
+            while not results.empty():
+                outcomes.append(results.get())
+                bar.update()
+                if arguments.output is not None and len(outcomes) % 20 == 0:
+                    _write(arguments.output, outcomes)
+            for worker in workers:
+                worker.join(0.2)
+    if arguments.output is not None:
+        _write(arguments.output, outcomes)
+    chosen = [o for o in outcomes if o.task in numbers and o.condition == arguments.condition]
+    print(describe(chosen))
+    return 1 if any(worker.exitcode for worker in workers) else 0
+
+
+def _evaluate(options: dict[str, Any], jobs: Sequence[Job], results: "multiprocessing.Queue[Outcome]") -> None:
+    import torch
+
+    from vla_attention.capture.policies.pi.build import build_pi_policy
+
+    torch.set_num_threads(1)
+    policy = build_pi_policy(options["checkpoint"], tokenizer=None, device="cpu")
+    suite = find_suite(options["suite"])
+    tasks = list_tasks(suite)
+    environment: CubesEnvironment | None = None
+    cubes = 0
+    condition: Condition = options["condition"]
+    for number, state in jobs:
+        if environment is None or cubes != CUBE_TASKS[number].num_cubes:
+            if environment is not None:
+                environment.close()
+            environment = CubesEnvironment(tasks[number], EnvironmentSettings())
+            cubes = CUBE_TASKS[number].num_cubes
+        results.put(
+            run_episode(
+                environment,
+                policy,
+                tasks[number],
+                state,
+                condition,
+                max_steps=options["max_steps"] or suite.max_steps,
+                replan_steps=options["replan_steps"] or policy.default_replan_steps,
+                seed=options["seed"],
+            )
+        )
+    if environment is not None:
+        environment.close()
+
+
+def wilson(successes: int, count: int) -> tuple[float, float]:
+    """Return the 95 % interval of a rate (Wilson 1927)."""
+    z = 1.959964
+    rate, square = successes / count, z * z / count
+    middle = (rate + square / 2) / (1 + square)
+    half = z * math.sqrt(rate * (1 - rate) / count + square / (4 * count)) / (1 + square)
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def describe(outcomes: Sequence[Outcome]) -> str:
+    """Return a table of rates with 95 % intervals: solved, and the first touch at the named cube."""
+    lines = [f"{'task':<28}{'n':>5}  {'solved':<22}{'first touch named':<22}{'steps':>6}"]
+    groups: list[tuple[str, list[Outcome]]] = [
+        (CUBE_TASKS[task].name, [o for o in outcomes if o.task == task]) for task in sorted({o.task for o in outcomes})
+    ]
+    if len(groups) > 1:
+        groups.append(("all", list(outcomes)))
+    for name, chosen in groups:
+        count = len(chosen)
+        solved, named = sum(o.success for o in chosen), sum(o.first_touched == o.named for o in chosen)
+        steps = sum(o.steps for o in chosen) / count
+        lines.append(f"{name:<28}{count:>5}  {_rate(solved, count):<22}{_rate(named, count):<22}{steps:>6.0f}")
+    return "\n".join(lines)
+
+
+def _rate(successes: int, count: int) -> str:
+    low, high = wilson(successes, count)
+    return f"{successes / count:.1%} [{low:.1%}, {high:.1%}]"
+
+
+def _read(path: Path | None) -> list[Outcome]:
+    if path is None or not path.exists():
+        return []
+    return [Outcome(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))]
+
+
+def _write(path: Path, outcomes: Sequence[Outcome]) -> None:
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(json.dumps([asdict(outcome) for outcome in outcomes]), encoding="utf-8")
+    partial.replace(path)
