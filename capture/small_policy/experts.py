@@ -29,8 +29,9 @@ ALIGNED = 0.012
 HOLDING_GAP = (0.036, 0.064)
 #: Speed of the fingers, in metres per second, below which they have stopped.
 STOPPED = 0.02
-#: Distance in metres from a cube's centre at which a closed gripper is beside it.
-BESIDE = 0.062
+#: Distance in metres from a cube's centre at which a closed gripper is beside it: between the cube and its nearest
+#: neighbour there is room for the fingers.
+BESIDE = 0.052
 
 #: Axes of the gripper (columns) that points straight down: its fingers close along the world's y.
 _STRAIGHT = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
