@@ -15,8 +15,10 @@ PROGRAM = "python -m vla_attention.capture.small_policy"
 #: Sub-command -> what it does. Each is a module `<name>_command` here, with `add_arguments(parser)` and
 #: `run(arguments)`, which returns the exit code.
 COMMANDS: dict[str, str] = {
+    "demonstrate": "record demonstrations of scripted experts",
     "train": "train the policy, or a control, on demonstrations",
     "export": "write a training's averaged weights as a checkpoint folder for vla-capture pi",
+    "evaluate": "measure how often a policy solves the tasks",
 }
 
 

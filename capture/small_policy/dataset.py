@@ -16,15 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.environments.cubes.mark import paste_mark, verb_index
+from vla_attention.capture.environments.cubes.tasks import MARK_INSTRUCTION
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 
 #: What a policy can learn from. `words`: the instruction alone decides. `redundant`: a mark in the picture says the
 #: same. `mark`: the mark alone says it. `no-wrist`: as `words`, with wrist pictures of other samples.
 Control = Literal["words", "redundant", "mark", "no-wrist"]
 CONTROLS: tuple[Control, ...] = get_args(Control)
-#: The only instruction of the control `mark`.
-MARK_INSTRUCTION = "do what the mark says"
-
 #: Part of the scenes that are never trained on.
 HELD_OUT = 0.05
 INDEX_FILE = "demonstrations.json"

@@ -60,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 1 if failed else 0
 
 
-def _record(folder: Path, settings: DemonstrationSettings, parts: list[int], done: "multiprocessing.Queue[int]") -> None:
+def _record(folder: Path, settings: DemonstrationSettings, parts: list[int], done: multiprocessing.Queue[int]) -> None:
     demonstrator = Demonstrator(settings)
     try:
         for number in parts:

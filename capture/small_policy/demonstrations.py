@@ -163,7 +163,8 @@ class Demonstrator:
     def _detour_aim(self, generator: np.random.Generator, simulator: Any) -> NDArray[np.float64]:
         """Return a place (3,) over the table or near a cube, and whether the gripper is open or closed on the way."""
         if generator.random() < 0.5:
-            place = generator.choice(simulator.cube_positions()) + [0.0, 0.0, generator.uniform(0.03, 0.15)]
+            place = generator.choice(simulator.cube_positions())
+            place[2] += generator.uniform(0.03, 0.15)
         else:
             place = np.array([*generator.uniform([-0.15, -0.25], [0.15, 0.25]), generator.uniform(0.86, 1.05)])
         return np.array([*place, OPEN if generator.random() < 0.5 else CLOSED])
@@ -203,16 +204,16 @@ def _describe(
     return {
         "pictures": np.stack([model_image(observation.images[camera], PICTURE_SIZE) for camera in CAMERAS]),
         "state": libero_state(observation.eef_pos, observation.eef_quat, observation.gripper_qpos).astype(np.float32),
-        "task": np.int16(task),
-        "episode": np.int32(episode),
-        "scene": np.int32(episode),
-        "step": np.int16(step),
+        "task": np.array(task, dtype=np.int16),
+        "episode": np.array(episode, dtype=np.int32),
+        "scene": np.array(episode, dtype=np.int32),
+        "step": np.array(step, dtype=np.int16),
         "eef": observation.eef_pos.astype(np.float32),
         "cube_positions": cubes,
         "cube_pixels": np.stack([project(simulator.sim, camera, cubes) for camera in CAMERAS]),
-        "target": np.int8(simulator.target),
-        "destination": np.int8(destination),
-    }  # type: ignore[dict-item]  # numpy's scalars are stacked to arrays
+        "target": np.array(simulator.target, dtype=np.int8),
+        "destination": np.array(destination, dtype=np.int8),
+    }
 
 
 def project(simulation: Any, camera: str, points: NDArray[np.floating]) -> NDArray[np.float32]:

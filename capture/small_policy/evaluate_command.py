@@ -13,8 +13,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from vla_attention.capture.environments.cubes.environment import CubesEnvironment
 from vla_attention.capture.environments.base import EnvironmentSettings
+from vla_attention.capture.environments.cubes.environment import CubesEnvironment
 from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS
 from vla_attention.capture.environments.suites import find_suite, list_tasks
 from vla_attention.capture.small_policy.rollouts import CONDITIONS, Condition, Outcome, run_episode
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--max-steps", type=int, metavar="N", help="steps of an episode (default: the suite's)")
     parser.add_argument("--seed", type=int, default=7, metavar="N", help="seed of the policy's noise (default: 7)")
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default: 2)")
-    parser.add_argument("--output", type=Path, metavar="FILE", help="JSON file with every episode; kept ones are not run again")
+    parser.add_argument("--output", type=Path, metavar="FILE", help="JSON file with every episode; it is continued")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -58,8 +58,10 @@ def run(arguments: argparse.Namespace) -> int:
     context = multiprocessing.get_context("spawn")  # an OpenGL context does not survive a fork
     results = context.Queue()
     workers = [
-        context.Process(target=_evaluate, args=(vars(arguments), jobs[worker :: arguments.workers], results), daemon=True)
-        for worker in range(arguments.workers)
+        context.Process(
+            target=_evaluate, args=(vars(arguments), jobs[first :: arguments.workers], results), daemon=True
+        )
+        for first in range(arguments.workers)
     ]
     for worker in workers:
         worker.start()
@@ -79,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 1 if any(worker.exitcode for worker in workers) else 0
 
 
-def _evaluate(options: dict[str, Any], jobs: Sequence[Job], results: "multiprocessing.Queue[Outcome]") -> None:
+def _evaluate(options: dict[str, Any], jobs: Sequence[Job], results: multiprocessing.Queue[Outcome]) -> None:
     import torch
 
     from vla_attention.capture.policies.pi.build import build_pi_policy

@@ -25,7 +25,8 @@ OPEN, CLOSED = -1.0, 1.0
 TRAVEL_HEIGHT = 0.11
 #: Sideways distance in metres within which the gripper is over its goal.
 ALIGNED = 0.012
-#: Way between the fingers with a cube between them, in metres. A turned cube is up to 53 mm wide, an open gripper 79 mm.
+#: Way between the fingers with a cube between them, in metres. A turned cube is up to 53 mm wide, and an open gripper
+#: 79 mm.
 HOLDING_GAP = (0.036, 0.064)
 #: Speed of the fingers, in metres per second, below which they have stopped.
 STOPPED = 0.02
@@ -107,9 +108,13 @@ def _holds(state: TableState, cube: NDArray[np.float64]) -> bool:
     return bool(near and HOLDING_GAP[0] < state.gap < HOLDING_GAP[1] and abs(state.gap_speed) < STOPPED)
 
 
+def _up(way: float) -> NDArray[np.float64]:
+    return np.array([0.0, 0.0, way])
+
+
 def _lift(state: TableState, cube: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     if _holds(state, cube):
-        return state.gripper + [0.0, 0.0, 0.1], CLOSED
+        return state.gripper + _up(0.1), CLOSED
     away = np.linalg.norm(state.gripper[:2] - cube[:2])
     around = away < 1.5 * ALIGNED and abs(state.gripper[2] - cube[2]) < 0.015
     if around:
@@ -121,7 +126,7 @@ def _lift(state: TableState, cube: NDArray[np.float64]) -> tuple[NDArray[np.floa
 
 
 def _push(gripper: NDArray[np.float64], cube: NDArray[np.float64], side: float) -> NDArray[np.float64]:
-    start = cube - [0.0, side * BESIDE, 0.0]
+    start = cube - np.array([0.0, side * BESIDE, 0.0])
     low = gripper[2] < cube[2] + 0.025
     behind = side * (cube[1] - gripper[1])
     if low and abs(gripper[0] - cube[0]) < 0.018 and 0.02 < behind < BESIDE + 0.02:
@@ -131,16 +136,14 @@ def _push(gripper: NDArray[np.float64], cube: NDArray[np.float64], side: float) 
     return _descend(gripper, start, float(cube[2]))
 
 
-def _put(
-    state: TableState, cube: NDArray[np.float64], base: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], float]:
+def _put(state: TableState, cube: NDArray[np.float64], base: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     on_top = base[2] + 2 * HALF_SIZE
     sideways = float(np.linalg.norm(cube[:2] - base[:2]))
     grip_offset = state.gripper - cube
     if sideways < 0.02 and abs(cube[2] - on_top) < 0.005:
-        return state.gripper + [0.0, 0.0, 0.05 if state.gap > HOLDING_GAP[1] else 0.0], OPEN
+        return state.gripper + _up(0.05 if state.gap > HOLDING_GAP[1] else 0.0), OPEN
     if _holds(state, cube):
-        over = np.array([base[0], base[1], 0.0]) + [grip_offset[0], grip_offset[1], 0.0]
+        over = np.array([base[0] + grip_offset[0], base[1] + grip_offset[1], 0.0])
         clear = on_top + 0.035
         if sideways < ALIGNED:
             over[2] = on_top + grip_offset[2] - 0.02  # the controller stops short of its goal

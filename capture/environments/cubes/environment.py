@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
-from vla_attention.capture.environments.base import ROBOT, EnvironmentSettings, Task
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.capture.environments.base import ROBOT, EnvironmentSettings, StepResult, Task
+from vla_attention.capture.environments.cubes.mark import MARK_VERBS, paste_mark
 from vla_attention.capture.environments.cubes.scene import EVALUATION, draw_scene, scene_seed
-from vla_attention.capture.environments.cubes.tasks import COLOURS, CUBE_TASKS, CubeTask
+from vla_attention.capture.environments.cubes.tasks import COLOURS, CUBE_TASKS, MARK_ONLY, MARKED, CubeTask
+from vla_attention.capture.environments.episode_protocol import CAMERAS
 from vla_attention.capture.environments.simulator import SimulatedEnvironment
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import SceneObject
+
+#: Name of the mark as a scene object, and the camera whose pictures have it.
+MARK, MARKED_CAMERA = "mark", CAMERAS[0]
 
 
 class CubesEnvironment(SimulatedEnvironment):
@@ -20,12 +29,15 @@ class CubesEnvironment(SimulatedEnvironment):
     effect. Which objects are of interest depends on the task where it names colours; where it names a place (left,
     right), any of the three can be meant.
 
+    In the suites with a mark, the agent camera's pictures have it, and it is a scene object.
+
     purpose: what the scene's seeds begin with; demonstrations have scenes of their own (`scene.TRAINING`).
     """
 
     def __init__(self, task: Task, settings: EnvironmentSettings, purpose: str = EVALUATION) -> None:
         self._cube_task: CubeTask = CUBE_TASKS[task.task_id]
         self._purpose = purpose
+        self._has_mark = task.suite in (MARKED, MARK_ONLY)
         super().__init__(task, settings)
 
     def _build(self, options: dict[str, Any]) -> Any:
@@ -49,7 +61,33 @@ class CubesEnvironment(SimulatedEnvironment):
         named = {f"{colour}_cube" for colour in (task.target, task.destination) if colour in COLOURS}
         cubes = [SceneObject(name, "object", of_interest=name in named or not named) for name in names]
         roots: dict[str, Sequence[str]] = {name: (f"{name}_main",) for name in names}
+        if self._has_mark:
+            cubes.append(SceneObject(MARK, "object", of_interest=True))  # no body: it exists in pictures only
         return self._with_robot_and_background(cubes), roots | {ROBOT: self._robot_bodies()}
+
+    def step(self, action: NDArray[np.floating], observe: bool) -> StepResult:
+        """Advance by one control step; see `Environment.step`."""
+        result = super().step(action, observe)
+        if not self._has_mark or result.observation is None:
+            return result
+        images = dict(result.observation.images)
+        images[MARKED_CAMERA] = self._marked(images[MARKED_CAMERA])
+        return replace(result, observation=replace(result.observation, images=images))
+
+    def segmentation(self, camera: str) -> NDArray[np.int32]:
+        """Return the object of every pixel of the last picture; see `Environment.segmentation`."""
+        segmentation = super().segmentation(camera)
+        if self._has_mark and camera == MARKED_CAMERA:
+            plain = np.zeros((*segmentation.shape, 3), dtype=np.uint8)
+            number = [thing.name for thing in self.objects].index(MARK)
+            segmentation = np.where(self._marked(plain).any(axis=2), np.int32(number), segmentation)
+        return segmentation
+
+    def _marked(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        # The simulator's pictures have the bottom row first; a mark is pasted into the picture as policies get it.
+        verb = MARK_VERBS.index(self._cube_task.verb)
+        marked = paste_mark(np.ascontiguousarray(picture[::-1, ::-1]), self._simulator.target, verb)
+        return np.ascontiguousarray(marked[::-1, ::-1])
 
     @property
     def simulator(self) -> Any:

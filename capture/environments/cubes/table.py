@@ -25,8 +25,8 @@ LIFTED, PUSHED = 0.04, 0.05
 class CubeTable(SingleArmEnv):  # type: ignore[misc]  # robosuite has no types
     """Cubes of different colours on a table.
 
-    `scene` and `task` can be set before a reset. After every control step the environment knows which cube the gripper touched first
-    in the episode.
+    `scene` and `task` can be set before a reset. After every control step the environment knows which cube the gripper
+    touched first in the episode.
     """
 
     def __init__(self, task: CubeTask, **options: Any) -> None:

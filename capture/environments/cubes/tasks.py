@@ -70,9 +70,21 @@ CUBE_TASKS = _all_tasks()
 NUM_BASE_TASKS = 12
 
 
+#: Suites for control policies: the base tasks, with a mark in the picture that says what the instruction says
+#: (`mark.py`). In `cubes_marked` both are given; in `cubes_mark_only` all instructions are `MARK_INSTRUCTION`.
+MARKED, MARK_ONLY = "cubes_marked", "cubes_mark_only"
+MARK_INSTRUCTION = "do what the mark says"
+
+
 def list_cube_tasks(suite: Suite) -> tuple[Task, ...]:
-    """Return the tasks of the suite in their fixed order."""
+    """Return the tasks of the suite, or of one of the suites with a mark, in their fixed order."""
     return tuple(
-        Task(suite.name, task_id, task.name, task.instruction, suite.initial_states_per_task)
-        for task_id, task in enumerate(CUBE_TASKS)
+        Task(
+            suite.name,
+            task_id,
+            task.name,
+            MARK_INSTRUCTION if suite.name == MARK_ONLY else task.instruction,
+            suite.initial_states_per_task,
+        )
+        for task_id, task in enumerate(CUBE_TASKS[: suite.num_tasks])
     )

@@ -118,3 +118,22 @@ def test_touching_another_cube_first_is_no_success(environment: CubesEnvironment
 def test_a_table_of_three_refuses_a_task_for_four(environment: CubesEnvironment) -> None:
     with pytest.raises(BadArgument, match="3 cubes"):
         environment.give_task(CUBE_TASKS[_number("lift", "red", num_cubes=4)])
+
+
+def test_a_mark_is_in_the_picture_and_in_the_segmentation() -> None:
+    suite = find_suite("cubes_mark_only")
+    task = list_tasks(suite)[_number("push_left", "blue")]
+    assert task.instruction == "do what the mark says"
+    marked, plain = CubesEnvironment(task, SMALL), CubesEnvironment(list_tasks(SUITE)[task.task_id], SMALL)
+    observed, without = _act(marked, 3), _act(plain, 3)
+    segmentation = marked.segmentation("agentview")
+    names = [thing.name for thing in marked.objects]
+    marked.close()
+    plain.close()
+    is_mark = segmentation == names.index("mark")
+    assert is_mark.sum() == (64 // 8) ** 2
+    assert is_mark[-8:].sum() == is_mark.sum()  # the bottom rows of the simulator's picture are its upper edge
+    changed = (observed.images["agentview"] != without.images["agentview"]).any(axis=2)
+    assert (changed <= is_mark).all()
+    assert observed.images["agentview"][is_mark].mean(axis=0).argmax() == 2
+    np.testing.assert_array_equal(observed.images["robot0_eye_in_hand"], without.images["robot0_eye_in_hand"])
