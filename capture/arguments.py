@@ -8,6 +8,7 @@ from pathlib import Path
 
 from vla_attention.capture.capture_command import run_capture_of_family
 from vla_attention.capture.environments.suites import ALL_SUITES, STANDARD_SUITES, SUITES
+from vla_attention.capture.interventions.arguments import add_intervention_arguments
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.parity_command import run_parity_command
 from vla_attention.capture.policies.families import policy_families
@@ -139,6 +140,7 @@ def _add_capture_arguments(
     if script:
         which = f"layers to analyse; all are recorded (default: {' '.join(map(str, script.layers))})"
     add_recording_arguments(parser, which + family.layers_note)
+    add_intervention_arguments(parser)
     _add_output_arguments(parser, family, script)
 
 

@@ -7,9 +7,12 @@ from typing import Literal, cast
 
 import torch
 
-from vla_attention.capture.environments.base import EnvironmentSettings, check_initial_state_index
+from vla_attention.capture.environments.base import EnvironmentSettings, Task, check_initial_state_index
 from vla_attention.capture.environments.episode_protocol import WAIT_STEPS, EvaluationProtocol
 from vla_attention.capture.environments.suites import list_tasks
+from vla_attention.capture.interventions.prompts import check_synonyms
+from vla_attention.capture.interventions.resolution import interventions_for
+from vla_attention.capture.interventions.run_changes import AttentionChanges
 from vla_attention.capture.jobs.damaged_episodes import DamagedEpisodesLeft, find_damaged, what_to_do
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.jobs.worker import this_worker
@@ -135,6 +138,7 @@ def _record_missing(
     wanted = tasks if settings.task_ids is None else tuple(tasks[number] for number in settings.task_ids)
     for task in wanted:
         check_initial_state_index(task, settings.num_episodes - 1)
+    changes = _plan_changes(settings, policy, tasks)
     machine = describe_machine(device)
     attributes = RootAttributes(
         format=FORMAT_NAME,
@@ -144,6 +148,7 @@ def _record_missing(
         recording=recording,
         sites=policy.sites,
         provenance=machine,
+        interventions=changes.interventions,
     )
     if note:
         say(note)
@@ -183,8 +188,22 @@ def _record_missing(
         record=record,
         machine=machine,
         termination=termination,
+        changes=changes,
     )
-    return loop.record_all(todo), damaged_names
+    results = loop.record_all(todo)
+    if (empty := changes.describe_empty()) is not None:
+        say(empty)
+    return results, damaged_names
+
+
+def _plan_changes(settings: RunSettings, policy: Policy, tasks: Sequence[Task]) -> AttentionChanges:
+    """Return the run's interventions; what is known to be wrong with them is an error now, before the first episode."""
+    instructions = {task.task_id: task.instruction for task in tasks}
+    changes = AttentionChanges(interventions_for(settings.interventions, policy), instructions, settings.allow_empty)
+    if changes.interventions.prompt is not None:
+        check_synonyms(changes.interventions.prompt, instructions.values())
+    changes.check_names(policy.sites)
+    return changes
 
 
 def _checkpoint_line(identity: PolicyIdentity) -> str:
@@ -216,6 +235,8 @@ def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int, n
         f"Protocol: {protocol.name} (docs/protocol.md), seed {protocol.seed}, pictures of {protocol.image_size} "
         f"pixels, {protocol.wait_steps} waiting steps, at most {protocol.max_steps} steps after them."
     )
+    if not store.attributes.interventions.is_none:
+        say(f"Interventions: {store.attributes.interventions.describe()}.")
     say(f"A policy call gives {identity.action_horizon} actions, of which {protocol.replan_steps} are executed.")
     say(
         f"Recording {len(recording.layers)} layers, denoise steps {listing(recording.denoise_steps)}, "

@@ -6,15 +6,17 @@ Imports nothing heavy: mistakes in the arguments are reported before torch is lo
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vla_attention.capture.environments.base import Suite, check_task_id
 from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
 from vla_attention.capture.environments.suites import find_suite
+from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.precision import parse_precision
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX
 
@@ -42,7 +44,8 @@ class RunSettings:
     task_ids: None runs all tasks of the suite. protocol: the published evaluation that is followed; None takes that of
     the policy. seed, replan_steps, max_steps: None takes the protocol's number. array_task_ids: tasks that
     other processes of the same array job run; the store is expected to hold these too. verify: read every byte of the
-    episodes that an existing store has, before they count as done.
+    episodes that an existing store has, before they count as done. interventions: what is changed, with layer
+    numbers as typed. allow_empty: leave a replan unchanged where a group of an intervention has no key.
     """
 
     suite: Suite
@@ -58,6 +61,8 @@ class RunSettings:
     recording: RecordingSettings
     array_task_ids: tuple[int, ...] = ()
     verify: bool = False
+    interventions: Interventions = field(default_factory=Interventions)
+    allow_empty: bool = False
 
 
 def run_settings(arguments: argparse.Namespace) -> RunSettings:
@@ -84,6 +89,8 @@ def run_settings(arguments: argparse.Namespace) -> RunSettings:
         mode="overwrite" if arguments.overwrite else "resume" if arguments.resume else "new",
         libero_assets=arguments.libero_assets,
         recording=recording_settings(arguments),
+        interventions=read_interventions(arguments),
+        allow_empty=arguments.allow_empty,
     )
 
 

@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 from vla_attention.capture.environments.base import Environment, Observation, Task
 from vla_attention.capture.environments.coverage import patch_coverage
 from vla_attention.capture.environments.episode_protocol import WAIT_ACTION
+from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
+from vla_attention.capture.interventions.run_changes import AttentionChanges
 from vla_attention.capture.policies.policy import Policy, camera_frame, camera_grid
 from vla_attention.capture.rollout.policy_call import record_call
 from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.stores.store_format import Protocol
 
 #: Called after the actions of each replan with (environment steps done, replans done).
@@ -63,13 +66,17 @@ def record_episode(
     provenance: dict[str, str],
     report: StepReport | None = None,
     check: StopCheck = lambda: None,
+    changes: AttentionChanges | None = None,
 ) -> EpisodeResult:
     """Run one episode from the stored initial state of the same index, and commit it to the store.
 
     The protocol of the published evaluations: waiting steps, then one policy call for every `replan_steps` executed
     actions, until the task is solved or `max_steps` actions have been executed. An exception, also one from `check`,
     drops the episode: nothing of it remains in or beside the store.
+
+    changes: the run's interventions; None for none.
     """
+    changes = changes or AttentionChanges(Interventions(), {})
     protocol = store.attributes.protocol
     environment.reset(episode_index, protocol.seed)
     start = EpisodeStart(
@@ -88,7 +95,7 @@ def record_episode(
         success, step, replans = False, 0, 0
         while step < protocol.max_steps and not success:
             check()
-            actions = _replan(environment, policy, store, writer, task, episode_index, observation, step)
+            actions = _replan(environment, policy, store, writer, task, episode_index, observation, step, changes)
             replans += 1
             chunk = min(protocol.replan_steps, protocol.max_steps - step)
             for i in range(chunk):
@@ -129,12 +136,22 @@ def _replan(
     episode_index: int,
     observation: Observation,
     step: int,
+    changes: AttentionChanges,
 ) -> NDArray[np.float64]:
     protocol, recording = store.attributes.protocol, store.attributes.recording
+    interventions, replan = changes.interventions, len(writer.records)
+    where = f"replan {replan} (environment step {protocol.wait_steps + step}) of {writer.what}"
     policy_input = policy.prepare(observation, task.instruction)
-    seed = policy.replan_noise_seed(protocol.seed, task.task_id, episode_index, len(writer.records))
-    where = f"replan {len(writer.records)} (environment step {protocol.wait_steps + step}) of {writer.what}"
-    call = record_call(policy, policy_input, seed, recording, where)
+    coverage = _coverage(environment, policy, observation, where)
+    context = CallContext(
+        task.task_id, episode_index, replan, changes.instructions, tuple(environment.objects), coverage
+    )
+    if interventions.changes_input:
+        policy_input = policy.prepare_again(changed_inputs(policy_input.given, interventions, policy.sites, context))
+    noise = protocol.seed if interventions.noise is None else interventions.noise.seed
+    seed = policy.replan_noise_seed(noise, task.task_id, episode_index, replan)
+    editors = changes.editors(policy.sites, policy_input, context)
+    call = record_call(policy, policy_input, seed, recording, where, editors)
     writer.append(
         ReplanRecord(
             env_step=protocol.wait_steps + step,
@@ -146,7 +163,7 @@ def _replan(
             actions=call.actions,
             frames=policy_input.frames if recording.frames else {},
             camera_frames=policy_input.camera_frames if recording.frames else {},
-            coverage=_coverage(environment, policy, observation, where),
+            coverage=coverage,
         )
     )
     return call.actions

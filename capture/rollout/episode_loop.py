@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Suite, Task
 from vla_attention.capture.environments.suites import make_environment
+from vla_attention.capture.interventions.run_changes import AttentionChanges
 from vla_attention.capture.jobs.claims import Claims, Holder
 from vla_attention.capture.jobs.termination import Terminated, Termination
 from vla_attention.capture.jobs.worker import Worker
@@ -41,6 +42,8 @@ class EpisodeLoop:
     #: Provenance that is stored with every episode.
     machine: dict[str, str]
     termination: Termination
+    #: The run's interventions; None for none.
+    changes: AttentionChanges | None = None
     results: list[EpisodeResult] = field(default_factory=list, init=False)
     _environment: Environment | None = field(default=None, init=False)
     _task_id: int | None = field(default=None, init=False)
@@ -123,7 +126,15 @@ class EpisodeLoop:
         self._position = f"{name} at step 0"
         with self.termination.only_at_checks():
             result = record_episode(
-                environment, self.policy, self.store, task, episode, self.machine, report, self.termination.check
+                environment,
+                self.policy,
+                self.store,
+                task,
+                episode,
+                self.machine,
+                report,
+                self.termination.check,
+                self.changes,
             )
             self._position = None
             self.results.append(result)
