@@ -17,15 +17,17 @@ from vla_attention.capture.environments.base import EnvironmentSettings
 from vla_attention.capture.environments.cubes.environment import CubesEnvironment
 from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS
 from vla_attention.capture.environments.suites import find_suite, list_tasks
-from vla_attention.capture.small_policy.rollouts import CONDITIONS, Condition, Outcome, run_episode
+from vla_attention.capture.small_policy.rollouts import CONDITIONS, Condition, Outcome, run_episode, run_expert
 from vla_attention.schemas.errors import BadArgument, unknown_name
 
 Job = tuple[int, int]
+#: Stands for a checkpoint: the scripted experts.
+EXPERT = "expert"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `evaluate`."""
-    parser.add_argument("checkpoint", help="pi05_cubes, or a folder written by export")
+    parser.add_argument("checkpoint", help="pi05_cubes, a folder written by export, or `expert`: the scripted one")
     parser.add_argument("--suite", default="cubes", help="cubes (default), or the suite of a control")
     parser.add_argument("--task-id", type=int, nargs="+", metavar="N", help="tasks (default: all)")
     parser.add_argument("--episodes", type=int, default=50, metavar="N", help="initial states per task (default: 50)")
@@ -45,6 +47,10 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.condition not in CONDITIONS:
         raise unknown_name("condition", arguments.condition, CONDITIONS)
     numbers = arguments.task_id if arguments.task_id is not None else range(suite.num_tasks)
+    if arguments.checkpoint == EXPERT and arguments.condition != "normal":
+        raise BadArgument(
+            f"The experts see no pictures and read no words: they have no condition '{arguments.condition}'."
+        )
     outcomes = _read(arguments.output)
     known = {(outcome.task, outcome.state, outcome.condition) for outcome in outcomes}
     jobs = [
@@ -87,7 +93,8 @@ def _evaluate(options: dict[str, Any], jobs: Sequence[Job], results: multiproces
     from vla_attention.capture.policies.pi.build import build_pi_policy
 
     torch.set_num_threads(1)
-    policy = build_pi_policy(options["checkpoint"], tokenizer=None, device="cpu")
+    is_expert = options["checkpoint"] == EXPERT
+    policy = None if is_expert else build_pi_policy(options["checkpoint"], tokenizer=None, device="cpu")
     suite = find_suite(options["suite"])
     tasks = list_tasks(suite)
     environment: CubesEnvironment | None = None
@@ -99,16 +106,21 @@ def _evaluate(options: dict[str, Any], jobs: Sequence[Job], results: multiproces
                 environment.close()
             environment = CubesEnvironment(tasks[number], EnvironmentSettings())
             cubes = CUBE_TASKS[number].num_cubes
+        task, seed, max_steps = tasks[number], options["seed"], options["max_steps"] or suite.max_steps
+        if policy is None:
+            results.put(run_expert(environment, task, state, max_steps=max_steps, seed=seed))
+            continue
+        replan_steps = options["replan_steps"] or policy.default_replan_steps
         results.put(
             run_episode(
                 environment,
                 policy,
-                tasks[number],
+                task,
                 state,
                 condition,
-                max_steps=options["max_steps"] or suite.max_steps,
-                replan_steps=options["replan_steps"] or policy.default_replan_steps,
-                seed=options["seed"],
+                max_steps=max_steps,
+                replan_steps=replan_steps,
+                seed=seed,
             )
         )
     if environment is not None:
@@ -126,7 +138,7 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
 
 def describe(outcomes: Sequence[Outcome]) -> str:
     """Return a table of rates with 95 % intervals: solved, and the first touch at the named cube."""
-    lines = [f"{'task':<28}{'n':>5}  {'solved':<22}{'first touch named':<22}{'steps':>6}"]
+    lines = [f"{'task':<28}{'n':>5}  {'solved':<24}{'first touch named':<24}{'steps':>6}"]
     groups: list[tuple[str, list[Outcome]]] = [
         (CUBE_TASKS[task].name, [o for o in outcomes if o.task == task]) for task in sorted({o.task for o in outcomes})
     ]
@@ -136,7 +148,7 @@ def describe(outcomes: Sequence[Outcome]) -> str:
         count = len(chosen)
         solved, named = sum(o.success for o in chosen), sum(o.first_touched == o.named for o in chosen)
         steps = sum(o.steps for o in chosen) / count
-        lines.append(f"{name:<28}{count:>5}  {_rate(solved, count):<22}{_rate(named, count):<22}{steps:>6.0f}")
+        lines.append(f"{name:<28}{count:>5}  {_rate(solved, count):<24}{_rate(named, count):<24}{steps:>6.0f}")
     return "\n".join(lines)
 
 

@@ -15,6 +15,7 @@ from vla_attention.capture.environments.cubes.environment import CubesEnvironmen
 from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS
 from vla_attention.capture.environments.episode_protocol import WAIT_ACTION, WAIT_STEPS
 from vla_attention.capture.policies.policy import Policy, PolicyInput
+from vla_attention.capture.small_policy.experts import expert_action, read_state
 
 #: What is changed for the policy. `blind`: both pictures are black. `wordless`: the instruction is empty. `switched`:
 #: after `SWITCH_STEP` steps the instruction names another cube, and that one counts.
@@ -83,6 +84,21 @@ def _changed(policy: Policy, policy_input: PolicyInput, condition: Condition) ->
     if condition == "wordless":
         return policy.prepare_again(replace(given, instruction=""))
     return policy_input
+
+
+def run_expert(environment: CubesEnvironment, task: Task, state: int, *, max_steps: int, seed: int) -> Outcome:
+    """Run one episode of the scripted expert, without noise, and return how it went."""
+    cube_task = CUBE_TASKS[task.task_id]
+    environment.give_task(cube_task)
+    environment.reset(state, seed)
+    for _ in range(WAIT_STEPS):
+        environment.step(np.array(WAIT_ACTION), observe=False)
+    simulator, step, success = environment.simulator, 0, False
+    while step < max_steps and not success:
+        action = expert_action(cube_task.verb, read_state(simulator), simulator.target, simulator.destination)
+        success = environment.step(action, observe=False).success
+        step += 1
+    return Outcome(task.task_id, state, "normal", success, step, environment.first_touched, environment.named_cube)
 
 
 def other_task(number: int) -> int:
