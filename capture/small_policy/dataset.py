@@ -158,12 +158,12 @@ def split_scenes(samples: Samples, seed: int = 0) -> tuple[NDArray[np.int64], ND
     return np.flatnonzero(~held_out), np.flatnonzero(held_out)
 
 
-def usable_samples(samples: Samples, control: Control) -> NDArray[np.bool_]:
-    """Return which samples a control can use: a mark does not say on what a cube is put."""
+def usable_samples(samples: Samples, control: Control, num_tasks: int) -> NDArray[np.bool_]:
+    """Return which samples a training uses: those of the first tasks; a mark does not say on what a cube is put."""
+    usable: NDArray[np.bool_] = samples.task < num_tasks
     if control == "mark":
-        usable: NDArray[np.bool_] = samples.destination < 0
-        return usable
-    return np.ones(len(samples), dtype=np.bool_)
+        usable = usable & (samples.destination < 0)
+    return usable
 
 
 def task_weights(task: NDArray[np.integer]) -> NDArray[np.float64]:

@@ -54,6 +54,7 @@ def export(training: Path, folder: Path, name: str) -> dict[str, Any]:
     card = {
         "name": name,
         "control": facts["control"],
+        "num_tasks": facts["num_tasks"],
         "parameters": sum(tensor.numel() for tensor in weights.values()),
         "precision": "bfloat16, from averaged float32 weights",
         "seed": facts["seed"],

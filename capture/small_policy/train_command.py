@@ -22,6 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help=f"what the policy can learn from: {', '.join(CONTROLS)} (default: %(default)s)",
     )
+    parser.add_argument("--tasks", type=int, metavar="N", help="learn the first N tasks of the suite (default: all)")
     parser.add_argument(
         "--resume", action="store_true", help="go on from OUTPUT's checkpoint, if there is one; --steps may be changed"
     )
@@ -42,7 +43,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     torch.set_num_threads(arguments.threads)
     settings = TrainingSettings(
-        steps=arguments.steps, seed=arguments.seed, control=control, checkpoint_minutes=arguments.checkpoint_minutes
+        steps=arguments.steps,
+        seed=arguments.seed,
+        control=control,
+        num_tasks=arguments.tasks or len(list_tasks(find_suite("cubes"))),
+        checkpoint_minutes=arguments.checkpoint_minutes,
     )
     instructions = tuple(task.instruction for task in list_tasks(find_suite("cubes")))
     demonstrations = read_demonstrations(arguments.demonstrations, _say)

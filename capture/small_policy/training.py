@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.preprocess import Statistics
@@ -46,27 +47,33 @@ class UnusableTraining(UserError, ValueError):
 class TrainingSettings:
     """What a training depends on, besides the demonstrations.
 
-    steps: of the schedule. log_every, evaluate_every: steps between two lines of the log, and between two measurements
+    steps: of the schedule. num_tasks: the first tasks of the suite, which are learnt. log_every, evaluate_every: steps between two lines of the log, and between two measurements
     on held-out scenes. checkpoint_minutes: between two checkpoints.
     """
 
     steps: int
     seed: int = 0
     control: Control = "words"
+    num_tasks: int = len(CUBE_TASKS)
     batch_size: int = 64
     log_every: int = 20
     evaluate_every: int = 200
     checkpoint_minutes: float = 3.0
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch_size", "log_every", "evaluate_every"):
+        for name in ("steps", "num_tasks", "batch_size", "log_every", "evaluate_every"):
             if getattr(self, name) < 1:
                 raise BadArgument(f"{name} is {getattr(self, name)}; it must be at least 1.")
 
     @property
     def identity(self) -> dict[str, Any]:
         """What must be equal when a training goes on; the number of steps may be changed on the way."""
-        return {"seed": self.seed, "control": self.control, "batch_size": self.batch_size}
+        return {
+            "seed": self.seed,
+            "control": self.control,
+            "num_tasks": self.num_tasks,
+            "batch_size": self.batch_size,
+        }
 
 
 def learning_rate(step: int, steps: int) -> float:
@@ -186,7 +193,7 @@ def train(
     config = small_config(tokenizer.vocab_size)
     samples = demonstrations.samples
     training_part, held_out = split_scenes(samples)
-    usable = usable_samples(samples, settings.control)
+    usable = usable_samples(samples, settings.control, settings.num_tasks)
     training_part, held_out = training_part[usable[training_part]], held_out[usable[held_out]]
     statistics = state_statistics(samples.state[training_part])
     facts = {

@@ -109,8 +109,9 @@ def test_controls_change_pictures_and_prompts_as_they_say(demonstrations, tokeni
     np.testing.assert_array_equal(made["mark"][:, 1], plain[:, 1])
     task = samples.task[45]
     np.testing.assert_array_equal(made["mark"][1, 0], paste_mark(plain[1, 0], int(samples.target[45]), int(task)))
-    assert not usable_samples(samples, "mark")[samples.destination >= 0].any()
-    assert usable_samples(samples, "redundant").all()
+    assert not usable_samples(samples, "mark", 23)[samples.destination >= 0].any()
+    assert usable_samples(samples, "redundant", 23).all()
+    assert (samples.task[usable_samples(samples, "words", 2)] < 2).all()
 
     def different_prompts(control):
         samples_of = make_batches(demonstrations, tokenizer, control, jitter=False)
