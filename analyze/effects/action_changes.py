@@ -7,7 +7,7 @@ units of the base run's own spread: 1 is a change as large as the actions of the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,9 @@ TRANSLATION = slice(0, 3)
 #: A dimension with less spread than this part of the largest one is not driven by the policy. Division by its spread
 #: would make what is left of it, rounding or noise of the denoising, as large as a real movement.
 LEAST_SPREAD = 0.01
+#: A dimension that another noise seed changes by more than this many spreads is more than half noise: two draws of
+#: noise of variance v differ by 2 v on average.
+MOST_NOISE = 1.0
 
 
 @dataclass(frozen=True)
@@ -30,10 +33,14 @@ class ActionSpread:
     Attributes:
         spread: (dimension,) standard deviation over all replans and all steps of their chunks.
         used: (dimension,) bool, the dimensions that are compared.
+        noise: (dimension,) root mean square change by another noise seed, in spreads; None where it is not known.
+        reasons: (dimension,) why a dimension is not compared; empty for those that are.
     """
 
     spread: Array
     used: NDArray[np.bool_]
+    noise: Array | None = None
+    reasons: tuple[str, ...] = ()
 
     @property
     def left_out(self) -> tuple[int, ...]:
@@ -48,10 +55,34 @@ def action_spread(actions: Sequence[Array], dimensions: Sequence[int] | None = N
     """
     flat = np.concatenate([chunk.reshape(-1, chunk.shape[-1]) for chunk in actions])
     spread = flat.std(axis=0)
-    used = spread > LEAST_SPREAD * spread.max(initial=0.0)
-    if dimensions is not None:
-        used &= np.isin(np.arange(len(spread)), list(dimensions))
-    return ActionSpread(spread, used)
+    moves = spread > LEAST_SPREAD * spread.max(initial=0.0)
+    chosen = np.isin(np.arange(len(spread)), list(dimensions)) if dimensions is not None else np.ones_like(moves)
+    reasons = ["no spread" if not a else "" if b else "not chosen" for a, b in zip(moves, chosen, strict=True)]
+    return ActionSpread(spread, moves & chosen, reasons=tuple(reasons))
+
+
+def with_noise(spread: ActionSpread, noise: Array, leave_out: bool) -> ActionSpread:
+    """The same with the change by another noise seed; `leave_out`: dimensions that are mostly noise are not compared.
+
+    Such a dimension would make every effect as large as its noise. Where all of them are, all are kept.
+    """
+    mostly = spread.used & (noise > MOST_NOISE)
+    if not leave_out or mostly[spread.used].all():
+        return replace(spread, noise=noise)
+    reasons = ["mostly noise" if drop else reason for drop, reason in zip(mostly, spread.reasons, strict=True)]
+    return replace(spread, used=spread.used & ~mostly, noise=noise, reasons=tuple(reasons))
+
+
+def change_per_dimension(pairs: Sequence[tuple[Array, Array]], spread: Array) -> Array:
+    """Root mean square change (dimension,) over all replans and steps, in spreads; NaN where there is no spread.
+
+    pairs: actions (replan, step, dimension) of the base and of a rerun.
+    """
+    squares = np.sum([((other - base) ** 2).sum(axis=(0, 1)) for base, other in pairs], axis=0)
+    number = sum(base.shape[0] * base.shape[1] for base, _ in pairs)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        result: Array = np.where(spread > 0, np.sqrt(squares / number) / spread, np.nan)
+    return result
 
 
 def root_mean_square_change(base: Array, other: Array, spread: ActionSpread, steps: NDArray[np.int64]) -> Array:

@@ -16,7 +16,12 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.effects.action_changes import ActionSpread, action_spread
+from vla_attention.analyze.effects.action_changes import (
+    ActionSpread,
+    action_spread,
+    change_per_dimension,
+    with_noise,
+)
 from vla_attention.analyze.effects.conditions import FLOORS, Condition, Kind
 from vla_attention.analyze.effects.group_attention import MEASURES, GroupAttention, group_attention
 from vla_attention.analyze.effects.paired_replans import (
@@ -24,6 +29,7 @@ from vla_attention.analyze.effects.paired_replans import (
     CHANGES,
     BaseEpisode,
     Pairing,
+    actions_of,
     changes_of,
     mean_over_phases,
     pair_episodes,
@@ -35,7 +41,7 @@ from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.ratios.analysis import Analysis, analyse
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
-from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE, SHARE
+from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE, SHARE, Estimand
 from vla_attention.analyze.statistics.many_looks import adjusted_p_values
 from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.schemas.errors import BadArgument, listing
@@ -94,7 +100,7 @@ class EffectStudy:
     @cached_property
     def summary(self) -> pl.DataFrame:
         """Means over episodes with intervals, see `summary_of`."""
-        return summary_of(self.episodes, self.question)
+        return summary_of(self.episodes, self.question.settings.intervals)
 
     @cached_property
     def rollouts(self) -> pl.DataFrame:
@@ -136,6 +142,14 @@ def study_of(analysis: Analysis, opened: BaseAndReruns, dimensions: Sequence[int
     spread = _spread(opened.base, members, question.settings, dimensions)
     names = [episode.name for episode in opened.base.episodes]
     pairings = [pair_episodes(condition, members, names) for condition in opened.reruns]
+    noise = [pairing for pairing in pairings if pairing.condition.kind == Kind.NOISE]
+    if noise:
+        pairs = [
+            (one.actions, actions_of(one, rerun, pairing.condition))
+            for pairing in noise
+            for one, rerun in pairing.pairs
+        ]
+        spread = with_noise(spread, change_per_dimension(pairs, spread.spread), leave_out=dimensions is None)
     groups = [condition.group for condition in opened.reruns if condition.group is not None]
     attention = group_attention(question, groups) if groups else {}
     parts = [_episodes_of(pairing, spread, attention) for pairing in pairings]
@@ -194,7 +208,7 @@ def _episodes_of(pairing: Pairing, spread: ActionSpread, attention: dict[Any, Gr
 
     def measure(pair: tuple[BaseEpisode, Any]) -> list[dict[str, object]]:
         base, rerun = pair
-        changes = changes_of(base, rerun, spread, condition.store.path)
+        changes = changes_of(base, actions_of(base, rerun, condition), spread)
         there = _has_keys(known.get(base.name), len(changes))
         if not there.any():
             return []
@@ -266,7 +280,7 @@ def with_floors(episodes: pl.DataFrame, conditions: Sequence[Condition]) -> pl.D
     )
 
 
-def summary_of(episodes: pl.DataFrame, question: Question) -> pl.DataFrame:
+def summary_of(episodes: pl.DataFrame, estimand: Estimand = Estimand.TASKS_LIKE_THESE) -> pl.DataFrame:
     """Means over episodes with intervals; every task weighs the same.
 
     Returns:
@@ -276,7 +290,6 @@ def summary_of(episodes: pl.DataFrame, question: Question) -> pl.DataFrame:
         minus_noise_q and minus_random_q: p of no difference, adjusted for the number of conditions
         (Benjamini-Hochberg).
     """
-    estimand = question.settings.intervals
     values = {
         **_LIMITS,
         **dict.fromkeys((*MEASURES, "noise", "random"), POSITIVE),

@@ -112,19 +112,25 @@ def pair_episodes(condition: Condition, base: Sequence[BaseEpisode], all_names: 
     return Pairing(condition, pairs, missing, tuple(name for name in own if name not in all_names))
 
 
-def changes_of(base: BaseEpisode, rerun: StoredEpisode, spread: ActionSpread, store: object) -> Array:
-    """`CHANGES` of every replan of an episode, (replan, change). `store` is the rerun's path, for messages.
+def actions_of(base: BaseEpisode, rerun: StoredEpisode, condition: Condition) -> Array:
+    """Actions (replan, step, dimension) of an episode of a condition.
 
     Raises:
-        StoreError: the rerun has other replans, or actions of another shape.
+        StoreError: the rerun has other replans than the base, or actions of another shape.
     """
     actions = rerun.read("actions").astype(np.float64)
     steps = rerun.read("env_step").astype(np.int64)
     if not np.array_equal(steps, base.env_step) or actions.shape != base.actions.shape:
         raise StoreError(
-            f"{base.name} of {store} has {len(steps)} replans and actions of the shape {actions.shape}, and in its "
-            f"base {len(base.env_step)} and {base.actions.shape}: these are not the same replans; make the rerun again."
+            f"{base.name} of {condition.store.path} has {len(steps)} replans and actions of the shape {actions.shape}, "
+            f"and in its base {len(base.env_step)} and {base.actions.shape}: these are not the same replans; make the "
+            "rerun again."
         )
+    return actions
+
+
+def changes_of(base: BaseEpisode, actions: Array, spread: ActionSpread) -> Array:
+    """`CHANGES` of every replan of an episode, (replan, change), from the actions of its rerun (`actions_of`)."""
     whole = np.full(len(actions), actions.shape[1])
     return np.stack(
         (

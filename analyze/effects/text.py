@@ -27,7 +27,7 @@ _EFFECT_NOTE = (
 
 def effects_text(study: EffectStudy) -> str:
     """The whole text."""
-    parts = [_header(study), _groups(study), _others(study), _rollouts(study), _notes(study)]
+    parts = [_header(study), _groups(study), _left_out(study), _others(study), _rollouts(study), _notes(study)]
     if study.conditions:
         parts += [
             _floors(study),
@@ -208,14 +208,23 @@ def _rollouts(study: EffectStudy) -> str:
 
 def _dimensions(study: EffectStudy) -> str:
     spread = study.spread
-    used = [
-        f"{i}: {format_number(float(value))}{'' if spread.used[i] else ' (left out)'}"
-        for i, value in enumerate(spread.spread)
+    noise = [None] * len(spread.spread) if spread.noise is None else spread.noise.tolist()
+    body = [
+        [str(i), format_number(float(spread.spread[i])), format_number(noise[i]), spread.reasons[i] or "yes"]
+        for i in range(len(spread.spread))
     ]
-    lines = [heading("UNITS  standard deviation of each dimension of the base's actions"), *wrap(", ".join(used))]
-    if spread.left_out:
-        lines += wrap("Left out are dimensions without spread (below 1% of the largest) or not among --dimensions.")
-    return "\n".join(lines)
+    table = text_table(["dimension", "spread", "noise", "compared"], body, left=(3,))
+    note = (
+        "spread: standard deviation of the base's actions. noise: root mean square change by another noise seed, in "
+        "spreads; without --dimensions, those above 1 are left out, as they are more noise than movement."
+    )
+    return "\n".join([heading("UNITS  dimensions of the action"), table, *wrap(note)])
+
+
+def _left_out(study: EffectStudy) -> str:
+    """Which dimensions of the action are not compared."""
+    named = [f"{i} ({reason})" for i, reason in enumerate(study.spread.reasons) if reason]
+    return "\n".join(note_lines([f"not compared: dimensions {', '.join(named)} of the action."])) if named else ""
 
 
 def _notes(study: EffectStudy) -> str:

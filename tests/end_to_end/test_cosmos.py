@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 import zarr
 
+from tests.kit.questions import question_about
 from tests.kit.written_tables import written_steps
 from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.analyze.effects.conditions import GroupOfKeys
+from vla_attention.analyze.effects.group_attention import group_attention
 from vla_attention.capture.__main__ import main as capture
+from vla_attention.schemas.layout import Role
 
 pytestmark = pytest.mark.simulator
 
@@ -46,6 +50,20 @@ def test_the_store_is_whole_and_lists_both_sites(cosmos_store, capsys):
     assert "Site 'self'" in printed
     assert "Site 'cross'" in printed
     assert "words      stack, the, red, cube, on, top, of, green" in printed
+
+
+def test_a_group_of_an_intervention_is_found_at_its_own_site(cosmos_store):
+    """The question is at `self`; words are keys of `cross`, and both are measured."""
+    groups = [GroupOfKeys((text,)) for text in ("word:cube", "role:image", "word:mug")]
+    found = group_attention(question_about(cosmos_store), groups)
+    assert [found[group].site for group in groups] == ["cross", "self", None]
+    episode = zarr.open_group(cosmos_store / "episodes/task001_episode000", mode="r")
+    rows, roles = episode["self/rows"][:], episode["self/key_role"][:]
+    wanted = (rows.mean(axis=(1, 2, 3, 4)) * (roles == Role.IMAGE)).sum(axis=1)
+    np.testing.assert_allclose(found[groups[1]].values["task001_episode000"][:, 0], wanted, rtol=2e-3)
+    assert (found[groups[0]].values["task001_episode000"][:, 0] > 0).all()
+    at_self = group_attention(question_about(cosmos_store, site="self"), groups[:1])
+    assert at_self[groups[0]].site is None
 
 
 def test_rows_of_both_sites_sum_to_one_and_contributions_to_the_update(cosmos_store):

@@ -7,9 +7,11 @@ import pytest
 
 from vla_attention.analyze.effects.action_changes import (
     action_spread,
+    change_per_dimension,
     first_angle,
     gripper_flips,
     root_mean_square_change,
+    with_noise,
 )
 
 
@@ -65,3 +67,19 @@ def test_flips_are_counted_over_executed_steps():
     base[..., -1] = 1
     other[..., -1] = [[-1, 1, 1, -1], [0, -0.2, 1, 1]]  # a command of 0 leaves the gripper as it is
     assert gripper_flips(base, other, np.array([3, 4])).tolist() == [1 / 3, 1 / 4]
+
+
+def test_a_dimension_that_is_mostly_noise_is_left_out_unless_it_was_chosen():
+    generator = np.random.default_rng(3)
+    signal, noise = np.array([1.0, 0.1, 1.0]), np.array([0.05, 0.2, 0.5])
+    shape = (200, 5, 3)
+    moved = generator.normal(size=shape) * signal
+    base, other = (moved + generator.normal(size=shape) * noise for _ in range(2))
+    spread = action_spread([base])
+    change = change_per_dimension([(base[:50], other[:50]), (base[50:], other[50:])], spread.spread)
+    np.testing.assert_allclose(change, np.sqrt(2) * noise / np.hypot(signal, noise), rtol=0.06)
+    assert with_noise(spread, change, leave_out=True).left_out == (1,)
+    assert with_noise(spread, change, leave_out=True).reasons == ("", "mostly noise", "")
+    assert with_noise(spread, change, leave_out=False).left_out == ()
+    alone = action_spread([base], dimensions=(1,))
+    assert with_noise(alone, change, leave_out=True).used.tolist() == [False, True, False]

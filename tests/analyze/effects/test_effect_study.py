@@ -303,3 +303,26 @@ def test_replans_without_the_word_are_in_no_effect(folder, tmp_path):
         assert study.episodes["task_id"].unique().to_list() == [0]
         assert row_of(study, "without_bowl")["num_episodes"] == EPISODES
         assert study.notes == ()
+
+
+def test_dimensions_that_are_mostly_noise_are_named(folder, tmp_path):
+    def plant(task, episode, replans):
+        actions = changed_actions(PLANTED["noise"])(task, episode, replans)
+        generator = np.random.default_rng([task, episode])
+        actions[..., 4] += generator.normal(0, 1.5 * 0.05, actions.shape[:2])
+        return actions
+
+    spec = replace(
+        BASE,
+        plant_actions=plant,
+        interventions=PLANTED["noise"].interventions,
+        rerun_of=rerun_source(folder / "base.zarr"),
+    )
+    noisy = write_store(tmp_path / "noise.zarr", spec=spec)
+    study = study_effects(folder / "base.zarr", [noisy], AnalysisSettings())
+    assert study.spread.left_out == (4,)
+    assert "not compared: dimensions 4 (mostly noise) of the action." in effects_text(study)
+    assert row_of(study, "noise")["effect"] < 0.15
+    all_of_them = study_effects(folder / "base.zarr", [noisy], AnalysisSettings(), dimensions=tuple(range(7)))
+    assert all_of_them.spread.left_out == ()
+    assert row_of(all_of_them, "noise")["effect"] > 0.4
