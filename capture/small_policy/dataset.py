@@ -147,14 +147,17 @@ def find_control(name: str) -> Control:
 
 
 def split_scenes(samples: Samples, seed: int = 0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the samples for training and those held out, `HELD_OUT` of the scenes and at least one."""
+    """Return the samples for training and those held out, about `HELD_OUT` of the scenes and at least one.
+
+    Whether a scene is held out does not depend on the other scenes, so that more of them can be added later.
+    """
     scenes = np.unique(samples.scene)
     if len(scenes) < 2:
         raise BadArgument(
             f"The demonstrations have {len(scenes)} scene; at least 2 are needed, because one is held out."
         )
-    shuffled = np.random.Generator(np.random.Philox(seed)).permutation(scenes)
-    held_out = np.isin(samples.scene, shuffled[: max(1, round(HELD_OUT * len(scenes)))])
+    lots = np.random.Generator(np.random.Philox(seed)).random(int(scenes[-1]) + 1)
+    held_out = lots[samples.scene] < max(HELD_OUT, float(np.nextafter(lots[scenes].min(), 1.0)))
     return np.flatnonzero(~held_out), np.flatnonzero(held_out)
 
 

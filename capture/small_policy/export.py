@@ -64,6 +64,7 @@ def export(training: Path, folder: Path, name: str) -> dict[str, Any]:
         "training_minutes": round(seconds / 60, 1),
         "demonstrations": facts["demonstrations"],
         "samples": facts["samples"],
+        "earlier_demonstrations": facts.get("earlier", []),
         "instructions": facts["instructions"],
     }
     partial = folder.with_name(folder.name + ".partial")

@@ -27,6 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--resume", action="store_true", help="go on from OUTPUT's checkpoint, if there is one; --steps may be changed"
     )
     parser.add_argument(
+        "--new-demonstrations", action="store_true", help="with --resume: go on although there are others than before"
+    )
+    parser.add_argument(
         "--checkpoint-minutes", type=float, default=3.0, metavar="M", help="between checkpoints (default: %(default)s)"
     )
 
@@ -51,7 +54,15 @@ def run(arguments: argparse.Namespace) -> int:
     )
     instructions = tuple(task.instruction for task in list_tasks(find_suite("cubes")))
     demonstrations = read_demonstrations(arguments.demonstrations, _say)
-    train(demonstrations, instructions, arguments.output, settings, resume=arguments.resume, say=_say)
+    train(
+        demonstrations,
+        instructions,
+        arguments.output,
+        settings,
+        resume=arguments.resume,
+        new_demonstrations=arguments.new_demonstrations,
+        say=_say,
+    )
     return 0
 
 

@@ -6,7 +6,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -87,10 +87,13 @@ def learning_rate(step: int, steps: int) -> float:
 
 def state_statistics(state: np.ndarray) -> Statistics:
     """Return the statistics of the states (sample, 8) by which they are normalised."""
-    low, high = np.quantile(state.astype(np.float64), (0.01, 0.99), axis=0)
-    return Statistics(
-        mean=state.mean(axis=0, dtype=np.float64), std=state.std(axis=0, dtype=np.float64), q01=low, q99=high
-    )
+    state = state.astype(np.float64)
+    low, high = np.quantile(state, (0.01, 0.99), axis=0)
+    return Statistics(mean=state.mean(axis=0), std=state.std(axis=0), q01=low, q99=high)
+
+
+def _as_statistics(numbers: Mapping[str, list[float]]) -> Statistics:
+    return Statistics(**{name: np.array(values) for name, values in numbers.items()})
 
 
 class Training:
@@ -178,13 +181,15 @@ def train(
     settings: TrainingSettings,
     *,
     resume: bool = False,
+    new_demonstrations: bool = False,
     say: Callable[[str], None] = print,
     stop_at: int | None = None,
 ) -> Training:
     """Train in the folder `output`: checkpoints, log.csv, loss.png and what `export` needs.
 
-    instructions: of each task. resume: go on from the folder's checkpoint, if there is one. stop_at: end before this
-    step, as a kill would after a checkpoint.
+    instructions: of each task. resume: go on from the folder's checkpoint, if there is one. new_demonstrations: go on
+    with others than before; the statistics of the states stay. stop_at: end before this step, as a kill would after a
+    checkpoint.
     """
     output.mkdir(parents=True, exist_ok=True)
     tokenizer_file = output / TOKENIZER
@@ -195,16 +200,22 @@ def train(
     training_part, held_out = split_scenes(samples)
     usable = usable_samples(samples, settings.control, settings.num_tasks)
     training_part, held_out = training_part[usable[training_part]], held_out[usable[held_out]]
-    statistics = state_statistics(samples.state[training_part])
+    if not len(training_part) or not len(held_out):
+        raise BadArgument(
+            f"The control '{settings.control}' can use {len(training_part)} samples for training and {len(held_out)} "
+            "of scenes that are held out; record more demonstrations."
+        )
+    measured = state_statistics(samples.state[training_part])
     facts = {
         **settings.identity,
+        "instructions": list(instructions),
         "demonstrations": demonstrations.digest,
         "samples": {"training": len(training_part), "held_out": len(held_out)},
-        "instructions": list(instructions),
-        "state": {name: getattr(statistics, name).tolist() for name in ("mean", "std", "q01", "q99")},
+        "state": {name: getattr(measured, name).tolist() for name in ("mean", "std", "q01", "q99")},
     }
     training = Training(settings, config, number_ids(tokenizer).tolist())
-    _begin(training, output, facts, resume=resume, say=say)
+    facts = _begin(training, output, facts, resume=resume, new_demonstrations=new_demonstrations, say=say)
+    statistics = _as_statistics(facts["state"])
 
     def batches(part: np.ndarray, seed: int, jitter: bool) -> Batches:
         return Batches(
@@ -223,8 +234,8 @@ def train(
         step, now = training.step, time.monotonic()
         training.seconds = seconds_before + now - began
         if step % settings.log_every == 0 or step == last:
-            measured = training.measure(kept_out) if step % settings.evaluate_every == 0 or step == last else None
-            log.write(step, settings.steps, training.seconds, learning_rate(step - 1, settings.steps), measured)
+            losses_now = training.measure(kept_out) if step % settings.evaluate_every == 0 or step == last else None
+            log.write(step, settings.steps, training.seconds, learning_rate(step - 1, settings.steps), losses_now)
         if now - saved_at >= 60.0 * settings.checkpoint_minutes or step == last:
             save(training, output)
             log.draw()
@@ -233,24 +244,45 @@ def train(
 
 
 def _begin(
-    training: Training, output: Path, facts: dict[str, Any], *, resume: bool, say: Callable[[str], None]
-) -> None:
-    """Write the settings of a new training, or check them and load the checkpoint of one that goes on."""
+    training: Training,
+    output: Path,
+    facts: dict[str, Any],
+    *,
+    resume: bool,
+    new_demonstrations: bool,
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    """Write the settings of a new training, or check them and load the checkpoint of one that goes on; returns them."""
     checkpoint, settings_file = output / CHECKPOINT, output / SETTINGS
     if checkpoint.is_file() and not resume:
         raise BadArgument(f"'{output}' already has a training; go on with --resume, or give another folder.")
     if resume and checkpoint.is_file():
         before = json.loads(settings_file.read_text(encoding="utf-8"))["training"]
-        changed = [f"{name} was {before.get(name)!r}" for name in facts if before.get(name) != facts[name]]
+        fixed = (*training.settings.identity, "instructions")
+        changed = [f"{name} was {before.get(name)!r}" for name in fixed if before.get(name) != facts[name]]
         if changed:
             raise UnusableTraining(
                 f"The training in '{output}' had other settings than these: {'; '.join(changed)[:600]}; give the same "
                 "ones, or another folder."
             )
         training.load(torch.load(checkpoint, weights_only=True))
+        if before["demonstrations"] != facts["demonstrations"]:
+            if not new_demonstrations:
+                raise UnusableTraining(
+                    f"The training in '{output}' had other demonstrations ({before['samples']['training']} samples, "
+                    f"now {facts['samples']['training']}); give --new-demonstrations to go on with these."
+                )
+            earlier = {name: before[name] for name in ("demonstrations", "samples")} | {"until_step": training.step}
+            facts = {**facts, "earlier": [*before.get("earlier", []), earlier]}
+        elif "earlier" in before:
+            facts = {**facts, "earlier": before["earlier"]}
+        facts = {**facts, "state": before["state"]}
         say(f"goes on at step {training.step} of {training.settings.steps}")
     content = {"training": facts, "schedule": training.schedule, "config": asdict(training.config)}
-    settings_file.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    partial = settings_file.with_suffix(".partial")
+    partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    os.replace(partial, settings_file)
+    return facts
 
 
 def save(training: Training, output: Path) -> None:

@@ -8,11 +8,12 @@ import pytest
 import torch
 
 from tests.capture.small_policy.test_dataset import make_batches
-from tests.kit.made_up_demonstrations import INSTRUCTIONS
+from tests.kit.made_up_demonstrations import INSTRUCTIONS, write_demonstrations
 from vla_attention.capture.policies.pi.build import build_pi_policy
 from vla_attention.capture.policies.pi.flow_time import denoise_times
 from vla_attention.capture.policies.pi.gemma import RMSNorm
 from vla_attention.capture.small_policy.batches import number_ids
+from vla_attention.capture.small_policy.dataset import read_demonstrations
 from vla_attention.capture.small_policy.export import export
 from vla_attention.capture.small_policy.network import CAMERAS, initial_model, small_config
 from vla_attention.capture.small_policy.objectives import Heads, losses
@@ -134,6 +135,21 @@ def test_the_number_of_steps_may_change_on_the_way(demonstrations, tmp_path):
     found = train(demonstrations, INSTRUCTIONS, tmp_path, shorter, resume=True, say=quiet)
     assert found.step == 5
     assert json.loads((tmp_path / "settings.json").read_text())["schedule"] == [[0, 8], [3, 5]]
+
+
+def test_demonstrations_may_be_added_on_the_way(demonstrations, tmp_path):
+    few = write_demonstrations(tmp_path / "few", scenes=6, seed=1)
+    train(read_demonstrations(few), INSTRUCTIONS, tmp_path / "t", SETTINGS, stop_at=3, say=quiet)
+    before = json.loads((tmp_path / "t" / "settings.json").read_text())["training"]
+    with pytest.raises(UnusableTraining, match="--new-demonstrations"):
+        train(demonstrations, INSTRUCTIONS, tmp_path / "t", SETTINGS, resume=True, say=quiet)
+    added = {"resume": True, "new_demonstrations": True, "say": quiet}
+    train(demonstrations, INSTRUCTIONS, tmp_path / "t", SETTINGS, stop_at=5, **added)
+    train(demonstrations, INSTRUCTIONS, tmp_path / "t", SETTINGS, resume=True, say=quiet)
+    after = json.loads((tmp_path / "t" / "settings.json").read_text())["training"]
+    assert after["state"] == before["state"]
+    earlier = {name: before[name] for name in ("demonstrations", "samples")}
+    assert after["earlier"] == [{**earlier, "until_step": 3}]
 
 
 def test_a_folder_in_use_and_other_settings_are_refused(demonstrations, whole):
