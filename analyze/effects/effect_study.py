@@ -240,12 +240,12 @@ def _has_keys(attention: NDArray[np.float64] | None, replans: int) -> NDArray[np
 
 
 def _notes(pairings: Sequence[Pairing], attention: dict[Any, GroupAttention]) -> list[str]:
-    """Which episodes have no partner. A rerun may lack those in which its group has no keys."""
+    """Which episodes have no partner. A series lacks those with a replan without a key of its group."""
     notes = []
     for pairing in pairings:
         group = pairing.condition.group
         known = attention[group].values if group is not None else {}
-        empty = [name for name in pairing.missing if name in known and not _has_keys(known[name], 1).any()]
+        empty = [name for name in pairing.missing if name in known and not _has_keys(known[name], 1).all()]
         kept = replace(pairing, missing=tuple(name for name in pairing.missing if name not in empty))
         notes += [kept.note] if kept.note else []
     return notes
