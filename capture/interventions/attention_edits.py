@@ -13,7 +13,7 @@ more still reads itself, as nothing is passed on by that.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -61,14 +61,30 @@ class SiteEdit:
         return bool((self.values == (1.0 if self.kind == "factor" else 0.0)).all())
 
 
+@dataclass(frozen=True)
+class _Operands:
+    """What one edit does to the logits of one kind of call, on the model's device; None where nothing is to be done.
+
+    Axes (head or 1, query or 1, key). bias: added to the logits. dead: keys that become `MASKED_LOGIT`. members:
+    weights in a group that is made uniform.
+    """
+
+    bias: Tensor | None = None
+    dead: Tensor | None = None
+    members: Tensor | None = None
+
+
 @dataclass
 class SiteEditor(AttentionEditor):
-    """Applies the edits of one site during one replan, one after the other. Every replan needs a new one."""
+    """Applies the edits of one site during one replan, one after the other. Every replan needs a new one.
+
+    The changes that it returns may write to the logits that they are given.
+    """
 
     site: str
     edits: Sequence[SiteEdit]
-    #: Values of the edits on the model's device, by the edit's number.
-    _values: dict[int, Tensor] = field(default_factory=dict, init=False, repr=False)
+    #: By the edit's number and the kind of call, which are the same at every layer and denoise step.
+    _operands: dict[tuple[int, object], _Operands] = field(default_factory=dict, init=False, repr=False)
 
     def step_change(
         self, layer: int, denoise_step: int, action_queries: slice, own_keys: slice | None
@@ -84,24 +100,20 @@ class SiteEditor(AttentionEditor):
         if not numbers:
             return None
         where = f"layer {layer}, denoise step {denoise_step}"
+        kind = (action_queries.start, action_queries.stop, None if own_keys is None else own_keys.start)
 
-        def change(logits: Tensor) -> Tensor:
-            count, keys = logits.shape[-2:]
-            is_action = torch.zeros(count, dtype=torch.bool, device=logits.device)
+        def operands(number: int, logits: Tensor) -> _Operands:
+            heads, count, keys = logits.shape[1:]
+            edit, is_action = self.edits[number], np.zeros(count, dtype=bool)
             is_action[action_queries] = True
-            own = None
-            if own_keys is not None and not bool(is_action.all()):
-                own = torch.zeros(count, keys, dtype=torch.bool, device=logits.device)
-                own[torch.arange(count), torch.arange(own_keys.start, own_keys.stop)] = True
-                own &= ~is_action[:, None]
-            changed = logits
-            for number in numbers:
-                whole = self.edits[number].queries == "all"
-                changed = self._apply(number, changed, None, own if whole else None, None if whole else is_action)
-            self._check_keys_left(numbers, logits, changed, where)
-            return changed
+            stays = np.zeros((count, keys), dtype=bool)
+            if edit.queries == "action":
+                stays[~is_action] = True
+            elif own_keys is not None:
+                stays[np.arange(count), np.arange(own_keys.start, own_keys.stop)] = ~is_action
+            return _operands_of(edit, edit.values, stays, heads, logits.device)
 
-        return change
+        return self._change(numbers, ("step", kind), operands, where)
 
     def prefix_change(self, layer: int, tokens: Tensor) -> LogitChange | None:
         """Return the change of a call before the first denoise step, or None if nothing changes there."""
@@ -109,17 +121,14 @@ class SiteEditor(AttentionEditor):
         if not numbers:
             return None
 
-        def change(logits: Tensor) -> Tensor:
-            own = torch.eye(len(tokens), dtype=torch.bool, device=logits.device)
-            changed = logits
-            for number in numbers:
-                readers = self.edits[number].readers
-                chosen = None if readers is None else torch.from_numpy(readers).to(logits.device)[tokens]
-                changed = self._apply(number, changed, tokens, own, chosen)
-            self._check_keys_left(numbers, logits, changed, f"the prefix's layer {layer}")
-            return changed
+        def operands(number: int, logits: Tensor) -> _Operands:
+            edit, keys = self.edits[number], tokens.cpu().numpy()
+            stays = np.eye(len(keys), dtype=bool)
+            if edit.readers is not None:
+                stays[~edit.readers[keys]] = True
+            return _operands_of(edit, edit.values[keys], stays, logits.shape[1], logits.device)
 
-        return change
+        return self._change(numbers, ("prefix", len(tokens)), operands, f"the prefix's layer {layer}")
 
     def _at_layer(self, layer: int) -> list[tuple[int, SiteEdit]]:
         return [
@@ -128,34 +137,23 @@ class SiteEditor(AttentionEditor):
             if not edit.changes_nothing and (edit.layers is None or layer in edit.layers)
         ]
 
-    def _apply(
-        self, number: int, logits: Tensor, keys: Tensor | None, own: Tensor | None, queries: Tensor | None
-    ) -> Tensor:
-        """Apply one edit to logits (batch, head, query, key).
+    def _change(
+        self, numbers: Sequence[int], kind: object, operands: Callable[[int, Tensor], _Operands], where: str
+    ) -> LogitChange:
+        def change(logits: Tensor) -> Tensor:
+            had_keys = logits.amax(-1) > _LOWEST_LOGIT
+            for number in numbers:
+                if (number, kind) not in self._operands:
+                    self._operands[number, kind] = operands(number, logits)
+                logits = _applied(self._operands[number, kind], logits)
+            self._check_keys_left(numbers, had_keys, logits, where)
+            return logits
 
-        keys: the site's keys on the key axis, None for all. own: (query, key) bool, places that stay as they are.
-        queries: (query,) bool, the queries that change, None for all.
-        """
-        edit = self.edits[number]
-        if number not in self._values:
-            self._values[number] = torch.from_numpy(edit.values).to(logits.device)
-        values = self._values[number] if keys is None else self._values[number][keys]
-        if edit.kind == "factor":
-            changed = scale_weights(logits, values)
-        else:
-            members = values.float() if own is None else torch.where(own, 0.0, values.float())
-            changed = make_uniform(logits, members)
-        stays = torch.zeros(1, 1, dtype=torch.bool, device=logits.device) if own is None else own
-        if queries is not None:
-            stays = stays | ~queries[:, None]
-        if edit.heads is not None:
-            stays = stays.expand(logits.shape[1], *stays.shape).clone()
-            stays[[head for head in range(logits.shape[1]) if head not in edit.heads]] = True
-        return torch.where(stays, logits, changed)
+        return change
 
-    def _check_keys_left(self, numbers: Sequence[int], before: Tensor, after: Tensor, where: str) -> None:
-        """Raise `QueryWithoutKeys` if a query that had keys has none any more."""
-        lost = (before.amax(-1) > _LOWEST_LOGIT) & (after.amax(-1) <= _LOWEST_LOGIT)
+    def _check_keys_left(self, numbers: Sequence[int], had_keys: Tensor, after: Tensor, where: str) -> None:
+        """Raise `QueryWithoutKeys` if a query that had keys, (batch, head, query), has none any more."""
+        lost = had_keys & (after.amax(-1) <= _LOWEST_LOGIT)
         if bool(lost.any()):
             _, head, query = (int(i) for i in lost.nonzero()[0])
             groups = "; ".join(self.edits[number].group for number in numbers)
@@ -165,19 +163,43 @@ class SiteEditor(AttentionEditor):
             )
 
 
-def scale_weights(logits: Tensor, factors: Tensor) -> Tensor:
-    """Multiply the weights before normalising by the keys' factors (key,), 0 or more.
+def _operands_of(
+    edit: SiteEdit, values: NDArray[np.float64], stays: NDArray[np.bool_], heads: int, device: torch.device
+) -> _Operands:
+    """Return the operands of an edit with these values (key,); `stays` (query, key) are places that do not change."""
+    changes = ~stays[None]
+    if edit.heads is not None:
+        changes = changes & np.isin(np.arange(heads), edit.heads)[:, None, None]
+    # Axes along which all is the same have length 1.
+    changes = changes[:, :1] if (changes == changes[:, :1]).all() else changes
+    if edit.kind == "uniform":
+        return _Operands(members=torch.from_numpy(np.where(changes, values, 0.0).astype(np.float32)).to(device))
+    factors = np.where(changes, values, 1.0)
+    bias = torch.from_numpy(log_factors(factors)).to(device) if not np.isin(factors, (0.0, 1.0)).all() else None
+    dead = torch.from_numpy(factors == 0).to(device) if (factors == 0).any() else None
+    return _Operands(bias, dead)
 
-    logits: (..., key) float32. A factor of 1 leaves a logit as it is, a factor of 0 makes it `MASKED_LOGIT`.
-    """
-    bias = torch.log(torch.where(factors > 0, factors.double(), 1.0)).float()
-    return (logits + bias).masked_fill(factors == 0, MASKED_LOGIT)
+
+def _applied(operands: _Operands, logits: Tensor) -> Tensor:
+    """Return the logits (batch, head, query, key) after an edit."""
+    if operands.members is not None:
+        return make_uniform(logits, operands.members)
+    if operands.bias is not None:
+        logits.add_(operands.bias)
+    if operands.dead is not None:
+        logits.masked_fill_(operands.dead, MASKED_LOGIT)
+    return logits
+
+
+def log_factors(factors: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return what is added to logits for these factors of the weights before normalising; 0 for factors 0 and 1."""
+    return np.log(np.where(factors > 0, factors, 1.0)).astype(np.float32)
 
 
 def make_uniform(logits: Tensor, weights: Tensor) -> Tensor:
     """Replace the weights before normalising by their mean inside of a group, which keeps its sum.
 
-    logits: (..., query, key) float32. weights: (key,) or (query, key) float32 in 0..1, the keys' weights in the group.
+    logits: (..., query, key) float32. weights: (..., key) float32 in 0..1, the keys' weights in the group.
     """
     members = torch.where(logits > _LOWEST_LOGIT, weights, 0.0)
     inside = members > 0
