@@ -104,11 +104,15 @@ def root_mean_square_change(base: Array, other: Array, spread: ActionSpread, ste
 
 def first_angle(base: Array, other: Array) -> Array:
     """Angle in degrees (replan,) between the translations of the first actions; NaN where one of them is zero."""
-    first, second = base[:, 0, TRANSLATION], other[:, 0, TRANSLATION]
-    lengths = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        cosine = (first * second).sum(axis=1) / lengths
-        angle: Array = np.where(lengths > 0, np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))), np.nan)
+        first, second = (
+            part / np.linalg.norm(part, axis=1, keepdims=True)
+            for part in (base[:, 0, TRANSLATION], other[:, 0, TRANSLATION])
+        )
+    # Kahan's formula: exact for small angles, where the arc cosine loses half of the digits.
+    angle: Array = np.degrees(
+        2 * np.arctan2(np.linalg.norm(first - second, axis=1), np.linalg.norm(first + second, axis=1))
+    )
     return angle
 
 

@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     study = study_effects(arguments.base, arguments.reruns, settings_of(arguments), arguments.dimensions)
     text = effects_text(study)
     folder = arguments.output or Path("results") / arguments.base.stem / "effects"
-    tables = {"effects": study.episodes, "effects_summary": study.summary}
+    tables = {"effects": study.episodes, "effects_summary": study.summary} if study.conditions else {}
     if study.given.rollouts:
         tables |= {"rollouts": study.rollout_episodes, "rollouts_summary": study.rollouts}
     files = [*write_parquet(folder, **tables), *write_csv(folder, **tables)]

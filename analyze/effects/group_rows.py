@@ -30,7 +30,7 @@ class GroupRow:
 
 
 def group_rows(study: EffectStudy) -> list[GroupRow]:
-    """One row per group that was knocked out or kept: first those of the grouping, in its order, then the others."""
+    """One row per group that was knocked out or kept: those of the grouping in its order, then the others by effect."""
     rows = []
     alone = study.of_kind(Kind.ONLY)
     for condition in study.of_kind(Kind.WITHOUT):
@@ -39,7 +39,12 @@ def group_rows(study: EffectStudy) -> list[GroupRow]:
         alone = [other for other in alone if other is not reverse]
     rows += [_row(study, condition, None, condition) for condition in alone]
     order = {name: i for i, name in enumerate(study.analysis.grouping.names)}
-    return sorted(rows, key=lambda row: order.get(row.name, len(order)))
+    return sorted(rows, key=lambda row: (order.get(row.name, len(order)), -_effect(row)))
+
+
+def _effect(row: GroupRow) -> float:
+    """The effect without the group, by which rows are sorted; 0 where there is none."""
+    return (row.without or {}).get("effect") or 0.0
 
 
 def _row(study: EffectStudy, condition: Condition, without: Condition | None, only: Condition | None) -> GroupRow:

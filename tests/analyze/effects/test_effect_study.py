@@ -187,6 +187,7 @@ def test_nothing_changed_is_an_effect_of_zero(folder, tmp_path):
     write_store(tmp_path / "same.zarr", spec=spec)
     study = study_effects(folder / "base.zarr", [tmp_path / "same.zarr"], AnalysisSettings())
     assert study.episodes["effect"].unique().to_list() == [0.0]
+    assert study.episodes["angle"].unique().to_list() == [0.0]
     assert row_of(study, "same")["effect_low"] is None
     assert "same" in effects_text(study)
 
