@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 from vla_attention.capture.interventions.changed_inputs import changed_inputs
+from vla_attention.capture.interventions.resolution import ReplanPlace
+from vla_attention.capture.interventions.run_changes import AttentionChanges
 from vla_attention.capture.policies.policy import Policy, PolicyInput
 from vla_attention.capture.rerun.stored_calls import StoredCalls
 from vla_attention.capture.rollout.policy_call import RecordedCall, record_call
@@ -17,20 +20,29 @@ from vla_attention.schemas.stores.store_format import Recording
 class Repeater:
     """Makes stored policy calls again.
 
-    interventions: what is changed. instructions: of the store's tasks, by task id.
+    interventions: what is changed, with block indices for layers. instructions: of the store's tasks, by task id.
+    allow_empty: leave calls unchanged in which a group has no key, or an object is out of view.
     """
 
     policy: Policy
     recording: Recording
     interventions: Interventions = field(default_factory=Interventions)
     instructions: Mapping[int, str] = field(default_factory=dict)
+    allow_empty: bool = False
+
+    @cached_property
+    def attention(self) -> AttentionChanges:
+        """The changes of attention; it counts the calls without any."""
+        return AttentionChanges(self.interventions, tuple(self.instructions.values()), self.allow_empty)
 
     def prepare(self, calls: StoredCalls, replan: int) -> PolicyInput:
         """Return the model's input of a call."""
         given, policy = calls.given(replan), self.policy
         if self.interventions.changes_input:
             context = calls.context(replan, self.instructions)
-            given = changed_inputs(given, self.interventions, policy.sites, context)
+            given = changed_inputs(
+                given, self.interventions, policy.sites, context, allow_empty=self.allow_empty
+            )
         return policy.prepare_again(given)
 
     def noise_seed(self, calls: StoredCalls, replan: int) -> int:
@@ -42,5 +54,13 @@ class Repeater:
 
     def call(self, calls: StoredCalls, replan: int, policy_input: PolicyInput) -> RecordedCall:
         """Call the policy."""
+        attributes = calls.attributes
+        editors = self.attention.editors(
+            self.policy.sites,
+            policy_input,
+            attributes.objects,
+            calls.coverage_of(replan),
+            ReplanPlace(attributes.task_id, attributes.episode_index, replan),
+        )
         where = f"replan {replan} (environment step {calls.env_step[replan]}) of the rerun of {calls.episode.name}"
-        return record_call(self.policy, policy_input, self.noise_seed(calls, replan), self.recording, where)
+        return record_call(self.policy, policy_input, self.noise_seed(calls, replan), self.recording, where, editors)
