@@ -58,9 +58,7 @@ def changed_inputs(
     for change in interventions.images:
         if change.camera not in frames:
             raise unknown_name("camera", change.camera, frames)
-        frames[change.camera] = changed_picture(
-            frames[change.camera], change, sites, context, allow_empty=allow_empty
-        )
+        frames[change.camera] = changed_picture(frames[change.camera], change, sites, context, allow_empty=allow_empty)
         camera_frames.pop(change.camera, None)
     instruction = given.instruction
     if interventions.prompt is not None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vla_attention.capture.interventions.arguments import add_intervention_arguments
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import family_of_kind
 from vla_attention.capture.recording_arguments import add_recording_arguments
@@ -18,7 +19,11 @@ if TYPE_CHECKING:
 
 RERUN_EXAMPLES = """\
   vla-capture rerun runs/libero_10.zarr                      how far the calls of one episode are from the stored ones
-  vla-capture rerun runs/libero_10.zarr --store again.zarr --layers 0 1 2 --queries all    record more of the same calls
+  vla-capture rerun runs/libero_10.zarr --knockout camera:base_0_rgb       without one camera
+  vla-capture rerun runs/libero_10.zarr --keep role:instruction            with the words of the instruction alone
+  vla-capture rerun runs/libero_10.zarr --prompt empty --image left_wrist_0_rgb=blank
+  vla-capture rerun runs/libero_10.zarr --series default --words           every group and word, with controls
+  vla-capture rerun runs/libero_10.zarr --store more.zarr --layers 0 1 2 --queries all    more of the same calls
 """
 
 
@@ -32,6 +37,8 @@ def add_rerun_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -
         family = family_of_kind(root.policy.family)
         family.add_arguments(parser)
         parser.set_defaults(**family.rebuild(root.policy), family=family)
+    add_intervention_arguments(parser)
+    _add_series_arguments(parser)
     _add_selection_arguments(parser)
     add_recording_arguments(parser, "block indices", rerun=True)
     if root is not None:
@@ -75,6 +82,25 @@ def _take_recording_of(root: RootAttributes, parser: argparse.ArgumentParser) ->
     )
 
 
+def _add_series_arguments(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("a series of reruns, with --knockout-queries and the like for all of them")
+    group.add_argument(
+        "--series",
+        metavar="GROUPING",
+        help="for every group of a built-in grouping or TOML file: without it, with it alone, and without as many "
+        "random keys; and once with another noise seed",
+    )
+    group.add_argument("--words", action="store_true", help="with --series: every word of the instructions, too")
+    group.add_argument("--objects", action="store_true", help="with --series: every object of the scenes, too")
+    group.add_argument(
+        "--output-dir",
+        type=Path,
+        metavar="DIR",
+        help="with --series: folder of the stores, one for each condition; those that are whole are skipped (default: "
+        "the base's name and _reruns, beside it)",
+    )
+
+
 def _add_selection_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("which policy calls")
     group.add_argument("--task-id", type=int, nargs="+", metavar="N", help="one or several tasks (default: all)")
@@ -91,7 +117,13 @@ def _add_selection_arguments(parser: argparse.ArgumentParser) -> None:
 def _add_output_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("output")
     group.add_argument(
-        "--store", type=Path, metavar="OUT.zarr", help="store to write (default: with the base's name, beside it)"
+        "--name", metavar="NAME", default="", help="name of the condition, for tables (default: made of the options)"
+    )
+    group.add_argument(
+        "--store",
+        type=Path,
+        metavar="OUT.zarr",
+        help="store to write (default: beside the base, with the name of the condition)",
     )
     existing = group.add_mutually_exclusive_group()
     existing.add_argument("--resume", action="store_true", help="continue an existing store with what is missing")

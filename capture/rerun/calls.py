@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from vla_attention.capture.interventions.changed_inputs import changed_inputs
-from vla_attention.capture.interventions.resolution import ReplanPlace
 from vla_attention.capture.interventions.run_changes import AttentionChanges
 from vla_attention.capture.policies.policy import Policy, PolicyInput
 from vla_attention.capture.rerun.stored_calls import StoredCalls
@@ -33,16 +32,14 @@ class Repeater:
     @cached_property
     def attention(self) -> AttentionChanges:
         """The changes of attention; it counts the calls without any."""
-        return AttentionChanges(self.interventions, tuple(self.instructions.values()), self.allow_empty)
+        return AttentionChanges(self.interventions, self.instructions, self.allow_empty)
 
     def prepare(self, calls: StoredCalls, replan: int) -> PolicyInput:
         """Return the model's input of a call."""
         given, policy = calls.given(replan), self.policy
         if self.interventions.changes_input:
             context = calls.context(replan, self.instructions)
-            given = changed_inputs(
-                given, self.interventions, policy.sites, context, allow_empty=self.allow_empty
-            )
+            given = changed_inputs(given, self.interventions, policy.sites, context, allow_empty=self.allow_empty)
         return policy.prepare_again(given)
 
     def noise_seed(self, calls: StoredCalls, replan: int) -> int:
@@ -54,13 +51,7 @@ class Repeater:
 
     def call(self, calls: StoredCalls, replan: int, policy_input: PolicyInput) -> RecordedCall:
         """Call the policy."""
-        attributes = calls.attributes
-        editors = self.attention.editors(
-            self.policy.sites,
-            policy_input,
-            attributes.objects,
-            calls.coverage_of(replan),
-            ReplanPlace(attributes.task_id, attributes.episode_index, replan),
-        )
+        context = calls.context(replan, self.instructions)
+        editors = self.attention.editors(self.policy.sites, policy_input, context)
         where = f"replan {replan} (environment step {calls.env_step[replan]}) of the rerun of {calls.episode.name}"
         return record_call(self.policy, policy_input, self.noise_seed(calls, replan), self.recording, where, editors)

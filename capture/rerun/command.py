@@ -1,4 +1,4 @@
-"""`vla-capture rerun`: check that stored policy calls come out as they did, and make them again into a store."""
+"""`vla-capture rerun`: check that stored policy calls come out as they did, and make them again into stores."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from pathlib import Path
 from vla_attention.capture.capture_run import plan_recording
 from vla_attention.capture.command_line import check_writable
 from vla_attention.capture.device import load_torch
+from vla_attention.capture.interventions.resolution import interventions_for
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.provenance import describe_machine
 from vla_attention.capture.rerun.base_store import check_may_change, open_base
-from vla_attention.capture.rerun.fidelity import check_fidelity
-from vla_attention.capture.rerun.progress import RerunProgress
+from vla_attention.capture.rerun.interventions_of_rerun import check_on_store, rerun_interventions
 from vla_attention.capture.rerun.rerun_store import Rerun
 from vla_attention.capture.rerun.same_policy import check_same_policy
-from vla_attention.capture.rerun.stored_calls import check_has_inputs, read_calls
+from vla_attention.capture.rerun.series_run import SeriesRun
+from vla_attention.capture.rerun.stored_calls import check_has_inputs
 from vla_attention.capture.rollout.progress import say
 from vla_attention.capture.run_settings import recording_settings
 from vla_attention.capture.store.store_writer import WriteMode, refuse_existing
@@ -30,8 +31,16 @@ from vla_attention.schemas.threads import Threads
 
 def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Termination) -> int:
     """Run `vla-capture rerun` on parsed arguments; returns the exit code."""
+    if arguments.check is not None and arguments.check < 0:
+        raise BadArgument(f"Cannot use --check {arguments.check}; expected 0 or more policy calls.")
     base = open_base(arguments.base, arguments.task_id, arguments.num_episodes)
-    interventions = Interventions()
+    if arguments.series is not None:
+        series = SeriesRun.planned(arguments, base)
+        rerun = _prepare(arguments, base, threads, termination)
+        series.write(rerun, rerun.check(arguments.check))
+        return 0
+    _refuse_options_of_series(arguments)
+    interventions = rerun_interventions(arguments)
     check_may_change(base, interventions)
     target = _target(arguments, base, interventions)
     mode: WriteMode = "overwrite" if arguments.overwrite else "resume" if arguments.resume else "new"
@@ -40,14 +49,30 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
         if mode == "new" and target.exists():
             refuse_existing(target)
         check_writable(target.parent, "--store")
+    for line in check_on_store(interventions, base, allow_empty=arguments.allow_empty):
+        say(line)
     rerun = _prepare(arguments, base, threads, termination)
-    _check(rerun, arguments.check)
+    interventions = interventions_for(interventions, rerun.policy)
+    rerun.check(arguments.check)
     if target is None:
         return 0
-    added = rerun.write(target, mode, interventions)
+    if not interventions.is_none:
+        say(f"Interventions: {interventions.describe()}.")
+    say(rerun.describe_disk(target, [episode.attributes.num_replans for episode in base.episodes]))
+    added = rerun.write(target, mode, interventions, allow_empty=arguments.allow_empty)
     say(f"{added} episodes added. Store: {target}")
-    say(f"Next: vla-analyze {target}")
+    say(f"Next: vla-analyze {target}" if interventions.is_none else f"Next: vla-analyze effects {base.path} {target}")
     return 0
+
+
+def _refuse_options_of_series(arguments: argparse.Namespace) -> None:
+    for option, given in (
+        ("--words", arguments.words),
+        ("--objects", arguments.objects),
+        ("--output-dir", arguments.output_dir is not None),
+    ):
+        if given:
+            raise BadArgument(f"{option} belongs to a series; give --series GROUPING too, for instance default.")
 
 
 def _target(arguments: argparse.Namespace, base: Store, interventions: Interventions) -> Path | None:
@@ -77,26 +102,3 @@ def _prepare(arguments: argparse.Namespace, base: Store, threads: Threads, termi
         say(note)
     say(f"Policy: {identity.name} ({identity.checkpoint_format}: {identity.checkpoint}), weights as in {base.path}.")
     return Rerun(policy, base, recording, describe_machine(device), termination)
-
-
-def _check(rerun: Rerun, limit: int | None) -> None:
-    """Make the calls of the first episode again without any change, and print how far they are from the stored ones."""
-    if limit is not None and limit < 0:
-        raise BadArgument(f"Cannot use --check {limit}; expected 0 or more policy calls.")
-    if limit == 0:
-        say("No policy call was checked, as --check 0 says.")
-        return
-    calls = read_calls(rerun.base.episodes[0])
-    count = calls.num_replans if limit is None else min(limit, calls.num_replans)
-    progress = RerunProgress(1, count)
-    progress.begin(calls.episode.name)
-
-    def report(done: int) -> None:
-        rerun.termination.check()
-        progress.update(done, count)
-
-    try:
-        result = check_fidelity(rerun.unchanged, rerun.base.attributes.recording, calls, count, rerun.machine, report)
-    finally:
-        progress.close()
-    say(result.describe())

@@ -1,0 +1,164 @@
+"""Series of reruns: for every group of a grouping without it, with it alone, and without equally many random keys."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.capture.interventions.resolution import episode_vocabularies
+from vla_attention.schemas.errors import UserError, listing
+from vla_attention.schemas.groupings.builtin_groupings import find_grouping
+from vla_attention.schemas.groupings.grouping import REST
+from vla_attention.schemas.groupings.selector_weights import selector_weights
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
+from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange
+from vla_attention.schemas.layout import Role
+from vla_attention.schemas.stores.reader import Store
+
+#: Site -> an episode's tokens.
+TokensOfSites = Mapping[str, EpisodeTokens]
+
+
+@dataclass(frozen=True)
+class SeriesCondition:
+    """One rerun of a series: what is changed, and in which episodes (all those whose calls have the group)."""
+
+    interventions: Interventions
+    episodes: frozenset[str]
+
+    @property
+    def name(self) -> str:
+        """The condition's name, which is that of its store."""
+        return self.interventions.name
+
+
+@dataclass(frozen=True)
+class Series:
+    """The reruns of a series in the order in which they are made, and lines about what it leaves out."""
+
+    conditions: tuple[SeriesCondition, ...]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _GroupKeys:
+    """Where a group has keys: whole episodes, and those in which a random control finds enough other keys."""
+
+    episodes: frozenset[str]
+    with_control: frozenset[str]
+
+
+def plan_series(
+    base: Store, grouping: str, template: KeyKnockout, noise_seed: int, *, words: bool = False, objects: bool = False
+) -> Series:
+    """Plan the reruns of a store.
+
+    A group that some call of an episode has no key for is left out in that episode, and a group without any whole
+    episode altogether. Keys that hold nothing (padding, masked cameras) and action keys do not count.
+
+    Args:
+        base: the store.
+        grouping: name or file of a grouping; groups that take the rest (`*`) are left out.
+        template: places, queries, weight and seed of all knockouts; its selector is not used.
+        noise_seed: of the condition `noise`.
+        words, objects: further groups, one for every word of the instructions, and for every object of the scenes.
+    """
+    sites = [site.name for site in base.attributes.sites]
+    tokens: dict[str, TokensOfSites] = {
+        episode.name: {site: episode.tokens(base.attributes, site) for site in sites} for episode in base.episodes
+    }
+    vocabularies = episode_vocabularies(list(tokens.values()))
+    groups = {
+        **_groups_of(grouping, vocabularies),
+        **(_words(vocabularies) if words else {}),
+        **(_objects(vocabularies) if objects else {}),
+    }
+    everywhere = frozenset(tokens)
+    conditions = [SeriesCondition(Interventions("noise", noise=NoiseChange(noise_seed)), everywhere)]
+    absent, notes = [], []
+    for name, selector in groups.items():
+        keys = _keys_of(selector, tokens, vocabularies)
+        if not keys.episodes:
+            absent.append(name)
+            continue
+        if keys.episodes != everywhere:
+            notes.append(
+                f"Group '{name}': {len(everywhere) - len(keys.episodes)} of {len(everywhere)} episodes are left out, "
+                "in which some replan has no key of it."
+            )
+        knockout = replace(template, selector=selector, keep=False, random_seed=None)
+        conditions.append(_condition(f"without_{name}", knockout, keys.episodes))
+        conditions.append(_condition(f"only_{name}", replace(knockout, keep=True), keys.episodes))
+        if keys.with_control:
+            random = replace(knockout, random_seed=template.random_seed or 0)
+            conditions.append(_condition(f"random_{name}", random, keys.with_control))
+        if keys.with_control != keys.episodes:
+            notes.append(
+                f"Group '{name}' has a random control in {len(keys.with_control)} of {len(keys.episodes)} episodes: in "
+                "the others some replan has fewer keys outside of it than inside."
+            )
+    if absent:
+        notes.insert(0, f"Left out, as no episode has valid keys of them in all of its replans: {listing(absent, 40)}.")
+    return Series(tuple(conditions), tuple(notes))
+
+
+def _condition(name: str, knockout: KeyKnockout, episodes: frozenset[str]) -> SeriesCondition:
+    return SeriesCondition(Interventions(name, keys=(knockout,)), episodes)
+
+
+def _groups_of(grouping: str, vocabularies: Mapping[str, Vocabulary]) -> dict[str, str]:
+    """Return group -> selector of a grouping at all sites that it exists at, without the groups of the rest."""
+    groups: dict[str, str] = {}
+    problems: list[UserError] = []
+    for vocabulary in vocabularies.values():
+        try:
+            found = find_grouping(grouping, vocabulary)
+        except UserError as error:
+            problems.append(error)
+            continue
+        for name, selectors in found.groups.items():
+            if not any(selector.strip() == REST for selector in selectors):
+                joined = " | ".join(f"({selector})" for selector in selectors) if len(selectors) > 1 else selectors[0]
+                groups.setdefault(name, joined)
+    if not groups and problems:
+        raise problems[0]
+    return groups
+
+
+def _words(vocabularies: Mapping[str, Vocabulary]) -> dict[str, str]:
+    words = dict.fromkeys(word for vocabulary in vocabularies.values() for word in vocabulary.words)
+    return {f"word_{word}": f'word:"{word}"' for word in words}
+
+
+def _objects(vocabularies: Mapping[str, Vocabulary]) -> dict[str, str]:
+    names = dict.fromkeys(name for vocabulary in vocabularies.values() for name in vocabulary.objects)
+    return {f"object_{name}": f'object:"{name}"' for name in names}
+
+
+def _keys_of(selector: str, tokens: Mapping[str, TokensOfSites], vocabularies: Mapping[str, Vocabulary]) -> _GroupKeys:
+    episodes, with_control = set(), set()
+    for name, of_sites in tokens.items():
+        counts = list(_counts(selector, of_sites, vocabularies))
+        if (np.sum([inside for inside, _ in counts], axis=0) > 0).all():
+            episodes.add(name)
+            if all((np.round(inside) <= outside).all() for inside, outside in counts):
+                with_control.add(name)
+    return _GroupKeys(frozenset(episodes), frozenset(with_control))
+
+
+def _counts(
+    selector: str, tokens: TokensOfSites, vocabularies: Mapping[str, Vocabulary]
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.int64]]]:
+    """Return for every site the number of the group's keys, and of the other keys, each (replan,).
+
+    Valid keys that are no action keys count.
+    """
+    for site, weights in selector_weights(selector, tokens, vocabularies).items():
+        there = tokens[site]
+        countable = there.valid & (there.static_roles != int(Role.ACTION))
+        shape = (there.num_replans,)
+        inside = np.broadcast_to((weights * countable).sum(axis=1), shape)
+        yield inside, np.broadcast_to((countable & (weights == 0)).sum(axis=1), shape)

@@ -1,0 +1,160 @@
+"""Stored policy calls with interventions: what is stored, that it is applied again to the bit, and what is refused."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.capture.rerun.test_rerun import refused
+from vla_attention.capture.__main__ import main
+from vla_attention.schemas.interventions import KeyKnockout, NoiseChange
+from vla_attention.schemas.layout import Role
+from vla_attention.schemas.stores.reader import Store, open_store
+from vla_attention.schemas.stores.verify import verify_store
+
+ONE = ("--task-id", "0", "--num-episodes", "1")
+
+
+def rerun(base, target, *words: str) -> Store:
+    assert main(["rerun", str(base), "--store", str(target), "--check", "0", *ONE, *words]) == 0
+    store = open_store(target)
+    assert verify_store(store) == []
+    return store
+
+
+def assert_applied_again(target, capsys) -> None:
+    """An unchanged rerun of a store with interventions makes them again, to the bit."""
+    capsys.readouterr()
+    again = target.with_name("again.zarr")
+    assert main(["rerun", str(target), "--store", str(again)]) == 0
+    assert "made again without any change: bit-equal" in capsys.readouterr().out
+    assert open_store(again).attributes.interventions == open_store(target).attributes.interventions
+    for old, new in zip(open_store(target).episodes, open_store(again).episodes, strict=True):
+        assert old.attributes.arrays == new.attributes.arrays
+
+
+def test_a_knockout_is_exact_stored_and_applied_again(pi_store, tmp_path, capsys):
+    target = tmp_path / "without.zarr"
+    store = rerun(pi_store, target, "--knockout", "camera:base_0_rgb", "--knockout-layers", "0", "1")
+    knockout = KeyKnockout("camera:base_0_rgb", layers=(0, 1))
+    assert store.attributes.interventions.keys == (knockout,)
+    assert store.attributes.interventions.name == "without_camera_base_0_rgb"
+    assert store.attributes.rerun_of.run == open_store(pi_store).run
+    [old], [new] = open_store(pi_store).episodes[:1], store.episodes
+    span = store.attributes.sites[0].camera_span("base_0_rgb")
+    before, after = (episode.read("joint/rows")[..., span.start : span.stop] for episode in (old, new))
+    assert (before > 0).all()
+    assert (after[:, :2] == 0).all()
+    assert (after[:, 2:] > 0).all()
+    np.testing.assert_array_equal(old.read("env_step"), new.read("env_step"))
+    np.testing.assert_array_equal(old.read("noise_seed"), new.read("noise_seed"))
+    assert (old.read("actions") != new.read("actions")).any()
+    assert_applied_again(target, capsys)
+    assert "its run had interventions already" in refused(capsys, "rerun", target, "--prompt", "empty")
+
+
+def test_a_knockout_of_keys_without_mass_changes_nothing(pi_store, tmp_path):
+    store = rerun(pi_store, tmp_path / "nothing.zarr", "--knockout", "camera:right_wrist_0_rgb | role:padding")
+    [old], [new] = open_store(pi_store).episodes[:1], store.episodes
+    np.testing.assert_array_equal(old.read("actions"), new.read("actions"))
+    np.testing.assert_array_equal(old.read("joint/rows"), new.read("joint/rows"))
+
+
+def test_prompt_picture_and_noise_are_those_that_the_model_saw(pi_store, tmp_path, capsys):
+    target = tmp_path / "other.zarr"
+    changes = ["--prompt", "empty", "--image", "base_0_rgb=blank", "--noise-seed", "99", "--name", "blind"]
+    store = rerun(pi_store, target, *changes)
+    [old], [new] = open_store(pi_store).episodes[:1], store.episodes
+    assert store.attributes.interventions.name == "blind"
+    assert store.attributes.interventions.noise == NoiseChange(99)
+    assert (new.read("frames/base_0_rgb") == 128).all()
+    np.testing.assert_array_equal(new.read("frames/left_wrist_0_rgb"), old.read("frames/left_wrist_0_rgb"))
+    assert {prompt.instruction_text for prompt in new.attributes.prompts} == {""}
+    assert not (new.read("joint/key_role") == Role.INSTRUCTION).any()
+    assert not np.isin(new.read("noise_seed"), old.read("noise_seed")).any()
+    assert new.attributes.instruction == old.attributes.instruction
+    assert_applied_again(target, capsys)
+
+
+def test_prompts_of_another_task_shuffled_and_with_synonyms(pi_store, tmp_path):
+    (tmp_path / "words.json").write_text(json.dumps({"red": "crimson"}))
+
+    def prompt_of(change: str) -> set[str]:
+        words = ["rerun", str(pi_store), "--store", str(tmp_path / "prompt.zarr"), "--overwrite", "--check", "0"]
+        assert main([*words, "--num-episodes", "1", "--layers", "0", "--prompt", change]) == 0
+        first = open_store(tmp_path / "prompt.zarr").episodes[0]
+        return {prompt.instruction_text for prompt in first.attributes.prompts}
+
+    assert prompt_of("task:1") == {"stack the red cube on top of the green cube"}
+    assert prompt_of(f"synonyms:{tmp_path / 'words.json'}") == {"lift the crimson cube"}
+    [order] = prompt_of("shuffled")
+    assert sorted(order.split()) == ["cube", "lift", "red", "the"]
+
+
+def test_cosmos_without_words_and_with_the_wrist_alone(cosmos_store, tmp_path, capsys):
+    target = tmp_path / "without.zarr"
+    store = rerun(cosmos_store, target, "--knockout", "word:cube", "--keep", "frame:wrist")
+    [episode] = store.episodes
+    tokens = episode.tokens(store.attributes, "cross")
+    keys = [key for word in tokens.words[0] if word.text == "cube" for key in word.keys]
+    assert keys
+    assert (episode.read("cross/rows")[..., keys] == 0).all()
+    blank = store.attributes.sites[0].frame("frame0")
+    assert (episode.read("self/rows")[..., blank.start : blank.stop] == 0).all()
+    assert_applied_again(target, capsys)
+
+
+def test_wrong_interventions_are_one_sentence_and_leave_no_store(pi_store, cosmos_store, tmp_path, capsys):
+    target = tmp_path / "wrong.zarr"
+
+    def said(*words: str, base=pi_store) -> str:
+        sentence = refused(capsys, "rerun", base, "--store", target, "--check", "0", *words)
+        assert not target.exists()
+        return sentence
+
+    assert "The group 'word:green' of an intervention has no key in 6 of 12 replans" in said("--knockout", "word:green")
+    assert "there is no camera 'base'" in said("--knockout", "camera:base")
+    assert "Unknown camera 'base'" in said("--image", "base=blank")
+    assert "out of view of camera 'base_0_rgb' in 12 of 12 replans" in said("--image", "base_0_rgb=masked:cube")
+    assert "Unknown object 'ball'" in said("--image", "base_0_rgb=masked:ball")
+    assert "leaves a query without any key" in said("--knockout", "*")
+    assert "has no episode of it" in said("--prompt", "task:5")
+    assert "There is no head 8" in said("--knockout", "role:image", "--knockout-heads", "8")
+    assert "--words belongs to a series" in said("--words")
+    assert "has none" in said("--knockout", "role:instruction", "--knockout-queries", "prefix", base=cosmos_store)
+
+
+@pytest.mark.parametrize("option", ["--knockout", "--store", "--prompt"])
+def test_a_series_makes_its_own_interventions(pi_store, capsys, option):
+    said = refused(capsys, "rerun", pi_store, "--series", "default", option, "empty")
+    assert f"Cannot use {option} with --series" in said
+
+
+def test_a_series_has_every_group_and_word_with_its_controls(pi_store, tmp_path, capsys):
+    """One store for each condition; groups without keys are named; a second run finds all of them whole."""
+    folder = tmp_path / "series"
+    (tmp_path / "halves.toml").write_text(
+        '[groups]\nupper = "patch:base_0_rgb[0:1,0:2]"\nred = ["word:red"]\npads = "role:padding"\nrest = "*"\n'
+    )
+    words = ["rerun", str(pi_store), "--series", str(tmp_path / "halves.toml"), "--words", "--output-dir", str(folder)]
+    words += ["--num-episodes", "1", "--layers", "2", "--no-contributions", "--knockout-layers", "2", "--check", "1"]
+    assert main([*words, "--task-id", "0", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "Left out, as no episode has valid keys of them in all of its replans: pads." in said
+    assert "Group 'word_lift': 1 of 2 episodes are left out" in said
+    assert "policy calls, about" in said
+    names = {path.stem for path in folder.iterdir()}
+    assert {"noise", "without_upper", "only_upper", "random_upper", "without_red", "without_word_green"} <= names
+    assert not any("pads" in name or "rest" in name for name in names)
+    base = open_store(pi_store)
+    for name, episodes in (("without_upper", 2), ("only_upper", 2), ("without_word_lift", 1)):
+        store = open_store(folder / f"{name}.zarr")
+        assert store.attributes.interventions.name == name
+        assert store.attributes.interventions.keys[0].layers == (2,)
+        assert store.attributes.rerun_of.run == base.run
+        assert len(store.episodes) == episodes
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    assert main([*words, "--task-id", "0", "1"]) == 0
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
