@@ -147,7 +147,10 @@ def _replan(
         task.task_id, episode_index, replan, changes.instructions, tuple(environment.objects), coverage
     )
     if interventions.changes_input:
-        policy_input = policy.prepare_again(changed_inputs(policy_input.given, interventions, policy.sites, context))
+        given = changed_inputs(
+            policy_input.given, interventions, policy.sites, context, allow_empty=changes.allow_empty
+        )
+        policy_input = policy.prepare_again(given)
     noise = protocol.seed if interventions.noise is None else interventions.noise.seed
     seed = policy.replan_noise_seed(noise, task.task_id, episode_index, replan)
     editors = changes.editors(policy.sites, policy_input, context)

@@ -115,6 +115,7 @@ def test_mistakes_are_found_before_anything_is_written(tmp_path, capsys, words, 
         (("--knockout", "object:nothing"), "there is no object 'nothing'"),
         (("--knockout", "words:all", "--prompt", "empty"), "'words:all' of an intervention has no key at replan 0 of"),
         (("--knockout", "span:prompt | role:image | role:action"), "leaves a query without any key at site 'joint'"),
+        (("--image", "base_0_rgb=filled:cube"), "'cube' is out of view of camera 'base_0_rgb' at replan 0 of"),
         (("--keep", "camera:base_0_rgb", "--random-keys", "1"), "keys outside of the group at replan 0"),
     ],
 )
@@ -125,7 +126,7 @@ def test_mistakes_that_a_policy_call_shows(tmp_path, capsys, words, expected):
 
 
 def test_empty_groups_are_allowed_on_request(base, tmp_path, capsys):
-    words = ("--knockout", "words:all & role:image", "--allow-empty")
+    words = ("--knockout", "words:all & role:image", "--image", "base_0_rgb=filled:cube", "--allow-empty")
     same = captured(tmp_path / "a.zarr", "--task-id", "0", *words)
     assert "In 2 of 2 replans a group of an intervention had no key" in capsys.readouterr().out
     np.testing.assert_array_equal(same.episodes[0].read("actions"), base.episodes[0].read("actions"))
