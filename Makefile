@@ -8,7 +8,7 @@
 #
 # Options, as in: make capture SUITE=libero_10 TASK_ID="0 3" CHECKPOINT=~/pi05_libero, or make capture POLICY=cosmos
 POLICY     ?= pi
-CHECKPOINT ?= embedded
+CHECKPOINT ?= untrained
 SUITE      ?= robosuite
 TASK_ID    ?=
 EPISODES   ?=
@@ -20,8 +20,8 @@ OUTPUT     ?= results/$(basename $(notdir $(STORE)))/$(basename $(notdir $(GROUP
 # Anything else that the command lines accept, as in: make capture ARGS="--max-steps 100 --resume"
 ARGS       ?=
 
-# The embedded policy is untrained and never solves a task: two episodes of four tasks, cut short, show everything in minutes.
-DEMO := $(and $(filter embedded,$(CHECKPOINT)),$(filter robosuite,$(SUITE)))
+# The policy `untrained` has random weights and never solves a task: two episodes of four tasks, cut short, show everything in minutes.
+DEMO := $(and $(filter untrained,$(CHECKPOINT)),$(filter robosuite,$(SUITE)))
 ifneq ($(DEMO),)
 CAPTURE_ARGS := --num-episodes $(or $(EPISODES),2) --max-steps 50
 else

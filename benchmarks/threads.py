@@ -2,7 +2,7 @@
 
 Usage: python benchmarks/threads.py [--rounds 7] [--busy 2] [--threads N]
 
-Three processes make the embedded pi0.5's calls in turn, so that all of them see the same machine: with torch's own
+Three processes make the untrained pi0.5's calls in turn, so that all of them see the same machine: with torch's own
 defaults, with the number of threads and the sleeping that `vla-capture` sets, and with one thread. Two more scan a
 store of ten episodes through the Python API: with numpy's default threads, and with one BLAS thread inside the scan, as
 the product does. Medians are printed; on a machine with other work, "alone" is not alone.

@@ -13,7 +13,7 @@
 #
 # Environment variables; one that is empty counts as not set.
 # What is run
-#   CHECKPOINT     checkpoint folder of openpi or LeRobot, ORG/NAME on the hub, 'embedded' or 'dummy' (small, untrained)
+#   CHECKPOINT     checkpoint folder of openpi or LeRobot, ORG/NAME on the hub, 'untrained' or 'untrained-tiny' (random weights)
 #                  (default: ~/.cache/openpi/openpi-assets/checkpoints/pi05_libero)
 #   CKPT_PATH      the same under the other script's name
 #   CONFIG_NAME    openpi's name for the checkpoint's configuration (default: pi05_libero or what the checkpoint says)

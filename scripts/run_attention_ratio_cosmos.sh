@@ -13,7 +13,7 @@
 #
 # Environment variables; one that is empty counts as not set.
 # What is run
-#   CKPT_PATH      checkpoint folder, ORG/NAME on the hub, 'embedded' or 'dummy' (small, untrained)
+#   CKPT_PATH      checkpoint folder, ORG/NAME on the hub, 'untrained' or 'untrained-tiny' (random weights)
 #                  (default: nvidia/Cosmos-Policy-LIBERO-Predict2-2B)
 #   CHECKPOINT     the same under the other script's name
 #   CONFIG_NAME    the reference's name for the configuration (default: its LIBERO one)

@@ -144,7 +144,8 @@ class Analysis:
         question, headline, row = self.question, self.headline, self.overall
         untrained = question.untrained
         policy = question.stores[0].attributes.policy
-        name = f"{policy.name}{', untrained' if untrained else ''} ({shortened(policy.checkpoint, 60)})"
+        said = untrained and "untrained" not in policy.name
+        name = f"{policy.name}{', untrained' if said else ''} ({shortened(policy.checkpoint, 60)})"
         suites = sorted(self.episodes.cells["suite"].unique())
         layers, steps = len(set(question.selection.blocks)), question.selection.denoise_steps
         solved = sum(item.episode.attributes.success for item in question.selected)

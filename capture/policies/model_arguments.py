@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
+
+from vla_attention.schemas.errors import BadArgument
 
 #: The two untrained policies that come with the program: a small one, and a smaller one for tests.
-EMBEDDED = "embedded"
-DUMMY = "dummy"
-UNTRAINED = (EMBEDDED, DUMMY)
+UNTRAINED = "untrained"
+UNTRAINED_TINY = "untrained-tiny"
+UNTRAINED_POLICIES = (UNTRAINED, UNTRAINED_TINY)
+#: Their names in stores that were made before they said what the policies are.
+FORMER_NAMES = {"embedded": UNTRAINED, "dummy": UNTRAINED_TINY}
+
+
+def check_not_renamed(checkpoint: str) -> None:
+    """Raise `BadArgument` with the new name for a former name of an untrained policy, unless a folder is called so."""
+    if checkpoint in FORMER_NAMES and not Path(checkpoint).exists():
+        raise BadArgument(f"The policy '{checkpoint}' is now called '{FORMER_NAMES[checkpoint]}'; give this name.")
 
 
 def add_model_arguments(
@@ -26,9 +37,9 @@ def add_model_arguments(
     group.add_argument(
         *checkpoint_options,
         dest="checkpoint",
-        default=EMBEDDED,
+        default=UNTRAINED,
         metavar="PATH",
-        help=f"{checkpoint}; '{EMBEDDED}' is a small untrained policy that comes with the tool, '{DUMMY}' a "
+        help=f"{checkpoint}; '{UNTRAINED}' is a small untrained policy that comes with the tool, '{UNTRAINED_TINY}' a "
         "smaller one (default: %(default)s)",
     )
     group.add_argument("--config-name", metavar="NAME", help=config_name)

@@ -10,12 +10,12 @@ import pytest
 from vla_attention.capture.__main__ import main as capture
 
 #: The policy of test size gives four actions a call.
-DUMMY = ("pi", "--checkpoint", "dummy", "--replan-steps", "4", "--max-steps", "12")
+DUMMY = ("pi", "--checkpoint", "untrained-tiny", "--replan-steps", "4", "--max-steps", "12")
 
 
 @pytest.fixture(scope="session")
 def run_capture() -> Callable[..., None]:
-    """Run `vla-capture pi` with the dummy policy and further arguments; anything but success fails the test."""
+    """Run `vla-capture pi` with the tiny policy and further arguments; anything but success fails the test."""
 
     def run(*arguments: object) -> None:
         assert capture([*DUMMY, *map(str, arguments)]) == 0

@@ -11,7 +11,7 @@ from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.stores.store_format import FORMAT_VERSION
 
-DUMMY = ["pi", "--checkpoint", "dummy", "--replan-steps", "4"]
+DUMMY = ["pi", "--checkpoint", "untrained-tiny", "--replan-steps", "4"]
 
 
 def run(command, arguments, capsys) -> str:
@@ -46,7 +46,7 @@ def run(command, arguments, capsys) -> str:
         (["--num-episodes", "0"], "expected at least 1"),
         (["--num-episodes", "51"], "its initial states are 0 to 49"),
         (["--num-image-tokens", "256"], "4 keys; leave the option out"),
-        (["--paligemma-variant", "gemma_2b"], "contradicts the policy 'dummy'"),
+        (["--paligemma-variant", "gemma_2b"], "contradicts the policy 'untrained-tiny'"),
         (["--action-expert-variant", "gemma_300"], "Did you mean 'gemma_300m'?"),
         (["--device", "cuda:99"], "CUDA devices"),
         (["--resume", "--overwrite"], "not allowed with"),

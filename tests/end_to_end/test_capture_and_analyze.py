@@ -294,7 +294,17 @@ def test_capture_is_interrupted_cleanly(monkeypatch, tmp_path, capsys):
 
     monkeypatch.setattr("vla_attention.capture.rollout.episode_loop.record_episode", interrupt)
     code = capture(
-        ["pi", "--checkpoint", "dummy", "--replan-steps", "4", "--task-id", "0", "--store", str(tmp_path / "a.zarr")]
+        [
+            "pi",
+            "--checkpoint",
+            "untrained-tiny",
+            "--replan-steps",
+            "4",
+            "--task-id",
+            "0",
+            "--store",
+            str(tmp_path / "a.zarr"),
+        ]
     )
     assert code == 130
     assert "--resume" in capsys.readouterr().err

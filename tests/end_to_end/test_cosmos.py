@@ -22,7 +22,7 @@ pytestmark = pytest.mark.simulator
 ONE_LAYER = (
     "cosmos",
     "--ckpt-path",
-    "dummy",
+    "untrained-tiny",
     "--task-id",
     "0",
     "--num-episodes",
@@ -37,7 +37,17 @@ ONE_LAYER = (
 @pytest.fixture(scope="module")
 def cosmos_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     store = tmp_path_factory.mktemp("cosmos") / "cosmos.zarr"
-    arguments = ["cosmos", "--ckpt-path", "dummy", "--task-id", "1", "--num-episodes", "1", "--max-steps", "20"]
+    arguments = [
+        "cosmos",
+        "--ckpt-path",
+        "untrained-tiny",
+        "--task-id",
+        "1",
+        "--num-episodes",
+        "1",
+        "--max-steps",
+        "20",
+    ]
     assert capture([*arguments, "--num-open-loop-steps", "8", "--store", str(store)]) == 0
     return store
 
@@ -136,7 +146,7 @@ def test_queries_can_be_pooled_by_action_step(tmp_path):
     ],
 )
 def test_bad_input_is_one_sentence(arguments, expected, tmp_path, capsys):
-    given = ["cosmos", "--ckpt-path", "dummy", "--store", str(tmp_path / "a.zarr"), *arguments]
+    given = ["cosmos", "--ckpt-path", "untrained-tiny", "--store", str(tmp_path / "a.zarr"), *arguments]
     assert capture(given) == 2
     said = capsys.readouterr().err.strip()
     assert expected in said

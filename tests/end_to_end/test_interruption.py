@@ -24,7 +24,7 @@ from vla_attention.capture.published.evaluate import evaluate_attention_ratio
 
 pytestmark = pytest.mark.simulator
 
-DUMMY = ["pi", "--checkpoint", "dummy", "--replan-steps", "4", "--task-id", "0"]
+DUMMY = ["pi", "--checkpoint", "untrained-tiny", "--replan-steps", "4", "--task-id", "0"]
 NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2")
 
 
@@ -135,7 +135,7 @@ def test_array_tasks_fill_one_store_and_the_analysis_comes_last(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     for name, value in {"MIN": "0", "MAX": "1", "STEP": "1", "COUNT": "2"}.items():
         monkeypatch.setenv(f"SLURM_ARRAY_TASK_{name}", value)
-    arguments = ["--checkpoint", "dummy", "--task-suite", "robosuite", "--num-episodes", "1"]
+    arguments = ["--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--num-episodes", "1"]
     short = ["--replan-steps", "4", "--max-steps", "8"]
     folder = tmp_path / "results/attention_ratio_robosuite"
     store = folder / "robosuite.zarr"

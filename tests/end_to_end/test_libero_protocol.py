@@ -16,7 +16,7 @@ from vla_attention.capture.__main__ import main as capture
 
 EPISODE = "episodes/task000_episode002"
 #: The rack, the cabinet and the stove of this task have no joint: every reset places them.
-SHORT = ("pi", "--checkpoint", "dummy", "--task-suite", "libero_goal", "--task-id", "0", "--max-steps", "4")
+SHORT = ("pi", "--checkpoint", "untrained-tiny", "--task-suite", "libero_goal", "--task-id", "0", "--max-steps", "4")
 
 
 @pytest.mark.simulator

@@ -77,7 +77,7 @@ def test_an_array_interrupted_in_episodes_equals_a_single_process(tmp_path, monk
     output = tmp_path / "array"
     store = output / "robosuite.zarr"
     variables = {
-        "CHECKPOINT": "dummy",
+        "CHECKPOINT": "untrained-tiny",
         "TASK_SUITE": "robosuite",
         "NUM_EPISODES": str(EPISODES),
         "ARGS": ARGS,
@@ -135,10 +135,10 @@ def test_an_array_interrupted_in_episodes_equals_a_single_process(tmp_path, monk
 
     single = tmp_path / "single"
     for task in TASKS:
-        arguments = ["--checkpoint", "dummy", "--task-suite", "robosuite", "--task-id", str(task)]
+        arguments = ["--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", str(task)]
         arguments += ["--num-episodes", str(EPISODES), "--layers", "0", "2", "--output-dir", str(single), *ARGS.split()]
         assert evaluate_attention_ratio([*arguments, "--stage", "capture"]) == 0
-    arguments = ["--task-suite", "robosuite", "--checkpoint", "dummy", "--layers", "0", "2"]
+    arguments = ["--task-suite", "robosuite", "--checkpoint", "untrained-tiny", "--layers", "0", "2"]
     assert evaluate_attention_ratio([*arguments, "--output-dir", str(single), "--stage", "analyze"]) == 0
     assert_same(store, single / "robosuite.zarr")
     name = "attention_ratio_results_robosuite.json"

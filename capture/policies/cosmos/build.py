@@ -9,10 +9,11 @@ from vla_attention.capture.policies.cosmos.config import DEFAULT_CONFIG_NAME, fi
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, random_policy
 from vla_attention.capture.policies.cosmos.loading import CosmosOptions, load_cosmos_policy
 from vla_attention.capture.policies.cosmos.policy import ACTION_FRAME, CosmosPolicy
+from vla_attention.capture.policies.model_arguments import UNTRAINED, UNTRAINED_TINY, check_not_renamed
 from vla_attention.capture.policies.precision import find_dtype
 from vla_attention.schemas.errors import BadArgument
 
-_UNTRAINED = {"embedded": EMBEDDED_CONFIG, "dummy": DUMMY_CONFIG}
+_UNTRAINED = {UNTRAINED: EMBEDDED_CONFIG, UNTRAINED_TINY: DUMMY_CONFIG}
 
 
 def build_cosmos_policy(
@@ -38,7 +39,8 @@ def build_cosmos_policy(
     """Build the policy and check the options against it; parameters are the options of the command line.
 
     `checkpoint` is a folder, a file of weights, a name on the hub, or one of the untrained policies that come with the
-    package: `embedded`, `dummy`. Raises `BadArgument` or `UnknownName` for frames and calls that do not exist.
+    package: `untrained`, `untrained-tiny`. Raises `BadArgument` or `UnknownName` for frames and calls that do not
+    exist.
     """
     find_config(config_name)  # checked first, so that the error comes before any download
     options = CosmosOptions(
@@ -54,6 +56,7 @@ def build_cosmos_policy(
         query_frame=query_frame,
         dtype=find_dtype(dtype) if dtype is not None else None,
     )
+    check_not_renamed(checkpoint)
     if checkpoint in _UNTRAINED:
         policy = _untrained(checkpoint, options, device)
     else:

@@ -1,8 +1,8 @@
 """Untrained Cosmos policies with seeded random weights, which run on any machine.
 
-They solve no task. `embedded` has the published policy's depth, latent frames and sampler at a quarter of its picture
+They solve no task. `untrained` has the published policy's depth, latent frames and sampler at a quarter of its picture
 area, so that the same layer and frame
-numbers exist; `dummy` is for tests. Weights are scaled such that attention has structure:
+numbers exist; `untrained-tiny` is for tests. Weights are scaled such that attention has structure:
 rows are neither uniform nor on one key, and depend on pictures, words, noise and time.
 """
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from vla_attention.capture.policies.cosmos.protocol import COSMOS
 from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedScript
-from vla_attention.capture.policies.model_arguments import UNTRAINED, add_model_arguments
+from vla_attention.capture.policies.model_arguments import FORMER_NAMES, UNTRAINED_POLICIES, add_model_arguments
 from vla_attention.schemas.errors import BadArgument
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _CHECKPOINT = "nvidia/Cosmos-Policy-LIBERO-Predict2-2B"
 _EXAMPLES = f"""\
-  vla-capture cosmos                                         embedded untrained policy, built-in tasks
+  vla-capture cosmos                                         untrained policy, built-in tasks
   vla-capture cosmos --ckpt-path {_CHECKPOINT} --task-suite libero_10
 """
 
@@ -104,7 +104,7 @@ def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
         "chunk_size": identity.action_horizon,
     }
     if identity.checkpoint_format == "seeded":
-        return {"checkpoint": identity.name, **facts}
+        return {"checkpoint": FORMER_NAMES.get(identity.name, identity.name), **facts}
     return {
         "checkpoint": identity.checkpoint,
         "config_name": identity.config["configuration"],
@@ -136,7 +136,7 @@ FAMILY = PolicyFamily(
     replan_default="--num-open-loop-steps",
     protocols=(COSMOS,),
     seed_of="seed of the noise; the simulator's is 0, as published",
-    untrained=UNTRAINED,
+    untrained=UNTRAINED_POLICIES,
     analysis_arguments=_analysis_arguments,
     parity=ParityCases(recognises=_is_cosmos_case, run=_run_parity),
     published=PublishedScript(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from vla_attention.capture.policies.model_arguments import UNTRAINED, UNTRAINED_TINY, check_not_renamed
 from vla_attention.capture.policies.pi.config import GEMMA_VARIANTS, GemmaConfig, find_config, find_variant
 from vla_attention.capture.policies.pi.embedded import dummy_policy, embedded_policy
 from vla_attention.capture.policies.pi.formats import detect_format, find_format
@@ -16,7 +17,7 @@ from vla_attention.capture.policies.pi.policy import PiPolicy
 from vla_attention.capture.policies.precision import find_dtype
 from vla_attention.schemas.errors import BadArgument, listing
 
-_UNTRAINED = {"embedded": embedded_policy, "dummy": dummy_policy}
+_UNTRAINED = {UNTRAINED: embedded_policy, UNTRAINED_TINY: dummy_policy}
 
 
 def build_pi_policy(
@@ -36,7 +37,8 @@ def build_pi_policy(
     """Build the policy and check the options against it.
 
     `checkpoint` is a folder, a name on a hub, or one of the two untrained policies that come with the package:
-    `embedded`, `dummy`. Raises `BadArgument` if a variant or the number of image tokens contradicts the policy.
+    `untrained`, `untrained-tiny`. Raises `BadArgument` if a variant or the number of image tokens contradicts the
+    policy.
     """
     wanted = {
         "--paligemma-variant": find_variant(paligemma_variant) if paligemma_variant else None,
@@ -51,6 +53,7 @@ def build_pi_policy(
     )
     if config_name is not None:
         find_config(config_name)  # an unknown name is reported before any download
+    check_not_renamed(checkpoint)
     if checkpoint in _UNTRAINED:
         if dataclasses.replace(options, dtype=None) != CheckpointOptions() or options.dtype == torch.bfloat16:
             raise BadArgument(

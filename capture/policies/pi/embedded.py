@@ -12,6 +12,7 @@ from torch import Tensor
 
 from vla_attention.capture.environments.episode_protocol import OPENPI_REPLAN_STEPS
 from vla_attention.capture.policies.identity import PolicySource
+from vla_attention.capture.policies.model_arguments import UNTRAINED, UNTRAINED_TINY
 from vla_attention.capture.policies.pi.config import GemmaConfig, PiConfig, SiglipConfig, find_variant
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.model_weights import expected_shapes, model_from_state
@@ -134,10 +135,10 @@ def _random_policy(
 
 
 def embedded_policy(seed: int = 0, device: str | torch.device = "cpu") -> PiPolicy:
-    """Build the embedded policy; the seed draws its weights."""
-    return _random_policy("embedded", EMBEDDED_CONFIG, seed, device)
+    """Build the untrained policy; the seed draws its weights."""
+    return _random_policy(UNTRAINED, EMBEDDED_CONFIG, seed, device)
 
 
 def dummy_policy(seed: int = 0, device: str | torch.device = "cpu") -> PiPolicy:
     """Build the policy of test size; all four actions of a chunk are executed."""
-    return _random_policy("dummy", DUMMY_CONFIG, seed, device, replan_steps=DUMMY_CONFIG.action_horizon)
+    return _random_policy(UNTRAINED_TINY, DUMMY_CONFIG, seed, device, replan_steps=DUMMY_CONFIG.action_horizon)

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from vla_attention.capture.environments.episode_protocol import LEROBOT, OPENPI
 from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedScript
-from vla_attention.capture.policies.model_arguments import UNTRAINED, add_model_arguments
+from vla_attention.capture.policies.model_arguments import FORMER_NAMES, UNTRAINED_POLICIES, add_model_arguments
 
 if TYPE_CHECKING:
     from vla_attention.capture.policies.pi.policy import PiPolicy
     from vla_attention.schemas.stores.store_format import PolicyIdentity
 
 _EXAMPLES = """\
-  vla-capture pi                                             embedded untrained policy, built-in tasks
+  vla-capture pi                                             untrained policy, built-in tasks
   vla-capture pi --checkpoint ~/.cache/openpi/openpi-assets/checkpoints/pi05_libero \\
       --task-suite libero_10 --num-episodes 5 --output-dir results/attention_ratio
   vla-capture pi --checkpoint lerobot/pi05_libero_finetuned --tokenizer PATH --task-suite libero_10
@@ -74,7 +74,7 @@ def _build(arguments: argparse.Namespace, device: str) -> PiPolicy:
 
 def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
     if identity.checkpoint_format == "seeded":
-        return {"checkpoint": identity.name}
+        return {"checkpoint": FORMER_NAMES.get(identity.name, identity.name)}
     settings = {"checkpoint": identity.checkpoint, "dtype": identity.config["dtype"]}
     if identity.checkpoint_format in ("openpi_torch", "openpi_jax", "lerobot"):
         settings["checkpoint_format"] = identity.checkpoint_format
@@ -104,7 +104,7 @@ FAMILY = PolicyFamily(
     replan_default="5 for openpi, n_action_steps for LeRobot",
     protocols=(OPENPI, LEROBOT),
     layers_note="; also the published scripts' numbers 18..35 (25 = block 7)",
-    untrained=UNTRAINED,
+    untrained=UNTRAINED_POLICIES,
     parity=ParityCases(
         recognises=_is_pi_case,
         run=_run_parity,

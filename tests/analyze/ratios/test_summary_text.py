@@ -60,7 +60,7 @@ def test_header_says_what_was_analysed():
 
 
 def test_untrained_weights_are_said_first():
-    run = AnalysedRun(stores=["x.zarr"], policy="dummy", untrained=True, denoise_steps=[0])
+    run = AnalysedRun(stores=["x.zarr"], policy="untrained-tiny", untrained=True, denoise_steps=[0])
     text = summarise(*CASES["one"](), run)
     assert text.index("WARNING: the policy has untrained") < text.index("store:")
 

@@ -25,7 +25,17 @@ def without_simulator(monkeypatch):
 
 
 def run(store: Path, *words: str, family: str = "pi") -> int:
-    first = [family, "--checkpoint", "dummy", "--num-episodes", "1", "--max-steps", "8", "--precision", "exact"]
+    first = [
+        family,
+        "--checkpoint",
+        "untrained-tiny",
+        "--num-episodes",
+        "1",
+        "--max-steps",
+        "8",
+        "--precision",
+        "exact",
+    ]
     return main([*first, "--store", str(store), *words])
 
 

@@ -45,7 +45,7 @@ def dummy_cosmos():
     pytest.importorskip("diffusers")
     from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, random_policy
 
-    return random_policy("dummy", DUMMY_CONFIG)
+    return random_policy("untrained-tiny", DUMMY_CONFIG)
 
 
 MAKERS = {"pi05": dummy_policy, "pi0": dummy_pi0, "cosmos": dummy_cosmos}
@@ -255,5 +255,5 @@ def test_the_prefix_runs_once_before_all_denoise_steps(pi):
 
 def test_cosmos_has_no_prefix():
     policy = policy_named("cosmos")
-    with pytest.raises(BadArgument, match="policy 'dummy' has none"):
+    with pytest.raises(BadArgument, match="policy 'untrained-tiny' has none"):
         editors_of(policy, prepared(policy), KeyKnockout("role:image", queries="prefix"))

@@ -272,7 +272,7 @@ def test_a_link_to_a_store_and_several_stores(store, episode, tmp_path, capsys):
 def test_resuming_records_what_is_missing_and_says_what_is_damaged(tmp_path, monkeypatch, capsys):
     capture_without_simulator(monkeypatch)
     store = tmp_path / "a.zarr"
-    given = ["pi", "--checkpoint", "dummy", "--task-id", "0", "--replan-steps", "4", "--max-steps", "4"]
+    given = ["pi", "--checkpoint", "untrained-tiny", "--task-id", "0", "--replan-steps", "4", "--max-steps", "4"]
     given += ["--num-episodes", "3", "--store", str(store)]
     assert main(given) == 0
     reference = files(store)
@@ -317,7 +317,16 @@ def test_the_other_suites_do_not_wait_for_a_repair(tmp_path, monkeypatch, capsys
             raise DamagedEpisodesLeft(f"damage in {settings.suite.name}.")
 
     monkeypatch.setattr("vla_attention.capture.capture_run.run_capture", run_capture)
-    arguments = ["--checkpoint", "dummy", "--task-suite", "all", "--stage", "capture", "--output-dir", str(tmp_path)]
+    arguments = [
+        "--checkpoint",
+        "untrained-tiny",
+        "--task-suite",
+        "all",
+        "--stage",
+        "capture",
+        "--output-dir",
+        str(tmp_path),
+    ]
     assert evaluate_attention_ratio(arguments) == 2
     assert captured == ["libero_spatial", "libero_object", "libero_goal", "libero_10"]
     assert "damage in libero_spatial. damage in libero_goal." in capsys.readouterr().err

@@ -48,7 +48,7 @@ def run(script: str, folder: Path, *words: str, **variables: str) -> subprocess.
 )
 def test_a_mistake_is_one_sentence_and_leaves_nothing(tmp_path, script, variables, expected):
     (tmp_path / "file").write_text("")
-    done = run(script, tmp_path, CHECKPOINT="dummy", **variables)
+    done = run(script, tmp_path, CHECKPOINT="untrained-tiny", **variables)
     assert done.returncode == 2, done.stderr
     assert expected in done.stderr
     assert done.stderr.count("\n") == 1
@@ -130,7 +130,7 @@ def test_variables_become_the_options_that_they_name():
 
 def test_a_job_with_a_real_checkpoint_needs_a_gpu():
     assert arguments(SLURM_JOB_ID="1") == ["--device", "cuda"]
-    assert arguments(SLURM_JOB_ID="1", CHECKPOINT="dummy") == ["--checkpoint", "dummy"]
+    assert arguments(SLURM_JOB_ID="1", CHECKPOINT="untrained-tiny") == ["--checkpoint", "untrained-tiny"]
     assert arguments(SLURM_JOB_ID="1", DEVICE="cpu") == ["--device", "cpu"]
     assert arguments(SLURM_JOB_ID="1", STAGE="analyze", SLURM_ARRAY_TASK_ID="3") == ["--stage", "analyze"]
     assert arguments(SLURM_ARRAY_TASK_ID="3") == ["--array-index", "3"]

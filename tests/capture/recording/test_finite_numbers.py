@@ -22,8 +22,8 @@ from vla_attention.schemas.stores.verify import verify_store
 
 #: The same episode 0 is written before the policy is spoiled: it must stay whole.
 DUMMY = {
-    "pi": ["pi", "--checkpoint", "dummy", "--task-id", "0", "--replan-steps", "4", "--max-steps", "8"],
-    "cosmos": ["cosmos", "--ckpt-path", "dummy", "--task-id", "0", "--max-steps", "8"],
+    "pi": ["pi", "--checkpoint", "untrained-tiny", "--task-id", "0", "--replan-steps", "4", "--max-steps", "8"],
+    "cosmos": ["cosmos", "--ckpt-path", "untrained-tiny", "--task-id", "0", "--max-steps", "8"],
 }
 
 

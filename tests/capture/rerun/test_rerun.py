@@ -119,12 +119,14 @@ def test_another_state_than_the_prompts_is_an_error(pi_store):
 
 
 def test_wrong_stores_and_settings_are_one_sentence(pi_store, tmp_path, capsys):
-    assert "There is no store at" in refused(capsys, "rerun", tmp_path / "nothing.zarr", "--checkpoint", "dummy")
+    assert "There is no store at" in refused(
+        capsys, "rerun", tmp_path / "nothing.zarr", "--checkpoint", "untrained-tiny"
+    )
     assert "into the store itself" in refused(capsys, "rerun", pi_store, "--store", pi_store, "--overwrite")
     assert "no episode of task 7; it has tasks 0, 1" in refused(capsys, "rerun", pi_store, "--task-id", "7")
     assert "--num-episodes 0" in refused(capsys, "rerun", pi_store, "--num-episodes", "0")
     assert "--check -1" in refused(capsys, "rerun", pi_store, "--check", "-1")
-    assert "its weights have the digest" in refused(capsys, "rerun", pi_store, "--checkpoint", "embedded")
+    assert "its weights have the digest" in refused(capsys, "rerun", pi_store, "--checkpoint", "untrained")
     assert "expected block indices" in refused(capsys, "rerun", pi_store, "--layers", "9")
     assert "unrecognized arguments: --t5-tokenizer" in refused(capsys, "rerun", pi_store, "--t5-tokenizer", "x")
 

@@ -14,7 +14,7 @@ from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, random_
 @pytest.fixture(scope="session")
 def dummy():
     pytest.importorskip("diffusers")
-    return random_policy("dummy", DUMMY_CONFIG)
+    return random_policy("untrained-tiny", DUMMY_CONFIG)
 
 
 @pytest.fixture(scope="session")

@@ -164,7 +164,7 @@ def test_a_name_on_the_hub_without_a_network(monkeypatch):
 
 def test_untrained_policies_of_one_seed_are_the_same():
     pytest.importorskip("diffusers")
-    policy = build_cosmos_policy("embedded", device="cpu")
+    policy = build_cosmos_policy("untrained", device="cpu")
     assert policy.num_layers == 28
-    again = random_policy("embedded", policy.config)
+    again = random_policy("untrained", policy.config)
     assert again.identity().digest == policy.identity().digest

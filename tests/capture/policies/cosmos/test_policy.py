@@ -76,7 +76,7 @@ def test_rows_are_those_of_the_action_frame_only(dummy, prepared):
 
 
 def test_another_query_frame_has_other_rows(dummy, prepared):
-    other = random_policy("dummy", DUMMY_CONFIG, query_frame="curr_last")
+    other = random_policy("untrained-tiny", DUMMY_CONFIG, query_frame="curr_last")
     assert other.query_frame == "primary"
     ours, theirs = recorders_for(dummy), recorders_for(other)
     actions = dummy.act(prepared, 195, ours)
@@ -171,7 +171,7 @@ def test_frames_are_found_by_name_and_number():
 def test_without_diffusers_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "diffusers.models.autoencoders.autoencoder_kl_wan", None)
     with pytest.raises(MissingDependency, match=r"vla-attention\[cosmos\]"):
-        build_cosmos_policy("dummy", device="cpu")
+        build_cosmos_policy("untrained-tiny", device="cpu")
 
 
 def test_a_call_that_never_was_is_an_error():
@@ -191,7 +191,7 @@ def test_identity_survives_json_and_names_what_matters(dummy):
     assert identity.untrained is True
     for name in ("dtype", "configuration", "normalisation", "prompt_format", "query_frame"):
         assert name in identity.config
-    assert random_policy("dummy", DUMMY_CONFIG, 1).identity().digest != identity.digest
+    assert random_policy("untrained-tiny", DUMMY_CONFIG, 1).identity().digest != identity.digest
 
 
 def test_denoise_times_and_noise_seeds(dummy):
@@ -205,7 +205,12 @@ def test_denoise_times_and_noise_seeds(dummy):
 def test_options_reach_the_policy():
     pytest.importorskip("diffusers")
     policy = build_cosmos_policy(
-        "dummy", device="cpu", num_denoising_steps_action=4, chunk_size=8, num_open_loop_steps=5, query_frame="frame4"
+        "untrained-tiny",
+        device="cpu",
+        num_denoising_steps_action=4,
+        chunk_size=8,
+        num_open_loop_steps=5,
+        query_frame="frame4",
     )
     assert policy.num_denoise_steps == 4
     assert policy.action_horizon == 8
@@ -231,7 +236,7 @@ def test_options_reach_the_policy():
 def test_options_that_cannot_be_are_one_sentence(options, message):
     pytest.importorskip("diffusers")
     with pytest.raises((BadArgument, UnknownName), match=message):
-        build_cosmos_policy("dummy", device="cpu", **options)
+        build_cosmos_policy("untrained-tiny", device="cpu", **options)
 
 
 def test_swapping_only_the_embedding_under_the_same_noise_changes_the_actions(dummy, prepared):
