@@ -47,8 +47,9 @@ class UnusableTraining(UserError, ValueError):
 class TrainingSettings:
     """What a training depends on, besides the demonstrations.
 
-    steps: of the schedule. num_tasks: the first tasks of the suite, which are learnt. log_every, evaluate_every: steps between two lines of the log, and between two measurements
-    on held-out scenes. checkpoint_minutes: between two checkpoints.
+    steps: of the schedule. num_tasks: the first tasks of the suite, which are learnt. log_every, evaluate_every: steps
+    between two lines of the log, and between two measurements on held-out scenes. checkpoint_minutes: between two
+    checkpoints.
     """
 
     steps: int
