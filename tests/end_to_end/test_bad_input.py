@@ -51,6 +51,7 @@ def run(command, arguments, capsys) -> str:
         (["--device", "cuda:99"], "CUDA devices"),
         (["--resume", "--overwrite"], "not allowed with"),
         (["--checkpoint", "no/such/folder"], "There is no checkpoint"),
+        (["--checkpoint", "dummy"], "now called 'untrained-tiny'"),
         (["--checkpoint", "gs://bucket/name", "--config-name", "pi05_libro"], "Did you mean 'pi05_libero'?"),
         (["--dtype", "float16"], "expected float32, bfloat16"),
         (["--checkpoint-format", "openpi"], "Existing: openpi_torch, openpi_jax, lerobot"),
