@@ -70,7 +70,7 @@ class LossLog:
 
         with self._path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
-        figure = Figure(figsize=(12, 3.4), layout="constrained")
+        figure = Figure(figsize=(12, 3.6), layout="constrained")
         for axis, (part, title) in zip(figure.subplots(1, len(_PANELS)), _PANELS.items(), strict=True):
             for prefix, label, colour, width in (
                 ("train", "training (mean between rows)", _TRAINING, 1.0),
@@ -83,5 +83,5 @@ class LossLog:
             axis.set_xlabel("step")
             axis.grid(visible=True, which="both", alpha=0.25)
         figure.axes[0].set_ylabel("loss (log scale)")
-        figure.axes[0].legend(fontsize=7)
+        figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
         figure.savefig(self._picture, dpi=110)
