@@ -209,7 +209,7 @@ def _episodes_of(pairing: Pairing, spread: ActionSpread, attention: dict[Any, Gr
     def measure(pair: tuple[BaseEpisode, Any]) -> list[dict[str, object]]:
         base, rerun = pair
         changes = changes_of(base, actions_of(base, rerun, condition), spread)
-        there = _has_keys(known.get(base.name), len(changes))
+        there = _has_keys(known.get(base.name), len(changes), condition.kind)
         if not there.any():
             return []
         changes[~there] = np.nan
@@ -231,12 +231,16 @@ def _episodes_of(pairing: Pairing, spread: ActionSpread, attention: dict[Any, Gr
     return pl.DataFrame(rows, schema=_EPISODE_SCHEMA)
 
 
-def _has_keys(attention: NDArray[np.float64] | None, replans: int) -> NDArray[np.bool_]:
+def _has_keys(attention: NDArray[np.float64] | None, replans: int = 1, kind: Kind = Kind.WITHOUT) -> NDArray[np.bool_]:
     """Replans (replan,) in which a group has keys in the base: a word is in some instructions only.
 
-    Where it has none nothing was changed, and the effect is not 0 but missing.
+    Where it has none nothing was changed, and the effect is not 0 but missing. Of a group that covers less than half a
+    patch, the random control has no key: they are counted in whole keys.
     """
-    return np.ones(replans, dtype=bool) if attention is None else attention[:, MEASURES.index("keys")] > 0
+    if attention is None:
+        return np.ones(replans, dtype=bool)
+    keys = attention[:, MEASURES.index("keys")]
+    return keys >= 0.5 if kind == Kind.RANDOM else keys > 0
 
 
 def _notes(pairings: Sequence[Pairing], attention: dict[Any, GroupAttention]) -> list[str]:
@@ -245,7 +249,7 @@ def _notes(pairings: Sequence[Pairing], attention: dict[Any, GroupAttention]) ->
     for pairing in pairings:
         group = pairing.condition.group
         known = attention[group].values if group is not None else {}
-        empty = [name for name in pairing.missing if name in known and not _has_keys(known[name], 1).all()]
+        empty = [name for name in pairing.missing if name in known and not _has_keys(known[name]).all()]
         kept = replace(pairing, missing=tuple(name for name in pairing.missing if name not in empty))
         notes += [kept.note] if kept.note else []
     return notes

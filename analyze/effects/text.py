@@ -216,7 +216,8 @@ def _dimensions(study: EffectStudy) -> str:
     table = text_table(["dimension", "spread", "noise", "compared"], body, left=(3,))
     note = (
         "spread: standard deviation of the base's actions. noise: root mean square change by another noise seed, in "
-        "spreads; without --dimensions, those above 1 are left out, as they are more noise than movement."
+        "spreads; without --dimensions, those above 1 are left out, as they are more noise than movement (all are kept "
+        "where all would be)."
     )
     return "\n".join([heading("UNITS  dimensions of the action"), table, *wrap(note)])
 

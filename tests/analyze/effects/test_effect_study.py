@@ -327,3 +327,17 @@ def test_dimensions_that_are_mostly_noise_are_named(folder, tmp_path):
     all_of_them = study_effects(folder / "base.zarr", [noisy], AnalysisSettings(), dimensions=tuple(range(7)))
     assert all_of_them.spread.left_out == ()
     assert row_of(all_of_them, "noise")["effect"] > 0.4
+
+
+def test_a_control_of_less_than_half_a_key_is_none(folder, tmp_path):
+    """An object that covers 0.3 of a patch: its knockout is a knockout, and random keys are counted in whole ones."""
+    selector = "object:robot & patch:base_0_rgb[0:1,0:1]"
+    for name, options in (("without_robot", {}), ("random_robot", {"random_seed": 0})):
+        write_rerun(
+            tmp_path / f"{name}.zarr", folder / "base.zarr", PlantedRerun(knockout(name, selector, **options), 0.3)
+        )
+    found = study_effects(folder / "base.zarr", [tmp_path], AnalysisSettings()).episodes.filter(phase="all")
+    keys = {row["episode_index"]: row for row in found.filter(condition="without_robot", task_id=0).to_dicts()}
+    assert all(row["keys"] > 0 and row["num_replans"] == REPLANS for row in keys.values())
+    controls = found.filter(condition="random_robot")
+    assert controls["num_replans"].sum() < found.filter(condition="without_robot")["num_replans"].sum()
