@@ -123,13 +123,17 @@ class Rerun:
             repeater = Repeater(self.policy, self.recording, interventions, self.instructions, allow_empty)
         progress = RerunProgress(len(todo), sum(episode.attributes.num_replans for episode in todo))
         try:
-            return rerun_episodes(repeater, store, todo, self.machine, progress, self.termination)
+            added = rerun_episodes(repeater, store, todo, self.machine, progress, self.termination)
         except UserError:
             if is_new and not store.committed():
                 shutil.rmtree(store.path)
             raise
         finally:
             progress.close()
+        # With the stored prompts this was said before the first call.
+        if interventions.prompt is not None and (line := repeater.attention.describe_empty()):
+            say(line)
+        return added
 
     def describe_disk(self, target: Path, replans: Sequence[int]) -> str:
         """Return the line about the disk space of reruns of episodes with so many policy calls."""
