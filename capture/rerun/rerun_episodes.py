@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from vla_attention.capture.rerun.stored_calls import StoredCalls, read_calls
 from vla_attention.capture.store.episode_writer import EpisodeStart, ReplanRecord
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.stores.reader import StoredEpisode
-from vla_attention.schemas.stores.store_format import parse_episode_name
+from vla_attention.schemas.stores.store_format import StoreExists, parse_episode_name
 
 
 def rerun_episodes(
@@ -31,14 +32,15 @@ def rerun_episodes(
         Terminated: SIGTERM was received; the episode in progress was dropped.
         CorruptEpisode: an episode is damaged. Those before it stay.
     """
-    done, added = store.committed(), 0
+    added = 0
     for episode in episodes:
-        if parse_episode_name(episode.name) in done:
-            continue
         termination.check()
-        with termination.only_at_checks():
+        # Another process may run the same command, and have committed an episode meanwhile.
+        if store.has(*parse_episode_name(episode.name)):
+            continue
+        with termination.only_at_checks(), suppress(StoreExists):
             rerun_episode(repeater, store, read_calls(episode), machine, progress, termination)
-        added += 1
+            added += 1
     return added
 
 

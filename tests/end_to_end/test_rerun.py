@@ -15,8 +15,8 @@ pytestmark = [pytest.mark.simulator, pytest.mark.libero]
 
 #: Family -> the options of a short capture, and the camera that shows the objects.
 FAMILIES = {
-    "pi": (("--checkpoint", "dummy", "--max-steps", "12"), "base_0_rgb"),
-    "cosmos": (("--ckpt-path", "dummy", "--max-steps", "20"), "primary"),
+    "pi": (("--checkpoint", "untrained-tiny", "--max-steps", "12"), "base_0_rgb"),
+    "cosmos": (("--ckpt-path", "untrained-tiny", "--max-steps", "20"), "primary"),
 }
 
 

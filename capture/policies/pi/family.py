@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -80,7 +81,9 @@ def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
         settings["checkpoint_format"] = identity.checkpoint_format
     if identity.checkpoint_format.startswith("openpi"):
         settings["discrete_state_input"] = identity.config["config"].get("discrete_state_input", False)
-    return settings
+    # A configuration that was derived from the files says more than its name.
+    named = re.fullmatch(r"openpi's (\w+)", identity.config["configuration"])
+    return settings | ({"config_name": named[1]} if named else {})
 
 
 def _is_pi_case(content: Mapping[str, Any]) -> bool:

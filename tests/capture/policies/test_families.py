@@ -79,6 +79,11 @@ def test_a_third_family_captures_and_is_analysed(tmp_path, capfd):
     assert steps.height == 6
     assert (tmp_path / "attention_ratio_results_robosuite.json").is_file()
     assert "seen / read" in printed
+    # Its store is run again with the family's own options.
+    assert main(["rerun", str(store), "--toy-size", "3", "--check", "2"]) == 0
+    assert "made again without any change: bit-equal" in capfd.readouterr().out
+    assert main(["rerun", str(store)]) == 2
+    assert "its policy has the action_horizon 3, and this one has 4" in capfd.readouterr().err
 
 
 @pytest.mark.usefixtures("toy_is_registered")
