@@ -14,6 +14,7 @@ from vla_attention.analyze.statistics.many_looks import NAMED_AT
 
 #: Sentences that name conditions after looking at all: beyond noise, and beyond random keys.
 _SENTENCES = 2
+_MODALITIES = ("visual", "linguistic")
 
 
 def answer_lines(study: EffectStudy) -> list[str]:
@@ -22,7 +23,8 @@ def answer_lines(study: EffectStudy) -> list[str]:
         return ["No rerun was given, only rollouts: there are no effects on single actions."]
     grouping = study.analysis.grouping
     rows = {row.name: row for row in group_rows(study)}
-    sides = [] if grouping.ratio is None else [*grouping.ratio.numerator, *grouping.ratio.denominator]
+    # Where a site has one of the modalities only (Cosmos), the grouping has no ratio.
+    sides = _MODALITIES if grouping.ratio is None else (*grouping.ratio.numerator, *grouping.ratio.denominator)
     lines = [noise_sentence(study)]
     lines += [side_sentence(rows[name], name) for name in sides if name in rows]
     if study.analysis.headline is not None:

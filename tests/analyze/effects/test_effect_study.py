@@ -341,3 +341,11 @@ def test_a_control_of_less_than_half_a_key_is_none(folder, tmp_path):
     assert all(row["keys"] > 0 and row["num_replans"] == REPLANS for row in keys.values())
     controls = found.filter(condition="random_robot")
     assert controls["num_replans"].sum() < found.filter(condition="without_robot")["num_replans"].sum()
+
+
+def test_what_is_seen_and_read_is_told_without_a_ratio_too(folder):
+    """As for Cosmos, where each site has one of the modalities."""
+    series = [folder / "series" / f"{name}.zarr" for name in ("noise", "without_visual")]
+    study = study_effects(folder / "base.zarr", series, AnalysisSettings(groups=("image=role:image",)))
+    assert study.analysis.grouping.ratio is None
+    assert "Without visual the action changes by 1.2" in " ".join(effects_text(study).split())
