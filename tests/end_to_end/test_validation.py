@@ -1,0 +1,123 @@
+"""`benchmarks/validation`: the reduced run on policies that were trained for a step, and its arithmetic."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import polars as pl
+import pytest
+
+from benchmarks.validation.__main__ import main
+from benchmarks.validation.calls import changed_episodes, chosen_replans, spread_of
+from benchmarks.validation.changes import without
+from benchmarks.validation.known import contrasts
+from benchmarks.validation.page import blocks, fill_page
+from benchmarks.validation.policies import KnownPolicy, load_policy
+from benchmarks.validation.tables import means, spearman
+from tests.kit.made_up_demonstrations import INSTRUCTIONS, write_demonstrations
+from vla_attention.analyze.effects.effect_study import study_effects
+from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.capture.__main__ import main as capture
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.stores.reader import open_store
+
+
+def quiet(line: str) -> None:
+    """Say nothing."""
+
+
+def numbers_of(values):
+    """A table of one number per task, as of one policy."""
+    rows = [("cubes", task, 0, "ratio_lift", value) for task, value in enumerate(values)]
+    names = ["suite", "task_id", "episode_index", "number", "value"]
+    return pl.DataFrame(rows, schema=names, orient="row")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rank_correlation_is_that_of_scipy(seed):
+    scipy_stats = pytest.importorskip("scipy.stats")
+    generator = np.random.default_rng(seed)
+    first, second = generator.integers(0, 6, (2, 12)).astype(float)  # with ties
+    assert spearman(first, second) == pytest.approx(scipy_stats.spearmanr(first, second).statistic)
+
+
+def test_rank_correlation_needs_four_items_and_spread():
+    assert np.isnan(spearman(np.arange(3.0), np.arange(3.0)))
+    assert np.isnan(spearman(np.ones(5), np.arange(5.0)))
+    assert spearman(np.array([1.0, 2, 3, 4, np.nan]), np.array([1.0, 2, 3, 4, 0])) == pytest.approx(1)
+
+
+def test_means_go_back_to_their_scale():
+    table = numbers_of([1.0, 4.0])
+    assert means(table, ["number"], scale="log")[0]["value"] == pytest.approx(2.0)
+    assert means(numbers_of([np.nan, 4.0]), ["number"])[0]["num_episodes"] == 1
+
+
+@pytest.mark.parametrize(
+    ("reader", "other", "verdict"),
+    [
+        ([0.5, 0.6, 0.4, 0.5], [2.0, 2.1, 1.9, 2.0], "separates"),
+        ([2.0, 2.1, 1.9, 2.0], [0.5, 0.6, 0.4, 0.5], "wrong way"),
+        ([0.5, 2.0, 0.4, 2.2], [2.0, 0.5, 1.9, 0.6], "does not"),
+    ],
+)
+def test_a_reader_has_the_smaller_lift(reader, other, verdict):
+    policies = [KnownPolicy("a", "a", "cubes", "words"), KnownPolicy("b", "b", "cubes", "redundant")]
+    rows = contrasts(policies, {"a": numbers_of(reader), "b": numbers_of(other)})
+    assert {row["number"]: row["verdict"] for row in rows}["ratio_lift"] == verdict
+
+
+def test_replans_are_spread_over_the_episode():
+    assert chosen_replans(9, 3).tolist() == [1, 4, 7]
+    assert chosen_replans(2, 3).tolist() == [0, 1]
+
+
+def test_a_page_without_marks_is_refused(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("nothing")
+    with pytest.raises(BadArgument, match="has no marks"):
+        fill_page(page, {"policies": []})
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    """The reduced run about two policies that were trained for one step."""
+    from vla_attention.capture.small_policy.dataset import read_demonstrations
+    from vla_attention.capture.small_policy.export import export
+    from vla_attention.capture.small_policy.training import TrainingSettings, train
+
+    folder = tmp_path_factory.mktemp("validation")
+    demonstrations = read_demonstrations(write_demonstrations(folder / "demonstrations"))
+    for control in ("words", "redundant"):
+        settings = TrainingSettings(steps=1, batch_size=2, control=control)
+        train(demonstrations, INSTRUCTIONS, folder / control, settings, say=quiet)
+        export(folder / control, folder / "policies" / f"{control}_0", f"{control}_0")
+    given = [str(folder / "policies"), "--work", str(folder / "work"), "--reduced"]
+    assert main(given) == 0
+    return folder / "work"
+
+
+@pytest.mark.simulator
+@pytest.mark.slow
+def test_the_reduced_run_has_every_table_and_unchanged_calls_are_the_stored_ones(work):
+    results = json.loads((work / "results.json").read_text())
+    assert set(blocks(results)) == {"policies", "words/redundant", "other", "prediction", "mixing", "success"}
+    assert [policy["rerun_difference"] for policy in results["policies"]] == [0.0, 0.0]
+    assert {row["family"] for row in results["prediction"]} >= {"groups", "regions", "tokens", "heads, text"}
+    assert len(list(work.glob("validation_*.png"))) == 3
+
+
+@pytest.mark.simulator
+@pytest.mark.slow
+def test_effects_are_those_of_vla_analyze_on_the_stores_of_vla_capture_rerun(work, tmp_path):
+    base = open_store(work / "words_0" / "base.zarr")
+    store = tmp_path / "without.zarr"
+    assert capture(["rerun", str(base.path), "--knockout", "role:instruction", "--store", str(store)]) == 0
+    table = study_effects(base.path, [store], AnalysisSettings()).episodes.filter(phase="all")
+    spread = spread_of(base)
+    changes = {"words": without("role:instruction")}
+    ours = changed_episodes(load_policy(base.path), base, lambda episode: changes, 99, tmp_path / "calls", quiet)
+    expected = {row["task_id"]: row["effect"] for row in table.iter_rows(named=True)}
+    for episode in ours:
+        assert episode.effect("words", spread).mean() == pytest.approx(expected[episode.task_id], rel=1e-6)
