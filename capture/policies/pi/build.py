@@ -14,6 +14,7 @@ from vla_attention.capture.policies.pi.formats import detect_format, find_format
 from vla_attention.capture.policies.pi.loading import CheckpointOptions, load_pi_policy
 from vla_attention.capture.policies.pi.locate import find_checkpoint, find_tokenizer
 from vla_attention.capture.policies.pi.policy import PiPolicy
+from vla_attention.capture.policies.pi.shipped import SHIPPED
 from vla_attention.capture.policies.precision import find_dtype
 from vla_attention.schemas.errors import BadArgument, listing
 
@@ -62,9 +63,12 @@ def build_pi_policy(
             )
         policy = _UNTRAINED[checkpoint](device=device)
     else:
-        path = find_checkpoint(checkpoint)
+        path = SHIPPED[checkpoint] if checkpoint in SHIPPED else find_checkpoint(checkpoint)
         detect_format(path, options.checkpoint_format)  # a folder without a checkpoint is reported first
         policy = load_pi_policy(path, find_tokenizer(path, tokenizer), options=options, device=device)
+        if checkpoint in SHIPPED:
+            # Where the package is installed differs between machines; its name does not.
+            policy.source = dataclasses.replace(policy.source, checkpoint=checkpoint)
     config = policy.model.config
     for option, given, actual in (
         ("--paligemma-variant", wanted["--paligemma-variant"], config.paligemma),

@@ -1,0 +1,58 @@
+"""The trained policy that comes with the package: its size, its card, and that it reads and looks."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.kit.policy_inputs import make_observation
+from vla_attention.capture.policies.pi.build import build_pi_policy
+from vla_attention.capture.policies.pi.policy import PiPolicy
+from vla_attention.capture.policies.pi.shipped import CUBES_POLICY, SHIPPED
+from vla_attention.schemas.layout import Role
+
+FOLDER = SHIPPED[CUBES_POLICY]
+
+
+@pytest.fixture(scope="module")
+def policy() -> PiPolicy:
+    return build_pi_policy(CUBES_POLICY, tokenizer=None, device="cpu")
+
+
+def test_it_is_as_small_as_promised_and_its_card_agrees(policy: PiPolicy) -> None:
+    card = json.loads((FOLDER / "card.json").read_text(encoding="utf-8"))
+    parameters = sum(parameter.numel() for parameter in policy.model.parameters())
+    assert parameters == card["parameters"] <= 5_000_000
+    assert sum(file.stat().st_size for file in FOLDER.rglob("*") if file.is_file()) <= 10_000_000
+    assert card["control"] == "words"
+
+
+def test_stores_name_it_and_not_the_place_where_it_is_installed(policy: PiPolicy) -> None:
+    identity = policy.identity()
+    assert (identity.name, identity.checkpoint, identity.untrained) == (CUBES_POLICY, CUBES_POLICY, False)
+
+
+def test_its_words_are_whole_tokens_and_its_state_has_a_token_per_number(policy: PiPolicy) -> None:
+    observation = make_observation()
+    given = policy.prepare(observation, "put the red cube on the green cube")
+    pieces = given.prompt.pieces
+    text = given.prompt.text
+    words = [text[piece.start : piece.stop].strip() for piece in pieces]
+    for word in ("put", "the", "red", "cube", "on", "green"):
+        assert word in words
+    assert (given.key_role["joint"] == Role.STATE).sum() == 8
+
+
+def test_another_word_changes_what_it_does(policy: PiPolicy) -> None:
+    observation = make_observation()
+    red, again, blue = (
+        policy.act(policy.prepare(observation, f"lift the {colour} cube"), 3) for colour in ("red", "red", "blue")
+    )
+    np.testing.assert_array_equal(red, again)
+    assert not np.allclose(red, blue, atol=1e-3)
+    black = replace(observation, images={name: np.zeros_like(image) for name, image in observation.images.items()})
+    blind = policy.act(policy.prepare(black, "lift the red cube"), 3)
+    assert not np.allclose(red, blind, atol=1e-3)
