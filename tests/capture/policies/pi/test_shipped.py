@@ -36,7 +36,7 @@ def test_stores_name_it_and_not_the_place_where_it_is_installed(policy: PiPolicy
 
 
 def test_its_words_are_whole_tokens_and_its_state_has_a_token_per_number(policy: PiPolicy) -> None:
-    observation = make_observation()
+    observation = make_observation(0)
     given = policy.prepare(observation, "put the red cube on the green cube")
     pieces = given.prompt.pieces
     text = given.prompt.text
@@ -47,7 +47,7 @@ def test_its_words_are_whole_tokens_and_its_state_has_a_token_per_number(policy:
 
 
 def test_another_word_changes_what_it_does(policy: PiPolicy) -> None:
-    observation = make_observation()
+    observation = make_observation(0)
     red, again, blue = (
         policy.act(policy.prepare(observation, f"lift the {colour} cube"), 3) for colour in ("red", "red", "blue")
     )
