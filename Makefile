@@ -8,8 +8,8 @@
 #
 # Options, as in: make capture SUITE=libero_10 TASK_ID="0 3" CHECKPOINT=~/pi05_libero, or make capture POLICY=cosmos
 POLICY     ?= pi
-CHECKPOINT ?= untrained
-SUITE      ?= robosuite
+CHECKPOINT ?= $(if $(filter pi,$(POLICY)),pi05_cubes,untrained)
+SUITE      ?= $(if $(filter pi05_cubes,$(CHECKPOINT)),cubes,robosuite)
 TASK_ID    ?=
 EPISODES   ?=
 LAYERS     ?=
@@ -20,13 +20,9 @@ OUTPUT     ?= results/$(basename $(notdir $(STORE)))/$(basename $(notdir $(GROUP
 # Anything else that the command lines accept, as in: make capture ARGS="--max-steps 100 --resume"
 ARGS       ?=
 
-# The policy `untrained` has random weights and never solves a task: two episodes of four tasks, cut short, show everything in minutes.
-DEMO := $(and $(filter untrained,$(CHECKPOINT)),$(filter robosuite,$(SUITE)))
-ifneq ($(DEMO),)
-CAPTURE_ARGS := --num-episodes $(or $(EPISODES),2) --max-steps 50
-else
-CAPTURE_ARGS := --num-episodes $(or $(EPISODES),5)
-endif
+# What comes along shows everything in minutes: two episodes a task, cut short for random weights, which solve nothing.
+BUILT_IN := $(filter pi05_cubes:cubes untrained:robosuite,$(CHECKPOINT):$(SUITE))
+CAPTURE_ARGS := --num-episodes $(or $(EPISODES),$(if $(BUILT_IN),2,5)) $(if $(filter untrained:%,$(BUILT_IN)),--max-steps 50)
 
 PYTHON ?= python3
 BIN := .venv/bin

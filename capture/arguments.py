@@ -149,10 +149,10 @@ def _add_evaluation_arguments(
 ) -> None:
     group = parser.add_argument_group("evaluation")
     names = ", ".join(suite.name for suite in SUITES)
-    which = f"one of {names} (default: robosuite)"
+    which = f"one of {names} (default: {family.default_suite})"
     if script:
         which = f"one of {names}, or {ALL_SUITES} for {listing(STANDARD_SUITES)} (default: libero_10)"
-    group.add_argument("--task-suite", default="robosuite", metavar="SUITE", help=which)
+    group.add_argument("--task-suite", default=family.default_suite, metavar="SUITE", help=which)
     group.add_argument(
         "--task-id", type=int, nargs="+", metavar="N", help="one or several tasks (default: all tasks of the suite)"
     )

@@ -85,7 +85,9 @@ class PolicyFamily:
     #: a note on further layer numbers, for the help text of `--layers`
     layers_note: str = ""
     #: checkpoints that come with the program and run without a GPU
-    untrained: tuple[str, ...] = ()
+    built_in: tuple[str, ...] = ()
+    #: the default of `--task-suite`: the one that the default checkpoint is for
+    default_suite: str = "robosuite"
     #: parsed arguments -> further arguments of an analysis that follows the capture
     analysis_arguments: Callable[[argparse.Namespace], list[str]] = no_arguments
     parity: ParityCases | None = None

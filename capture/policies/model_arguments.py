@@ -27,20 +27,22 @@ def add_model_arguments(
     checkpoint: str,
     config_name: str,
     dtype_default: str,
+    default: str = UNTRAINED,
     checkpoint_options: tuple[str, ...] = ("--checkpoint",),
 ) -> argparse._ArgumentGroup:
     """Add the group `model` with checkpoint, configuration, precision and device, and return the group.
 
-    checkpoint, config_name: help texts of these options. checkpoint_options: the spellings of the first one.
+    checkpoint, config_name: help texts of these options. default: of the first one. checkpoint_options: the spellings
+    of the first one.
     """
     group = parser.add_argument_group("model")
     group.add_argument(
         *checkpoint_options,
         dest="checkpoint",
-        default=UNTRAINED,
+        default=default,
         metavar="PATH",
-        help=f"{checkpoint}; '{UNTRAINED}' is a small untrained policy that comes with the tool, '{UNTRAINED_TINY}' a "
-        "smaller one (default: %(default)s)",
+        help=f"{checkpoint}; '{UNTRAINED}' and '{UNTRAINED_TINY}' have random weights and come along (default: "
+        "%(default)s)",
     )
     group.add_argument("--config-name", metavar="NAME", help=config_name)
     group.add_argument("--dtype", metavar="NAME", help=f"float32 or bfloat16 (default: {dtype_default})")

@@ -72,7 +72,7 @@ def arguments_from_environment(environment: Mapping[str, str], family: PolicyFam
         arguments += ["--array-index", given["SLURM_ARRAY_TASK_ID"]]
     if get("DEVICE"):
         arguments += ["--device", given["DEVICE"]]
-    elif in_slurm and stage != "analyze" and (not checkpoint or checkpoint not in family.untrained):
+    elif in_slurm and stage != "analyze" and (not checkpoint or checkpoint not in family.built_in):
         # A job without a GPU fails at once, instead of running on the CPU until its time is over.
         arguments += ["--device", "cuda"]
     try:

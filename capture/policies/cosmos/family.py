@@ -136,7 +136,7 @@ FAMILY = PolicyFamily(
     replan_default="--num-open-loop-steps",
     protocols=(COSMOS,),
     seed_of="seed of the noise; the simulator's is 0, as published",
-    untrained=UNTRAINED_POLICIES,
+    built_in=UNTRAINED_POLICIES,
     analysis_arguments=_analysis_arguments,
     parity=ParityCases(recognises=_is_cosmos_case, run=_run_parity),
     published=PublishedScript(

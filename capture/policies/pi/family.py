@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any
 from vla_attention.capture.environments.episode_protocol import LEROBOT, OPENPI
 from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedScript
 from vla_attention.capture.policies.model_arguments import FORMER_NAMES, UNTRAINED_POLICIES, add_model_arguments
+from vla_attention.capture.policies.pi.shipped import CUBES_POLICY, SHIPPED
 
 if TYPE_CHECKING:
     from vla_attention.capture.policies.pi.policy import PiPolicy
     from vla_attention.schemas.stores.store_format import PolicyIdentity
 
 _EXAMPLES = """\
-  vla-capture pi                                             untrained policy, built-in tasks
+  vla-capture pi                                             a small trained policy and its tasks, docs/cubes.md
   vla-capture pi --checkpoint ~/.cache/openpi/openpi-assets/checkpoints/pi05_libero \\
       --task-suite libero_10 --num-episodes 5 --output-dir results/attention_ratio
   vla-capture pi --checkpoint lerobot/pi05_libero_finetuned --tokenizer PATH --task-suite libero_10
@@ -29,7 +30,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     model = add_model_arguments(
         parser,
         checkpoint="checkpoint folder of openpi (JAX or PyTorch) or LeRobot, ORG/NAME on the Hugging Face hub, or "
-        "gs://...",
+        f"gs://...; '{CUBES_POLICY}' is a small trained policy that comes with the tool",
+        default=CUBES_POLICY,
         config_name="openpi's name for the configuration (pi05_libero, pi0_libero ...)",
         dtype_default="what a LeRobot checkpoint states, else float32",
     )
@@ -107,7 +109,8 @@ FAMILY = PolicyFamily(
     replan_default="5 for openpi, n_action_steps for LeRobot",
     protocols=(OPENPI, LEROBOT),
     layers_note="; also the published scripts' numbers 18..35 (25 = block 7)",
-    untrained=UNTRAINED_POLICIES,
+    built_in=(*SHIPPED, *UNTRAINED_POLICIES),
+    default_suite="cubes",
     parity=ParityCases(
         recognises=_is_pi_case,
         run=_run_parity,
