@@ -10,7 +10,17 @@ import pytest
 from vla_attention.capture.__main__ import main as capture
 
 #: The policy of test size gives four actions a call.
-DUMMY = ("pi", "--checkpoint", "untrained-tiny", "--replan-steps", "4", "--max-steps", "12")
+DUMMY = (
+    "pi",
+    "--checkpoint",
+    "untrained-tiny",
+    "--task-suite",
+    "robosuite",
+    "--replan-steps",
+    "4",
+    "--max-steps",
+    "12",
+)
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.stores.store_format import FORMAT_VERSION
 
-DUMMY = ["pi", "--checkpoint", "untrained-tiny", "--replan-steps", "4"]
+DUMMY = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--replan-steps", "4"]
 
 
 def run(command, arguments, capsys) -> str:

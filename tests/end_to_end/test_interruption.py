@@ -24,7 +24,7 @@ from vla_attention.capture.published.evaluate import evaluate_attention_ratio
 
 pytestmark = pytest.mark.simulator
 
-DUMMY = ["pi", "--checkpoint", "untrained-tiny", "--replan-steps", "4", "--task-id", "0"]
+DUMMY = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--replan-steps", "4", "--task-id", "0"]
 NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2")
 
 

@@ -29,6 +29,8 @@ def run(store: Path, *words: str, family: str = "pi") -> int:
         family,
         "--checkpoint",
         "untrained-tiny",
+        "--task-suite",
+        "robosuite",
         "--num-episodes",
         "1",
         "--max-steps",

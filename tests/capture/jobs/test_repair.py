@@ -272,7 +272,19 @@ def test_a_link_to_a_store_and_several_stores(store, episode, tmp_path, capsys):
 def test_resuming_records_what_is_missing_and_says_what_is_damaged(tmp_path, monkeypatch, capsys):
     capture_without_simulator(monkeypatch)
     store = tmp_path / "a.zarr"
-    given = ["pi", "--checkpoint", "untrained-tiny", "--task-id", "0", "--replan-steps", "4", "--max-steps", "4"]
+    given = [
+        "pi",
+        "--checkpoint",
+        "untrained-tiny",
+        "--task-suite",
+        "robosuite",
+        "--task-id",
+        "0",
+        "--replan-steps",
+        "4",
+        "--max-steps",
+        "4",
+    ]
     given += ["--num-episodes", "3", "--store", str(store)]
     assert main(given) == 0
     reference = files(store)

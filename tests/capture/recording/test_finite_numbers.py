@@ -22,7 +22,19 @@ from vla_attention.schemas.stores.verify import verify_store
 
 #: The same episode 0 is written before the policy is spoiled: it must stay whole.
 DUMMY = {
-    "pi": ["pi", "--checkpoint", "untrained-tiny", "--task-id", "0", "--replan-steps", "4", "--max-steps", "8"],
+    "pi": [
+        "pi",
+        "--checkpoint",
+        "untrained-tiny",
+        "--task-suite",
+        "robosuite",
+        "--task-id",
+        "0",
+        "--replan-steps",
+        "4",
+        "--max-steps",
+        "8",
+    ],
     "cosmos": ["cosmos", "--ckpt-path", "untrained-tiny", "--task-id", "0", "--max-steps", "8"],
 }
 

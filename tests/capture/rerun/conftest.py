@@ -12,7 +12,8 @@ from vla_attention.capture.__main__ import main
 
 def capture(path: Path, family: str, *arguments: str) -> Path:
     """Two tasks, two episodes each, three policy calls an episode (Cosmos: two)."""
-    words = ["--checkpoint", "untrained-tiny", "--task-id", "0", "1", "--num-episodes", "2", "--max-steps"]
+    words = ["--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", "0", "1"]
+    words += ["--num-episodes", "2", "--max-steps"]
     with pytest.MonkeyPatch.context() as patch:
         capture_without_simulator(patch)
         steps = "12" if family == "pi" else "20"
