@@ -39,7 +39,7 @@ def plot_attention_and_effect(study: EffectStudy, folder: Path) -> list[Path]:
     note = (
         f"Each point: a group of keys that was knocked out; n = {n}. Bars: {interval_name(DEFAULT_LEVEL)}s, about "
         f"{study.question.settings.intervals.words}. Attention is the base's, in the same replans. "
-        "Larger groups have more mass by their size alone. Names stand where there is room."
+        "Larger groups have more mass by their size alone. Names stand where there is room; very long bars are cut."
     )
     title(figure, "Attention to a group, and what the action does without it", note)
     table = _table(rows)
@@ -50,7 +50,9 @@ def plot_attention_and_effect(study: EffectStudy, folder: Path) -> list[Path]:
     for axes, measure in zip(panels, ("mass", "lift"), strict=True):
         _panel(axes, rows, measure, [study.of(one) for one in study.of_kind(Kind.NOISE)])
     panels[0].set_ylabel("effect without it (standard deviations)")
-    panels[0].set_ylim(bottom=0)
+    # A few long intervals must not squeeze all points into the lower edge.
+    largest = [row.without["effect"] for row in rows if row.without is not None]
+    panels[0].set_ylim(0, 1.4 * max([*largest, *(study.of(one)["effect"] for one in study.of_kind(Kind.NOISE))]) or 1)
     for axes, measure in zip(panels, ("mass", "lift"), strict=True):
         _name_points(axes, [row for row in rows if row.attention[measure]], measure)
     return save_figure(figure, folder, STEM, table)
