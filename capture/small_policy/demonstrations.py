@@ -74,8 +74,7 @@ class Demonstrator:
 
     def __init__(self, settings: DemonstrationSettings) -> None:
         self.settings = settings
-        suite = find_suite("cubes")
-        tasks = list_tasks(suite)
+        tasks = list_tasks(find_suite("cubes"))
         numbers = {task.num_cubes: number for number, task in enumerate(CUBE_TASKS)}
         self._environments = {
             cubes: CubesEnvironment(

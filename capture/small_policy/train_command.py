@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS
 from vla_attention.capture.small_policy.dataset import CONTROLS, find_control, read_demonstrations
 from vla_attention.schemas.errors import BadArgument
 
@@ -41,7 +42,6 @@ def run(arguments: argparse.Namespace) -> int:
         raise BadArgument(f"--threads is {arguments.threads}; it must be at least 1.")
     import torch
 
-    from vla_attention.capture.environments.suites import find_suite, list_tasks
     from vla_attention.capture.small_policy.training import TrainingSettings, train
 
     torch.set_num_threads(arguments.threads)
@@ -49,10 +49,10 @@ def run(arguments: argparse.Namespace) -> int:
         steps=arguments.steps,
         seed=arguments.seed,
         control=control,
-        num_tasks=arguments.tasks or len(list_tasks(find_suite("cubes"))),
+        num_tasks=arguments.tasks or len(CUBE_TASKS),
         checkpoint_minutes=arguments.checkpoint_minutes,
     )
-    instructions = tuple(task.instruction for task in list_tasks(find_suite("cubes")))
+    instructions = tuple(task.instruction for task in CUBE_TASKS)
     demonstrations = read_demonstrations(arguments.demonstrations, _say)
     train(
         demonstrations,

@@ -65,7 +65,8 @@ def _all_tasks() -> tuple[CubeTask, ...]:
     return tuple(tasks)
 
 
-#: The tasks in the order of their numbers. The first `NUM_BASE_TASKS` share scenes of three cubes and four verbs.
+#: The tasks in the order of their numbers. The first `NUM_BASE_TASKS` share scenes of three cubes and four verbs; the
+#: suite `cubes` has those before the ones that put a cube on another, `cubes_harder` has all.
 CUBE_TASKS = _all_tasks()
 NUM_BASE_TASKS = 12
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from vla_attention.capture.environments.cubes.scene import draw_scene, find_targ
 from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS, NUM_BASE_TASKS, list_cube_tasks
 from vla_attention.capture.environments.suites import find_suite
 
-SUITE = find_suite("cubes")
+SUITE, HARDER = find_suite("cubes"), find_suite("cubes_harder")
 
 
 @pytest.mark.parametrize("num_cubes", [3, 4])
@@ -54,8 +56,9 @@ def test_left_is_the_robots_left() -> None:
 
 
 def test_tasks_have_names_and_instructions_that_tell_them_apart() -> None:
-    tasks = list_cube_tasks(SUITE)
-    assert len(tasks) == SUITE.num_tasks == len(CUBE_TASKS)
+    tasks = list_cube_tasks(HARDER)
+    assert len(tasks) == HARDER.num_tasks == len(CUBE_TASKS)
+    assert list_cube_tasks(SUITE) == tuple(replace(task, suite=SUITE.name) for task in tasks[: SUITE.num_tasks])
     assert len({task.name for task in tasks}) == len(tasks)
     base = tasks[:NUM_BASE_TASKS]
     assert len({task.instruction for task in base}) == NUM_BASE_TASKS
