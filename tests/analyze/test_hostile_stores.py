@@ -17,8 +17,10 @@ from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.commands import COMMANDS
 from vla_attention.analyze.parse.command import main as parse
 from vla_attention.capture.__main__ import main as capture
+from vla_attention.schemas.interventions import Interventions, PromptChange
+from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.stores.digest import bytes_digest, seal_digest
-from vla_attention.testing.stores import StoreSpec, reseal, write_store
+from vla_attention.testing.stores import StoreSpec, rerun_source, reseal, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, contributions=True)
 #: Clears a screen, moves the cursor, reverses the direction of writing, begins a line, is markup, and is a formula.
@@ -72,6 +74,15 @@ def hostile_texts(store: Path) -> None:
     change_episodes(store, episode)
 
 
+def make_rerun(store: Path, of: Path) -> None:
+    """Turn a copy into a rerun with a hostile name and a hostile prompt."""
+    interventions = Interventions(MARKUP, prompt=PromptChange("text", text=INSTRUCTION))
+    source = {"run": rerun_source(of).run, "name": MARKUP}
+    change(store / "zarr.json", lambda root: root.update(interventions=to_json(interventions), rerun_of=source))
+    for folder in (store / "episodes").glob("task*"):
+        reseal(folder)
+
+
 def files_under(folder: Path) -> set[Path]:
     return {path for path in folder.rglob("*") if path.is_file()}
 
@@ -104,6 +115,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "objects": ("STORE", "--output", "OUT"),
     "time": ("STORE", "--output", "OUT", "--no-plots"),
     "compare": ("STORE", "OTHER", "--output", "OUT", "--no-plots"),
+    "effects": ("STORE", "OTHER", "--output", "OUT"),
     "overlay": ("STORE", "OTHER", "--output", "OUT"),
     "report": ("STORE", "--output", "OUT", "--episodes", "1", "--tasks", "0", "--layers", "0"),
     "export": ("STORE", "--csv", "--output", "OUT"),
@@ -126,6 +138,10 @@ def test_hostile_texts_are_printed_visibly_and_nothing_is_written_elsewhere(
     if command == "compare":
         shutil.rmtree(other)
         shutil.copytree(store, other)
+    if command == "effects":
+        shutil.rmtree(other)
+        shutil.copytree(store, other)
+        make_rerun(other, of=store)
     out = tmp_path / "out"
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")

