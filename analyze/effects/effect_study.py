@@ -244,15 +244,22 @@ def _has_keys(attention: NDArray[np.float64] | None, replans: int = 1, kind: Kin
 
 
 def _notes(pairings: Sequence[Pairing], attention: dict[Any, GroupAttention]) -> list[str]:
-    """Which episodes have no partner. A series lacks those with a replan without a key of its group."""
-    notes = []
+    """Which episodes have no partner. A series lacks those with a replan without a key of its group.
+
+    Conditions that lack the same episodes share a note.
+    """
+    names: dict[str, list[str]] = {}
     for pairing in pairings:
         group = pairing.condition.group
         known = attention[group].values if group is not None else {}
         empty = [name for name in pairing.missing if name in known and not _has_keys(known[name]).all()]
         kept = replace(pairing, missing=tuple(name for name in pairing.missing if name not in empty))
-        notes += [kept.note] if kept.note else []
-    return notes
+        if kept.gap:
+            names.setdefault(kept.gap, []).append(pairing.condition.name)
+    return [
+        f"{found[0]} {gap}." if len(found) == 1 else f"Each of {len(found)} conditions ({listing(found, 3)}) {gap}."
+        for gap, found in names.items()
+    ]
 
 
 def with_floors(episodes: pl.DataFrame, conditions: Sequence[Condition]) -> pl.DataFrame:

@@ -81,14 +81,14 @@ class Pairing:
     unknown: tuple[str, ...]
 
     @property
-    def note(self) -> str:
-        """Which episodes have no partner; empty when all have one."""
+    def gap(self) -> str:
+        """Which episodes have no partner, as the rest of a sentence; empty when all have one."""
         parts = []
         if self.missing:
             parts.append(f"lacks {listing(self.missing, 6)} of the base, which are in none of its numbers")
         if self.unknown:
             parts.append(f"has {listing(self.unknown, 6)}, which the base lacks")
-        return f"{self.condition.name} {' and '.join(parts)}." if parts else ""
+        return " and ".join(parts)
 
 
 def pair_episodes(condition: Condition, base: Sequence[BaseEpisode], all_names: Sequence[str]) -> Pairing:
