@@ -56,6 +56,7 @@ def caveats(analysis: Analysis, masses: Mapping[str, float], sinks: pl.DataFrame
     question = analysis.question
     found = [
         *_weights(question),
+        *_dependence(question),
         *_baseline(analysis),
         *_infinite(analysis),
         *_episodes(analysis),
@@ -78,6 +79,18 @@ def _weights(question: Question) -> list[Caveat]:
     if not question.untrained:
         return []
     return [Caveat("Untrained weights", untrained_sentence("The policy has"), True)]
+
+
+def _dependence(question: Question) -> list[Caveat]:
+    if question.untrained:
+        return []
+    sentence = (
+        "Attention says which keys the action queries read, not on what the action depends: in policies that were "
+        "trained to need one word of the sentence, this word got less attention than a key's uniform share, because "
+        "the keys of the pictures had read it (docs/validation.md). A dependence is shown by an intervention: "
+        "vla-capture rerun with --prompt, or with --knockout and --knockout-queries all."
+    )
+    return [Caveat("Attention and dependence", sentence)]
 
 
 def _baseline(analysis: Analysis) -> list[Caveat]:

@@ -15,7 +15,7 @@ import argparse
 import json
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,7 @@ class Plan:
     replans: int
     max_steps: int | None
     conditions: tuple[str, ...] = tuple(CONDITIONS)[1:]
+    control_rollouts: bool = True
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -105,6 +106,7 @@ def run(plan: Plan) -> dict[str, Any]:
         if "prediction" in plan.stages and shipped:
             table = predicted_effects(model, store, folder / "prediction", plan.replans, say)
             results |= {"prediction": correlations(table), "items": item_means(table)}
+            results["prediction_everywhere"] = correlations(table, "everywhere")
         if "mixing" in plan.stages and shipped and not model.has_prefix:
             say("question 3 is left out: the policy has no prefix in which text and pictures read each other")
         elif "mixing" in plan.stages and shipped:
@@ -113,7 +115,7 @@ def run(plan: Plan) -> dict[str, Any]:
             base = {"policy": policy.name, "control": policy.control, "condition": "nothing changed"}
             success_rows.append(base | success(store))
             cameras = [camera.name for camera in model.cameras]
-            own = CONTROL_CONDITIONS.get(policy.control, ()) if policy.seed == 0 else ()
+            own = CONTROL_CONDITIONS.get(policy.control, ()) if policy.seed == 0 and plan.control_rollouts else ()
             which = plan.conditions if shipped else tuple(name for name in own if name in plan.conditions)
             success_rows += success_under(policy, cameras, folder, plan.tasks, 1, plan.max_steps, which, say)
         results["policies"].append({"rerun_difference": 0.0} | facts)
@@ -144,6 +146,9 @@ def _plan(arguments: argparse.Namespace) -> Plan:
         tasks = arguments.task_id or list(range(NUM_BASE_TASKS))
     max_steps = arguments.max_steps or (MAX_STEPS if policies else None)
     plan = Plan(policies, shipped, arguments.work, stages, tasks, arguments.num_episodes, arguments.replans, max_steps)
+    if arguments.rollouts is not None:
+        chosen = tuple(tuple(CONDITIONS)[number] for number in arguments.rollouts)
+        plan = replace(plan, conditions=chosen, control_rollouts=False)
     if arguments.reduced:
         few = ("prompt empty", "without the instruction's words")
         plan = Plan(policies, shipped, arguments.work, stages, arguments.task_id or [0, 4], 1, 1, 10, few)
@@ -167,6 +172,14 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--page", type=Path, metavar="FILE", help="write tables and pictures into this page, too")
     parser.add_argument("--reduced", action="store_true", help="two tasks, ten steps, one policy call of each episode")
     parser.add_argument("--stages", nargs="+", choices=STAGES, default=STAGES, help="default: all")
+    parser.add_argument(
+        "--rollouts",
+        type=int,
+        nargs="+",
+        metavar="N",
+        choices=range(1, len(CONDITIONS)),
+        help="rollouts of the shipped policy alone, under these conditions of success.py, from 1 (default: all)",
+    )
     parser.add_argument("--task-id", type=int, nargs="+", metavar="N", help="default: the base tasks; of your own: all")
     parser.add_argument("--num-episodes", type=int, default=1, metavar="N", help="of each task (default: 1)")
     parser.add_argument("--replans", type=int, default=3, metavar="N", help="policy calls of each episode (default: 3)")

@@ -48,6 +48,7 @@ NUMBERS: dict[str, Number] = {
     "only_visual": Number("effect with pictures alone", READ, scale="plain"),
     "without_instruction": Number("effect without the instruction's words", READ, scale="plain"),
     "without_instruction_all": Number("... for all queries", READ, scale="plain"),
+    "instruction_beyond": Number("effect without the instruction's words, minus random keys", READ, scale="plain"),
     "without_colour": Number("effect without the colour's word", READ, scale="plain"),
     "without_colour_all": Number("... for all queries", READ, scale="plain"),
     "without_verb": Number("effect without the verb", READ, scale="plain"),
@@ -57,6 +58,7 @@ NUMBERS: dict[str, Number] = {
     "wrist_lift": Number("lift of the wrist camera", WRIST),
     "without_wrist": Number("effect without the wrist camera's keys", WRIST, scale="plain"),
     "without_wrist_all": Number("... for all queries", WRIST, scale="plain"),
+    "wrist_beyond": Number("effect without the wrist camera's keys, minus random keys", WRIST, scale="plain"),
     "wrist_blank": Number("effect of a blank wrist camera", WRIST, scale="plain"),
     "mark_enrichment": Number("enrichment of the mark", MARK),
     "without_mark": Number("effect without the mark's keys", MARK, scale="plain"),
@@ -69,6 +71,7 @@ NUMBERS: dict[str, Number] = {
     "base_blank": Number("effect of a blank agent camera", OTHER, scale="plain"),
     "noise": Number("noise floor: another seed", OTHER, scale="plain"),
     "random_instruction": Number("floor: as many random keys as the instruction", OTHER, scale="plain"),
+    "random_colour": Number("floor: one random key", OTHER, scale="plain"),
     "random_wrist": Number("floor: as many random keys as the wrist camera", OTHER, scale="plain"),
 }
 #: What is compared: the control that depends, the one that does not, and the numbers' subject.
@@ -78,6 +81,11 @@ CONTRASTS = (
     ("words", "no-wrist", WRIST),
     ("mark", "redundant", MARK),
 )
+#: Effects beyond those of as many random keys: name -> the effect and its control.
+_BEYOND = {
+    "instruction_beyond": ("without_instruction", "random_instruction"),
+    "wrist_beyond": ("without_wrist", "random_wrist"),
+}
 _ID = ["suite", "task_id", "episode_index"]
 
 
@@ -139,8 +147,9 @@ def effect_numbers(
     spread, suite = spread_of(store), store.attributes.protocol.suite
     rows, furthest = [], 0.0
     for episode in changed_episodes(policy, store, known_changes, replans, folder, say):
-        for name in episode.actions:
-            value = float(np.mean(episode.effect(name, spread)))
+        values = {name: float(np.mean(episode.effect(name, spread))) for name in episode.actions}
+        values |= {name: values[group] - values[control] for name, (group, control) in _BEYOND.items()}
+        for name, value in values.items():
             if name == NOTHING:
                 furthest = max(furthest, value)
             elif name in NUMBERS:

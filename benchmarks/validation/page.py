@@ -8,7 +8,7 @@ from typing import Any
 
 from benchmarks.validation.known import CONTRASTS, NUMBERS, OTHER
 from benchmarks.validation.mixing import CUTS, GROUPS
-from benchmarks.validation.policies import TITLES
+from benchmarks.validation.policies import SHIPPED, TITLES
 from benchmarks.validation.prediction import ATTENTION, FAMILIES
 from vla_attention.analyze.show.numbers import format_number
 from vla_attention.schemas.errors import BadArgument
@@ -49,6 +49,7 @@ def policies_table(results: Results) -> str:
 def known_table(results: Results, first: str, other: str, about: str) -> str:
     verdicts = {row["number"]: row for row in results["contrasts"] if row["contrast"] == f"{first}/{other}"}
     rows = []
+    columns = (first, other, SHIPPED) if first == "words" else (first, other)
     for name, number in NUMBERS.items():
         if number.about != about or name not in verdicts:
             continue
@@ -56,8 +57,8 @@ def known_table(results: Results, first: str, other: str, about: str) -> str:
         count = f"{_VERDICTS[row['verdict']]} ({row['expected']} of {row['pairs']}"
         count += f", {row['wrong']} wrong)" if row["wrong"] else ")"
         verdict = count if row["pairs"] else "not in both"
-        rows.append((number.title, _of_control(results, first, name), _of_control(results, other, name), verdict))
-    return markdown(("number", TITLES[first], TITLES[other], "tells them apart"), rows)
+        rows.append((number.title, *(_of_control(results, control, name) for control in columns), verdict))
+    return markdown(("number", *(TITLES[control] for control in columns), "tells the first two apart"), rows)
 
 
 def other_table(results: Results) -> str:
@@ -72,10 +73,10 @@ def _of_control(results: Results, control: str, number: str) -> str:
     return "; ".join(with_interval(row) for row in sorted(chosen, key=lambda row: row["seed"])) or "-"
 
 
-def prediction_table(results: Results) -> str:
+def prediction_table(results: Results, key: str = "prediction") -> str:
     rows = []
     for family, what in FAMILIES.items():
-        of = {row["measure"]: row for row in results["prediction"] if row["family"] == family}
+        of = {row["measure"]: row for row in results[key] if row["family"] == family}
         if not of:
             continue
         mass = of["mass"]
@@ -114,6 +115,8 @@ def blocks(results: Results) -> dict[str, str]:
             made[f"{first}/{other}"] = lambda a=first, b=other, c=about: known_table(results, a, b, c)  # type: ignore[misc]
     if results.get("known"):
         made["other"] = lambda: other_table(results)
+    if results.get("prediction_everywhere"):
+        made["prediction everywhere"] = lambda: prediction_table(results, "prediction_everywhere")
     for name, make in (("prediction", prediction_table), ("mixing", mixing_table), ("success", success_table)):
         if results.get(name):
             made[name] = lambda make=make: make(results)  # type: ignore[misc]

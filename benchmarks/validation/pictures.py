@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.ticker import LogLocator
 
 from benchmarks.validation.known import NUMBERS
 from benchmarks.validation.mixing import CUTS, GROUPS
@@ -61,9 +62,9 @@ def draw_known(results: Mapping[str, Any], path: Path) -> None:
 
 @drawn_in_our_style
 def draw_prediction(results: Mapping[str, Any], path: Path) -> None:
-    """Rank correlations with intervals, and attention against effect for groups, and parts in layers."""
-    figure = new_figure(10.0, 4.2)
-    forest, groups, parts = figure.subplots(1, 3, width_ratios=[1.3, 1, 1])
+    """Rank correlations with intervals, and mass against effect for the action queries and for all queries."""
+    figure = new_figure(10.5, 4.2)
+    forest, direct, everywhere = figure.subplots(1, 3, width_ratios=[1.2, 1, 1])
     families = [name for name in FAMILIES if any(row["family"] == name for row in results["prediction"])]
     for j, measure in enumerate(ATTENTION):
         drawn = False
@@ -80,22 +81,25 @@ def draw_prediction(results: Mapping[str, Any], path: Path) -> None:
     forest.axvline(0.0, color="#999999", linewidth=0.7)
     forest.set_yticks(range(len(families)), families)
     forest.invert_yaxis()
-    forest.set_xlim(-1, 1)
+    forest.set_xlim(-0.5, 1)
     forest.set_xlabel("rank correlation with the effect of knocking it out")
     figure.legend(*forest.get_legend_handles_labels(), loc="outside upper left", ncols=len(ATTENTION), fontsize=7)
-    for axis, family in ((groups, "groups"), (parts, "parts and layers")):
-        items = [item for item in results["items"] if item["family"] == family and item["mass"]]
-        masses, effects = [item["mass"] for item in items], [item["effect"] for item in items]
+    for axis, column, title in (
+        (direct, "effect", "groups, knocked out for\nthe action queries"),
+        (everywhere, "everywhere", "the same for all queries"),
+    ):
+        items = [item for item in results["items"] if item["family"] == "groups" and item["mass"] and item[column]]
+        masses, effects = [item["mass"] for item in items], [item[column] for item in items]
         axis.plot(masses, effects, "o", color=COLOURS[0], markersize=4)
         ratio_axis(axis.xaxis, masses)
-        ratio_axis(axis.yaxis, effects)
-        for item in items if family == "groups" else ():
-            axis.annotate(
-                item["item"], (item["mass"], item["effect"]), fontsize=6, xytext=(3, 2), textcoords="offset points"
-            )
+        axis.xaxis.set_major_locator(LogLocator(subs=(1.0,)))
+        ratio_axis(axis.yaxis, [item[name] for item in items for name in ("effect", "everywhere") if item[name]])
+        for item in items:
+            place = (item["mass"], item[column])
+            axis.annotate(item["item"], place, fontsize=6, xytext=(3, 2), textcoords="offset points")
         axis.set_xlabel("mass")
-        axis.set_ylabel("effect of knocking it out")
-        axis.set_title(family)
+        axis.set_ylabel("effect")
+        axis.set_title(title)
     figure.savefig(path, dpi=DPI)
 
 

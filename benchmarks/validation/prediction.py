@@ -30,6 +30,7 @@ FAMILIES = {
     "regions": "sixteen equal blocks of patches of each camera",
     "tokens": "every single key of the prompt: one key each",
     "words": "every word of the instruction: one key each, where a word is one piece",
+    "parts": "each camera and each part of the prompt",
     "parts and layers": "each camera and part of the prompt in each layer",
     "heads, pictures": "all picture keys in each head of each layer",
     "heads, text": "the linguistic keys in each head of each layer",
@@ -58,6 +59,12 @@ class Item:
         """The group knocked out for the action queries."""
         place = self.group.place
         return Interventions(keys=(KeyKnockout(self.group.selectors[0], layers=place.layers, heads=place.heads),))
+
+    @property
+    def everywhere(self) -> Interventions | None:
+        """The group knocked out for all queries; None for an item that is in some layers or heads only."""
+        whole = self.group.place == Place()
+        return Interventions(keys=(KeyKnockout(self.group.selectors[0], queries="all"),)) if whole else None
 
 
 def items_of(store: Store, episode: StoredEpisode) -> list[Item]:
@@ -88,7 +95,7 @@ def items_of(store: Store, episode: StoredEpisode) -> list[Item]:
         for layer in layers
         for head in heads
     ]
-    return found
+    return found + [Item("parts", name, GroupOfKeys((selector,))) for name, selector in parts.items()]
 
 
 def _has_valid_keys(tokens: EpisodeTokens, span: Span) -> bool:
@@ -119,7 +126,8 @@ def predicted_effects(
     """One row per episode and item: its effect and its attention in the same replans.
 
     Returns:
-        family, item, suite, task_id, episode_index, effect, and a column for each of `ATTENTION`; null where there is
+        family, item, suite, task_id, episode_index, effect (of a knockout for the action queries), everywhere (for all
+        queries; null for items in some layers or heads), and a column for each of `ATTENTION`; null where there is
         none: norms exist for whole parts and for all heads together only.
     """
     spread = spread_of(store)
@@ -128,14 +136,19 @@ def predicted_effects(
     def changes_of(episode: StoredEpisode) -> dict[str, Interventions]:
         return {item.key: item.change for item in items[episode.name]}
 
-    episodes = changed_episodes(policy, store, changes_of, replans, folder, say)
+    def everywhere_of(episode: StoredEpisode) -> dict[str, Interventions]:
+        found = {item.key: item.everywhere for item in items[episode.name]}
+        return {key: change for key, change in found.items() if change is not None}
+
+    episodes = changed_episodes(policy, store, changes_of, replans, folder / "action", say)
+    all_queries = changed_episodes(policy, store, everywhere_of, replans, folder / "all", say)
     say("attention to the same groups ...")
     question = va.open(store.path).ask()
     groups = list(dict.fromkeys(item.group for of_episode in items.values() for item in of_episode))
     attention = group_attention(question, groups)
     cleaned = group_attention(_without_sinks(question), groups)
     rows = []
-    for episode in episodes:
+    for episode, whole in zip(episodes, all_queries, strict=True):
         for item in items[episode.name]:
             effects = episode.effect(item.key, spread)
             there = np.isfinite(effects)
@@ -145,7 +158,10 @@ def predicted_effects(
             clean = np.nan_to_num(_values(cleaned[item.group], episode)[there, MEASURES.index("mass")]).mean()
             row = {"family": item.family, "item": item.name, "suite": store.attributes.protocol.suite}
             row |= {"task_id": episode.task_id, "episode_index": episode.episode_index}
-            row |= {"effect": float(effects[there].mean()), "keys": float(values[MEASURES.index("keys")])}
+            row |= {"effect": float(effects[there].mean()), "everywhere": None}
+            if item.key in whole.actions:
+                row["everywhere"] = _number(float(np.mean(whole.effect(item.key, spread))))
+            row |= {"keys": float(values[MEASURES.index("keys")])}
             known = (values[0], values[1], clean, values[2])
             rows.append(row | {name: _number(value) for name, value in zip(ATTENTION, known, strict=True)})
     return pl.DataFrame(rows, infer_schema_length=None)
@@ -166,8 +182,10 @@ def _without_sinks(question: Question) -> Question:
     return without_sinks(question, search_sinks(question, rule).sinks, rule)
 
 
-def correlations(table: pl.DataFrame) -> list[dict[str, Any]]:
+def correlations(table: pl.DataFrame, effect: str = "effect") -> list[dict[str, Any]]:
     """Rank correlations between attention and effect over the items of an episode, and their means over episodes.
+
+    effect: the column of the effects. A measure that some items of a family have not is left out.
 
     Each is computed inside of an episode, then averaged on Fisher's scale over tasks; intervals take the task as unit.
     `highest`: in how many episodes the item with most attention has the largest effect; `chance`: 1 / items.
@@ -175,14 +193,14 @@ def correlations(table: pl.DataFrame) -> list[dict[str, Any]]:
     found = []
     for family in FAMILIES:
         for measure in ATTENTION:
-            chosen = table.filter(pl.col(measure).is_not_null(), family=family)
-            if not chosen.height:
+            chosen = table.filter(pl.col(effect).is_not_null(), family=family)
+            if not chosen.height or chosen[measure].null_count():
                 continue
             rows = []
             for (suite, task, episode), part in chosen.group_by(
                 "suite", "task_id", "episode_index", maintain_order=True
             ):
-                first, second = part[measure].to_numpy(), part["effect"].to_numpy()
+                first, second = part[measure].to_numpy(), part[effect].to_numpy()
                 value = spearman(first, second)
                 if np.isfinite(value):
                     hit = float(np.argmax(first) == np.argmax(second))
@@ -202,6 +220,6 @@ def item_means(table: pl.DataFrame) -> list[dict[str, Any]]:
     """Means over episodes of every item of some families, for the picture."""
     chosen = table.filter(pl.col("family").is_in(["groups", "parts and layers", "heads, pictures", "heads, text"]))
     grouped = chosen.group_by("family", "item", maintain_order=True).agg(
-        pl.col("effect", "keys", *ATTENTION).mean(), pl.len().alias("episodes")
+        pl.col("effect", "everywhere", "keys", *ATTENTION).mean(), pl.len().alias("episodes")
     )
     return grouped.to_dicts()

@@ -14,9 +14,9 @@ from benchmarks.validation.policies import KnownPolicy, record, success
 CONDITIONS: dict[str, tuple[str, ...]] = {
     "nothing changed": (),
     "prompt empty": ("--prompt", "empty"),
-    "another colour named": ("--prompt", "synonyms:{synonyms}"),
     "without the instruction's words": ("--knockout", "role:instruction"),
     "... for all queries": ("--knockout", "role:instruction", "--knockout-queries", "all"),
+    "another colour named": ("--prompt", "synonyms:{synonyms}"),
     "without the agent camera, all queries": ("--knockout", "camera:{first}", "--knockout-queries", "all"),
     "agent camera blank": ("--image", "{first}=blank"),
     "without the wrist camera, all queries": ("--knockout", "camera:{last}", "--knockout-queries", "all"),
@@ -49,7 +49,11 @@ def success_under(
     found = []
     for number, name in enumerate(CONDITIONS):
         # Only sentences of the suites of cubes name a colour, and the constant one of a control does not.
-        if name not in conditions or ("colour" in name and policy.control in ("mark", "")):
+        if (
+            name not in conditions
+            or ("colour" in name and "cubes" not in policy.suite)
+            or ("colour" in name and policy.control == "mark")
+        ):
             continue
         say(f"{policy.name}: {name}")
         options = [option.format(synonyms=synonyms, first=cameras[0], last=cameras[-1]) for option in CONDITIONS[name]]

@@ -169,6 +169,7 @@ def test_a_slider_over_some_of_the_replans_says_so(analysis: Analysis) -> None:
 def test_untrained_weights_and_compute_types_are_caveats(analysis: Analysis) -> None:
     found = {note.topic: note for note in caveats(analysis, role_masses(analysis.question))}
     assert found["Untrained weights"].grave
+    assert "Attention and dependence" not in found
     assert "does not state" in found["Compute type"].sentence
     assert "2 episodes each" in found["Few episodes"].sentence
     assert "3 action queries" in found["Mean over queries"].sentence
@@ -180,6 +181,7 @@ def test_untrained_weights_and_compute_types_are_caveats(analysis: Analysis) -> 
         topics = [note.topic for note in notes]
         assert topic in topics
         assert "Untrained weights" not in topics
+        assert "Attention and dependence" in topics
 
 
 def no_words(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
