@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator
+from matplotlib.transforms import Bbox
 
 from benchmarks.validation.known import NUMBERS
 from benchmarks.validation.mixing import CUTS, GROUPS
@@ -57,6 +59,7 @@ def draw_known(results: Mapping[str, Any], path: Path) -> None:
         axis.set_title(SHOWN[name], fontsize=8)
         axis.set_xticks(range(len(controls)), [TITLES[name] for name in controls], fontsize=6, rotation=60)
         axis.set_xlim(-0.6, len(controls) - 0.4)
+    figure.suptitle(_sample(results).replace("\n", " "), fontsize=8, x=0.01, ha="left")
     figure.savefig(path, dpi=DPI)
 
 
@@ -94,13 +97,48 @@ def draw_prediction(results: Mapping[str, Any], path: Path) -> None:
         ratio_axis(axis.xaxis, masses)
         axis.xaxis.set_major_locator(LogLocator(subs=(1.0,)))
         ratio_axis(axis.yaxis, [item[name] for item in items for name in ("effect", "everywhere") if item[name]])
-        for item in items:
-            place = (item["mass"], item[column])
-            axis.annotate(item["item"], place, fontsize=6, xytext=(3, 2), textcoords="offset points")
         axis.set_xlabel("mass")
         axis.set_ylabel("effect")
         axis.set_title(title)
+        axis.set_xlim(0.4 * min(masses), 4 * max(masses))  # room for names
+    figure.draw_without_rendering()
+    for axis, column in ((direct, "effect"), (everywhere, "everywhere")):
+        found = [item for item in results["items"] if item["family"] == "groups" and item["mass"] and item[column]]
+        _name_points(axis, [(item["item"], item["mass"], item[column]) for item in found])
+    forest.set_title(_sample(results))
     figure.savefig(path, dpi=DPI)
+
+
+def _sample(results: Mapping[str, Any]) -> str:
+    """What the points of a picture are means of."""
+    settings = results["settings"]
+    tasks = results["policies"][0]["episodes"] // settings["episodes"]
+    each = "one episode" if settings["episodes"] == 1 else f"{settings['episodes']} episodes"
+    return f"n = {tasks} tasks, {each} each;\nbars: 95% intervals over tasks"
+
+
+def _name_points(axes: Axes, points: Sequence[tuple[str, float, float]]) -> None:
+    """Write each name beside its point, where it covers no other name if there is such a place."""
+    taken: list[Bbox] = []
+    for name, x, y in sorted(points, key=lambda point: -point[2]):
+        tried = []
+        for right, up in ((3, 1), (-3, 1), (3, -6), (-3, -6), (3, 6), (-3, 6), (3, -11), (-3, -11)):
+            text = axes.annotate(
+                name,
+                (x, y),
+                fontsize=6,
+                xytext=(right, up),
+                textcoords="offset points",
+                ha="left" if right > 0 else "right",
+            )
+            box = text.get_window_extent()
+            covered = sum(box.overlaps(other) for other in taken)
+            tried.append((covered, len(tried), text, box))
+        best = min(tried, key=lambda one: one[:2])
+        for one in tried:
+            if one is not best:
+                one[2].remove()
+        taken.append(best[3])
 
 
 @drawn_in_our_style
@@ -120,6 +158,7 @@ def draw_mixing(results: Mapping[str, Any], path: Path) -> None:
                 axis.plot([x, x], [row["low"], row["high"]], color="black", linewidth=0.8)
     axis.set_xticks(np.arange(len(GROUPS)), [f"without {what}" for what in GROUPS.values()], fontsize=7)
     axis.set_ylabel("effect on the action")
+    axis.set_title(_sample(results).replace("\n", " "), fontsize=8, loc="left")
     axis.legend(fontsize=7)
     figure.savefig(path, dpi=DPI)
 
