@@ -5,19 +5,22 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 from tqdm import tqdm
 
+from vla_attention.capture.small_policy.dataset import INDEX_FILE
 from vla_attention.capture.small_policy.demonstrations import (
-    SETTINGS_FILE,
     DemonstrationSettings,
     Demonstrator,
     part_path,
     settings_content,
     write_part,
 )
+from vla_attention.capture.small_policy.processes import share_among_processes
 from vla_attention.schemas.errors import BadArgument
 
 
@@ -38,29 +41,18 @@ def run(arguments: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     _check_same(folder, settings)
     missing = [number for number in range(arguments.parts) if not part_path(folder, number).exists()]
-    shares = [missing[worker :: arguments.workers] for worker in range(arguments.workers)]
-    context = multiprocessing.get_context("spawn")  # an OpenGL context does not survive a fork
-    done = context.Queue()
-    workers = [
-        context.Process(target=_record, args=(folder, settings, share, done), daemon=True) for share in shares if share
-    ]
-    for worker in workers:
-        worker.start()
-    samples = 0
+    samples: list[int] = []
     with tqdm(total=arguments.parts, initial=arguments.parts - len(missing), unit="part", disable=None) as bar:
-        while any(worker.is_alive() for worker in workers) or not done.empty():
-            while not done.empty():
-                samples += done.get()
-                bar.update()
-            for worker in workers:
-                worker.join(0.5 / len(workers))
-    failed = [worker.exitcode for worker in workers if worker.exitcode]
+        record = partial(_record, folder, settings)
+        complete = share_among_processes(record, missing, arguments.workers, samples.append, bar)
     size = sum(file.stat().st_size for file in folder.glob("part_*.npz"))
-    print(f"{samples} samples added; {folder} has {size / 1e6:.0f} MB.")
-    return 1 if failed else 0
+    print(f"{sum(samples)} samples added; {folder} has {size / 1e6:.0f} MB.")
+    return 0 if complete else 1
 
 
-def _record(folder: Path, settings: DemonstrationSettings, parts: list[int], done: multiprocessing.Queue[int]) -> None:
+def _record(
+    folder: Path, settings: DemonstrationSettings, parts: Sequence[int], done: multiprocessing.Queue[int]
+) -> None:
     demonstrator = Demonstrator(settings)
     try:
         for number in parts:
@@ -73,7 +65,7 @@ def _record(folder: Path, settings: DemonstrationSettings, parts: list[int], don
 
 def _check_same(folder: Path, settings: DemonstrationSettings) -> None:
     """Write the settings into a new folder; raise `BadArgument` if the folder has those of other demonstrations."""
-    path, content = folder / SETTINGS_FILE, settings_content(settings)
+    path, content = folder / INDEX_FILE, settings_content(settings)
     if not path.exists():
         path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
         return

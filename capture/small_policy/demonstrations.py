@@ -27,7 +27,6 @@ from vla_attention.capture.small_policy.experts import CLOSED, OPEN, expert_acti
 
 #: Height and width of the pictures, in pixels, and length of the action chunks.
 PICTURE_SIZE, HORIZON = 64, 10
-SETTINGS_FILE = "demonstrations.json"
 _MOST_EPISODES = 10**9
 
 

@@ -8,15 +8,17 @@ import math
 import multiprocessing
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from vla_attention.capture.environments.base import EnvironmentSettings
+from vla_attention.capture.environments.base import EnvironmentSettings, check_task_id
 from vla_attention.capture.environments.cubes.environment import CubesEnvironment
 from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS
 from vla_attention.capture.environments.suites import find_suite, list_tasks
+from vla_attention.capture.small_policy.processes import share_among_processes
 from vla_attention.capture.small_policy.rollouts import CONDITIONS, Condition, Outcome, run_episode, run_expert
 from vla_attention.schemas.errors import BadArgument, unknown_name
 
@@ -47,6 +49,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.condition not in CONDITIONS:
         raise unknown_name("condition", arguments.condition, CONDITIONS)
     numbers = arguments.task_id if arguments.task_id is not None else range(suite.num_tasks)
+    for number in numbers:
+        check_task_id(suite, number)
     if arguments.checkpoint == EXPERT and arguments.condition != "normal":
         raise BadArgument(
             f"The experts see no pictures and read no words: they have no condition '{arguments.condition}'."
@@ -61,30 +65,20 @@ def run(arguments: argparse.Namespace) -> int:
     ]
     # All tasks of one number of cubes share a simulator, so neighbours in this order need no other one.
     jobs.sort(key=lambda job: (CUBE_TASKS[job[0]].num_cubes, job[1], job[0]))
-    context = multiprocessing.get_context("spawn")  # an OpenGL context does not survive a fork
-    results = context.Queue()
-    workers = [
-        context.Process(
-            target=_evaluate, args=(vars(arguments), jobs[first :: arguments.workers], results), daemon=True
-        )
-        for first in range(arguments.workers)
-    ]
-    for worker in workers:
-        worker.start()
+
+    def keep(outcome: Outcome) -> None:
+        outcomes.append(outcome)
+        if arguments.output is not None and len(outcomes) % 20 == 0:
+            _write(arguments.output, outcomes)
+
     with tqdm(total=len(jobs), unit="episode", disable=None) as bar:
-        while any(worker.is_alive() for worker in workers) or not results.empty():
-            while not results.empty():
-                outcomes.append(results.get())
-                bar.update()
-                if arguments.output is not None and len(outcomes) % 20 == 0:
-                    _write(arguments.output, outcomes)
-            for worker in workers:
-                worker.join(0.2)
+        work = partial(_evaluate, vars(arguments))
+        complete = share_among_processes(work, jobs, arguments.workers, keep, bar)
     if arguments.output is not None:
         _write(arguments.output, outcomes)
     chosen = [o for o in outcomes if o.task in numbers and o.condition == arguments.condition]
     print(describe(chosen))
-    return 1 if any(worker.exitcode for worker in workers) else 0
+    return 0 if complete else 1
 
 
 def _evaluate(options: dict[str, Any], jobs: Sequence[Job], results: multiprocessing.Queue[Outcome]) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from vla_attention.capture.environments.base import Observation, Task
 from vla_attention.capture.environments.cubes.environment import CubesEnvironment
-from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS
+from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS, NAMED_COLOURS
 from vla_attention.capture.environments.episode_protocol import WAIT_ACTION, WAIT_STEPS
 from vla_attention.capture.policies.policy import Policy, PolicyInput
 from vla_attention.capture.small_policy.experts import expert_action, read_state
@@ -49,12 +49,8 @@ def run_episode(
     seed: int,
 ) -> Outcome:
     """Run one episode and return how it went."""
-    environment.give_task(CUBE_TASKS[task.task_id])
-    environment.reset(state, seed)
+    observation = _begin(environment, task, state, seed)
     instruction, number = task.instruction, task.task_id
-    observation: Observation | None = None
-    for step in range(WAIT_STEPS):
-        observation = environment.step(np.array(WAIT_ACTION), observe=step == WAIT_STEPS - 1).observation
     step, replan, success = 0, 0, False
     while step < max_steps and not success:
         if condition == "switched" and step == SWITCH_STEP:
@@ -76,6 +72,15 @@ def run_episode(
     return Outcome(task.task_id, state, condition, success, step, environment.first_touched, named)
 
 
+def _begin(environment: CubesEnvironment, task: Task, state: int, seed: int) -> Observation | None:
+    """Begin an episode and wait; returns what is seen after the last waiting step."""
+    environment.give_task(CUBE_TASKS[task.task_id])
+    environment.reset(state, seed)
+    for _ in range(WAIT_STEPS - 1):
+        environment.step(np.array(WAIT_ACTION), observe=False)
+    return environment.step(np.array(WAIT_ACTION), observe=True).observation
+
+
 def _changed(policy: Policy, policy_input: PolicyInput, condition: Condition) -> PolicyInput:
     given = policy_input.given
     if condition == "blind":
@@ -88,14 +93,10 @@ def _changed(policy: Policy, policy_input: PolicyInput, condition: Condition) ->
 
 def run_expert(environment: CubesEnvironment, task: Task, state: int, *, max_steps: int, seed: int) -> Outcome:
     """Run one episode of the scripted expert, without noise, and return how it went."""
-    cube_task = CUBE_TASKS[task.task_id]
-    environment.give_task(cube_task)
-    environment.reset(state, seed)
-    for _ in range(WAIT_STEPS):
-        environment.step(np.array(WAIT_ACTION), observe=False)
-    simulator, step, success = environment.simulator, 0, False
+    _begin(environment, task, state, seed)
+    verb, simulator, step, success = CUBE_TASKS[task.task_id].verb, environment.simulator, 0, False
     while step < max_steps and not success:
-        action = expert_action(cube_task.verb, read_state(simulator), simulator.target, simulator.destination)
+        action = expert_action(verb, read_state(simulator), simulator.target, simulator.destination)
         success = environment.step(action, observe=False).success
         step += 1
     return Outcome(task.task_id, state, "normal", success, step, environment.first_touched, environment.named_cube)
@@ -104,6 +105,5 @@ def run_expert(environment: CubesEnvironment, task: Task, state: int, *, max_ste
 def other_task(number: int) -> int:
     """Return the task with the same verb whose instruction names the next colour."""
     task = CUBE_TASKS[number]
-    colours = ("red", "green", "blue")
-    other: Any = colours[(colours.index(task.target) + 1) % len(colours)]
+    other: Any = NAMED_COLOURS[(NAMED_COLOURS.index(task.target) + 1) % len(NAMED_COLOURS)]
     return CUBE_TASKS.index(replace(task, target=other))
