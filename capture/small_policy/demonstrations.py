@@ -73,7 +73,7 @@ class Demonstrator:
 
     def __init__(self, settings: DemonstrationSettings) -> None:
         self.settings = settings
-        tasks = list_tasks(find_suite("cubes"))
+        tasks = list_tasks(find_suite("cubes_harder"))  # all tasks
         numbers = {task.num_cubes: number for number, task in enumerate(CUBE_TASKS)}
         self._environments = {
             cubes: CubesEnvironment(
