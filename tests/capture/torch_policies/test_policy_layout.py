@@ -1,0 +1,118 @@
+"""Layouts are plain data that go to JSON and back, and say what is wrong in them."""
+
+import json
+import re
+from dataclasses import replace
+
+import pytest
+
+from vla_attention.capture.torch_policies.policy_layout import (
+    CallRule,
+    CameraPicture,
+    PolicyLayout,
+    PromptText,
+    RecordedSite,
+    check_versions,
+)
+from vla_attention.schemas.errors import BadArgument, UnknownName
+from vla_attention.schemas.jsonable import from_json, to_json
+from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span
+
+KEYS = SiteLayout(
+    "joint",
+    (
+        Span("image_front", "image", 0, 4, "front", PatchGrid(2, 2, 8, 8)),
+        Span("prompt", "text", 4, 10),
+        Span("actions", "action", 10, 13),
+    ),
+)
+ROLES = {"image_front": "image", "prompt": "instruction", "actions": "action"}
+SITE = RecordedSite(KEYS, (-3, None), ROLES, "blocks.{block}.out", "prompt")
+LAYOUT = PolicyLayout(
+    name="small",
+    family="small",
+    sites=(SITE,),
+    rules=(CallRule(r"blocks\.(?P<block>\d+)\.attention", "joint", queries=3), CallRule("vision.*", None)),
+    num_layers=2,
+    num_heads=2,
+    num_denoise_steps=4,
+    denoise_times=(1.0, 0.75, 0.5, 0.25),
+    cameras=(CameraPicture("front", "pad"),),
+    text=PromptText(("prompt",), "embed", (7,)),
+    versions={"torch": ("2.",)},
+)
+
+
+def test_a_layout_goes_to_json_and_back():
+    assert from_json(PolicyLayout, json.loads(json.dumps(to_json(LAYOUT)))) == LAYOUT
+
+
+@pytest.mark.parametrize(
+    ("given", "count", "expected"),
+    [((-3, None), 3, (0, 3)), ((-3, None), 20, (17, 20)), ((0, 5), 20, (0, 5)), ((-3, -1), 20, (17, 19))],
+)
+def test_action_queries_count_from_either_end(given, count, expected):
+    assert replace(SITE, action_queries=given).queries(count) == expected
+
+
+@pytest.mark.parametrize("given", [(-4, None), (0, 5), (3, None)])
+def test_a_call_with_fewer_queries_is_refused(given):
+    with pytest.raises(BadArgument, match="the call has 3 queries"):
+        replace(SITE, action_queries=given).queries(3)
+
+
+def test_rules_fit_whole_paths_and_their_conditions():
+    rule = LAYOUT.rules[0]
+    match = rule.fits("blocks.1.attention", "sdpa", 3, 13)
+    assert match is not None
+    assert match["block"] == "1"
+    assert rule.fits("model.blocks.1.attention", "sdpa", 3, 13) is None
+    assert rule.fits("blocks.1.attention", "sdpa", 4, 13) is None
+
+
+def test_roles_of_masked_keys_follow_the_spans():
+    assert [SITE.masked_role(span) for span in KEYS.spans] == [Role.MASKED_IMAGE, Role.PADDING, Role.PADDING]
+    assert SITE.role_of(KEYS.spans[1]) is Role.INSTRUCTION
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"sites": ()}, "it has no site"),
+        ({"rules": (CallRule("vision.*", None),)}, "no rule gives calls to the site 'joint'"),
+        ({"rules": (*LAYOUT.rules, CallRule("x(?P<block>1)", "cros"))}, "gives calls to the site 'cros', which does"),
+        ({"denoise_times": (1.0,)}, "1 denoise times for 4 denoise steps"),
+        ({"cameras": (CameraPicture("wrist"),)}, "the camera 'wrist' has no span"),
+        ({"text": PromptText(("prompt", "more"), "embed")}, "the prompt's span 'more' is not in site 'joint'"),
+        ({"autoregressive": True}, "one denoise step"),
+        ({"num_layers": 0}, "its number of layers is 0"),
+    ],
+)
+def test_what_does_not_fit_is_said(changes, sentence):
+    with pytest.raises(BadArgument, match=re.escape(sentence)):
+        replace(LAYOUT, **changes)
+
+
+def test_rules_and_sites_check_themselves():
+    with pytest.raises(BadArgument, match="no regular expression"):
+        CallRule("(", None)
+    with pytest.raises(BadArgument, match="does not say which block"):
+        CallRule("blocks", "joint")
+    with pytest.raises(BadArgument, match="both a site and a sequence"):
+        CallRule("(?P<block>1)", "joint", sequence=(("joint", 0),))
+    with pytest.raises(UnknownName, match="Unknown span 'promt'"):
+        RecordedSite(KEYS, (0, 1), {**ROLES, "promt": "text"})
+    with pytest.raises(BadArgument, match="no role for the spans actions"):
+        RecordedSite(KEYS, (0, 1), {"image_front": "image", "prompt": "text"})
+    with pytest.raises(UnknownName, match="Unknown role 'imag'"):
+        RecordedSite(KEYS, (0, 1), {**ROLES, "image_front": "imag"})
+    with pytest.raises(BadArgument, match="which are none"):
+        RecordedSite(KEYS, (3, 3), ROLES)
+
+
+def test_another_version_is_a_sentence():
+    assert check_versions(LAYOUT, {"torch": "2.13.0"}) is None
+    sentence = check_versions(LAYOUT, {"torch": "3.0"})
+    assert sentence is not None
+    assert "was written for torch 2. (installed: 3.0)" in sentence
+    assert "none" in str(check_versions(LAYOUT, {}))
