@@ -35,6 +35,7 @@ LEVELS = {
     "capture.recording": 2,
     "capture.jobs": 3,
     "capture.policies": 3,
+    "capture.torch_policies": 4,
     "capture.rollout": 4,
     "capture": 5,
     "capture.published": 6,

@@ -1,0 +1,157 @@
+"""What is known about one attention call of a policy, and who is told about it.
+
+`watch_attention` (watch.py) builds these for every kind of call. The policy's own kernel computes the output; rows are
+computed beside it, for the wanted queries only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import torch
+from torch import Tensor
+
+#: How a policy computes attention. `sdpa`: `scaled_dot_product_attention`. `softmax`: a softmax by hand whose result is
+#: multiplied with values. `multihead`: `multi_head_attention_forward`, which `nn.MultiheadAttention` calls. `flex`:
+#: `flex_attention`. transformers' attention interface calls one of these.
+Kind = Literal["sdpa", "softmax", "multihead", "flex"]
+#: Which queries or batch rows: a slice, or their positions (count,) int64, which may count from the end.
+Positions = slice | Tensor | Sequence[int]
+#: Logits at or below this are of masked keys: masks are written as -inf, as the lowest number of a dtype, as -1e9, or
+#: as -1e4, the smallest in use.
+MASKED_BELOW = -5000.0
+
+
+@dataclass(frozen=True)
+class CallShape:
+    """What is known before the kernel of a call runs.
+
+    Attributes:
+        module: path of the innermost module of the watched policy whose forward is running, "" for the policy itself.
+        kind: how attention is computed.
+        number: position among all attention calls of the watched block, from 0.
+        batch, heads, kv_heads, queries, keys: sizes of the axes. Before a softmax by hand has met its values,
+            `kv_heads` is `heads`.
+        dtype: of the tensors that the kernel gets, such as `bfloat16`.
+    """
+
+    module: str
+    kind: Kind
+    number: int
+    batch: int
+    heads: int
+    kv_heads: int
+    queries: int
+    keys: int
+    dtype: str
+
+    def __str__(self) -> str:
+        heads = f"{self.heads} heads" if self.heads == self.kv_heads else f"{self.heads}/{self.kv_heads} heads"
+        return f"{self.module or '(policy)'}: {self.kind}, {self.queries} x {self.keys}, {heads}, {self.dtype}"
+
+
+class CallTensors(Protocol):
+    """The tensors of one call, as far as they are asked for. Every kind of call has its own class."""
+
+    def value(self) -> Tensor:
+        """Return the values (batch, kv_head, key, dim)."""
+        ...
+
+    def output(self) -> Tensor:
+        """Return what the policy's kernel computed, (batch, head, query, dim), before any projection."""
+        ...
+
+    def rows(self, queries: Positions, batch: Positions) -> Tensor:
+        """Return float32 probabilities (batch, head, query, key)."""
+        ...
+
+    def allowed(self, queries: Positions) -> Tensor:
+        """Return (batch, query, key) bool: keys that the policy's mask lets the query see in any head."""
+        ...
+
+
+@dataclass(frozen=True)
+class AttentionCall:
+    """One attention call, right after its kernel ran. Its tensors may be overwritten in place later.
+
+    Attributes:
+        shape: module, kind and sizes.
+        tensors: where the tensors come from.
+    """
+
+    shape: CallShape
+    tensors: CallTensors
+
+    @property
+    def value(self) -> Tensor:
+        """The values (batch, kv_head, key, dim)."""
+        return self.tensors.value()
+
+    @property
+    def output(self) -> Tensor:
+        """What the policy's own kernel computed, (batch, head, query, dim), before the output projection."""
+        return self.tensors.output()
+
+    def rows(self, queries: Positions = slice(None), batch: Positions = slice(None)) -> Tensor:
+        """Return the probabilities of these queries, (batch, head, query, key) float32, exact zeros where masked."""
+        with torch.no_grad():
+            return self.tensors.rows(queries, batch)
+
+    def allowed(self, queries: Positions = slice(None)) -> Tensor:
+        """Return (batch, query, key) bool: keys that the policy's mask lets the query see in any head."""
+        with torch.no_grad():
+            return self.tensors.allowed(queries)
+
+    def product_error(self, rows: Tensor, queries: Positions = slice(None), batch: Positions = slice(None)) -> float:
+        """Return the largest |rows V - output| of these queries, relative to the largest |output| among them.
+
+        rows: (batch, head, query, key) of the same queries and batch rows. Rows that are those of the kernel give
+        rounding errors: some 1e-7 where it computes in float32, some 1e-3 to 1e-2 where in bfloat16.
+        """
+        with torch.no_grad():
+            value = at_positions(self.value, 0, batch).float()
+            output = at_positions(at_positions(self.output, 0, batch), 2, queries).float()
+            size, heads, count, keys = rows.shape
+            # Heads that share a value head become extra queries of that head, without copies of the values.
+            stacked = rows.reshape(size, value.shape[1], heads // value.shape[1] * count, keys)
+            difference = (torch.matmul(stacked, value).reshape(output.shape) - output).abs()
+            if not difference.numel():
+                return 0.0
+            largest, scale = float(difference.max()), float(output.abs().max())
+            return largest / scale if scale > 0 else (0.0 if largest == 0 else float("inf"))
+
+
+class Watcher(Protocol):
+    """Is told about every attention call of a watched block, in order."""
+
+    def change(self, shape: CallShape) -> Tensor | None:
+        """Return logits to add before the softmax, broadcastable to (batch, head, query, key), or None for no change.
+
+        Asked before the kernel runs. -inf takes a key away.
+        """
+        ...
+
+    def saw(self, call: AttentionCall) -> None:
+        """Take what is wanted of a call, right after its kernel; in order."""
+        ...
+
+
+def at_positions(tensor: Tensor, axis: int, positions: Positions) -> Tensor:
+    """Return the positions of an axis: a view for a slice, a copy for a list of positions."""
+    if isinstance(positions, slice):
+        start, stop, step = positions.indices(tensor.shape[axis])
+        if (start, stop, step) == (0, tensor.shape[axis], 1):
+            return tensor
+        if step > 0:
+            return tensor[(slice(None),) * axis + (slice(start, stop, step),)]
+    return tensor.index_select(axis, position_numbers(positions, tensor.shape[axis], tensor.device))
+
+
+def position_numbers(positions: Positions, size: int, device: torch.device | str = "cpu") -> Tensor:
+    """Return positions on an axis of `size` as (count,) int64 without negative numbers."""
+    if isinstance(positions, slice):
+        positions = range(size)[positions]
+    numbers = torch.as_tensor(positions, dtype=torch.int64, device=device)
+    return torch.where(numbers < 0, numbers + size, numbers)
