@@ -6,8 +6,8 @@
     run.ratios()                            # a polars frame; docs/python.md lists the other methods
 
 Public names: `open` and `OpenStores` (stage two), `UserError` (the base of every error that a user can cause) and
-`__version__`. `vla_attention.testing` makes small stores with known content. This import loads neither torch nor zarr,
-polars or numpy.
+`__version__`. `vla_attention.datasets` reads data sets of robots. `vla_attention.testing` makes small stores with known
+content. This import loads neither torch nor zarr, polars or numpy.
 """
 
 from __future__ import annotations
@@ -50,4 +50,8 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("vla-attention")
+    if name == "datasets":
+        from importlib import import_module
+
+        return import_module("vla_attention.datasets")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

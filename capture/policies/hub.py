@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from vla_attention.schemas.errors import MissingDependency, UserError
 
@@ -14,7 +15,7 @@ HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 
 
 class CheckpointUnavailable(UserError, ConnectionError):
-    """A checkpoint, or a file of it, cannot be downloaded."""
+    """A checkpoint or data set, or a file of it, cannot be downloaded."""
 
 
 def hub_cache() -> Path:
@@ -28,11 +29,13 @@ def snapshots_folder(repository: str) -> Path:
     return hub_cache() / f"models--{repository.replace('/', '--')}" / "snapshots"
 
 
-def fetch_from_hub(repository: str, patterns: Sequence[str], how: str) -> Path:
+def fetch_from_hub(
+    repository: str, patterns: Sequence[str], how: str, kind: Literal["model", "dataset"] = "model"
+) -> Path:
     """Return the folder of a repository's files that match the patterns, downloaded unless they are in the cache.
 
-    how: ends an error message with another way to get the files. Raises `MissingDependency` without the client,
-    `CheckpointUnavailable` if the download fails.
+    how: ends an error message with another way to get the files. kind: of the repository. Raises `MissingDependency`
+    without the client, `CheckpointUnavailable` if the download fails.
     """
     try:
         from huggingface_hub import snapshot_download
@@ -42,7 +45,7 @@ def fetch_from_hub(repository: str, patterns: Sequence[str], how: str) -> Path:
             f"`pip install 'vla-attention[hub]'`, or {how}."
         ) from error
     try:
-        return Path(snapshot_download(repository, allow_patterns=list(patterns)))
+        return Path(snapshot_download(repository, repo_type=kind, allow_patterns=list(patterns)))
     except Exception as error:  # the client's own errors, those of its HTTP library, and OSError
         raise CheckpointUnavailable(
             f"'{repository}' could not be fetched from the Hugging Face hub ({first_line(error)}); {how}."

@@ -40,7 +40,7 @@ def test_local_folders_come_first(tmp_path, monkeypatch):
 def test_a_hub_name_is_downloaded_by_the_hub_s_client(monkeypatch, tmp_path):
     asked = []
 
-    def snapshot_download(name, allow_patterns):
+    def snapshot_download(name, repo_type, allow_patterns):
         asked.append((name, allow_patterns))
         return str(tmp_path)
 

@@ -1,0 +1,1 @@
+"""Policy calls on recorded data sets of robots, without a simulator: `vla-capture replay`, and the readers."""

@@ -1,0 +1,240 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import polars as pl
+import pytest
+
+from tests.kit.lerobot_data_sets import (
+    H264,
+    Encoding,
+    MadeUpEpisode,
+    made_up_episodes,
+    number_of,
+    numbered_picture,
+    write_data_set,
+)
+from vla_attention.capture.policies.hub import CheckpointUnavailable
+from vla_attention.capture.replay.data_set_errors import (
+    DamagedDataSet,
+    DataSetNotFound,
+    UndecodableVideo,
+    UnsupportedDataSet,
+)
+from vla_attention.capture.replay.lerobot_dataset import open_dataset
+from vla_attention.schemas.errors import BadArgument, UnknownName
+
+CAMERAS = ("observation.images.front", "observation.images.wrist")
+ENCODINGS = {"png": None, "h264": H264, "av1": Encoding()}
+VERSIONS = ("v2.1", "v3.0")
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_every_frame_has_its_own_picture_numbers_and_task(tmp_path, version, encoding):
+    episodes = made_up_episodes((7, 5, 9), CAMERAS)
+    data = open_dataset(write_data_set(tmp_path / "robot", version, episodes, video=ENCODINGS[encoding]))
+    assert (data.name, data.fps, data.cameras) == ("robot", 10.0, CAMERAS)
+    assert data.tasks == {0: "put the cup on the plate", 1: "open the drawer"}
+    assert [(entry.index, entry.length) for entry in data.episodes] == [(0, 7), (1, 5), (2, 9)]
+    for index, made in enumerate(episodes):
+        episode = data.episode(index)
+        np.testing.assert_array_equal(episode.column("action"), made.columns["action"])
+        frames = list(episode.frames())
+        assert [frame.index for frame in frames] == list(range(made.length))
+        for i, frame in enumerate(frames):
+            assert frame.seconds == pytest.approx(i / 10)
+            assert frame.instruction == made.tasks[i]
+            np.testing.assert_array_equal(frame.values["observation.state"], made.columns["observation.state"][i])
+            for c, camera in enumerate(CAMERAS):
+                assert number_of(frame.images[camera]) == 100 * index + 50 * c + i
+                if encoding == "png":
+                    np.testing.assert_array_equal(frame.images[camera], made.images[camera][i])
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_every_nth_frame_of_chosen_cameras(tmp_path, version):
+    data = open_dataset(write_data_set(tmp_path / "robot", version, made_up_episodes((7, 40), CAMERAS), video=H264))
+    frames = list(data.episode(1).frames(every=17, cameras=[CAMERAS[1]]))
+    assert [frame.index for frame in frames] == [0, 17, 34]
+    assert [number_of(frame.images[CAMERAS[1]]) for frame in frames] == [150, 167, 184]
+    assert all(list(frame.images) == [CAMERAS[1]] for frame in frames)
+    with pytest.raises(BadArgument, match="every 0th"):
+        next(data.episode(1).frames(every=0))
+
+
+def test_the_task_of_a_frame_may_change_within_an_episode(tmp_path):
+    made = made_up_episodes((4,))[0]
+    episode = MadeUpEpisode(made.images, made.columns, ["open it", "open it", "close it", "close it"])
+    data = open_dataset(write_data_set(tmp_path / "robot", "v3.0", [episode]))
+    assert data.episode(0).instructions == ("open it", "open it", "close it", "close it")
+
+
+def test_the_digest_names_the_content_and_not_the_place(tmp_path):
+    episodes = made_up_episodes((4, 3))
+    one = open_dataset(write_data_set(tmp_path / "one", "v3.0", episodes))
+    two = open_dataset(write_data_set(tmp_path / "two", "v3.0", episodes))
+    other = open_dataset(write_data_set(tmp_path / "other", "v3.0", episodes[:1]))
+    assert one.digest == two.digest != other.digest
+
+
+def edit_info(folder, **changes):
+    path = folder / "meta" / "info.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def test_what_is_no_data_set_is_said(tmp_path):
+    with pytest.raises(DataSetNotFound, match=r"no data set at .*give a folder, or ORG/NAME"):
+        open_dataset(tmp_path / "nothing" / "at" / "all")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "notes.txt").write_text("")
+    with pytest.raises(DataSetNotFound, match=r"no meta/info.json and holds notes.txt"):
+        open_dataset(tmp_path / "empty")
+
+
+@pytest.mark.parametrize("version", ["v1.6", "v4.0", None, 3])
+def test_another_version_is_refused_with_those_that_are_read(tmp_path, version):
+    folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3,)))
+    edit_info(folder, codebase_version=version)
+    with pytest.raises(UnsupportedDataSet, match=r"this program reads v2.0, v2.1, v3.0"):
+        open_dataset(folder)
+
+
+@pytest.mark.parametrize(
+    "template", ["../../{episode_index}.parquet", "/etc/{episode_index}", "{elsewhere}", "{episode_index.real}", "{"]
+)
+def test_a_path_template_stays_inside_of_the_data_set(tmp_path, template):
+    folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3,)))
+    edit_info(folder, data_path=template)
+    with pytest.raises((DamagedDataSet, BadArgument), match="path"):
+        open_dataset(folder)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_an_unknown_episode_and_missing_files_are_said(tmp_path, version):
+    folder = write_data_set(tmp_path / "robot", version, made_up_episodes((3, 4, 3)), video=H264)
+    data = open_dataset(folder)
+    with pytest.raises(UnknownName, match=r"no episode 3; its episodes are 0 to 2"):
+        data.episode(3)
+    videos = sorted(folder.glob("videos/**/*.mp4"))
+    videos[-1].unlink()
+    data.check_files([0], data.cameras)
+    with pytest.raises(DataSetNotFound, match=r"lacks 1 of the files .*mp4"):
+        data.check_files([0, 2], data.cameras)
+    with pytest.raises(DataSetNotFound, match="no video"):
+        list(data.episode(2).frames())
+    for table in folder.glob("data/**/*.parquet"):
+        table.unlink()
+    with pytest.raises(DataSetNotFound, match="parquet"):
+        data.episode(0)
+
+
+def test_rows_that_contradict_the_meta_files_are_refused(tmp_path):
+    folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((4,)))
+    table = next(folder.glob("data/**/*.parquet"))
+    rows = pl.read_parquet(table)
+    rows.head(3).write_parquet(table)
+    with pytest.raises(DamagedDataSet, match=r"has 3 rows .*frames 0 to 3"):
+        open_dataset(folder).episode(0)
+    rows.with_columns(pl.lit(7).alias("task_index")).write_parquet(table)
+    with pytest.raises(DamagedDataSet, match="task 7"):
+        open_dataset(folder).episode(0)
+    table.write_bytes(b"no table")
+    with pytest.raises(DamagedDataSet, match="cannot be read"):
+        open_dataset(folder).episode(0)
+
+
+def test_numbers_that_are_not_finite_are_refused(tmp_path):
+    episode = made_up_episodes((4,))[0]
+    episode.columns["action"][2, 1] = np.nan
+    data = open_dataset(write_data_set(tmp_path / "robot", "v3.0", [episode]))
+    with pytest.raises(DamagedDataSet, match=r"'action' of episode 0 .* first at frame 2"):
+        data.episode(0).column("action")
+    with pytest.raises(UnknownName, match=r"Did you mean 'action'\?"):
+        data.episode(0).column("actions")
+
+
+def test_a_video_that_is_shorter_than_its_table_is_refused(tmp_path):
+    from tests.kit.lerobot_data_sets import write_video
+
+    folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((6,)), video=H264)
+    write_video(next(folder.glob("videos/**/*.mp4")), [numbered_picture(i) for i in range(5)], 10, H264)
+    with pytest.raises(DamagedDataSet, match=r"no picture at 0.5000 s: its 5 pictures are at 0.0000 to 0.4000 s"):
+        list(open_dataset(folder).episode(0).frames())
+
+
+def test_a_damaged_video_and_a_damaged_picture_are_refused(tmp_path):
+    folder = write_data_set(tmp_path / "video", "v2.1", made_up_episodes((6,)), video=H264)
+    video = next(folder.glob("videos/**/*.mp4"))
+    video.write_bytes(b"no video at all")
+    with pytest.raises(UndecodableVideo, match="no video that can be read"):
+        list(open_dataset(folder).episode(0).frames())
+    folder = write_data_set(tmp_path / "png", "v2.1", made_up_episodes((2,)))
+    table = next(folder.glob("data/**/*.parquet"))
+    cell = {"bytes": b"no picture", "path": None}
+    kind = pl.Struct({"bytes": pl.Binary, "path": pl.String})
+    pl.read_parquet(table).with_columns(pl.Series(CAMERAS[0], [cell, cell], dtype=kind)).write_parquet(table)
+    with pytest.raises(DamagedDataSet, match="cannot be decoded"):
+        list(open_dataset(folder).episode(0).frames())
+
+
+def test_pictures_may_be_files_of_the_data_set_and_no_others(tmp_path):
+    made = made_up_episodes((2,))
+    folder = write_data_set(tmp_path / "robot", "v2.1", made)
+    table = next(folder.glob("data/**/*.parquet"))
+    kind = pl.Struct({"bytes": pl.Binary, "path": pl.String})
+    rows = pl.read_parquet(table)
+    (folder / "images").mkdir()
+    for i, cell in enumerate(rows[CAMERAS[0]]):
+        (folder / "images" / f"{i}.png").write_bytes(cell["bytes"])
+    (tmp_path / "outside.png").write_bytes(rows[CAMERAS[0]][0]["bytes"])
+    cells = [{"bytes": None, "path": f"images/{i}.png"} for i in range(2)]
+    rows.with_columns(pl.Series(CAMERAS[0], cells, dtype=kind)).write_parquet(table)
+    frames = list(open_dataset(folder).episode(0).frames())
+    assert [number_of(frame.images[CAMERAS[0]]) for frame in frames] == [0, 1]
+    for place in ("../outside.png", str(tmp_path / "outside.png"), ""):
+        cells = [{"bytes": None, "path": place}] * 2
+        rows.with_columns(pl.Series(CAMERAS[0], cells, dtype=kind)).write_parquet(table)
+        with pytest.raises(DataSetNotFound, match="neither in its table nor in a file"):
+            list(open_dataset(folder).episode(0).frames())
+
+
+def test_names_of_the_hub(tmp_path, monkeypatch):
+    pytest.importorskip("huggingface_hub")
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path))
+    with pytest.raises(CheckpointUnavailable, match="hf download --repo-type dataset lerobot/pusht"):
+        open_dataset("lerobot/pusht")
+    write_data_set(tmp_path / "lerobot" / "pusht", "v3.0", made_up_episodes((3,)))
+    assert open_dataset("lerobot/pusht").name == "lerobot/pusht"
+
+
+def test_only_the_files_of_the_wanted_episodes_are_fetched(tmp_path, monkeypatch):
+    import huggingface_hub
+
+    folder = write_data_set(tmp_path / "hub", "v2.1", made_up_episodes((3, 3), CAMERAS), video=H264)
+    asked = []
+
+    def snapshot_download(name, repo_type, allow_patterns):
+        asked.append((name, repo_type, allow_patterns))
+        return str(folder)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path / "none"))
+    data = open_dataset("org/name")
+    list(data.episode(1).frames(cameras=CAMERAS[1:]))
+    assert [(name, kind) for name, kind, _ in asked] == [("org/name", "dataset")] * 3
+    assert [path for _, _, paths in asked[1:] for path in paths] == [
+        "data/chunk-000/episode_000001.parquet",
+        f"videos/chunk-000/{CAMERAS[1]}/episode_000001.mp4",
+    ]
+
+
+def test_the_public_name(tmp_path):
+    import vla_attention as va
+
+    write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3,)))
+    assert [frame.index for frame in va.datasets.open(tmp_path / "robot").episode(0).frames()] == [0, 1, 2]

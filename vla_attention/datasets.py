@@ -1,0 +1,21 @@
+"""Data sets of robots, read without LeRobot: `va.datasets.open(FOLDER or ORG/NAME)`.
+
+    import vla_attention as va
+
+    data = va.datasets.open("data/so101_pick")
+    data.cameras, data.fps, data.tasks               # what it holds; data.features lists every column
+    for frame in data.episode(3).frames(every=10):
+        frame.images["observation.images.front"]     # (height, width, 3) uint8
+        frame.values["observation.state"]            # (number,) float64
+        frame.instruction, frame.seconds, frame.index
+
+`vla-capture replay` records policy calls on such frames; docs/data-sets.md describes both.
+"""
+
+from __future__ import annotations
+
+from vla_attention.capture.replay.data_set_errors import DataSetError
+from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, DataSetFrame, LeRobotDataset
+from vla_attention.capture.replay.lerobot_dataset import open_dataset as open
+
+__all__ = ["DataSetEpisode", "DataSetError", "DataSetFrame", "LeRobotDataset", "open"]
