@@ -14,12 +14,21 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.schemas.errors import BadArgument, unknown_name
+from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.safe_text import check_name
 
-SiteName = Literal["joint", "self", "cross"]
+#: Any name that `check_site_name` accepts. `joint`: prefix and suffix keys together (pi). `self` and `cross`: the
+#: query's own tokens, and the text or prefix.
+SiteName = str
 SpanKind = Literal["image", "text", "state", "action", "latent"]
 ROLE_DTYPE = np.uint8
+#: Groups and arrays of an episode beside those of its sites.
+RESERVED_NAMES = frozenset(
+    {
+        *("actions", "camera_frames", "dataset_action_count", "dataset_actions", "denoise_time", "env_step", "frames"),
+        *("noise_seed", "objects", "prompt_index", "seal", "state", "zarr.json"),
+    }
+)
 
 
 class Role(IntEnum):
@@ -39,6 +48,7 @@ class Role(IntEnum):
     VALUE = 12
     TEXT = 13
     NULL = 14
+    ABSENT = 15
 
     @property
     def label(self) -> str:
@@ -46,8 +56,18 @@ class Role(IntEnum):
         return self.name.lower()
 
 
-#: Roles of keys that can never hold information: exact zeros of a mask, or an inert null sink.
-INVALID_ROLES = (Role.MASKED_IMAGE, Role.PADDING, Role.NULL)
+#: Roles of keys that can never hold information: exact zeros of a mask, an inert null sink, or a key that does not
+#: exist at this replan (a shorter prompt, fewer generated tokens).
+INVALID_ROLES = (Role.MASKED_IMAGE, Role.PADDING, Role.NULL, Role.ABSENT)
+
+
+def check_site_name(name: str) -> None:
+    """Raise `BadArgument` unless a name can be a site's: one part of a path, and of no other group of an episode."""
+    check_name("site", name)
+    if name in RESERVED_NAMES:
+        raise BadArgument(
+            f"A site cannot be called '{name}': episodes have an array or a group of that name. Give it another name."
+        )
 
 
 def find_role(label: str) -> Role:
@@ -75,7 +95,12 @@ class PatchGrid:
 
 @dataclass(frozen=True)
 class Span:
-    """A run of neighbouring keys [start, stop) of one kind."""
+    """A run of neighbouring keys [start, stop) of one kind.
+
+    `growing`: the keys of tokens that are generated one after another. Action query q sees the first
+    `q + growing_offset` of them; the others do not exist yet. Tokens that are not generated at a replan have the role
+    `absent`, and each makes the action queries of that replan one fewer.
+    """
 
     name: str
     kind: SpanKind
@@ -83,10 +108,17 @@ class Span:
     stop: int
     camera: str | None = None
     grid: PatchGrid | None = None
+    growing: bool = False
+    growing_offset: int = 0
 
     def __post_init__(self) -> None:
-        """Check the names; they are parts of paths in a store."""
+        """Check the names, which are parts of paths in a store, and the offset."""
         check_name("span", self.name)
+        if self.growing_offset < 0 or (self.growing_offset and not self.growing):
+            raise BadArgument(
+                f"Span '{self.name}' has the growing offset {self.growing_offset}; expected 0 or more, and 0 unless "
+                "the span is growing."
+            )
         if self.camera is not None:
             check_name("camera", self.camera)
 
@@ -100,14 +132,22 @@ class Span:
 class SiteLayout:
     """The spans of one softmax family, in key order, without gaps.
 
+    `layers`: the blocks that have this site; empty where all recorded blocks have it. `heads`: its number of heads, and
+    `num_action_queries`: its number of action queries; 0 where they are those of the policy and of the recording.
+
     Raises `BadArgument` when spans leave a gap, overlap, share a name, or a grid does not match its span's length.
     """
 
     name: SiteName
     spans: tuple[Span, ...]
+    layers: tuple[int, ...] = ()
+    heads: int = 0
+    num_action_queries: int = 0
 
     def __post_init__(self) -> None:
-        """Check that the spans tile [0, num_keys)."""
+        """Check the name and the numbers, and that the spans tile [0, num_keys)."""
+        check_site_name(self.name)
+        self._check_numbers()
         position = 0
         seen: set[str] = set()
         for span in self.spans:
@@ -126,6 +166,21 @@ class SiteLayout:
             seen.add(span.name)
             position = span.stop
 
+    def _check_numbers(self) -> None:
+        if list(self.layers) != sorted(set(self.layers)) or min(self.layers, default=0) < 0:
+            raise BadArgument(
+                f"Site '{self.name}' has the layers {listing(self.layers, 40)}; expected different block indices from "
+                "0 up, in ascending order."
+            )
+        if self.heads < 0 or self.num_action_queries < 0:
+            raise BadArgument(
+                f"Site '{self.name}' has {self.heads} heads and {self.num_action_queries} action queries; expected 0 "
+                "(those of the policy) or more."
+            )
+        growing = [span.name for span in self.spans if span.growing]
+        if len(growing) > 1:
+            raise BadArgument(f"Site '{self.name}' has the growing spans {listing(growing)}; expected at most one.")
+
     @property
     def num_keys(self) -> int:
         """Number of keys of the site."""
@@ -135,6 +190,11 @@ class SiteLayout:
     def cameras(self) -> tuple[str, ...]:
         """Camera names, in key order."""
         return tuple(span.camera for span in self.spans if span.camera is not None)
+
+    @property
+    def growing_span(self) -> Span | None:
+        """The span of generated tokens; None where every action query sees the same keys."""
+        return next((span for span in self.spans if span.growing), None)
 
     def span(self, name: str) -> Span:
         """Return the span of that name; the error lists the existing ones."""

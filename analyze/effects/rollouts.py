@@ -52,7 +52,8 @@ def rollout_pairs(condition: Condition, question: Question) -> tuple[pl.DataFram
     suite, rows = question.stores[0].suite, []
     for start in shared:
         first, other = base[start].attributes, own[start].attributes
-        success, steps = (float(first.success), float(other.success)), (first.num_steps, other.num_steps)
+        success = [None if one.success is None else float(one.success) for one in (first, other)]
+        steps = first.num_steps, other.num_steps
         rows.append(
             {
                 "suite": suite,
@@ -63,7 +64,7 @@ def rollout_pairs(condition: Condition, question: Question) -> tuple[pl.DataFram
                 "episode": other.episode_index,
                 "success_base": success[0],
                 "success": success[1],
-                "success_difference": success[1] - success[0],
+                "success_difference": None if success[0] is None or success[1] is None else success[1] - success[0],
                 "steps_base": float(steps[0]),
                 "steps": float(steps[1]),
                 "steps_difference": float(steps[1] - steps[0]),

@@ -27,6 +27,7 @@ from vla_attention.analyze.measures.frames import (
     Tables,
     concat_tables,
     episode_id,
+    float_values,
     long_table,
     replan_axis,
 )
@@ -275,7 +276,8 @@ def _task_row(
         "num_replans": int(part["num_replans"].sum()),
     }
     tasks = values(_TASK)
-    plain = {"success_rate": mean_over_episodes(part["success"].to_numpy().astype(np.float64))}
+    # Outcomes that are not known are NaN, and in no mean.
+    plain = {"success_rate": mean_over_episodes(float_values(part["success"]))}
     bounded: dict[str, EpisodeStatistic] = {}
     if grouping.ratio:
         spread = summarize(values("ratio_mean"))

@@ -63,6 +63,8 @@ def long_table(
 
 def _constant(name: str, item: SelectedEpisode, height: int) -> pl.Series:
     value = item.store.suite if name == "suite" else getattr(item.episode.attributes, name)
+    if name == "success":
+        return pl.Series(name, [value], dtype=pl.Boolean).new_from_index(0, height)  # null where it is not known
     # Instructions are any text, and tables are printed and drawn.
     return _labels(name, [visible(value) if isinstance(value, str) else value]).new_from_index(0, height)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from vla_attention.analyze.overlay.colours import Measure, Scale, color_bar, outline_color
 from vla_attention.analyze.overlay.overlay_data import EpisodeOverlay, draw, orientation_note
 from vla_attention.analyze.overlay.overlay_study import OverlayStudy
-from vla_attention.analyze.show.numbers import format_number
+from vla_attention.analyze.show.numbers import format_number, outcome_word
 from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, hide_frame
 from vla_attention.analyze.show.plot_colours import NOTE_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
@@ -42,7 +42,7 @@ def plot_overlay_strip(
     width = max(6.4, 0.35 + columns * _SIDE)
     side = _SIDE if columns > 3 else 2.1
     figure = new_figure(width, 1.55 + len(blocks) * (0.42 + len(cameras) * side))
-    outcome = "success" if attributes.success else "failure"
+    outcome = outcome_word(attributes.success)
     shown = f"replan{'s' if len(replans) > 1 else ''} {_numbers(replans)} of {overlay.num_replans}"
     note = f"{'; '.join(part for part in (outcome, shown, study.averaged_over) if part)}. {orientation_note(overlay)}"
     title(figure, episode_heading(overlay), note)

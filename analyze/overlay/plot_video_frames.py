@@ -15,7 +15,7 @@ from vla_attention.analyze.overlay.overlay_data import EpisodeOverlay, draw, ori
 from vla_attention.analyze.overlay.overlay_study import OverlayStudy
 from vla_attention.analyze.overlay.plot_strip import draw_scale, episode_heading
 from vla_attention.analyze.overlay.video import VideoFormat, write_video
-from vla_attention.analyze.show.numbers import format_number
+from vla_attention.analyze.show.numbers import format_number, outcome_word
 from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, legend_above, ratio_axis, whole_numbers
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure
@@ -95,7 +95,7 @@ def _set_up(overlay: EpisodeOverlay, grouping: Grouping, scale: Scale, pictures:
 
     cameras, attributes = list(overlay.maps), overlay.item.episode.attributes
     figure = new_figure(max(7.0, len(cameras) * _SIDE + _CURVE), _SIDE + 1.6)
-    outcome = "success" if attributes.success else "failure"
+    outcome = outcome_word(attributes.success)
     title(figure, episode_heading(overlay), f"{outcome}; a picture per replan. {orientation_note(overlay)}")
     ratios = [*[1.0] * len(cameras), _CURVE / _SIDE]
     grid = figure.add_gridspec(2, len(cameras) + 1, width_ratios=ratios, height_ratios=[1.0, 0.06])

@@ -42,6 +42,7 @@ from vla_attention.analyze.ratios.contribution_text import (
     same_sides,
 )
 from vla_attention.analyze.ratios.summary_text import AnalysedRun, ratio_definition, summary_text
+from vla_attention.analyze.show.numbers import solved_text
 from vla_attention.analyze.show.output_files import write_parquet, write_text, writing
 from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.stores.selection import Selection, denoise_text, heads_text
@@ -148,7 +149,7 @@ class Analysis:
         name = f"{policy.name}{', untrained' if said else ''} ({shortened(policy.checkpoint, 60)})"
         suites = sorted(self.episodes.cells["suite"].unique())
         layers, steps = len(set(question.selection.blocks)), question.selection.denoise_steps
-        solved = sum(item.episode.attributes.success for item in question.selected)
+        solved = solved_text(item.episode.attributes.success for item in question.selected)
         found = [run_sentence(name, row, solved, suites, layers, steps, question.site)]
         if headline is not None:
             found.append(ratio_sentence(headline))

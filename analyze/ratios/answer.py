@@ -64,11 +64,11 @@ def headline_of(row: Mapping[str, Any], what: str, name: str, about: str, untrai
 
 
 def run_sentence(
-    policy: str, row: Mapping[str, Any], solved: int, suites: list[str], layers: int, steps: tuple[int, ...], site: str
+    policy: str, row: Mapping[str, Any], solved: str, suites: list[str], layers: int, steps: tuple[int, ...], site: str
 ) -> str:
-    """What was run: policy, episodes, tasks, and which attention was measured."""
+    """What was run: policy, episodes, tasks, outcomes in words (`solved`), and which attention was measured."""
     return (
-        f"{policy} in {listing(suites, 4)}: {of_tasks(row['num_episodes'], row['num_tasks'])}, {solved} solved; "
+        f"{policy} in {listing(suites, 4)}: {of_tasks(row['num_episodes'], row['num_tasks'])}, {solved}; "
         f"attention of the action queries at {plural(row['num_replans'], 'replan')}, {plural(layers, 'layer')}, "
         f"denoise {'step' if len(steps) == 1 else 'steps'} {listing(steps)}, site '{site}'."
     )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables, float_values, layer_name
 from vla_attention.analyze.measures.masses import ratio
-from vla_attention.analyze.show.numbers import format_number, plural
+from vla_attention.analyze.show.numbers import format_number, outcome_word, plural
 from vla_attention.analyze.show.plot_axes import (
     BASELINE_LABEL,
     legend_above,
@@ -60,7 +60,7 @@ def plot_ratio_evolution(
     layer = first["layer"]
     figure = new_figure(10, 6.8)
     of_layer = layer_name(layer, "mean over layers") + (f" (block {first['block']})" if layer != LAYERS_AVG else "")
-    outcome = "success" if first["success"] else "failure"
+    outcome = outcome_word(first["success"])
     note = (
         f"{of_layer}; {outcome} after {first['num_steps']} steps; {plural(episode.height, 'replan')}; "
         f"grouping '{grouping.name}'"

@@ -12,7 +12,14 @@ from vla_attention.analyze.measures.aggregate import layer_order, overall_layer,
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables, layer_name
 from vla_attention.analyze.ratios.verdict import LINGUISTIC_BELOW, VISUAL_ABOVE, meanings, reading, verdict
 from vla_attention.analyze.show.headings import WIDTH, heading, title, untrained_warning, wrap, wrap_all
-from vla_attention.analyze.show.numbers import format_number, format_percent, interval_name, plural, row_interval
+from vla_attention.analyze.show.numbers import (
+    format_number,
+    format_percent,
+    interval_name,
+    plural,
+    row_interval,
+    solved_text,
+)
 from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.intervals import Estimand
@@ -71,7 +78,12 @@ def _header(run: AnalysedRun, grouping: Grouping, episodes: Tables) -> str:
     of_layer = episodes.filter(pl.col("layer") == overall_layer(episodes.cells))
     overall = of_layer.cells
     num_tasks = overall.select("suite", "task_id").n_unique()
-    successes = int(overall["success"].sum())
+    known = overall["success"].drop_nulls()
+    outcomes = (
+        f"{int(known.sum())} successful ({format_percent(int(known.sum()) / len(known))})"
+        if len(known) == overall.height
+        else solved_text(overall["success"])
+    )
     layers = [layer for layer in layer_order(episodes.cells) if layer != LAYERS_AVG]
     blocks = dict(episodes.cells.select("layer", "block").unique().iter_rows())
     translated = [f"{layer} = block {blocks[layer]}" for layer in layers if str(blocks[layer]) != layer]
@@ -83,8 +95,7 @@ def _header(run: AnalysedRun, grouping: Grouping, episodes: Tables) -> str:
     lines += _labelled("suite", ", ".join(sorted(overall["suite"].unique())))
     lines += _labelled(
         "episodes",
-        f"{overall.height} of {plural(num_tasks, 'task')}, {successes} successful "
-        f"({format_percent(successes / overall.height)}); {int(overall['num_replans'].sum())} replans",
+        f"{overall.height} of {plural(num_tasks, 'task')}, {outcomes}; {int(overall['num_replans'].sum())} replans",
     )
     lines += _labelled("layers", listing(layers, 40) + (f" ({', '.join(translated)})" if translated else ""))
     lines += _labelled("averaged over", f"denoise steps {listing(run.denoise_steps, 40)}; {run.heads}")

@@ -18,6 +18,7 @@ from vla_attention.analyze.show.numbers import (
     format_percent_interval,
     interval_name,
     plural,
+    solved_text,
 )
 from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
@@ -48,8 +49,8 @@ def headline_section(analysis: Analysis, notes: Sequence[Caveat]) -> Section:
     """The numbers over all selected tasks; `notes` are the caveats of this analysis."""
     row, ratio = analysis.overall, analysis.grouping.ratio
     boxes = _fraction_boxes(analysis) if ratio is None else _ratio_boxes(row, ratio.numerator, ratio.denominator)
-    solved = sum(item.episode.attributes.success for item in analysis.question.selected)
-    note = f"of {plural(row['num_tasks'], 'task')}; {solved} solved; "
+    solved = solved_text(item.episode.attributes.success for item in analysis.question.selected)
+    note = f"of {plural(row['num_tasks'], 'task')}; {solved}; "
     boxes.append(Box("episodes", str(row["num_episodes"]), note + plural(row["num_replans"], "replan")))
     parts: list[Part] = [Headline([caveat for caveat in notes if caveat.grave], boxes)]
     if ratio is not None:

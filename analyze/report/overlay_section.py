@@ -26,7 +26,7 @@ from vla_attention.analyze.report.pictures import photograph, png_address
 from vla_attention.analyze.report.ratio_curve import RatioCurve, ratio_curve
 from vla_attention.analyze.report.report_settings import ReportSettings
 from vla_attention.analyze.report.section_parts import Paragraph, Section
-from vla_attention.analyze.show.numbers import format_number, format_percent
+from vla_attention.analyze.show.numbers import format_number, format_percent, outcome_word
 from vla_attention.analyze.show.patch_pictures import upright
 from vla_attention.analyze.show.progress import progress_bar
 
@@ -130,7 +130,7 @@ def choose_episodes(selected: Sequence[SelectedEpisode], count: int) -> list[Sel
     picked: list[SelectedEpisode] = []
     spread = np.linspace(0, len(tasks) - 1, min(count, len(tasks))).round()
     for turn, place in enumerate(sorted({int(place) for place in spread})):
-        fitting = [item for item in tasks[place] if item.episode.attributes.success == (turn % 2 == 0)]
+        fitting = [item for item in tasks[place] if item.episode.attributes.success is (turn % 2 == 0)]
         picked.append((fitting or tasks[place])[0])
     # With fewer tasks than wanted episodes: further episodes of the same tasks, in turn.
     rest = [item for depth in range(max(map(len, tasks))) for group in tasks for item in group[depth : depth + 1]]
@@ -154,7 +154,7 @@ def _scale_bar(scale: Scale) -> ScaleBar:
 
 def _episode(overlay: EpisodeOverlay, replans: Sequence[int], scale: Scale) -> ShownEpisode:
     attributes = overlay.item.episode.attributes
-    outcome = "solved" if attributes.success else "not solved"
+    outcome = outcome_word(attributes.success, "solved", "not solved")
     name = f"{overlay.item.store.suite} task {attributes.task_id}, episode {attributes.episode_index}"
     curve = None if overlay.ratio is None else ratio_curve(overlay.ratio, overlay.uniform_ratio, overlay.env_step)
     missing = overlay.ratio is not None and curve is None

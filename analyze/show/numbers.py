@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from vla_attention.schemas.command_line import format_bytes as format_bytes  # shared with capture
@@ -64,6 +64,21 @@ def plural(count: int, noun: str) -> str:
     if count == 1:
         return f"1 {noun}"
     return f"{count} {noun[:-1]}ies" if noun.endswith("ty") else f"{count} {noun}s"
+
+
+def solved_text(outcomes: Iterable[bool | None]) -> str:
+    """`3 solved`; `3 of 5 with a known outcome solved` where some are not known, `outcomes not known` where all are."""
+    given = list(outcomes)
+    known = [outcome for outcome in given if outcome is not None]
+    if given and not known:
+        return "outcomes not known"
+    solved = sum(known)
+    return f"{solved} solved" if len(known) == len(given) else f"{solved} of {len(known)} with a known outcome solved"
+
+
+def outcome_word(success: bool | None, solved: str = "success", failed: str = "failure") -> str:
+    """The outcome of an episode in a word or two."""
+    return "outcome not known" if success is None else solved if success else failed
 
 
 def of_tasks(num_episodes: int, num_tasks: int) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import polars as pl
 
 from vla_attention.analyze.show.headings import wrap
-from vla_attention.analyze.show.numbers import of_tasks, plural
+from vla_attention.analyze.show.numbers import of_tasks, plural, solved_text
 from vla_attention.analyze.stores.selection import select_episodes
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS
@@ -49,9 +49,10 @@ def one_line(stores: Sequence[Store]) -> str:
     """Numbers of stores, episodes, tasks, solved episodes and replans, and the suites."""
     episodes = [episode.attributes for store in stores for episode in store.episodes]
     tasks = {(store.suite, task) for store in stores for task in store.task_ids}
-    solved, replans = (sum(getattr(one, name) for one in episodes) for name in ("success", "num_replans"))
+    replans = sum(one.num_replans for one in episodes)
+    solved = solved_text(one.success for one in episodes)
     return (
-        f"{plural(len(stores), 'store')}: {of_tasks(len(episodes), len(tasks))} ({solved} solved), {replans} replans, "
+        f"{plural(len(stores), 'store')}: {of_tasks(len(episodes), len(tasks))} ({solved}), {replans} replans, "
         f"suite {listing(dict.fromkeys(store.suite for store in stores))}"
     )
 
@@ -89,8 +90,8 @@ def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
         f"{protocol.image_size} pixels, replan every {protocol.replan_steps} steps, at most {protocol.max_steps} steps "
         f"after {protocol.wait_steps} waiting steps"
     )
-    solved = sum(episode.attributes.success for episode in episodes)
-    yield f"  episodes   {len(episodes)} ({solved} solved), tasks {listing(store.task_ids, 100)}"
+    solved = solved_text(episode.attributes.success for episode in episodes)
+    yield f"  episodes   {len(episodes)} ({solved}), tasks {listing(store.task_ids, 100)}"
     labels = [
         f"{label} (block {block})" if label != block else str(block)
         for label, block in zip(

@@ -14,6 +14,7 @@ from vla_attention.analyze.show.numbers import (
     format_signed,
     of_tasks,
     row_interval,
+    solved_text,
 )
 from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.show.text_table import text_table
@@ -43,6 +44,11 @@ def time_text(question: Question, courses: TimeCourses, settings: TimeSettings) 
     return "\n\n".join(parts) + "\n"
 
 
+def _outcomes(success: pl.Series) -> str:
+    known = success.drop_nulls()
+    return f"{int(known.sum())} successful" if len(known) == len(success) else solved_text(success)
+
+
 def _header(question: Question, courses: TimeCourses) -> str:
     of = courses.autocorrelation
     layer = layer_name(courses.layer, LAYERS_AVG)
@@ -51,7 +57,7 @@ def _header(question: Question, courses: TimeCourses) -> str:
         lines += wrap(untrained_warning())
     lines += wrap(f"stores: {', '.join(str(store.path) for store in question.stores)}")
     lines += wrap(
-        f"{of_tasks(of.height, of.select('suite', 'task_id').n_unique())}, {int(of['success'].sum())} successful; "
+        f"{of_tasks(of.height, of.select('suite', 'task_id').n_unique())}, {_outcomes(of['success'])}; "
         f"{layer}; grouping '{question.grouping.name}'. "
         f"{interval_note(DEFAULT_LEVEL, question.settings.intervals.words, 'pointwise')}"
     )

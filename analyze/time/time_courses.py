@@ -106,7 +106,7 @@ class _Episode:
 
     identity: tuple[object, ...]
     task: tuple[str, int]
-    success: bool
+    success: bool | None
     values: NDArray[np.float64]
     uniform: float
     starts: NDArray[np.int64]
@@ -140,8 +140,9 @@ def time_courses(
     estimand = question.settings.intervals
     classes = {ALL: episodes}
     solved = [episode for episode in episodes if episode.success]
-    if 0 < len(solved) < len(episodes):
-        classes |= {SUCCESS: solved, FAILURE: [episode for episode in episodes if not episode.success]}
+    failed = [episode for episode in episodes if episode.success is False]
+    if solved and failed:
+        classes |= {SUCCESS: solved, FAILURE: failed}
     course = [
         _course(members, outcome, alignment, quantities, settings, estimand)
         for outcome, members in classes.items()
@@ -298,8 +299,9 @@ def _change_table(
 def _outcomes_table(episodes: Sequence[_Episode], quantities: Sequence[str], estimand: Estimand) -> pl.DataFrame:
     """Success against failure on the episodes' means over replans: log2 of the ratio, and fractions."""
     tasks = _task_numbers(episodes)
-    solved = np.array([episode.success for episode in episodes])
+    solved = np.array([episode.success is True for episode in episodes])
     means = np.array([[summarize(column).mean for column in episode.values.T] for episode in episodes], np.float64)
+    means[[episode.success is None for episode in episodes]] = np.nan  # in neither class
     names, found = [], []
     for i, quantity in enumerate(quantities):
         values = means[:, i] / np.log(2.0) if quantity == RATIO else means[:, i]

@@ -30,7 +30,7 @@ class EpisodeStatus:
 
     task_id: int
     episode: int
-    success: bool
+    success: bool | None
     bytes: int
     at: str
     by: str
@@ -41,7 +41,7 @@ class TaskStatus:
     """One task.
 
     expected: number of episodes; None if neither the user nor a record gives it.
-    committed, success, bytes: of the episodes that are not damaged.
+    committed, success, bytes: of the episodes that are not damaged. unknown: how many of them have no known outcome.
     missing: indices of the expected episodes that the store lacks.
     damaged: episodes that are in the store, but cannot be used.
     """
@@ -56,6 +56,7 @@ class TaskStatus:
     last_by: str
     missing: tuple[int, ...]
     damaged: tuple[DamagedEpisode, ...]
+    unknown: int = 0
 
 
 @dataclass(frozen=True)
@@ -141,12 +142,13 @@ def store_status(path: Path, expected: int | None = None, verify: bool = False) 
                 instruction=instructions.get(task_id, ""),
                 committed=len(found),
                 expected=wanted,
-                success=sum(episode.success for episode in found),
+                success=sum(episode.success is True for episode in found),
                 bytes=sum(episode.bytes for episode in found),
                 last_at=last.at if last else "",
                 last_by=last.by if last else "",
                 missing=tuple(sorted(set(range(wanted or 0)) - present)),
                 damaged=tuple(faulty),
+                unknown=sum(episode.success is None for episode in found),
             )
         )
     return StoreStatus(str(path), root.protocol.suite, root.policy.name, tuple(tasks), tuple(holders(path)))
@@ -174,7 +176,7 @@ def _cells(task: TaskStatus) -> tuple[str, ...]:
     return (
         str(task.task_id),
         f"{task.committed} of {'?' if task.expected is None else task.expected}",
-        str(task.success) if task.committed else "-",
+        str(task.success) if task.committed > task.unknown else "-",
         format_bytes(task.bytes) if task.committed else "-",
         task.last_at.removesuffix("+00:00").replace("T", " ") or "-",
         visible(task.last_by) or ("unknown" if task.committed else "-"),

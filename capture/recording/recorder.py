@@ -175,7 +175,8 @@ def make_recorders(
     """
     recorders: dict[str, AttentionRecorder] = {}
     for site in sites:
-        plan = RecordingPlan(recording.layers, recording.denoise_steps, recording.heads, recording.queries, site.name)
+        own = recording.of_site(site)
+        plan = RecordingPlan(own.layers, own.denoise_steps, own.heads, own.queries, site.name)
         roles = key_role[site.name]
         parts = segment_members(site, roles[None], segments_of(site, roles))[0] if recording.contributions else None
         recorders[site.name] = AttentionRecorder(plan, site.num_keys, parts, pools)

@@ -57,11 +57,12 @@ def estimate_disk(
     recording: Recording, sites: Sequence[SiteLayout], picture_sizes: Sequence[int], replans: int, episodes: int
 ) -> DiskEstimate:
     """Estimate a run's size; `picture_sizes` are the decoded bytes of each stored camera picture."""
-    chunks = len(recording.layers) * len(recording.denoise_steps)
-    rows_of_site = chunks * len(recording.heads) * recording.num_queries
     # A picture may be noise; those that simulators draw take about a third of this.
     total = float(_SMALL_PER_REPLAN) + (_INCOMPRESSIBLE * sum(picture_sizes) if recording.frames else 0)
     for site in sites:
+        of_site = recording.of_site(site)
+        chunks = len(of_site.layers) * len(of_site.denoise_steps)
+        rows_of_site = chunks * len(of_site.heads) * of_site.num_queries
         segments = sum(_SEGMENTS_OF_SPAN.get(span.kind, 1) for span in site.spans)
         total += rows_of_site * site.num_keys * bytes_per_number(recording.mantissa_bits) + chunks * _CHUNK_OVERHEAD
         total += rows_of_site * 4 * (segments + 1) * _INCOMPRESSIBLE + site.num_keys

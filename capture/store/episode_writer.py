@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -50,19 +50,21 @@ class ReplanRecord:
 
     `rows` and `key_role` are per site. `state` is (state_dim,), `actions` (horizon, action_dim) as given to the
     environment, `frames` and `camera_frames` per policy camera (row, column, channel) uint8, `coverage` per policy
-    camera (patch, object) float32.
+    camera (patch, object) float32. `dataset_actions` (steps, action_dim) are those that a data set has from this replan
+    on, fewer at the end of its episode. What is None is not known; all replans of an episode know the same.
     """
 
     env_step: int
-    noise_seed: int
+    noise_seed: int | None
     rows: Mapping[str, RecordedRows]
     key_role: Mapping[str, NDArray[np.uint8]]
     prompt: Prompt
-    state: NDArray[np.float64]
-    actions: NDArray[np.float64]
+    state: NDArray[np.float64] | None
+    actions: NDArray[np.float64] | None
     frames: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
     camera_frames: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
     coverage: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    dataset_actions: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,8 @@ class EpisodeWriter:
         self.group = zarr.create_group(folder, zarr_format=3)
         self.digests: dict[str, ArrayRecord] = {}
         self.sites = {
-            site.name: SiteWriter(self.group, self.write, site, run.recording, max_replans) for site in run.sites
+            site.name: SiteWriter(self.group, self.write, site, run.recording.of_site(site), max_replans)
+            for site in run.sites
         }
         self.prompts: dict[Prompt, int] = {}
         self.records: list[ReplanRecord] = []
@@ -151,7 +154,8 @@ class EpisodeWriter:
         for camera, coverage in record.coverage.items():
             yield from coverage_problems(sites, camera, coverage[None], len(self.start.objects), replan)
         steps = [*(earlier.env_step for earlier in self.records[-1:]), record.env_step]
-        yield from counter_problems(np.array(steps), np.array([record.noise_seed]))
+        seeds = [] if record.noise_seed is None else [record.noise_seed]
+        yield from counter_problems(np.array(steps), np.array(seeds, dtype=np.int64))
 
     def _misfits(self, record: ReplanRecord) -> Iterator[str]:
         """Where a replan differs in form from the first one, so that their arrays could not be stacked."""
@@ -160,15 +164,25 @@ class EpisodeWriter:
             given, expected = list(getattr(record, what)), list(getattr(first, what))
             if given != expected:
                 yield f"it has {what} of the cameras {listing(given)}, the first replan of {listing(expected)}"
-        for what in ("state", "actions"):
+        for what in ("noise_seed", "state", "actions", "dataset_actions"):
             values, before = getattr(record, what), getattr(first, what)
-            if values.shape != before.shape:
+            if (values is None) is not (before is None):
+                yield f"it has {'no' if values is None else 'a'} {what}, other than the first replan"
+            if values is None or before is None or what == "noise_seed":
+                continue
+            # A data set may have fewer actions at the end of its episode.
+            axes = slice(1, None) if what == "dataset_actions" else slice(None)
+            if values.shape[axes] != before.shape[axes] or values.ndim != before.ndim:
                 yield f"{what} has the shape {values.shape}; that of the first replan is {before.shape}"
+            if what == "dataset_actions" and (values.ndim != 2 or not len(values)):
+                yield f"{what} has the shape {values.shape}; expected (steps, action_dim) with at least one step"
             if not np.isfinite(values).all():
                 yield f"{what} holds numbers that are NaN or infinite"
 
-    def commit(self, success: bool, num_steps: int) -> Path:
+    def commit(self, success: bool | None, num_steps: int) -> Path:
         """Finish, verify and publish the episode; returns its folder in the store.
+
+        success: None where nobody knows it. num_steps: 0 where it is not known.
 
         Raises:
             StoreExists: another writer has published the same episode meanwhile.
@@ -186,7 +200,7 @@ class EpisodeWriter:
             self._read_back(run)
             return self._publish()
 
-    def _attributes(self, success: bool, num_steps: int) -> EpisodeAttributes:
+    def _attributes(self, success: bool | None, num_steps: int) -> EpisodeAttributes:
         return EpisodeAttributes(
             **vars(self.start),
             success=success,
@@ -224,12 +238,19 @@ class EpisodeWriter:
     def _write_side_arrays(self) -> None:
         records = self.records
         self.write("env_step", np.array([record.env_step for record in records], dtype=np.int32), ("replan",))
-        self.write("noise_seed", np.array([record.noise_seed for record in records], dtype=np.int64), ("replan",))
+        seeds = [record.noise_seed for record in records if record.noise_seed is not None]
+        if seeds:
+            self.write("noise_seed", np.array(seeds, dtype=np.int64), ("replan",))
         index = np.array([self.prompts[record.prompt] for record in records], dtype=np.int32)
         self.write("prompt_index", index, ("replan",))
         self.write("denoise_time", np.asarray(self.denoise_times, dtype=np.float32), ("denoise",))
-        self.write("state", np.stack([record.state for record in records]), ("replan", "state_dim"))
-        self.write("actions", np.stack([record.actions for record in records]), ("replan", "horizon", "action_dim"))
+        states = [record.state for record in records if record.state is not None]
+        if states:
+            self.write("state", np.stack(states), ("replan", "state_dim"))
+        actions = [record.actions for record in records if record.actions is not None]
+        if actions:
+            self.write("actions", np.stack(actions), ("replan", "horizon", "action_dim"))
+        self._write_dataset_actions([r.dataset_actions for r in records if r.dataset_actions is not None])
         for camera in records[0].frames:
             frames = np.stack([record.frames[camera] for record in records])
             self.write(f"frames/{camera}", frames, ("replan", "row", "column", "channel"))
@@ -239,6 +260,16 @@ class EpisodeWriter:
         for camera in records[0].coverage:
             coverage = np.stack([record.coverage[camera] for record in records])
             self.write(f"objects/{camera}", coverage, ("replan", "patch", "object"))
+
+    def _write_dataset_actions(self, actions: Sequence[NDArray[np.float64]]) -> None:
+        if not actions:
+            return
+        counts = np.array([len(steps) for steps in actions], dtype=np.int32)
+        stacked = np.zeros((len(actions), counts.max(), actions[0].shape[1]))
+        for replan, steps in enumerate(actions):
+            stacked[replan, : len(steps)] = steps
+        self.write("dataset_actions", stacked, ("replan", "horizon", "action_dim"))
+        self.write("dataset_action_count", counts, ("replan",))
 
     def _read_back(self, run: str) -> None:
         """Read everything back from disk, with the checks of `vla-analyze verify`."""

@@ -15,6 +15,7 @@ from vla_attention.schemas.layout import ROLE_DTYPE, SiteLayout
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, round_mantissa
 from vla_attention.schemas.segments import Segment, merge_segments, segment_masses, segment_members, segments_of
 from vla_attention.schemas.stores.content_rules import (
+    absent_problems,
     gram_problems,
     role_problems,
     row_problems,
@@ -75,6 +76,7 @@ class SiteWriter:
             f"{name}/rows", rows[None], recorded.row_sum[None], recording, FLOAT32_MANTISSA_BITS, replan
         )
         yield from row_sum_problems(f"{name}/row_sum", recorded.row_sum[None], recording, replan)
+        yield from absent_problems(self.layout, rows[None], key_role[None], recording, replan)
         if gram is not None:
             yield from gram_problems(f"{name}/contribution", gram[None], recording, replan)
 

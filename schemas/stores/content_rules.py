@@ -80,6 +80,39 @@ def row_problems(
         )
 
 
+def absent_problems(
+    layout: SiteLayout,
+    rows: NDArray[np.float32],
+    key_role: NDArray[np.integer],
+    recording: Recording,
+    first_replan: int = 0,
+) -> Iterator[str]:
+    """Rows (replan, layer, denoise, head, query, key) and roles (replan, key): a key that does not exist has no mass.
+
+    Does not exist: a key with the role `absent`, and with all queries stored, a key of a growing span that is generated
+    after the query.
+    """
+    name = f"{layout.name}/rows"
+    absent = key_role == Role.ABSENT
+    for replan in np.flatnonzero(absent.any(axis=1)).tolist():
+        given = rows[replan][..., absent[replan]] != 0
+        if given.any():
+            yield f"{name} gives mass to a key with the role 'absent' at replan {first_replan + replan}"
+            return
+    growing = layout.growing_span
+    if growing is None or recording.queries != "all":
+        return
+    for query in range(rows.shape[4]):
+        later = rows[..., query, min(growing.start + query + growing.growing_offset, growing.stop) : growing.stop]
+        if (later != 0).any():
+            replan = int(np.argwhere(later.any(axis=(1, 2, 3, 4)))[0][0])
+            yield (
+                f"{name} gives query {query} mass of a key of the growing span '{growing.name}' that does not exist "
+                f"for it yet, at replan {first_replan + replan}"
+            )
+            return
+
+
 def row_sum_problems(
     name: str, row_sum: NDArray[np.floating], recording: Recording, first_replan: int = 0
 ) -> Iterator[str]:
@@ -137,7 +170,7 @@ def _where(mask: NDArray[np.bool_], recording: Recording, first_replan: int) -> 
 def role_problems(layout: SiteLayout, key_role: NDArray[np.integer], first_replan: int = 0) -> Iterator[str]:
     """Role codes (replan, key): each key has a role that a key of its span can have."""
     for span in layout.spans:
-        allowed = _ROLES_OF_KIND[span.kind]
+        allowed = (*_ROLES_OF_KIND[span.kind], Role.ABSENT)
         wrong = ~np.isin(key_role[:, span.start : span.stop], [int(role) for role in allowed])
         if wrong.any():
             replan, key = np.argwhere(wrong)[0]

@@ -106,6 +106,10 @@ class StoredEpisode:
     def _layers(self) -> dict[str, ShardedLayers | None]:
         return {}
 
+    def has(self, name: str) -> bool:
+        """Whether the episode has an array of that name."""
+        return name in self.attributes.arrays
+
     def array(self, name: str) -> zarr.Array[Any]:
         """Open one array with zarr-python, which gets the array's files through the seal.
 

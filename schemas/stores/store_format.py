@@ -13,8 +13,10 @@ NAME.zarr/                            attributes: `RootAttributes`
     joint/layer, denoise, head        the numbers of the recorded layers, denoise steps and heads (coordinates)
     env_step, noise_seed, prompt_index  (replan,)
     denoise_time                      (denoise,)
-    state                             (replan, state_dim)
-    actions                           (replan, horizon, action_dim), as given to the environment
+    state                             (replan, state_dim); only where it is known
+    actions                           (replan, horizon, action_dim), as given to the environment; only where known
+    dataset_actions                   (replan, horizon, action_dim), those of the data set; only where there are some
+    dataset_action_count              (replan,): how many of them there are at this replan; the rest is 0
     frames/<camera>                   (replan, row, column, channel) uint8, as the model sees it
     camera_frames/<camera>            the same, as the camera gave it; only where `frames` is a rounded model input
     objects/<camera>                  (replan, patch, object) float32
@@ -24,10 +26,10 @@ NAME.zarr/                            attributes: `RootAttributes`
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.layout import Prompt, SiteLayout
@@ -36,7 +38,7 @@ from vla_attention.schemas.segments import Segment
 
 FORMAT_NAME = "vla-attention"
 #: A whole number. A reader accepts versions from `OLDEST_VERSION` to its own.
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 #: Seals of version 1 bind metadata only: files that were exchanged between episodes would be read without an error.
 OLDEST_VERSION = 2
 STORE_SUFFIX = ".zarr"
@@ -106,6 +108,40 @@ class Recording:
         """Length of the query axis."""
         return {"mean": 1, "steps": self.num_pools, "all": self.num_action_queries}[self.queries]
 
+    def of_site(self, site: SiteLayout) -> Recording:
+        """What is recorded of one site: the layers and heads that it has, and its own number of action queries.
+
+        Raises:
+            BadArgument: none of the recorded layers or heads has this site.
+        """
+        if not (site.layers or site.heads or site.num_action_queries):
+            return self
+        layers = tuple(layer for layer in self.layers if not site.layers or layer in site.layers)
+        heads = tuple(head for head in self.heads if not site.heads or head < site.heads)
+        if not layers:
+            raise BadArgument(
+                f"Site '{site.name}' is in none of the recorded layers {listing(self.layers, 40)}; it is in layers "
+                f"{listing(site.layers, 40)}."
+            )
+        if not heads:
+            raise BadArgument(
+                f"Site '{site.name}' has none of the recorded heads {listing(self.heads, 40)}; it has heads 0 to "
+                f"{site.heads - 1}."
+            )
+        # Numbers of recorded calls stand for blocks in families whose sites are in all of them.
+        labels = self.layer_labels if layers == self.layers else layers
+        return replace(
+            self,
+            layers=layers,
+            layer_labels=labels,
+            heads=heads,
+            num_action_queries=site.num_action_queries or self.num_action_queries,
+        )
+
+
+#: Names of protocols of runs whose loop is not ours: the caller's own, and a replayed data set.
+OTHER_LOOPS = ("recorded", "dataset")
+
 
 @dataclass(frozen=True)
 class Protocol:
@@ -113,6 +149,9 @@ class Protocol:
 
     `name` is the published evaluation that is followed (openpi, lerobot or cosmos): it decides how resets are seeded.
     `image_size` is the height and width of the simulator's pictures in pixels. `docs/protocol.md` has the details.
+
+    Runs without a simulator of ours have the name `recorded` (the caller's own loop) or `dataset` (a replayed data
+    set); `suite` is the caller's name for the tasks, and a number that is not known is 0.
     """
 
     name: str
@@ -126,6 +165,11 @@ class Protocol:
     def __post_init__(self) -> None:
         """Check the suite's name."""
         check_name("suite", self.suite)
+
+    @property
+    def of_other_loop(self) -> bool:
+        """Whether the loop is not ours: state, actions, noise seeds and some numbers may then be unknown."""
+        return self.name in OTHER_LOOPS
 
 
 @dataclass(frozen=True)
@@ -177,7 +221,8 @@ class RootAttributes:
     """Attributes of the store's root group: the run's identity. The same for every process that adds episodes.
 
     All of it is the run's configuration, except the fields in `JOB_RECORDS`. `interventions` says what the run changed
-    in the policy and its input, `rerun_of` which store's policy calls it repeated. Version 2 has neither of the two.
+    in the policy and its input, `rerun_of` which store's policy calls it repeated. Version 2 has neither of the two,
+    and up to version 3 sites are `joint`, `self` and `cross`, and in all recorded layers.
     """
 
     format: str
@@ -189,6 +234,25 @@ class RootAttributes:
     provenance: dict[str, str]
     interventions: Interventions = field(default_factory=Interventions)
     rerun_of: RerunSource | None = None
+
+    def __post_init__(self) -> None:
+        """Check that sites have different names, and that something of each is recorded."""
+        names = [site.name for site in self.sites]
+        if len(set(names)) != len(names):
+            raise BadArgument(f"The sites {listing(names)} do not have different names.")
+        for site in self.sites:
+            self.recording.of_site(site)
+
+    def site(self, name: str) -> SiteLayout:
+        """The site of that name; the error lists the existing ones."""
+        for site in self.sites:
+            if site.name == name:
+                return site
+        raise unknown_name("site", name, [site.name for site in self.sites])
+
+    def recording_of(self, site: str) -> Recording:
+        """What is recorded of a site, see `Recording.of_site`."""
+        return self.recording.of_site(self.site(site))
 
 
 #: Paths of the fields of `RootAttributes` that describe the job which made the store, not the run's configuration:
@@ -244,8 +308,9 @@ class EpisodeSeal:
 class EpisodeAttributes:
     """Attributes of one episode's group.
 
-    `num_steps` is the number of actions executed after the waiting steps, with the one that solved the task. The
-    instruction and the prompts are any text; what is shown of them is made `safe_text.visible`.
+    `success` is None where nobody knows it. `num_steps` is the number of actions executed after the waiting steps, with
+    the one that solved the task; 0 where it is not known. The instruction and the prompts are any text; what is shown
+    of them is made `safe_text.visible`.
     """
 
     task_id: int
@@ -254,7 +319,7 @@ class EpisodeAttributes:
     episode_index: int
     initial_state_index: int
     initial_state_digest: str
-    success: bool
+    success: bool | None
     num_steps: int
     num_replans: int
     prompts: tuple[Prompt, ...]

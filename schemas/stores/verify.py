@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
 from vla_attention.schemas.stores.content_rules import (
+    absent_problems,
     camera_picture_problems,
     counter_problems,
     coverage_problems,
@@ -98,11 +99,22 @@ def _guarded(check: Iterator[str]) -> Iterator[str]:
 
 def _expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dict[str, tuple[int, ...]]:
     """First axes of every array that must be there; arrays that are not named here begin with the replans."""
-    recording, replans = root.recording, attributes.num_replans
-    cells = (replans, len(recording.layers), len(recording.denoise_steps), len(recording.heads), recording.num_queries)
-    shapes: dict[str, tuple[int, ...]] = {"denoise_time": (len(recording.denoise_steps),)}
-    shapes |= dict.fromkeys(("env_step", "noise_seed", "prompt_index", "state", "actions"), (replans,))
+    replans = attributes.num_replans
+    shapes: dict[str, tuple[int, ...]] = {"denoise_time": (len(root.recording.denoise_steps),)}
+    shapes |= dict.fromkeys(("env_step", "prompt_index"), (replans,))
+    if not root.protocol.of_other_loop:
+        shapes |= dict.fromkeys(("noise_seed", "state", "actions"), (replans,))
+    if "dataset_actions" in attributes.arrays:
+        shapes["dataset_action_count"] = (replans,)
     for site in root.sites:
+        recording = root.recording.of_site(site)
+        cells = (
+            replans,
+            len(recording.layers),
+            len(recording.denoise_steps),
+            len(recording.heads),
+            recording.num_queries,
+        )
         shapes[f"{site.name}/rows"] = (*cells, site.num_keys)
         shapes[f"{site.name}/row_sum"] = cells
         shapes[f"{site.name}/atoms"] = (*cells, len(attributes.segments.get(site.name, ())))
@@ -124,7 +136,9 @@ def _metadata_problems(episode: StoredEpisode, file: str) -> Iterator[str]:
 def _array_problems(root: RootAttributes, episode: StoredEpisode, name: str, sha256: str) -> Iterator[str]:
     """One pass over an array: its digest, and the rules for the numbers of rows, segments' masses and contributions."""
     array = episode.array(name)
-    recording, kind = root.recording, name.rpartition("/")[2]
+    site_name, _, kind = name.rpartition("/")
+    site = next((site for site in root.sites if site.name == site_name), None)
+    recording = root.recording if site is None else root.recording.of_site(site)
     sums = _row_sums(episode, name, array.shape[:-1]) if kind in ("rows", "atoms") else None
     digest, problems = ArrayDigest(), list[str]()
     step = max(1, (array.shards or array.chunks)[0])
@@ -136,6 +150,9 @@ def _array_problems(root: RootAttributes, episode: StoredEpisode, name: str, sha
         if sums is not None:
             bits = recording.mantissa_bits if kind == "rows" else FLOAT32_MANTISSA_BITS
             problems += row_problems(name, values, sums[first : first + step], recording, bits, first)
+            if kind == "rows" and site is not None and not problems:
+                roles = episode.read(f"{site_name}/key_role", slice(first, first + step))
+                problems += absent_problems(site, values, roles, recording, first)
         elif kind == "row_sum":
             problems += row_sum_problems(name, values, recording, first)
         elif kind == "contribution":
@@ -183,4 +200,11 @@ def _camera_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[s
 
 
 def _counter_problems(_root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
-    yield from counter_problems(episode.read("env_step"), episode.read("noise_seed"))
+    arrays = episode.attributes.arrays
+    seeds = episode.read("noise_seed") if "noise_seed" in arrays else np.zeros(0, dtype=np.int64)
+    yield from counter_problems(episode.read("env_step"), seeds)
+    if "dataset_actions" in arrays and "dataset_action_count" in arrays:
+        horizon = arrays["dataset_actions"].shape[1]
+        counts = episode.read("dataset_action_count")
+        if not ((counts >= 1) & (counts <= horizon)).all():
+            yield f"dataset_action_count is {counts.min()} to {counts.max()}; expected 1 to {horizon}"

@@ -6,6 +6,7 @@ from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
 from vla_attention.schemas.groupings.words import find_phrase, split_words, words_of
 from vla_attention.schemas.layers import select_layers
 from vla_attention.schemas.layout import PatchGrid, Piece, Prompt, Role, SiteLayout, Span, find_role
+from vla_attention.schemas.stores.store_format import Recording
 
 
 def span(name: str, start: int, stop: int, **more) -> Span:
@@ -55,6 +56,7 @@ def test_role_codes_never_change():
     assert {role.label: int(role) for role in Role} == {
         "image": 1, "masked_image": 2, "bos": 3, "template": 4, "instruction": 5, "state": 6, "padding": 7,
         "action": 8, "proprio": 9, "blank": 10, "future": 11, "value": 12, "text": 13, "null": 14,
+        "absent": 15,
     }  # fmt: skip
     assert find_role("Image") is Role.IMAGE
 
@@ -103,3 +105,38 @@ def test_half_a_name_and_a_near_name_are_recognised():
     assert did_you_mean("zzz", ["libero_10"]) == ""
     assert listing(range(5), limit=3) == "0, 1, 2 and 2 more"
     assert listing([]) == "none"
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"name": "state"}, "A site cannot be called 'state'"),
+        ({"name": "a/b"}, "'a/b' cannot be the name of a site"),
+        ({"layers": (3, 1)}, "in ascending order"),
+        ({"layers": (-1,)}, "from 0 up"),
+        ({"heads": -1}, "has -1 heads"),
+        ({"spans": (span("a", 0, 2, growing=True), span("b", 2, 3, growing=True))}, "the growing spans a, b"),
+    ],
+)
+def test_a_site_has_a_name_of_its_own_and_numbers_that_can_be(changes, said):
+    with pytest.raises(BadArgument, match=said):
+        SiteLayout(**{"name": "even", "spans": (span("a", 0, 2),), **changes})
+
+
+def test_only_growing_spans_have_an_offset():
+    assert span("a", 0, 2, growing=True, growing_offset=1).growing_offset == 1
+    for more in ({"growing_offset": 1}, {"growing": True, "growing_offset": -1}):
+        with pytest.raises(BadArgument, match="growing offset"):
+            span("a", 0, 2, **more)
+
+
+def test_what_is_recorded_of_a_site():
+    recording = Recording((0, 1, 2, 5), (0, 1, 2, 5), (0,), (0, 1, 3), "all", 4, 10)
+    everything = SiteLayout("joint", (span("a", 0, 2),))
+    assert recording.of_site(everything) is recording
+    own = recording.of_site(SiteLayout("odd", (span("a", 0, 2),), layers=(1, 3, 5), heads=2, num_action_queries=1))
+    assert (own.layers, own.layer_labels, own.heads, own.num_queries) == ((1, 5), (1, 5), (0, 1), 1)
+    with pytest.raises(BadArgument, match="Site 'far' is in none of the recorded layers 0, 1, 2, 5; it is in layers 7"):
+        recording.of_site(SiteLayout("far", (span("a", 0, 2),), layers=(7,)))
+    with pytest.raises(BadArgument, match="none of the recorded heads 3; it has heads 0 to 1"):
+        Recording((0,), (0,), (0,), (3,), "all", 4, 10).of_site(SiteLayout("few", (span("a", 0, 2),), heads=2))

@@ -280,8 +280,8 @@ def expected_arrays(spec: StoreSpec, task: int, episode: int) -> dict[str, NDArr
         "noise_seed": np.array([record.noise_seed for record in records], dtype=np.int64),
         "prompt_index": np.array([prompts.index(record.prompt) for record in records], dtype=np.int32),
         "denoise_time": denoise_times(spec).astype(np.float32),
-        "state": np.stack([record.state for record in records]),
-        "actions": np.stack([record.actions for record in records]),
+        "state": np.stack([record.state for record in records if record.state is not None]),
+        "actions": np.stack([record.actions for record in records if record.actions is not None]),
     }
     for camera in records[0].frames:
         arrays[f"frames/{camera}"] = np.stack([record.frames[camera] for record in records])

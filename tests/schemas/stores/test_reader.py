@@ -25,7 +25,15 @@ from vla_attention.schemas.stores.store_format import (
     StoreError,
     StoreNotFound,
 )
-from vla_attention.testing.stores import StoreSpec, episode_records, reseal, root_attributes, write_store
+from vla_attention.testing import assert_whole
+from vla_attention.testing.stores import (
+    StoreSpec,
+    episode_records,
+    expected_arrays,
+    reseal,
+    root_attributes,
+    write_store,
+)
 
 SPEC = StoreSpec(tasks=(1, 12), episodes=2, replans=2)
 
@@ -205,6 +213,22 @@ def test_a_store_of_version_2():
     assert open_store(old).episodes[0].read("joint/rows").shape[0] == StoreSpec().replans
 
 
+def test_a_store_of_version_3():
+    old = GOLDEN / "stores" / "version3.zarr"
+    attributes, run = read_run(old)
+    assert attributes.format_version == 3
+    assert run == "6ab6c1fdf9394b17f9bf13dfb8280c4dd1d6165212ab5c24f52e153c23f655a8"
+    (site,) = attributes.sites
+    assert (site.layers, site.heads, site.num_action_queries, site.growing_span) == ((), 0, 0, None)
+    assert attributes.recording_of("joint") is attributes.recording
+    episode = open_store(old).episodes[0]
+    expected = expected_arrays(StoreSpec(tasks=(0,), episodes=1), task=0, episode=0)
+    assert {name: bytes(episode.read(name)) for name in expected} == {
+        name: bytes(values) for name, values in expected.items()
+    }
+    assert_whole(old)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -219,7 +243,11 @@ def test_a_store_of_version_2():
             {"sites": [{"name": "joint", "spans": [{"name": "a", "kind": "image", "start": 3, "stop": 5}]}]},
             "gap or overlap",
         ),
-        ({"sites": [{"name": "sideways", "spans": []}]}, r"\$\.sites\[0\]\.name is 'sideways'"),
+        ({"sites": [{"name": "../up", "spans": []}]}, "'../up' cannot be the name of a site"),
+        ({"sites": [{"name": "frames", "spans": []}]}, "A site cannot be called 'frames'"),
+        ({"sites": [{"name": "self", "spans": []}] * 2}, "do not have different names"),
+        ({"sites": [{"name": "self", "spans": [], "layers": [1, 3]}]}, "in none of the recorded layers 0, 2; it is in"),
+        ({"sites": [{"name": "self", "spans": [], "layers": [3, 1]}]}, "in ascending order"),
         ({"surprise": 1}, "unknown field 'surprise'"),
     ],
 )
