@@ -13,15 +13,15 @@ from vla_attention.schemas.layout import PatchGrid
 
 Picture = NDArray[np.uint8]
 
-#: Grey level of a blank picture: the middle of the model's range.
-BLANK = 128
+#: Grey levels of a blank picture: the middle of the model's range, and what a camera without light gives.
+GREY, BLACK = 128, 0
 #: Rounds of averaging neighbours that smooth a filled region.
 _SMOOTHING_ROUNDS = 60
 
 
-def blank(picture: Picture) -> Picture:
-    """Return an even grey picture."""
-    return np.full_like(picture, BLANK)
+def blank(picture: Picture, level: int = GREY) -> Picture:
+    """Return an even picture of one grey level, 0 to 255."""
+    return np.full_like(picture, level)
 
 
 def noise(picture: Picture, generator: np.random.Generator) -> Picture:
@@ -68,7 +68,7 @@ def masked(picture: Picture, mask: NDArray[np.bool_]) -> Picture:
     if not mask.any():
         return picture
     result = picture.copy()
-    result[mask] = BLANK if mask.all() else np.rint(picture[~mask].mean(axis=0)).astype(np.uint8)
+    result[mask] = GREY if mask.all() else np.rint(picture[~mask].mean(axis=0)).astype(np.uint8)
     return result
 
 

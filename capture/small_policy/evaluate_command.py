@@ -7,20 +7,27 @@ import json
 import math
 import multiprocessing
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
-from vla_attention.capture.environments.base import EnvironmentSettings, check_task_id
+from vla_attention.capture.environments.base import EnvironmentSettings, Suite, check_initial_state_index, check_task_id
 from vla_attention.capture.environments.cubes.environment import CubesEnvironment
 from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS
 from vla_attention.capture.environments.suites import find_suite, list_tasks
 from vla_attention.capture.small_policy.processes import share_among_processes
-from vla_attention.capture.small_policy.rollouts import CONDITIONS, Condition, Outcome, run_episode, run_expert
-from vla_attention.schemas.errors import BadArgument, unknown_name
+from vla_attention.capture.small_policy.rollouts import (
+    CONDITIONS,
+    Condition,
+    Outcome,
+    RolloutSettings,
+    other_task,
+    run_episode,
+    run_expert,
+)
+from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 
 Job = tuple[int, int]
 #: Stands for a checkpoint: the scripted experts.
@@ -38,85 +45,109 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--max-steps", type=int, metavar="N", help="steps of an episode (default: the suite's)")
     parser.add_argument("--seed", type=int, default=7, metavar="N", help="seed of the policy's noise (default: 7)")
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default: 2)")
-    parser.add_argument("--output", type=Path, metavar="FILE", help="JSON file with every episode; it is continued")
+    parser.add_argument("--output", type=Path, metavar="FILE", help="JSON file of every episode, which is continued")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What a file of outcomes is about, besides the condition, which every outcome names.
+
+    replan_steps: actions of each policy call that are executed; None: the policy's own number.
+    """
+
+    checkpoint: str
+    suite: str
+    max_steps: int
+    replan_steps: int | None
+    seed: int
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the missing episodes, print the rates; returns the exit code."""
     suite = find_suite(arguments.suite)
-    if suite.kind != "cubes":
-        raise BadArgument(f"Cannot evaluate in the suite '{suite.name}'; expected one of cubes.")
-    if arguments.condition not in CONDITIONS:
-        raise unknown_name("condition", arguments.condition, CONDITIONS)
-    numbers = arguments.task_id if arguments.task_id is not None else range(suite.num_tasks)
-    for number in numbers:
-        check_task_id(suite, number)
-    if arguments.checkpoint == EXPERT and arguments.condition != "normal":
-        raise BadArgument(
-            f"The experts see no pictures and read no words: they have no condition '{arguments.condition}'."
-        )
-    outcomes = _read(arguments.output)
+    evaluation, jobs = _planned(arguments, suite)
+    condition: Condition = arguments.condition
+    outcomes = _read(arguments.output, evaluation)
     known = {(outcome.task, outcome.state, outcome.condition) for outcome in outcomes}
-    jobs = [
-        (task, state)
-        for task in numbers
-        for state in range(arguments.episodes)
-        if (task, state, arguments.condition) not in known
-    ]
+    missing = [(task, state) for task, state in jobs if (task, state, condition) not in known]
     # All tasks of one number of cubes share a simulator, so neighbours in this order need no other one.
-    jobs.sort(key=lambda job: (CUBE_TASKS[job[0]].num_cubes, job[1], job[0]))
+    missing.sort(key=lambda job: (CUBE_TASKS[job[0]].num_cubes, job[1], job[0]))
 
     def keep(outcome: Outcome) -> None:
         outcomes.append(outcome)
         if arguments.output is not None and len(outcomes) % 20 == 0:
-            _write(arguments.output, outcomes)
+            _write(arguments.output, evaluation, outcomes)
 
-    with tqdm(total=len(jobs), unit="episode", disable=None) as bar:
-        work = partial(_evaluate, vars(arguments))
-        complete = share_among_processes(work, jobs, arguments.workers, keep, bar)
+    with tqdm(total=len(missing), unit="episode", disable=None) as bar:
+        work = partial(_evaluate, evaluation, condition)
+        complete = share_among_processes(work, missing, arguments.workers, keep, bar)
     if arguments.output is not None:
-        _write(arguments.output, outcomes)
-    chosen = [o for o in outcomes if o.task in numbers and o.condition == arguments.condition]
-    print(describe(chosen))
+        _write(arguments.output, evaluation, outcomes)
+    tasks = {task for task, _ in jobs}
+    print(describe([outcome for outcome in outcomes if outcome.task in tasks and outcome.condition == condition]))
     return 0 if complete else 1
 
 
-def _evaluate(options: dict[str, Any], jobs: Sequence[Job], results: multiprocessing.Queue[Outcome]) -> None:
+def _planned(arguments: argparse.Namespace, suite: Suite) -> tuple[Evaluation, list[Job]]:
+    """Return what is evaluated and its tasks with initial states; raise `BadArgument` for options that cannot be."""
+    if suite.kind != "cubes":
+        raise BadArgument(f"Cannot evaluate in the suite '{suite.name}'; expected one of cubes.")
+    if arguments.condition not in CONDITIONS:
+        raise unknown_name("condition", arguments.condition, CONDITIONS)
+    if arguments.checkpoint == EXPERT and arguments.condition != "normal":
+        raise BadArgument(
+            f"The experts see no pictures and read no words: they have no condition '{arguments.condition}'."
+        )
+    for option in ("episodes", "workers", "max_steps", "replan_steps"):
+        given = getattr(arguments, option)
+        if given is not None and given < 1:
+            raise BadArgument(f"Cannot use --{option.replace('_', '-')} {given}; expected at least 1.")
+    tasks = list_tasks(suite)
+    numbers = arguments.task_id if arguments.task_id is not None else list(range(suite.num_tasks))
+    for number in numbers:
+        check_task_id(suite, number)
+        check_initial_state_index(tasks[number], arguments.episodes - 1)
+        if arguments.condition == "switched":
+            other_task(number)
+    evaluation = Evaluation(
+        checkpoint=arguments.checkpoint,
+        suite=suite.name,
+        max_steps=suite.max_steps if arguments.max_steps is None else arguments.max_steps,
+        replan_steps=arguments.replan_steps,
+        seed=arguments.seed,
+    )
+    return evaluation, [(task, state) for task in numbers for state in range(arguments.episodes)]
+
+
+def _evaluate(
+    evaluation: Evaluation, condition: Condition, jobs: Sequence[Job], results: multiprocessing.Queue[Outcome]
+) -> None:
     import torch
 
     from vla_attention.capture.policies.pi.build import build_pi_policy
 
     torch.set_num_threads(1)
-    is_expert = options["checkpoint"] == EXPERT
-    policy = None if is_expert else build_pi_policy(options["checkpoint"], tokenizer=None, device="cpu")
-    suite = find_suite(options["suite"])
-    tasks = list_tasks(suite)
+    is_expert = evaluation.checkpoint == EXPERT
+    policy = None if is_expert else build_pi_policy(evaluation.checkpoint, tokenizer=None, device="cpu")
+    replan_steps = evaluation.replan_steps or (1 if policy is None else policy.default_replan_steps)
+    if policy is not None and replan_steps > policy.action_horizon:
+        raise BadArgument(
+            f"Cannot use --replan-steps {replan_steps}: the policy gives {policy.action_horizon} actions a call."
+        )
+    settings = RolloutSettings(evaluation.max_steps, replan_steps, evaluation.seed, condition)
+    tasks = list_tasks(find_suite(evaluation.suite))
     environment: CubesEnvironment | None = None
     cubes = 0
-    condition: Condition = options["condition"]
     for number, state in jobs:
         if environment is None or cubes != CUBE_TASKS[number].num_cubes:
             if environment is not None:
                 environment.close()
             environment = CubesEnvironment(tasks[number], EnvironmentSettings())
             cubes = CUBE_TASKS[number].num_cubes
-        task, seed, max_steps = tasks[number], options["seed"], options["max_steps"] or suite.max_steps
         if policy is None:
-            results.put(run_expert(environment, task, state, max_steps=max_steps, seed=seed))
-            continue
-        replan_steps = options["replan_steps"] or policy.default_replan_steps
-        results.put(
-            run_episode(
-                environment,
-                policy,
-                task,
-                state,
-                condition,
-                max_steps=max_steps,
-                replan_steps=replan_steps,
-                seed=seed,
-            )
-        )
+            results.put(run_expert(environment, tasks[number], state, settings))
+        else:
+            results.put(run_episode(environment, policy, tasks[number], state, settings))
     if environment is not None:
         environment.close()
 
@@ -151,13 +182,30 @@ def _rate(successes: int, count: int) -> str:
     return f"{successes / count:.1%} [{low:.1%}, {high:.1%}]"
 
 
-def _read(path: Path | None) -> list[Outcome]:
+def _read(path: Path | None, evaluation: Evaluation) -> list[Outcome]:
+    """Read the outcomes of a file; `BadArgument` if they are of another evaluation."""
     if path is None or not path.exists():
         return []
-    return [Outcome(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))]
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        of, episodes = content["evaluation"], [Outcome(**entry) for entry in content["episodes"]]
+    except (ValueError, TypeError, KeyError):
+        raise BadArgument(
+            f"Cannot go on with '{path}': it is no file of this command, or of a version that did not say what its "
+            "episodes are of; give another --output."
+        ) from None
+    different = [
+        f"{name.replace('_', ' ')} {of.get(name)}, not {value}"
+        for name, value in asdict(evaluation).items()
+        if of.get(name) != value
+    ]
+    if different:
+        raise BadArgument(f"'{path}' has episodes of other settings ({listing(different)}); give another --output.")
+    return episodes
 
 
-def _write(path: Path, outcomes: Sequence[Outcome]) -> None:
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(json.dumps([asdict(outcome) for outcome in outcomes]), encoding="utf-8")
-    partial.replace(path)
+def _write(path: Path, evaluation: Evaluation, outcomes: Sequence[Outcome]) -> None:
+    content = {"evaluation": asdict(evaluation), "episodes": [asdict(outcome) for outcome in outcomes]}
+    partial_file = path.with_name(f".{path.name}.partial")
+    partial_file.write_text(json.dumps(content), encoding="utf-8")
+    partial_file.replace(path)
