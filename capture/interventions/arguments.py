@@ -175,9 +175,9 @@ def _prompt(text: str) -> PromptChange:
     kind, separator, value = text.partition(":")
     if kind in ("empty", "shuffled") and not separator:
         return PromptChange("empty" if kind == "empty" else "shuffled")
-    if kind == "shuffled" and value.isdigit():
+    if kind == "shuffled" and value.isdecimal():
         return PromptChange("shuffled", seed=int(value))
-    if kind == "task" and value.isdigit():
+    if kind == "task" and value.isdecimal():
         return PromptChange("task", task_id=int(value))
     if kind == "text" and separator:
         return PromptChange("text", text=value)
@@ -195,7 +195,7 @@ def _image(text: str) -> ImageChange:
     if camera:
         if kind in ("blank", "noise", "rotated") and not separator:
             return ImageChange(camera, kind)  # type: ignore[arg-type]  # one of the literals
-        if kind == "noise" and value.isdigit():
+        if kind == "noise" and value.isdecimal():
             return ImageChange(camera, "noise", seed=int(value))
         if kind in ("masked", "filled") and value:
             return ImageChange(camera, "masked" if kind == "masked" else "filled", object=value)

@@ -21,6 +21,14 @@ COMMANDS: dict[str, str] = {
     "evaluate": "measure how often a policy solves the tasks",
 }
 
+#: What a command says after Ctrl-C.
+IF_STOPPED: dict[str, str] = {
+    "demonstrate": "the parts that are whole are kept, run the same command again to go on.",
+    "train": "the last checkpoint is kept, continue with --resume.",
+    "export": "no checkpoint was written.",
+    "evaluate": "episodes in the file of --output are kept, run the same command again to go on.",
+}
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a sub-command; returns the exit code, which is 2 after a mistake in the arguments."""
@@ -38,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run_command(
         f"{PROGRAM} {arguments.command}",
         lambda: _module(arguments.command).run(arguments),
-        "what was written is kept, continue with --resume.",
+        IF_STOPPED[arguments.command],
     )
 
 

@@ -7,6 +7,7 @@ batches.
 from __future__ import annotations
 
 import hashlib
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -126,7 +127,7 @@ def read_demonstrations(folder: str | Path, say: Callable[[str], None] = lambda 
 def _opened(part: Path) -> np.lib.npyio.NpzFile:
     try:
         opened: np.lib.npyio.NpzFile = np.load(part, allow_pickle=False)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise UnusableDemonstrations(f"'{part}' cannot be read ({error}); make it again.") from error
     return opened
 
@@ -134,7 +135,10 @@ def _opened(part: Path) -> np.lib.npyio.NpzFile:
 def _array(part: Path, arrays: np.lib.npyio.NpzFile, name: str) -> np.ndarray:
     if name not in arrays:
         raise UnusableDemonstrations(f"'{part}' has no array '{name}'; it has {listing(sorted(arrays))}.")
-    array: np.ndarray = arrays[name]
+    try:
+        array: np.ndarray = arrays[name]
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise UnusableDemonstrations(f"'{name}' of '{part}' cannot be read ({error}); make it again.") from error
     return array
 
 

@@ -40,6 +40,9 @@ def run(arguments: argparse.Namespace) -> int:
     control = find_control(arguments.control)
     if arguments.threads < 1:
         raise BadArgument(f"--threads is {arguments.threads}; it must be at least 1.")
+    num_tasks = len(CUBE_TASKS) if arguments.tasks is None else arguments.tasks
+    if not 1 <= num_tasks <= len(CUBE_TASKS):
+        raise BadArgument(f"Cannot use --tasks {num_tasks}; expected 1 to {len(CUBE_TASKS)}.")
     import torch
 
     from vla_attention.capture.small_policy.training import TrainingSettings, train
@@ -49,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
         steps=arguments.steps,
         seed=arguments.seed,
         control=control,
-        num_tasks=arguments.tasks or len(CUBE_TASKS),
+        num_tasks=num_tasks,
         checkpoint_minutes=arguments.checkpoint_minutes,
     )
     instructions = tuple(task.instruction for task in CUBE_TASKS)

@@ -120,6 +120,8 @@ def test_noise():
         (["--attention", "a:b=1", "--knockout-queries", "prefix:role:text"], "prefix:SELECTOR with --attention"),
         (["--prompt", "emty"], r"'emty'. Did you mean 'empty'\? Expected one of empty, shuffled"),
         (["--prompt", "task:x"], "'task:x'"),
+        (["--prompt", "task:²"], "'task:²'"),
+        (["--image", "base=noise:²"], "'base=noise:²'; expected"),
         (["--prompt", "synonyms:nowhere.json"], "nowhere.json"),
         (["--image", "base"], "'base'; expected CAMERA= and one of blank, noise"),
         (["--image", "=blank"], "'=blank'; expected CAMERA="),

@@ -52,9 +52,12 @@ def test_a_folder_without_demonstrations_or_with_a_damaged_part(folder, tmp_path
     np.savez(copy / "part_0001.npz", **arrays)
     with pytest.raises(UnusableDemonstrations, match="no array 'eef'"):
         read_demonstrations(copy)
-    (copy / "part_0001.npz").write_bytes(b"damaged")
-    with pytest.raises(UnusableDemonstrations, match="cannot be read"):
-        read_demonstrations(copy)
+    whole = (folder / "part_0001.npz").read_bytes()
+    flipped = whole[:1000] + bytes([whole[1000] ^ 1]) + whole[1001:]
+    for damaged in (b"damaged", b"", whole[:-30], flipped):
+        (copy / "part_0001.npz").write_bytes(damaged)
+        with pytest.raises(UnusableDemonstrations, match="cannot be read"):
+            read_demonstrations(copy)
 
 
 def test_scenes_are_held_out_whole(demonstrations):

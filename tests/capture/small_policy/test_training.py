@@ -12,6 +12,7 @@ from tests.kit.made_up_demonstrations import INSTRUCTIONS, write_demonstrations
 from vla_attention.capture.policies.pi.build import build_pi_policy
 from vla_attention.capture.policies.pi.flow_time import denoise_times
 from vla_attention.capture.policies.pi.gemma import RMSNorm
+from vla_attention.capture.small_policy.__main__ import main
 from vla_attention.capture.small_policy.batches import number_ids
 from vla_attention.capture.small_policy.dataset import read_demonstrations
 from vla_attention.capture.small_policy.export import export
@@ -191,3 +192,9 @@ def test_an_exported_policy_runs_like_any_checkpoint(demonstrations, whole, tmp_
     np.testing.assert_allclose(policy.processing.environment_actions(actions, sample), actions[:, :7], atol=1e-6)
     with pytest.raises(BadArgument, match="exists already"):
         export(folder, tmp_path / "mark_0", "again")
+
+
+@pytest.mark.parametrize("number", ["0", "24", "-1"])
+def test_a_number_of_tasks_that_does_not_exist_is_refused(tmp_path, capsys, number):
+    assert main(["train", str(tmp_path), str(tmp_path / "out"), "--tasks", number]) == 2
+    assert f"Cannot use --tasks {number}; expected 1 to 23." in capsys.readouterr().err
