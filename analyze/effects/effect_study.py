@@ -47,6 +47,7 @@ from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, open_store
+from vla_attention.schemas.stores.store_format import CorruptEpisode
 
 _LIMITS = {"effect": POSITIVE, "effect_chunk": POSITIVE, "angle": POSITIVE, "gripper_flips": SHARE}
 _NAMES = ("condition", "kind", "group", "selector")
@@ -142,6 +143,7 @@ def study_of(analysis: Analysis, opened: BaseAndReruns, dimensions: Sequence[int
     spread = _spread(opened.base, members, question.settings, dimensions)
     names = [episode.name for episode in opened.base.episodes]
     pairings = [pair_episodes(condition, members, names) for condition in opened.reruns]
+    notes = [*opened.notes]
     noise = [pairing for pairing in pairings if pairing.condition.kind == Kind.NOISE]
     if noise:
         pairs = [
@@ -152,8 +154,18 @@ def study_of(analysis: Analysis, opened: BaseAndReruns, dimensions: Sequence[int
         spread = with_noise(spread, change_per_dimension(pairs, spread.spread), leave_out=dimensions is None)
     groups = [condition.group for condition in opened.reruns if condition.group is not None]
     attention = group_attention(question, groups) if groups else {}
-    parts = [_episodes_of(pairing, spread, attention) for pairing in pairings]
-    episodes = pl.concat(parts) if parts else pl.DataFrame(schema=_EPISODE_SCHEMA)
+    measured = [(pairing, _episodes_of(pairing, spread, attention)) for pairing in pairings]
+    empty = [pairing.condition.name for pairing, rows in measured if not rows.height]
+    if empty:
+        notes.append(
+            f"{listing(empty)} {'is' if len(empty) == 1 else 'are'} left out: in the replans that are compared, the "
+            "group has no key in the base."
+        )
+        if len(empty) == len(measured) and not opened.rollouts:
+            raise BadArgument(f"No rerun of {opened.base.path} can be compared: {notes[-1].rstrip('.')}.")
+    pairings = [pairing for pairing, rows in measured if rows.height]
+    opened = replace(opened, reruns=tuple(pairing.condition for pairing in pairings))
+    episodes = pl.concat([pl.DataFrame(schema=_EPISODE_SCHEMA), *(rows for _, rows in measured)])
     rollouts = [rollout_pairs(condition, question) for condition in opened.rollouts]
     unpaired = [note for _, note in rollouts if note]
     return EffectStudy(
@@ -165,18 +177,26 @@ def study_of(analysis: Analysis, opened: BaseAndReruns, dimensions: Sequence[int
         rollout_episodes=pl.concat([table for table, _ in rollouts])
         if rollouts
         else pl.DataFrame(schema=ROLLOUT_COLUMNS),
-        notes=(*opened.notes, *_notes(pairings, attention), *unpaired),
+        notes=(*notes, *_notes(pairings, attention), *unpaired),
     )
 
 
 def _spread(
     base: Store, members: Sequence[BaseEpisode], settings: AnalysisSettings, dimensions: Sequence[int] | None
 ) -> ActionSpread:
-    """The units, from every episode of the base: they do not change with --tasks. Damaged episodes are left out."""
-    if settings.skip_corrupt or len(members) == len(base.episodes):
-        actions = [member.actions for member in members]
-    else:
-        actions = [episode.read("actions").astype(np.float64) for episode in base.episodes]
+    """The units, from every episode of the base: they do not change with --tasks.
+
+    With `skip_corrupt`, episodes with damaged actions are left out.
+    """
+    read = {member.name: member.actions for member in members}
+    actions = []
+    for episode in base.episodes:
+        try:
+            known = read.get(episode.name)
+            actions.append(episode.read("actions").astype(np.float64) if known is None else known)
+        except CorruptEpisode:
+            if not settings.skip_corrupt:
+                raise
     number = actions[0].shape[2]
     for dimension in dimensions or ():
         if not 0 <= dimension < number:

@@ -197,6 +197,8 @@ def test_the_units_do_not_change_with_the_selected_tasks(folder, study):
     some = study_effects(folder / "base.zarr", two, AnalysisSettings(tasks=(1,)))
     np.testing.assert_array_equal(some.spread.spread, study.spread.spread)
     assert some.episodes["task_id"].unique().to_list() == [1]
+    skipping = study_effects(folder / "base.zarr", two, AnalysisSettings(tasks=(1,), skip_corrupt=True))
+    np.testing.assert_array_equal(skipping.spread.spread, study.spread.spread)
     only = study_effects(folder / "base.zarr", two, AnalysisSettings(), dimensions=(6,))
     row = row_of(only, "without_visual")
     assert row["effect"] < 2  # flips of a gripper of spread 1 change it by two spreads
@@ -304,6 +306,18 @@ def test_replans_without_the_word_are_in_no_effect(folder, tmp_path):
         assert study.episodes["task_id"].unique().to_list() == [0]
         assert row_of(study, "without_bowl")["num_episodes"] == EPISODES
         assert study.notes == ()
+
+
+def test_a_rerun_without_any_key_of_its_group_is_left_out_by_name(folder, tmp_path):
+    """'bowl' is in the instruction of task 0, and the rerun holds task 1 only, as --allow-empty allows it."""
+    planted = PlantedRerun(knockout("without_bowl", "word:bowl"), 0.3)
+    write_rerun(tmp_path / "bowl.zarr", folder / "base.zarr", planted, tasks=(1,))
+    given = [tmp_path, folder / "series" / "noise.zarr"]
+    study = study_effects(folder / "base.zarr", given, AnalysisSettings())
+    assert [condition.name for condition in study.conditions] == ["noise"]
+    assert "note: without_bowl is left out" in effects_text(study)
+    with pytest.raises(BadArgument, match="No rerun of .*base.zarr can be compared: without_bowl is left out"):
+        study_effects(folder / "base.zarr", [tmp_path], AnalysisSettings())
 
 
 def test_dimensions_that_are_mostly_noise_are_named(folder, tmp_path):
