@@ -7,7 +7,7 @@ has the formulas; the arithmetic is in `capture/interventions/`. Groups of keys 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -15,6 +15,11 @@ from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.safe_text import check_name, check_text, visible
 
 Queries = Literal["action", "all", "prefix"]
+_READERS: dict[Queries, str] = {
+    "action": "the action queries",
+    "all": "all queries",
+    "prefix": "the prefix's queries",
+}
 
 
 @dataclass(frozen=True)
@@ -68,7 +73,7 @@ class KeyKnockout:
         what = "all keys but" if self.keep else "the keys of"
         if self.random_seed is not None:
             what = f"random keys (seed {self.random_seed}), as many as {what}"
-        readers = {"action": "the action queries", "all": "all queries", "prefix": "the prefix's queries"}[self.queries]
+        readers = _READERS[self.queries]
         readers += f" of '{self.query_selector}'" if self.query_selector else ""
         strength = "" if self.weight == 1 else f" with the weight {self.weight:g}"
         places = _describe_places(self.layers, self.heads, self.denoise_steps)
@@ -98,9 +103,8 @@ class AttentionScale:
 
     def describe(self) -> str:
         """The intervention in words."""
-        return f"attention to '{self.selector}' times {self.factor:g}" + _describe_places(
-            self.layers, self.heads, self.denoise_steps
-        )
+        places = _describe_places(self.layers, self.heads, self.denoise_steps)
+        return f"attention to '{self.selector}' times {self.factor:g}{_describe_readers(self.queries)}{places}"
 
 
 @dataclass(frozen=True)
@@ -124,9 +128,8 @@ class AttentionUniform:
 
     def describe(self) -> str:
         """The intervention in words."""
-        return f"attention made uniform inside '{self.selector}'" + _describe_places(
-            self.layers, self.heads, self.denoise_steps
-        )
+        places = _describe_places(self.layers, self.heads, self.denoise_steps)
+        return f"attention made uniform inside '{self.selector}'{_describe_readers(self.queries)}{places}"
 
 
 @dataclass(frozen=True)
@@ -145,6 +148,7 @@ class PromptChange:
 
     def __post_init__(self) -> None:
         """Check that the kind has what it needs."""
+        _check_seed("shuffled words", self.seed)
         if (self.kind == "task") != (self.task_id is not None):
             raise BadArgument(f"A prompt change '{self.kind}' has the task {self.task_id}; only 'task' needs one.")
         if (self.kind == "synonyms") != bool(self.synonyms):
@@ -157,7 +161,7 @@ class PromptChange:
             "shuffled": f"the instruction's words shuffled (seed {self.seed})",
             "task": f"the instruction of task {self.task_id}",
             "text": f"the instruction '{visible(self.text)}'",
-            "synonyms": f"{len(self.synonyms)} words replaced by synonyms",
+            "synonyms": f"{len(self.synonyms)} words replaced by synonyms ({listing(_pairs(self.synonyms), 6)})",
         }[self.kind]
 
 
@@ -180,6 +184,7 @@ class ImageChange:
     def __post_init__(self) -> None:
         """Check the names, and that the kind has what it needs."""
         check_name("camera", self.camera)
+        _check_seed("a picture of noise", self.seed)
         if (self.kind in ("masked", "filled")) != bool(self.object):
             raise BadArgument(
                 f"A picture change '{self.kind}' names the object '{self.object}'; 'masked' and 'filled' name one, the "
@@ -192,6 +197,7 @@ class ImageChange:
         """The intervention in words."""
         detail = f" '{self.object}'" if self.object else ""
         detail += f" by {self.rows}, {self.columns} patches" if self.kind == "shifted" else ""
+        detail += f" (seed {self.seed})" if self.kind == "noise" and self.seed else ""
         return f"camera '{self.camera}' {self.kind}{detail}"
 
 
@@ -290,6 +296,15 @@ def _check_places(selector: str, *places: Sequence[int] | None) -> None:
 def _check_seed(what: str, seed: int | None) -> None:
     if seed is not None and seed < 0:
         raise BadArgument(f"The seed of {what} is {seed}; expected 0 or more.")
+
+
+def _pairs(synonyms: Mapping[str, str]) -> list[str]:
+    return [f"{visible(word)} by {visible(synonym)}" for word, synonym in synonyms.items()]
+
+
+def _describe_readers(queries: Queries) -> str:
+    """Whose attention changes; the action queries go without saying."""
+    return "" if queries == "action" else f" for {_READERS[queries]}"
 
 
 def _describe_places(*places: tuple[int, ...] | None) -> str:

@@ -13,6 +13,7 @@ from vla_attention.capture.interventions.changed_inputs import CallContext, obje
 from vla_attention.capture.interventions.condition_name import condition_name
 from vla_attention.capture.interventions.prompts import check_synonyms
 from vla_attention.capture.interventions.run_changes import check_stored_replans
+from vla_attention.capture.rerun.base_store import instructions_of
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.groupings.resolve import EmptyGroup
 from vla_attention.schemas.interventions import ImageChange, Interventions
@@ -34,7 +35,7 @@ def check_on_store(interventions: Interventions, base: Store, *, allow_empty: bo
         BadArgument: there is no instruction of a task, or none with a word that has a synonym.
     """
     prompt = interventions.prompt
-    instructions = {episode.attributes.task_id: episode.attributes.instruction for episode in base.episodes}
+    instructions = instructions_of(base)
     if prompt is not None and prompt.kind == "synonyms":
         check_synonyms(prompt, instructions.values())
     if prompt is not None and prompt.kind == "task" and prompt.task_id not in instructions:
@@ -57,6 +58,9 @@ def _check_object(change: ImageChange, base: Store, allow_empty: bool) -> Iterab
     names = dict.fromkeys(thing.name for episode in base.episodes for thing in episode.attributes.objects)
     if change.object not in names:
         raise unknown_name("object", change.object, names)
+    cameras = [camera.name for camera in base.attributes.policy.cameras]
+    if change.camera not in cameras:
+        raise unknown_name("camera", change.camera, cameras)
     first, empty, total = "", 0, 0
     for episode in base.episodes:
         attributes, name = episode.attributes, f"objects/{change.camera}"

@@ -58,14 +58,27 @@ def test_in_words():
         "the keys of 'word:bowl | camera:base' knocked out with the weight 0.5 for the action queries, layers 0, 3, "
         "denoise steps 9; random keys (seed 3), as many as all keys but 'camera:base' knocked out for all queries, "
         "heads 1; the keys of 'role:image' knocked out for the prefix's queries of 'role:instruction'; attention made "
-        "uniform inside 'camera:base'; attention to 'role:image' times 0.25; 1 words replaced by synonyms; camera "
-        "'base' shifted by 3, -2 patches; camera 'base' masked 'bowl_1'; the noise of seed 4"
+        "uniform inside 'camera:base'; attention to 'role:image' times 0.25; 1 words replaced by synonyms (bowl by "
+        "dish); camera 'base' shifted by 3, -2 patches; camera 'base' masked 'bowl_1'; the noise of seed 4"
     )
+
+
+def test_what_differs_is_described_differently():
+    alike = [
+        (AttentionScale("word:a", 0.5), AttentionScale("word:a", 0.5, queries="all")),
+        (AttentionUniform("word:a"), AttentionUniform("word:a", queries="prefix")),
+        (ImageChange("base", "noise"), ImageChange("base", "noise", seed=3)),
+        (PromptChange("synonyms", synonyms={"a": "b"}), PromptChange("synonyms", synonyms={"a": "c"})),
+    ]
+    for one, other in alike:
+        assert one.describe() != other.describe()
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: PromptChange("shuffled", seed=-1), "shuffled words is -1"),
+        (lambda: ImageChange("base", "noise", seed=-1), "a picture of noise is -1"),
         (lambda: KeyKnockout(" "), "has no selector"),
         (lambda: KeyKnockout("word:a\nb"), "control characters"),
         (lambda: KeyKnockout("word:a", weight=1.5), "the weight 1.5; expected 0 to 1"),

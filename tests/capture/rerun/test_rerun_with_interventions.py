@@ -117,6 +117,7 @@ def test_wrong_interventions_are_one_sentence_and_leave_no_store(pi_store, cosmo
     assert "The group 'word:green' of an intervention has no key in 6 of 12 replans" in said("--knockout", "word:green")
     assert "there is no camera 'base'" in said("--knockout", "camera:base")
     assert "Unknown camera 'base'" in said("--image", "base=blank")
+    assert "Unknown camera 'base'" in said("--image", "base=masked:cube")
     assert "out of view of camera 'base_0_rgb' in 12 of 12 replans" in said("--image", "base_0_rgb=masked:cube")
     assert "Unknown object 'ball'" in said("--image", "base_0_rgb=masked:ball")
     assert "leaves a query without any key" in said("--knockout", "*")
