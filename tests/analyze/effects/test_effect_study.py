@@ -316,7 +316,7 @@ def test_a_rerun_without_any_key_of_its_group_is_left_out_by_name(folder, tmp_pa
     study = study_effects(folder / "base.zarr", given, AnalysisSettings())
     assert [condition.name for condition in study.conditions] == ["noise"]
     assert "note: without_bowl is left out" in effects_text(study)
-    with pytest.raises(BadArgument, match="No rerun of .*base.zarr can be compared: without_bowl is left out"):
+    with pytest.raises(BadArgument, match=r"No rerun of .*base.zarr can be compared: without_bowl is left out"):
         study_effects(folder / "base.zarr", [tmp_path], AnalysisSettings())
 
 
