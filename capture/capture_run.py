@@ -12,7 +12,7 @@ from vla_attention.capture.environments.episode_protocol import WAIT_STEPS, Eval
 from vla_attention.capture.environments.suites import list_tasks
 from vla_attention.capture.interventions.prompts import check_synonyms
 from vla_attention.capture.interventions.resolution import interventions_for
-from vla_attention.capture.interventions.run_changes import AttentionChanges
+from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.jobs.damaged_episodes import DamagedEpisodesLeft, find_damaged, what_to_do
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.jobs.worker import this_worker
@@ -25,7 +25,7 @@ from vla_attention.capture.jobs.worker_records import (
 )
 from vla_attention.capture.policies.policy import Policy, stored_picture_sizes
 from vla_attention.capture.provenance import describe_machine
-from vla_attention.capture.rollout.episode import EpisodeResult, check_protocol, max_replans
+from vla_attention.capture.rollout.episode import EpisodeResult, EpisodeRun, check_protocol, max_replans
 from vla_attention.capture.rollout.episode_loop import EpisodeLoop
 from vla_attention.capture.rollout.progress import say
 from vla_attention.capture.run_settings import RecordingSettings, RunSettings
@@ -182,13 +182,10 @@ def _record_missing(
     loop = EpisodeLoop(
         suite=settings.suite,
         environment_settings=EnvironmentSettings(evaluation, settings.libero_assets),
-        policy=policy,
-        store=store,
+        run=EpisodeRun(policy, store, machine, changes, termination.check),
         worker=worker,
         record=record,
-        machine=machine,
         termination=termination,
-        changes=changes,
     )
     results = loop.record_all(todo)
     if (empty := changes.describe_empty()) is not None:
@@ -196,10 +193,10 @@ def _record_missing(
     return results, damaged_names
 
 
-def _plan_changes(settings: RunSettings, policy: Policy, tasks: Sequence[Task]) -> AttentionChanges:
+def _plan_changes(settings: RunSettings, policy: Policy, tasks: Sequence[Task]) -> RunChanges:
     """Return the run's interventions; what is known to be wrong with them is an error now, before the first episode."""
     instructions = {task.task_id: task.instruction for task in tasks}
-    changes = AttentionChanges(interventions_for(settings.interventions, policy), instructions, settings.allow_empty)
+    changes = RunChanges(interventions_for(settings.interventions, policy), instructions, settings.allow_empty)
     if changes.interventions.prompt is not None:
         check_synonyms(changes.interventions.prompt, instructions.values())
     changes.check_names(policy.sites)

@@ -21,7 +21,7 @@ from vla_attention.analyze.time.alignment import replan_starts
 from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
 from vla_attention.capture.interventions.changed_inputs import changed_inputs
 from vla_attention.capture.interventions.resolution import TooFewKeys, interventions_for
-from vla_attention.capture.interventions.run_changes import AttentionChanges
+from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.rerun.stored_calls import StoredCalls, read_calls
 from vla_attention.schemas.groupings.resolve import EmptyGroup
 from vla_attention.schemas.interventions import Interventions
@@ -125,7 +125,7 @@ def changed_call(
     if change.noise is not None:
         seed = policy.replan_noise_seed(change.noise.seed, context.task_id, context.episode_index, replan)
     try:
-        editors = AttentionChanges(change, instructions).editors(policy.sites, policy_input, context)
+        editors = RunChanges(change, instructions).editors(policy.sites, policy_input, context)
         actions: Array = policy.act(policy_input, seed, None, editors)
     except (EmptyGroup, TooFewKeys, QueryWithoutKeys):
         return np.full(calls.actions.shape[1:], np.nan)

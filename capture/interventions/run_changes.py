@@ -31,8 +31,8 @@ from vla_attention.schemas.stores.reader import Store
 
 
 @dataclass
-class AttentionChanges:
-    """Makes the editors of every policy call of a run.
+class RunChanges:
+    """What a run changes, and the editors of its policy calls' attention.
 
     Attributes:
         interventions: what is changed; layer numbers are block indices (`interventions_for`).

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from vla_attention.capture.interventions.changed_inputs import changed_inputs
-from vla_attention.capture.interventions.run_changes import AttentionChanges
+from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.policies.policy import Policy, PolicyInput
 from vla_attention.capture.rerun.stored_calls import StoredCalls
 from vla_attention.capture.rollout.policy_call import RecordedCall, record_call
@@ -30,9 +30,9 @@ class Repeater:
     allow_empty: bool = False
 
     @cached_property
-    def attention(self) -> AttentionChanges:
+    def attention(self) -> RunChanges:
         """The changes of attention; it counts the calls without any."""
-        return AttentionChanges(self.interventions, self.instructions, self.allow_empty)
+        return RunChanges(self.interventions, self.instructions, self.allow_empty)
 
     def prepare(self, calls: StoredCalls, replan: int) -> PolicyInput:
         """Return the model's input of a call."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from vla_attention.capture.environments.base import Environment, Observation, Ta
 from vla_attention.capture.environments.coverage import patch_coverage
 from vla_attention.capture.environments.episode_protocol import WAIT_ACTION
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
-from vla_attention.capture.interventions.run_changes import AttentionChanges
+from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.policies.policy import Policy, camera_frame, camera_grid
 from vla_attention.capture.rollout.policy_call import record_call
 from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
@@ -25,7 +25,7 @@ from vla_attention.schemas.stores.store_format import Protocol
 
 #: Called after the actions of each replan with (environment steps done, replans done).
 StepReport = Callable[[int, int], None]
-#: Called before every environment step and policy call. An exception that it raises drops the episode.
+#: Raises an exception when the process shall stop.
 StopCheck = Callable[[], None]
 
 
@@ -57,26 +57,31 @@ def check_protocol(protocol: Protocol, policy: Policy) -> None:
         )
 
 
+@dataclass(frozen=True)
+class EpisodeRun:
+    """What all episodes of a process have in common.
+
+    machine: provenance that is stored with every episode. changes: the run's interventions; without any, nothing.
+    check: called before every environment step and policy call; an exception that it raises drops the episode.
+    """
+
+    policy: Policy
+    store: RunStore
+    machine: dict[str, str]
+    changes: RunChanges = field(default_factory=lambda: RunChanges(Interventions(), {}))
+    check: StopCheck = lambda: None
+
+
 def record_episode(
-    environment: Environment,
-    policy: Policy,
-    store: RunStore,
-    task: Task,
-    episode_index: int,
-    provenance: dict[str, str],
-    report: StepReport | None = None,
-    check: StopCheck = lambda: None,
-    changes: AttentionChanges | None = None,
+    run: EpisodeRun, environment: Environment, task: Task, episode_index: int, report: StepReport | None = None
 ) -> EpisodeResult:
     """Run one episode from the stored initial state of the same index, and commit it to the store.
 
     The protocol of the published evaluations: waiting steps, then one policy call for every `replan_steps` executed
-    actions, until the task is solved or `max_steps` actions have been executed. An exception, also one from `check`,
-    drops the episode: nothing of it remains in or beside the store.
-
-    changes: the run's interventions; None for none.
+    actions, until the task is solved or `max_steps` actions have been executed. An exception, also one from
+    `run.check`, drops the episode: nothing of it remains in or beside the store.
     """
-    changes = changes or AttentionChanges(Interventions(), {})
+    policy, store, check = run.policy, run.store, run.check
     protocol = store.attributes.protocol
     environment.reset(episode_index, protocol.seed)
     start = EpisodeStart(
@@ -87,7 +92,7 @@ def record_episode(
         initial_state_index=episode_index,
         initial_state_digest=environment.initial_state_digest,
         objects=tuple(environment.objects),
-        provenance=provenance,
+        provenance=run.machine,
     )
     denoise_times = policy.denoise_times()[list(store.attributes.recording.denoise_steps)]
     with store.episode(start, denoise_times, max_replans(protocol)) as writer:
@@ -95,7 +100,7 @@ def record_episode(
         success, step, replans = False, 0, 0
         while step < protocol.max_steps and not success:
             check()
-            actions = _replan(environment, policy, store, writer, task, episode_index, observation, step, changes)
+            actions = _replan(run, environment, writer, start, observation, step)
             replans += 1
             chunk = min(protocol.replan_steps, protocol.max_steps - step)
             for i in range(chunk):
@@ -128,31 +133,29 @@ def _wait(environment: Environment, steps: int, check: StopCheck) -> Observation
 
 
 def _replan(
+    run: EpisodeRun,
     environment: Environment,
-    policy: Policy,
-    store: RunStore,
     writer: EpisodeWriter,
-    task: Task,
-    episode_index: int,
+    start: EpisodeStart,
     observation: Observation,
     step: int,
-    changes: AttentionChanges,
 ) -> NDArray[np.float64]:
-    protocol, recording = store.attributes.protocol, store.attributes.recording
+    """Call the policy after `step` policy steps, store the call, and return its actions (horizon, action dim)."""
+    policy, changes = run.policy, run.changes
+    protocol, recording = run.store.attributes.protocol, run.store.attributes.recording
+    task_id, episode_index = start.task_id, start.episode_index
     interventions, replan = changes.interventions, len(writer.records)
     where = f"replan {replan} (environment step {protocol.wait_steps + step}) of {writer.what}"
-    policy_input = policy.prepare(observation, task.instruction)
+    policy_input = policy.prepare(observation, start.instruction)
     coverage = _coverage(environment, policy, observation, where)
-    context = CallContext(
-        task.task_id, episode_index, replan, changes.instructions, tuple(environment.objects), coverage
-    )
+    context = CallContext(task_id, episode_index, replan, changes.instructions, start.objects, coverage)
     if interventions.changes_input:
         given = changed_inputs(
             policy_input.given, interventions, policy.sites, context, allow_empty=changes.allow_empty
         )
         policy_input = policy.prepare_again(given)
     noise = protocol.seed if interventions.noise is None else interventions.noise.seed
-    seed = policy.replan_noise_seed(noise, task.task_id, episode_index, replan)
+    seed = policy.replan_noise_seed(noise, task_id, episode_index, replan)
     editors = changes.editors(policy.sites, policy_input, context)
     call = record_call(policy, policy_input, seed, recording, where, editors)
     writer.append(

@@ -9,15 +9,12 @@ from dataclasses import dataclass, field
 
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Suite, Task
 from vla_attention.capture.environments.suites import make_environment
-from vla_attention.capture.interventions.run_changes import AttentionChanges
 from vla_attention.capture.jobs.claims import Claims, Holder
 from vla_attention.capture.jobs.termination import Terminated, Termination
 from vla_attention.capture.jobs.worker import Worker
 from vla_attention.capture.jobs.worker_records import RecordWriter
-from vla_attention.capture.policies.policy import Policy
-from vla_attention.capture.rollout.episode import EpisodeResult, record_episode
+from vla_attention.capture.rollout.episode import EpisodeResult, EpisodeRun, record_episode
 from vla_attention.capture.rollout.progress import Progress
-from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.stores.store_format import StoreExists, episode_name
@@ -35,15 +32,10 @@ class EpisodeLoop:
 
     suite: Suite
     environment_settings: EnvironmentSettings
-    policy: Policy
-    store: RunStore
+    run: EpisodeRun
     worker: Worker
     record: RecordWriter
-    #: Provenance that is stored with every episode.
-    machine: dict[str, str]
     termination: Termination
-    #: The run's interventions; None for none.
-    changes: AttentionChanges | None = None
     results: list[EpisodeResult] = field(default_factory=list, init=False)
     _environment: Environment | None = field(default=None, init=False)
     _task_id: int | None = field(default=None, init=False)
@@ -60,8 +52,8 @@ class EpisodeLoop:
             Terminated: after SIGTERM; the current episode was dropped.
         """
         with ExitStack() as stack:
-            self._claims = stack.enter_context(Claims(self.store.path, self.worker))
-            self._progress = Progress(len(missing), self.store.attributes.protocol.max_steps)
+            self._claims = stack.enter_context(Claims(self.run.store.path, self.worker))
+            self._progress = Progress(len(missing), self.run.store.attributes.protocol.max_steps)
             stack.callback(self._progress.close)
             stack.callback(self._close_environment)
             try:
@@ -91,14 +83,14 @@ class EpisodeLoop:
         name = episode_name(task.task_id, episode)
         self.termination.check()
         # Check before and after claiming: another process may commit the episode at any time before our claim.
-        if self.store.has(task.task_id, episode):
+        if self.run.store.has(task.task_id, episode):
             self._progress.skip(name)
             return None
         holder = self._claims.acquire(name)
         if holder is not None:
             return holder
         try:
-            if self.store.has(task.task_id, episode):
+            if self.run.store.has(task.task_id, episode):
                 self._progress.skip(name)
             else:
                 self._record(task, episode)
@@ -118,24 +110,14 @@ class EpisodeLoop:
             self._position = f"{name} at step {step}"
             self._progress.update(step, replans)
 
-        missing = environment.missing_resets(episode, self.store.attributes.protocol.seed)
+        missing = environment.missing_resets(episode, self.run.store.attributes.protocol.seed)
         if missing:
             self._progress.say(
                 f"{name}: the published furniture depends on the resets of earlier episodes; making {missing} first."
             )
         self._position = f"{name} at step 0"
         with self.termination.only_at_checks():
-            result = record_episode(
-                environment,
-                self.policy,
-                self.store,
-                task,
-                episode,
-                self.machine,
-                report,
-                self.termination.check,
-                self.changes,
-            )
+            result = record_episode(self.run, environment, task, episode, report)
             self._position = None
             self.results.append(result)
             self.record.add_commit(result.folder.name)
@@ -160,7 +142,7 @@ class EpisodeLoop:
 
     def _describe_stop(self, missing: Sequence[TaskEpisode]) -> str:
         committed = listing([result.folder.name for result in self.results], 40)
-        left = sum(not self.store.has(task.task_id, episode) for task, episode in missing)
+        left = sum(not self.run.store.has(task.task_id, episode) for task, episode in missing)
         dropped = f"dropped {self._position}" if self._position else "no episode was in progress"
         return (
             f"Stopped by SIGTERM: {dropped}; committed {len(self.results)} episodes ({committed}); "

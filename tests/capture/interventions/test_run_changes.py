@@ -7,7 +7,7 @@ import pytest
 
 from tests.kit.policy_inputs import make_observation
 from vla_attention.capture.interventions.changed_inputs import CallContext
-from vla_attention.capture.interventions.run_changes import AttentionChanges, check_stored_replans
+from vla_attention.capture.interventions.run_changes import RunChanges, check_stored_replans
 from vla_attention.capture.policies.pi.embedded import dummy_policy
 from vla_attention.schemas.groupings.resolve import EmptyGroup
 from vla_attention.schemas.groupings.selectors import SelectorError
@@ -19,9 +19,9 @@ from vla_attention.testing import write_store
 BOWL = SceneObject("bowl_1", "object", True)
 
 
-def changes(*selectors: str, **fields) -> AttentionChanges:
+def changes(*selectors: str, **fields) -> RunChanges:
     interventions = Interventions(keys=tuple(KeyKnockout(selector) for selector in selectors))
-    return AttentionChanges(interventions, {0: "pick up the bowl", 4: "open the drawer"}, **fields)
+    return RunChanges(interventions, {0: "pick up the bowl", 4: "open the drawer"}, **fields)
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def policy():
     return dummy_policy()
 
 
-def editors(given: AttentionChanges, policy, covered: float = 0.0, replan: int = 0):
+def editors(given: RunChanges, policy, covered: float = 0.0, replan: int = 0):
     policy_input = policy.prepare(make_observation(0), "pick up the bowl")
     camera = policy.cameras[0].name
     coverage = {camera: np.array([[covered], [0], [0], [0]], dtype=np.float32)}
@@ -41,13 +41,13 @@ def test_names_before_the_run(policy):
     with pytest.raises(SelectorError, match="no instruction has the word 'mug'"):
         changes("word:mug").check_names(policy.sites)
     mug = Interventions(keys=(KeyKnockout("word:mug"),), prompt=PromptChange("text", text="take the mug"))
-    AttentionChanges(mug, {0: "pick up the bowl"}).check_names(policy.sites)
+    RunChanges(mug, {0: "pick up the bowl"}).check_names(policy.sites)
     with pytest.raises(SelectorError, match="no object 'plate_1'"):
         editors(changes("object:plate_1"), policy)
 
 
 def test_without_attention_there_are_no_editors(policy):
-    given = AttentionChanges(Interventions(noise=NoiseChange(3)), {0: "pick up the bowl"})
+    given = RunChanges(Interventions(noise=NoiseChange(3)), {0: "pick up the bowl"})
     given.check_names(policy.sites)
     assert editors(given, policy) is None
 

@@ -15,7 +15,7 @@ import torch
 from vla_attention.capture.environments.base import Observation, StepResult, Task
 from vla_attention.capture.environments.episode_protocol import WAIT_ACTION, WAIT_STEPS
 from vla_attention.capture.policies.policy import PolicyInput
-from vla_attention.capture.rollout.episode import check_protocol, max_replans, record_episode
+from vla_attention.capture.rollout.episode import EpisodeRun, check_protocol, max_replans, record_episode
 from vla_attention.capture.store.episode_writer import ReplanRecord
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import SceneObject
@@ -138,9 +138,8 @@ class FakeStore:
 def test_waiting_steps_then_a_policy_call_for_every_chunk() -> None:
     environment, policy, store = FakeEnvironment(), FakePolicy(), FakeStore()
     reports: list[tuple[int, int]] = []
-    result = record_episode(
-        environment, policy, store, TASK, 2, {"host": "x"}, lambda step, replans: reports.append((step, replans))
-    )
+    run = EpisodeRun(policy, store, {"host": "x"})
+    result = record_episode(run, environment, TASK, 2, lambda step, replans: reports.append((step, replans)))
     assert environment.start == (2, 7)
     np.testing.assert_array_equal(environment.actions[:WAIT_STEPS], [WAIT_ACTION] * WAIT_STEPS)
     # Three of the four actions of each chunk are executed, and only two of the last: max_steps is 8.
@@ -160,14 +159,14 @@ def test_waiting_steps_then_a_policy_call_for_every_chunk() -> None:
 
 def test_a_solved_task_ends_the_episode() -> None:
     environment, store = FakeEnvironment(solved_after=WAIT_STEPS + 2), FakeStore()
-    result = record_episode(environment, FakePolicy(), store, TASK, 0, {})
+    result = record_episode(EpisodeRun(FakePolicy(), store, {}), environment, TASK, 0)
     assert (result.success, result.num_steps, result.num_replans) == (True, 2, 1)
     assert store.ending == (True, 2)
 
 
 def test_a_replan_is_stored_with_its_rows_and_coverage() -> None:
     store = FakeStore(max_steps=1)
-    record_episode(FakeEnvironment(), FakePolicy(), store, TASK, 0, {})
+    record_episode(EpisodeRun(FakePolicy(), store, {}), FakeEnvironment(), TASK, 0)
     (record,) = store.records
     rows = record.rows["joint"]
     assert rows.rows.shape == (1, 1, 2, 1, 4)
@@ -193,7 +192,7 @@ def test_a_segmentation_that_does_not_fit_its_picture_is_refused(segmentation, m
     environment, store = FakeEnvironment(), FakeStore()
     environment.segmentation = lambda camera: segmentation
     with pytest.raises(BadArgument, match=message) as caught:
-        record_episode(environment, FakePolicy(), store, TASK, 2, {})
+        record_episode(EpisodeRun(FakePolicy(), store, {}), environment, TASK, 2)
     assert str(caught.value).startswith(
         "Cannot store replan 0 (environment step 10) of episode task003_episode002, camera 'agentview': "
     )
@@ -207,8 +206,9 @@ def test_an_error_of_the_check_drops_the_episode() -> None:
         if len(environment.actions) == 12:
             raise KeyboardInterrupt
 
+    run = EpisodeRun(FakePolicy(), store, {}, check=stop_after_twelve_steps)
     with pytest.raises(KeyboardInterrupt):
-        record_episode(environment, FakePolicy(), store, TASK, 0, {}, check=stop_after_twelve_steps)
+        record_episode(run, environment, TASK, 0)
     assert store.dropped
     assert store.ending is None
 
