@@ -22,6 +22,7 @@ from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
 from vla_attention.capture.interventions.changed_inputs import changed_inputs
 from vla_attention.capture.interventions.resolution import TooFewKeys, interventions_for
 from vla_attention.capture.interventions.run_changes import RunChanges
+from vla_attention.capture.rerun.base_store import instructions_of
 from vla_attention.capture.rerun.stored_calls import StoredCalls, read_calls
 from vla_attention.schemas.groupings.resolve import EmptyGroup
 from vla_attention.schemas.interventions import Interventions
@@ -77,7 +78,7 @@ def changed_episodes(
 ) -> list[ChangedEpisode]:
     """Make calls of every episode again under changes. Episodes whose result is in `folder` are read from there."""
     folder.mkdir(parents=True, exist_ok=True)
-    instructions = {episode.attributes.task_id: episode.attributes.instruction for episode in store.episodes}
+    instructions = instructions_of(store)
     found, begun = [], time.monotonic()
     for number, episode in enumerate(store.episodes, start=1):
         changes = changes_of(episode)

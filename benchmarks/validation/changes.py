@@ -3,26 +3,32 @@
 from __future__ import annotations
 
 from vla_attention.capture.environments.cubes.environment import MARK
+from vla_attention.capture.environments.cubes.tasks import NAMED_COLOURS
 from vla_attention.schemas.interventions import (
     ImageChange,
     Interventions,
     KeyKnockout,
     NoiseChange,
     PromptChange,
+    Queries,
 )
 from vla_attention.schemas.stores.reader import StoredEpisode
 
 BASE_CAMERA, WRIST_CAMERA = "base_0_rgb", "left_wrist_0_rgb"
-COLOUR_WORDS = ("red", "green", "blue")
+COLOUR_WORDS = NAMED_COLOURS
+#: Colour -> the one that is named in its place.
+NEXT_COLOUR = dict(zip(COLOUR_WORDS, (*COLOUR_WORDS[1:], COLOUR_WORDS[0]), strict=True))
 VISUAL, INSTRUCTION = "role:image", "role:instruction"
 #: The linguistic side of the default grouping, and all keys of the prompt, which could all carry the instruction on.
 LINGUISTIC = "role:bos | role:template | role:instruction"
 TEXT = f"{LINGUISTIC} | role:state"
 
 
-def without(selector: str, queries: str = "action", **further: object) -> Interventions:
-    """A group of keys knocked out."""
-    return Interventions(keys=(KeyKnockout(selector, queries=queries, **further),))  # type: ignore[arg-type]
+def without(
+    selector: str, queries: Queries = "action", *, keep: bool = False, random_seed: int | None = None
+) -> Interventions:
+    """A group of keys knocked out; arguments as in `KeyKnockout`."""
+    return Interventions(keys=(KeyKnockout(selector, keep=keep, queries=queries, random_seed=random_seed),))
 
 
 def colour_word(episode: StoredEpisode) -> str | None:
@@ -32,8 +38,7 @@ def colour_word(episode: StoredEpisode) -> str | None:
 
 def other_colour(instruction: str) -> str:
     """The instruction with the next colour in place of each."""
-    following = dict(zip(COLOUR_WORDS, (*COLOUR_WORDS[1:], COLOUR_WORDS[0]), strict=True))
-    return " ".join(following.get(word, word) for word in instruction.split())
+    return " ".join(NEXT_COLOUR.get(word, word) for word in instruction.split())
 
 
 def named_object(episode: StoredEpisode) -> str | None:

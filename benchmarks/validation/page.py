@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -112,14 +113,14 @@ def blocks(results: Results) -> dict[str, str]:
     present = {policy["control"] for policy in results["policies"]}
     for first, other, about in CONTRASTS:
         if {first, other} <= present:
-            made[f"{first}/{other}"] = lambda a=first, b=other, c=about: known_table(results, a, b, c)  # type: ignore[misc]
+            made[f"{first}/{other}"] = partial(known_table, results, first, other, about)
     if results.get("known"):
         made["other"] = lambda: other_table(results)
     if results.get("prediction_everywhere"):
         made["prediction everywhere"] = lambda: prediction_table(results, "prediction_everywhere")
     for name, make in (("prediction", prediction_table), ("mixing", mixing_table), ("success", success_table)):
         if results.get(name):
-            made[name] = lambda make=make: make(results)  # type: ignore[misc]
+            made[name] = partial(make, results)
     return {name: make() for name, make in made.items()}
 
 

@@ -210,8 +210,8 @@ def correlations(table: pl.DataFrame, effect: str = "effect") -> list[dict[str, 
             names = ["family", "suite", "task_id", "episode_index", "items", "hit", "value"]
             episodes = pl.DataFrame(rows, schema=names, orient="row")
             row = means(episodes, ["family"], scale="z")[0]
-            items = float(episodes["items"].mean())  # type: ignore[arg-type]
-            row |= {"measure": measure, "items": items, "highest": float(episodes["hit"].mean()), "chance": 1 / items}  # type: ignore[arg-type]
+            items, highest = (float(np.mean(episodes[name].to_numpy())) for name in ("items", "hit"))
+            row |= {"measure": measure, "items": items, "highest": highest, "chance": 1 / items}
             found.append(row)
     return found
 

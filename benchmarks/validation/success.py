@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.validation.changes import COLOUR_WORDS
+from benchmarks.validation.changes import NEXT_COLOUR
 from benchmarks.validation.policies import KnownPolicy, record, success
 
 #: Name -> options of `vla-capture`. The first and the last camera of the small policy are the agent's and the wrist's.
@@ -44,8 +44,7 @@ def success_under(
     """Rollouts under each condition; rows of policy, condition, episodes, solved."""
     folder.mkdir(parents=True, exist_ok=True)
     synonyms = folder / "other_colours.json"
-    following = dict(zip(COLOUR_WORDS, (*COLOUR_WORDS[1:], COLOUR_WORDS[0]), strict=True))
-    synonyms.write_text(json.dumps(following), encoding="utf-8")
+    synonyms.write_text(json.dumps(NEXT_COLOUR), encoding="utf-8")
     found = []
     for number, name in enumerate(CONDITIONS):
         # Only sentences of the suites of cubes name a colour, and the constant one of a control does not.
