@@ -21,6 +21,7 @@ from typing import Any
 
 import polars as pl
 
+from benchmarks.validation.calls import spread_of, units_of
 from benchmarks.validation.known import all_numbers, contrasts, known_numbers
 from benchmarks.validation.mixing import mixing
 from benchmarks.validation.page import fill_page, tables_text
@@ -99,18 +100,22 @@ def run(plan: Plan) -> dict[str, Any]:
         facts = {"name": policy.name, "control": policy.control, "seed": policy.seed, "suite": policy.suite}
         facts |= success(store)
         model = load_policy(store.path)
+        units = spread_of(store)
+        if set(plan.stages) != {"success"}:
+            units = units_of(model, store, folder / "units", say)
+        facts["left_out"] = list(units.left_out)
         if "known" in plan.stages and policy.control:
-            tables[policy.name], furthest = all_numbers(model, store, folder / "known", plan.replans, say)
+            tables[policy.name], furthest = all_numbers(model, store, units, folder / "known", plan.replans, say)
             facts["rerun_difference"] = furthest
         shipped = policy.checkpoint == plan.shipped.checkpoint
         if "prediction" in plan.stages and shipped:
-            table = predicted_effects(model, store, folder / "prediction", plan.replans, say)
+            table = predicted_effects(model, store, units, folder / "prediction", plan.replans, say)
             results |= {"prediction": correlations(table), "items": item_means(table)}
             results["prediction_everywhere"] = correlations(table, "everywhere")
         if "mixing" in plan.stages and shipped and not model.has_prefix:
             say("question 3 is left out: the policy has no prefix in which text and pictures read each other")
         elif "mixing" in plan.stages and shipped:
-            results["mixing"] = mixing(model, store, folder / "mixing", plan.replans, say)
+            results["mixing"] = mixing(model, store, units, folder / "mixing", plan.replans, say)
         if "success" in plan.stages:
             base = {"policy": policy.name, "control": policy.control, "condition": "nothing changed"}
             success_rows.append(base | success(store))

@@ -16,7 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.analyze.effects.action_changes import ActionSpread, action_spread, root_mean_square_change
+from vla_attention.analyze.effects.action_changes import (
+    ActionSpread,
+    action_spread,
+    change_per_dimension,
+    root_mean_square_change,
+    with_noise,
+)
 from vla_attention.analyze.time.alignment import replan_starts
 from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
 from vla_attention.capture.interventions.changed_inputs import changed_inputs
@@ -25,7 +31,7 @@ from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.rerun.base_store import instructions_of
 from vla_attention.capture.rerun.stored_calls import StoredCalls, read_calls
 from vla_attention.schemas.groupings.resolve import EmptyGroup
-from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.interventions import Interventions, NoiseChange
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 
 Array = NDArray[np.float64]
@@ -33,6 +39,10 @@ Array = NDArray[np.float64]
 Changes = Mapping[str, Interventions]
 #: The stored call, unchanged: its effect is how far the rerun is from the store.
 NOTHING = "nothing"
+#: Another noise seed: the run's with this in place of its base.
+NOISE = Interventions(noise=NoiseChange(1000))
+#: More replans than any episode has.
+_ALL_REPLANS = 10**9
 
 
 @dataclass(frozen=True)
@@ -58,8 +68,20 @@ class ChangedEpisode:
 
 
 def spread_of(store: Store) -> ActionSpread:
-    """The units of effects: all actions of the store."""
+    """The spread of all actions of the store, without regard to noise."""
     return action_spread([episode.read("actions").astype(np.float64) for episode in store.episodes])
+
+
+def units_of(policy: Any, store: Store, folder: Path, say: Callable[[str], None]) -> ActionSpread:
+    """The units of effects, those of `vla-analyze effects` with a rerun under another noise seed.
+
+    All policy calls of the store are made again with that seed, and dimensions of the action that it changes by more
+    than their spread are left out: they would drown every effect.
+    """
+    spread = spread_of(store)
+    again = changed_episodes(policy, store, lambda episode: {"noise": NOISE}, _ALL_REPLANS, folder, say)
+    pairs = [(episode.base, episode.actions["noise"]) for episode in again]
+    return with_noise(spread, change_per_dimension(pairs, spread.spread), leave_out=True)
 
 
 def chosen_replans(number: int, count: int) -> NDArray[np.int64]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from benchmarks.validation.calls import NOISE
 from vla_attention.capture.environments.cubes.environment import MARK
 from vla_attention.capture.environments.cubes.tasks import NAMED_COLOURS
 from vla_attention.schemas.interventions import (
     ImageChange,
     Interventions,
     KeyKnockout,
-    NoiseChange,
     PromptChange,
     Queries,
 )
@@ -51,7 +51,7 @@ def known_changes(episode: StoredEpisode) -> dict[str, Interventions]:
     """The changes of question 1; those that an episode has no word or object for are left out."""
     changes = {
         "nothing": Interventions(),
-        "noise": Interventions(noise=NoiseChange(1000)),
+        "noise": NOISE,
         "without_visual": without(VISUAL),
         "only_visual": without(VISUAL, keep=True),
         "without_linguistic": without(LINGUISTIC),

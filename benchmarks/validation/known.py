@@ -12,10 +12,11 @@ import numpy as np
 import polars as pl
 
 import vla_attention as va
-from benchmarks.validation.calls import NOTHING, changed_episodes, spread_of
+from benchmarks.validation.calls import NOTHING, changed_episodes
 from benchmarks.validation.changes import BASE_CAMERA, WRIST_CAMERA, colour_word, known_changes, named_object
 from benchmarks.validation.policies import KnownPolicy
 from benchmarks.validation.tables import SCALES, means
+from vla_attention.analyze.effects.action_changes import ActionSpread
 from vla_attention.analyze.measures.sinks import SinkRule
 from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.errors import UserError
@@ -141,10 +142,10 @@ def attention_numbers(store: Store) -> Iterator[pl.DataFrame]:
 
 
 def effect_numbers(
-    policy: Any, store: Store, folder: Path, replans: int, say: Callable[[str], None]
+    policy: Any, store: Store, spread: ActionSpread, folder: Path, replans: int, say: Callable[[str], None]
 ) -> tuple[pl.DataFrame, float]:
     """The same table of effects, and how far unchanged calls are from the stored ones, in units of the spread."""
-    spread, suite = spread_of(store), store.attributes.protocol.suite
+    suite = store.attributes.protocol.suite
     rows, furthest = [], 0.0
     for episode in changed_episodes(policy, store, known_changes, replans, folder, say):
         values = {name: float(np.mean(episode.effect(name, spread))) for name in episode.actions}
@@ -219,7 +220,7 @@ def _sign(first: pl.DataFrame, other: pl.DataFrame, name: str, number: Number) -
 
 
 def all_numbers(
-    policy: Any, store: Store, folder: Path, replans: int, say: Callable[[str], None]
+    policy: Any, store: Store, spread: ActionSpread, folder: Path, replans: int, say: Callable[[str], None]
 ) -> tuple[pl.DataFrame, float]:
     """Attention and effects of one policy; numbers that its store has not are left out."""
     parts = []
@@ -227,5 +228,5 @@ def all_numbers(
         parts += list(attention_numbers(store))
     except UserError as error:
         say(f"{store.path}: {error}")
-    effects, furthest = effect_numbers(policy, store, folder, replans, say)
+    effects, furthest = effect_numbers(policy, store, spread, folder, replans, say)
     return pl.concat([*parts, effects]), furthest

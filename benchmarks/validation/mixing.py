@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from benchmarks.validation.calls import changed_episodes, spread_of
+from benchmarks.validation.calls import changed_episodes
 from benchmarks.validation.changes import mixing_changes
 from benchmarks.validation.tables import means
+from vla_attention.analyze.effects.action_changes import ActionSpread
 from vla_attention.schemas.stores.reader import Store
 
 CUTS = {
@@ -28,13 +29,15 @@ GROUPS = {
 }
 
 
-def mixing(policy: Any, store: Store, folder: Path, replans: int, say: Callable[[str], None]) -> list[dict[str, Any]]:
+def mixing(
+    policy: Any, store: Store, spread: ActionSpread, folder: Path, replans: int, say: Callable[[str], None]
+) -> list[dict[str, Any]]:
     """Effects of cuts in the prefix, and of groups that the action queries cannot read under each cut.
 
     Rows: cut, group (empty: the cut by itself, against the stored actions), value with low and high; the effect of a
     group is against the same cut with all groups there.
     """
-    spread, suite = spread_of(store), store.attributes.protocol.suite
+    suite = store.attributes.protocol.suite
     rows: list[tuple[str, str, str, int, int, float]] = []
     for episode in changed_episodes(policy, store, mixing_changes, replans, folder, say):
         place = (suite, episode.task_id, episode.episode_index)

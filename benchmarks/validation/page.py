@@ -41,10 +41,12 @@ def policies_table(results: Results) -> str:
             policy["suite"],
             f"{policy['solved']} of {policy['episodes']}",
             f"{policy['rerun_difference']:.2g}",
+            ", ".join(map(str, policy.get("left_out", ()))) or "-",
         )
         for policy in results["policies"]
     ]
-    return markdown(("policy", "what is known", "suite", "solved", "unchanged calls differ by"), rows)
+    header = ("policy", "what is known", "suite", "solved", "unchanged calls differ by", "dimensions left out")
+    return markdown(header, rows)
 
 
 def known_table(results: Results, first: str, other: str, about: str) -> str:

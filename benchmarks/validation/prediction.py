@@ -11,9 +11,10 @@ import numpy as np
 import polars as pl
 
 import vla_attention as va
-from benchmarks.validation.calls import ChangedEpisode, changed_episodes, spread_of
+from benchmarks.validation.calls import ChangedEpisode, changed_episodes
 from benchmarks.validation.changes import LINGUISTIC, VISUAL
 from benchmarks.validation.tables import means, spearman
+from vla_attention.analyze.effects.action_changes import ActionSpread
 from vla_attention.analyze.effects.conditions import GroupOfKeys, Place
 from vla_attention.analyze.effects.group_attention import MEASURES, GroupAttention, group_attention
 from vla_attention.analyze.measures.question import Question
@@ -121,7 +122,7 @@ def _single_keys(tokens: EpisodeTokens) -> Iterator[str]:
 
 
 def predicted_effects(
-    policy: Any, store: Store, folder: Path, replans: int, say: Callable[[str], None]
+    policy: Any, store: Store, spread: ActionSpread, folder: Path, replans: int, say: Callable[[str], None]
 ) -> pl.DataFrame:
     """One row per episode and item: its effect and its attention in the same replans.
 
@@ -130,7 +131,6 @@ def predicted_effects(
         queries; null for items in some layers or heads), and a column for each of `ATTENTION`; null where there is
         none: norms exist for whole parts and for all heads together only.
     """
-    spread = spread_of(store)
     items = {episode.name: items_of(store, episode) for episode in store.episodes}
 
     def changes_of(episode: StoredEpisode) -> dict[str, Interventions]:
