@@ -10,7 +10,7 @@ from typing import Any
 from benchmarks.validation.known import CONTRASTS, NUMBERS, OTHER
 from benchmarks.validation.mixing import CUTS, GROUPS
 from benchmarks.validation.policies import SHIPPED, TITLES
-from benchmarks.validation.prediction import ATTENTION, FAMILIES
+from benchmarks.validation.prediction import ATTENTION, BASELINE, FAMILIES
 from vla_attention.analyze.show.numbers import format_number
 from vla_attention.schemas.errors import BadArgument
 
@@ -84,9 +84,9 @@ def prediction_table(results: Results, key: str = "prediction") -> str:
             continue
         mass = of["mass"]
         hits = f"{100 * mass['highest']:.0f} % ({100 * mass['chance']:.0f} %)"
-        cells = [with_interval(of.get(measure)) for measure in ATTENTION]
+        cells = [with_interval(of.get(measure)) for measure in (*ATTENTION, BASELINE)]
         rows.append((f"{family}: {what}", f"{mass['items']:.0f}", *cells, hits))
-    return markdown(("items", "number", *ATTENTION, "most mass is largest effect (chance)"), rows)
+    return markdown(("items", "number", *ATTENTION, "number of keys", "most mass is largest effect (chance)"), rows)
 
 
 def mixing_table(results: Results) -> str:

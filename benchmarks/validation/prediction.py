@@ -38,6 +38,8 @@ FAMILIES = {
 }
 #: Measure -> where it comes from.
 ATTENTION = ("mass", "lift", "mass without sinks", "contribution norm")
+#: What needs no attention at all: a larger group has a larger effect. Without spread where all items have one size.
+BASELINE = "keys"
 _PARTS = {"bos": Role.BOS, "template": Role.TEMPLATE, "instruction": Role.INSTRUCTION, "state": Role.STATE}
 
 
@@ -187,12 +189,13 @@ def correlations(table: pl.DataFrame, effect: str = "effect") -> list[dict[str, 
 
     effect: the column of the effects. A measure that some items of a family have not is left out.
 
-    Each is computed inside of an episode, then averaged on Fisher's scale over tasks; intervals take the task as unit.
+    Each is computed inside of an episode, then averaged over tasks; intervals take the task as unit. Not on Fisher's
+    scale: of few items the order is often the same, and there a correlation of 1 has no finite value.
     `highest`: in how many episodes the item with most attention has the largest effect; `chance`: 1 / items.
     """
     found = []
     for family in FAMILIES:
-        for measure in ATTENTION:
+        for measure in (*ATTENTION, BASELINE):
             chosen = table.filter(pl.col(effect).is_not_null(), family=family)
             if not chosen.height or chosen[measure].null_count():
                 continue
@@ -209,7 +212,7 @@ def correlations(table: pl.DataFrame, effect: str = "effect") -> list[dict[str, 
                 continue
             names = ["family", "suite", "task_id", "episode_index", "items", "hit", "value"]
             episodes = pl.DataFrame(rows, schema=names, orient="row")
-            row = means(episodes, ["family"], scale="z")[0]
+            row = means(episodes, ["family"])[0]
             items, highest = (float(np.mean(episodes[name].to_numpy())) for name in ("items", "hit"))
             row |= {"measure": measure, "items": items, "highest": highest, "chance": 1 / items}
             found.append(row)

@@ -12,7 +12,7 @@ from vla_attention.analyze.statistics.episode_intervals import means_with_interv
 from vla_attention.analyze.statistics.intervals import NO_LIMITS
 
 #: Scale on which a number is averaged and compared, and the way back.
-SCALES = {"log": (np.log, np.exp), "plain": (lambda x: x, lambda x: x), "z": (np.arctanh, np.tanh)}
+SCALES = {"log": (np.log, np.exp), "plain": (lambda x: x, lambda x: x)}
 
 
 def means(table: pl.DataFrame, by: Sequence[str], value: str = "value", scale: str = "plain") -> list[dict[str, Any]]:
@@ -23,7 +23,7 @@ def means(table: pl.DataFrame, by: Sequence[str], value: str = "value", scale: s
     into, back = SCALES[scale]
     values = table[value].to_numpy().astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
-        transformed = into(np.clip(values, -0.9999, 0.9999) if scale == "z" else values)
+        transformed = into(values)
     there = np.isfinite(transformed)
     chosen = table.with_columns(pl.Series(value, transformed)).filter(pl.Series(there))
     if not chosen.height:

@@ -16,6 +16,7 @@ from benchmarks.validation.changes import without
 from benchmarks.validation.known import contrasts
 from benchmarks.validation.page import blocks, fill_page
 from benchmarks.validation.policies import KnownPolicy, load_policy
+from benchmarks.validation.prediction import correlations
 from benchmarks.validation.tables import means, spearman
 from tests.kit.made_up_demonstrations import INSTRUCTIONS, write_demonstrations
 from tests.kit.reruns import BASE, base_actions, write_base
@@ -56,6 +57,21 @@ def test_means_go_back_to_their_scale():
     table = numbers_of([1.0, 4.0])
     assert means(table, ["number"], scale="log")[0]["value"] == pytest.approx(2.0)
     assert means(numbers_of([np.nan, 4.0]), ["number"])[0]["num_episodes"] == 1
+
+
+def test_rank_correlations_are_averaged_as_they_are():
+    orders = {0: [1.0, 2, 3, 4], 1: [1.0, 3, 2, 4]}  # correlations of 1 and 0.8
+    rows = [
+        {"family": "words", "item": str(i), "suite": "cubes", "task_id": task, "episode_index": 0, "effect": float(i)}
+        | {"keys": 2.0 - (i == 0), "mass": mass}
+        | dict.fromkeys(("lift", "mass without sinks", "contribution norm"), None)
+        for task, order in orders.items()
+        for i, mass in enumerate(order)
+    ]
+    found = {row["measure"]: row for row in correlations(pl.DataFrame(rows, infer_schema_length=None))}
+    assert set(found) == {"mass", "keys"}
+    assert found["mass"]["value"] == pytest.approx(0.9)
+    assert found["keys"]["value"] == pytest.approx(np.sqrt(0.6))
 
 
 @pytest.mark.parametrize(
