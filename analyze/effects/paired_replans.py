@@ -116,7 +116,7 @@ def actions_of(base: BaseEpisode, rerun: StoredEpisode, condition: Condition) ->
     """Actions (replan, step, dimension) of an episode of a condition.
 
     Raises:
-        StoreError: the rerun has other replans than the base, or actions of another shape.
+        StoreError: the rerun has other replans than the base, or actions of another shape, or was given other states.
     """
     actions = rerun.read("actions").astype(np.float64)
     steps = rerun.read("env_step").astype(np.int64)
@@ -125,6 +125,13 @@ def actions_of(base: BaseEpisode, rerun: StoredEpisode, condition: Condition) ->
             f"{base.name} of {condition.store.path} has {len(steps)} replans and actions of the shape {actions.shape}, "
             f"and in its base {len(base.env_step)} and {base.actions.shape}: these are not the same replans; make the "
             "rerun again."
+        )
+    # A base that was recorded again with the same settings has the digest of the one that was rerun.
+    own, others = base.item.episode.read("state"), rerun.read("state")
+    if own.shape != others.shape or not np.allclose(own, others, rtol=1e-5, atol=1e-6):
+        raise StoreError(
+            f"{base.name} of {condition.store.path} was made from other states of the robot than its base has: the "
+            "base was recorded again since; make the rerun again."
         )
     return actions
 

@@ -277,6 +277,8 @@ def test_what_does_not_fit_is_refused_in_one_sentence(folder, tmp_path):
     assert "holds none of the 6 selected episodes of its base" in refused(elsewhere)
     shorter = write_rerun(tmp_path / "shorter.zarr", base, PLANTED["noise"], replans=2)
     assert "these are not the same replans" in refused(shorter, StoreError)
+    recorded_again = write_rerun(tmp_path / "again.zarr", base, PLANTED["noise"], seed=5)
+    assert "other states of the robot than its base has" in refused(recorded_again, StoreError)
     with pytest.raises(BadArgument, match="There is no dimension 7 of the action"):
         study_effects(base, [folder / "series" / "noise.zarr"], AnalysisSettings(), dimensions=(7,))
     stranger = rollout(tmp_path / "s", "without_state", lambda *_: True, suite="goal")
