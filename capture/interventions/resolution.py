@@ -229,7 +229,9 @@ def _values(
     if edit.keep:
         group = np.where(others, 1 - group, 0.0)
     if edit.random_seed is not None:
-        count = round(float(group[tokens.valid[0]].sum()))
+        size = float(group[tokens.valid[0]].sum())
+        # An object that covers less than half of a patch has a control, too: one of no keys would change nothing.
+        count = max(1, round(size)) if size > 0 else 0
         keys = np.flatnonzero(others & (group == 0))
         if len(keys) < count:
             raise TooFewKeys(

@@ -107,6 +107,8 @@ def test_the_random_control():
     control = KeyKnockout("object:bowl_1", random_seed=0)  # 1.25 keys
     drawn = {int(np.flatnonzero(values(control, joint(), ReplanPlace(0, 0, i))["joint"] == 0)[0]) for i in range(60)}
     assert drawn == {2, 3, 4, 5, 6, 7}  # neither the object, nor padding, nor actions
+    sliver = joint({"base": np.array([[0.25, 0.0], [0, 0], [0, 0], [0, 0]], dtype=np.float32)})
+    assert (values(control, sliver)["joint"] == 0).sum() == 1
     with pytest.raises(TooFewKeys, match=r"needs 5 keys outside .* replan 7 of task000_episode002, and there are 3"):
         values(KeyKnockout("camera:base | word:the", random_seed=0), joint())
 
