@@ -1,0 +1,132 @@
+"""Tensors of attention calls that are given by queries, keys and masks, and how folded axes are taken apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from vla_attention.capture.torch_policies.attention_calls import MASKED_BELOW, Positions, at_positions, position_numbers
+from vla_attention.capture.torch_policies.call_changes import causal_mask, mask_as_logits
+
+#: Where modules keep their number of heads; asked where a kernel gets (batch · head, query, dim).
+_HEAD_NAMES = ("num_heads", "n_heads", "num_attention_heads", "heads", "n_head", "num_head", "nheads", "nhead")
+
+
+@dataclass(frozen=True)
+class LogitTensors:
+    """A call of queries, keys and values; rows are softmax(scale · query · keyᵀ + mask + change) in float32.
+
+    Attributes:
+        query: (batch, head, query, dim).
+        key, values: (batch, kv_head, key, dim).
+        outputs: of the policy's kernel, (batch, head, query, dim).
+        mask: the policy's mask, bool (True: keep) or additive, (batch or 1, head or 1, query or 1, key); None: none.
+        causal: whether query i sees keys 0..i only, beside the mask.
+        scale: factor of the logits.
+        change: logits that a watcher added, broadcastable to (batch, head, query, key).
+    """
+
+    query: Tensor
+    key: Tensor
+    values: Tensor
+    outputs: Tensor
+    mask: Tensor | None
+    causal: bool
+    scale: float
+    change: Tensor | None
+
+    def value(self) -> Tensor:
+        """Return the values (batch, kv_head, key, dim)."""
+        return self.values
+
+    def output(self) -> Tensor:
+        """Return what the kernel computed, (batch, head, query, dim)."""
+        return self.outputs
+
+    def rows(self, queries: Positions, batch: Positions) -> Tensor:
+        """Return float32 probabilities (batch, head, query, key) of these queries."""
+        logits = query_key_logits(
+            at_positions(at_positions(self.query, 0, batch), 2, queries), at_positions(self.key, 0, batch), self.scale
+        )
+        if self.mask is not None:
+            mask = part(self.mask, queries, batch)
+            logits = logits.masked_fill_(~mask, float("-inf")) if mask.dtype is torch.bool else logits.add_(mask)
+        if self.causal:
+            seen = causal_mask(self._numbers(queries), self.key.shape[2])
+            logits.masked_fill_(~seen, float("-inf"))
+        if self.change is not None:
+            logits.add_(part(self.change, queries, batch))
+        return normalised(logits)
+
+    def allowed(self, queries: Positions) -> Tensor:
+        """Return (batch, query, key) bool."""
+        batch, keys = self.key.shape[0], self.key.shape[2]
+        numbers = self._numbers(queries)
+        seen = torch.ones((batch, len(numbers), keys), dtype=torch.bool, device=self.query.device)
+        if self.mask is not None:
+            mask = part(self.mask, queries, slice(None))
+            seen &= (mask if mask.dtype is torch.bool else mask > MASKED_BELOW).any(1)
+        if self.causal:
+            seen &= causal_mask(numbers, keys)
+        return seen
+
+    def _numbers(self, queries: Positions) -> Tensor:
+        return position_numbers(queries, self.query.shape[2], self.query.device)
+
+
+def query_key_logits(query: Tensor, key: Tensor, scale: float) -> Tensor:
+    """Return scale · query · keyᵀ in float32 (float64 of float64), (batch, head, query, key); heads may share keys."""
+    dtype = torch.promote_types(query.dtype, torch.float32)
+    batch, heads, count, dim = query.shape
+    stacked = (query.to(dtype) * scale).reshape(batch, key.shape[1], heads // key.shape[1] * count, dim)
+    return torch.matmul(stacked, key.to(dtype).transpose(-1, -2)).reshape(batch, heads, count, key.shape[2])
+
+
+def normalised(logits: Tensor) -> Tensor:
+    """Return softmax(logits) over the last axis in float32; a query that sees no key (-inf throughout) gets zeros."""
+    rows = torch.softmax(logits, dim=-1)
+    return rows.masked_fill_(logits.amax(-1, keepdim=True) == float("-inf"), 0.0).float()
+
+
+def part(tensor: Tensor, queries: Positions, batch: Positions) -> Tensor:
+    """Return the wanted queries and batch rows of (batch or 1, head or 1, query or 1, key)."""
+    if tensor.shape[0] > 1:
+        tensor = at_positions(tensor, 0, batch)
+    return at_positions(tensor, 2, queries) if tensor.shape[2] > 1 else tensor
+
+
+def changed_mask(mask: Tensor | None, causal: bool, change: Tensor, queries: int, keys: int) -> tuple[Tensor, Tensor]:
+    """Return the policy's mask and the changed one as float32 logits, (batch or 1, head or 1, query, key)."""
+    before = torch.zeros((1, 1, queries, keys), device=change.device)
+    if mask is not None:
+        before = before + mask_as_logits(mask, torch.float32)
+    if causal:
+        seen = causal_mask(torch.arange(queries, device=change.device), keys)
+        before = before.masked_fill(~seen, float("-inf"))
+    return before, before + change
+
+
+def batch_and_heads(lead: Sequence[int], module: nn.Module | None) -> tuple[int, int]:
+    """Return (batch, heads) of the axes before query and dim (or before query and key).
+
+    Of one axis alone, the number of heads is taken from the module's attributes; without any it is the heads'.
+    """
+    sizes = list(lead)
+    if len(sizes) >= 2:
+        return int(torch.Size(sizes[:-1]).numel()), sizes[-1]
+    if not sizes:
+        return 1, 1
+    heads = _heads_of(module)
+    return (sizes[0] // heads, heads) if heads and sizes[0] % heads == 0 else (1, sizes[0])
+
+
+def _heads_of(module: nn.Module | None) -> int | None:
+    for holder in (module, getattr(module, "config", None)):
+        for name in _HEAD_NAMES:
+            heads = getattr(holder, name, None)
+            if isinstance(heads, int) and not isinstance(heads, bool) and heads > 0:
+                return heads
+    return None

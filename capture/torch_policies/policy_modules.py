@@ -1,0 +1,118 @@
+"""The modules that a policy holds, by path, and policies whose attention no Python code computes."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Iterator, Mapping
+
+import torch
+from torch import nn
+
+from vla_attention.schemas.errors import BadArgument
+
+#: How deep modules are looked for in objects that are no modules.
+_DEPTH = 4
+#: Classes whose instances run a compiled program, by the beginning of their full names.
+_COMPILED = (
+    "torch.jit.", "torch._inductor.package.", "torch_tensorrt.", "tensorrt.", "onnxruntime.",
+    "torch.cuda.graphs.CUDAGraph", "torch._inductor.runtime.", "torch.export.exported_program.", "openvino.",
+)  # fmt: skip
+
+
+class NoModules(BadArgument):
+    """What was given as a policy holds no torch module."""
+
+
+class CannotRunEager(BadArgument):
+    """A policy, or a part of it, that is compiled so that its attention cannot be seen."""
+
+
+def modules_of(policy: object) -> dict[str, nn.Module]:
+    """Return the modules of a policy by path; "" is the policy itself, if it is a module.
+
+    policy: an `nn.Module`, or an object that holds modules in its attributes, in lists or dictionaries too. What
+    `torch.compile` puts around a module is no part of a path.
+
+    Raises:
+        NoModules: no module is found.
+        CannotRunEager: a part is a compiled program: TorchScript, TensorRT, AOTInductor, a CUDA graph ...
+    """
+    policy = getattr(policy, "__self__", policy) if isinstance(policy, types.MethodType) else policy
+    found: dict[str, nn.Module] = {}
+    seen: set[int] = set()
+    for path, part in _parts(policy, "", 0, seen):
+        name = f"{type(part).__module__}.{type(part).__qualname__}"
+        if isinstance(part, torch.jit.ScriptModule) or name.startswith(_COMPILED):
+            raise CannotRunEager(
+                f"{path or 'The policy'} is a compiled program ({name}): its attention cannot be seen, and it cannot "
+                "be made eager. Load the policy as an ordinary torch module; torch.compile is fine."
+            )
+        if isinstance(part, nn.Module):
+            found.setdefault(path, part)
+    if not found:
+        raise NoModules(
+            f"The policy ({type(policy).__name__}) holds no torch module. Give the nn.Module itself, or an object with "
+            "the module among its attributes."
+        )
+    return found
+
+
+def _parts(part: object, path: str, depth: int, seen: set[int]) -> Iterator[tuple[str, object]]:
+    """Yield modules and compiled programs of an object by path, each once."""
+    if id(part) in seen:
+        return
+    seen.add(id(part))
+    if isinstance(part, nn.Module):
+        yield path, part
+        if isinstance(part, torch.jit.ScriptModule):
+            return
+        inner = part._modules.get("_orig_mod")
+        if inner is not None:
+            # torch.compile's wrapper has the path of what it wraps.
+            yield from _parts(inner, path, depth, seen)
+            return
+        for name, child in part._modules.items():
+            if child is not None:
+                yield from _parts(child, _joined(path, name), depth, seen)
+        attributes = {name: held for name, held in part.__dict__.items() if name not in _MODULE_ATTRIBUTES}
+        if depth < _DEPTH:
+            for name, held in attributes.items():
+                yield from _held(held, _joined(path, name), depth + 1, seen)
+    else:
+        yield from _held(part, path, depth, seen)
+
+
+#: What every nn.Module has.
+_MODULE_ATTRIBUTES = frozenset(nn.Module().__dict__)
+
+
+def _held(part: object, path: str, depth: int, seen: set[int]) -> Iterator[tuple[str, object]]:
+    """Yield what an object that is no module holds."""
+    if isinstance(part, nn.Module):
+        yield from _parts(part, path, depth, seen)
+        return
+    plain = (str, bytes, int, float, complex, bool, type(None), torch.Tensor, type, types.ModuleType, torch.dtype)
+    if isinstance(part, plain):
+        return
+    if id(part) in seen and depth:
+        return
+    seen.add(id(part))
+    if f"{type(part).__module__}.{type(part).__qualname__}".startswith(_COMPILED):
+        yield path, part
+        return
+    if depth >= _DEPTH:
+        return
+    if isinstance(part, Mapping):
+        items = [(str(name), held) for name, held in part.items()]
+    elif isinstance(part, list | tuple | set | frozenset):
+        items = [(str(number), held) for number, held in enumerate(part)]
+    elif isinstance(part, types.MethodType):
+        items = []
+    else:
+        items = list(getattr(part, "__dict__", {}).items()) if not callable(type(part).__dict__.get("__get__")) else []
+    for name, held in items:
+        yield from _held(held, _joined(path, name), depth + 1, seen)
+
+
+def _joined(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else name

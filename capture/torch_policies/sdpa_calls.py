@@ -1,0 +1,95 @@
+"""Attention calls through `torch.nn.functional.scaled_dot_product_attention`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall
+from vla_attention.capture.torch_policies.call_changes import check_keys_left, fitted_change
+from vla_attention.capture.torch_policies.call_tensors import LogitTensors, batch_and_heads, changed_mask
+from vla_attention.capture.torch_policies.watched_block import WatchedBlock
+
+FUNCTIONS: tuple[Callable[..., Any], ...] = (
+    torch.nn.functional.scaled_dot_product_attention,
+    torch.ops.aten.scaled_dot_product_attention,
+    torch.ops.aten.scaled_dot_product_attention.default,
+)
+
+
+@dataclass(frozen=True)
+class _Arguments:
+    query: Tensor
+    key: Tensor
+    value: Tensor
+    attn_mask: Tensor | None = None
+    dropout_p: float = 0.0
+    is_causal: bool = False
+    scale: float | None = None
+    enable_gqa: bool = False
+
+
+def watch_call(
+    block: WatchedBlock, function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]
+) -> Any:
+    """Run one call, changed if the watcher says so, and tell the watcher about it."""
+    given = _Arguments(*args, **kwargs)
+    query, key = given.query, given.key
+    where = block.where()
+    *lead, queries, dim = query.shape
+    keys = key.shape[-2]
+    batch, heads = batch_and_heads(lead, where.module)
+    kv_heads = heads
+    if given.enable_gqa and len(lead) >= 2:
+        kv_heads = key.shape[-3]
+    shape = block.new_shape(where, "sdpa", (batch, heads, kv_heads, queries, keys), query.dtype)
+    mask = None
+    if given.attn_mask is not None:
+        full = (*lead, *given.attn_mask.shape[-2:]) if given.attn_mask.ndim > 2 else given.attn_mask.shape
+        mask = _folded_mask(given.attn_mask, full, batch, heads)
+    change = block.change(shape)
+    if change is None:
+        output = function(*args, **kwargs)
+    else:
+        change = fitted_change(change, shape, query.device)
+        before, after = changed_mask(mask, given.is_causal, change, queries, keys)
+        check_keys_left(before, after, shape)
+        # As the kernel wants it: as many axes as the queries have.
+        logits = after.expand(-1, heads, -1, -1).expand(batch, -1, -1, -1).reshape(*lead, queries, keys)
+        output = function(
+            query, key, given.value, logits.to(query.dtype), given.dropout_p, scale=given.scale,
+            enable_gqa=given.enable_gqa,
+        )  # fmt: skip
+    tensors = LogitTensors(
+        query=query.detach().reshape(batch, heads, queries, dim),
+        key=_folded(key, lead, batch, kv_heads),
+        values=_folded(given.value, lead, batch, kv_heads),
+        outputs=output.detach().reshape(batch, heads, queries, given.value.shape[-1]),
+        mask=mask,
+        causal=given.is_causal,
+        scale=dim**-0.5 if given.scale is None else given.scale,
+        change=change,
+    )
+    block.saw(AttentionCall(shape, tensors))
+    return output
+
+
+def _folded(tensor: Tensor, lead: list[int], batch: int, kv_heads: int) -> Tensor:
+    """Return keys or values (..., key, dim) as (batch, kv_head, key, dim)."""
+    tensor = tensor.detach()
+    shared = [*lead[:-1], kv_heads] if len(lead) >= 2 else lead
+    return tensor.expand(*shared, *tensor.shape[-2:]).reshape(batch, kv_heads, *tensor.shape[-2:])
+
+
+def _folded_mask(mask: Tensor, full: Any, batch: int, heads: int) -> Tensor:
+    """Return a mask that can be broadcast to (..., query, key) as (batch or 1, head or 1, query or 1, key)."""
+    mask = mask.detach()
+    if mask.ndim == 4 and len(full) == 4:
+        return mask
+    if mask.ndim <= 2:
+        return mask.reshape(1, 1, *((1,) * (2 - mask.ndim)), *mask.shape)
+    return mask.expand(full).reshape(batch, heads, *mask.shape[-2:])

@@ -1,0 +1,332 @@
+"""Attention calls by hand: a softmax over the last axis, and a product of its result with the values.
+
+The result of the softmax is followed through casts, dropout, transposes and folds to a `matmul`, `bmm` or `einsum`. A
+softmax that meets no values (a classifier, the gate of a mixture of experts) is no attention call.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vla_attention.capture.torch_policies.attention_calls import (
+    MASKED_BELOW,
+    AttentionCall,
+    CallShape,
+    Positions,
+    at_positions,
+)
+from vla_attention.capture.torch_policies.call_changes import ChangeRefused, check_keys_left, fitted_change
+from vla_attention.capture.torch_policies.call_tensors import batch_and_heads, normalised, part
+from vla_attention.capture.torch_policies.softmax_axes import Axes, Product, find_product
+from vla_attention.capture.torch_policies.watched_block import WatchedBlock, Where
+
+SOFTMAXES: tuple[Callable[..., Any], ...] = (
+    torch.softmax, torch.nn.functional.softmax, Tensor.softmax, torch.special.softmax, torch._safe_softmax,
+    torch.ops.aten.softmax, torch.ops.aten.softmax.int, torch.ops.aten._softmax, torch.ops.aten._softmax.default,
+)  # fmt: skip
+_MATMULS = {
+    torch.matmul, torch.bmm, Tensor.matmul, Tensor.bmm, Tensor.__matmul__, Tensor.__rmatmul__, torch.linalg.matmul,
+    torch.ops.aten.matmul, torch.ops.aten.matmul.default, torch.ops.aten.bmm, torch.ops.aten.bmm.default,
+}  # fmt: skip
+#: Functions whose result has the same axes and the same numbers, up to rounding.
+_COPIES = {
+    Tensor.to, Tensor.type, Tensor.type_as, Tensor.float, Tensor.half, Tensor.bfloat16, Tensor.double,
+    Tensor.contiguous, Tensor.clone, torch.clone, Tensor.detach, torch.detach, Tensor.cpu, Tensor.cuda,
+    Tensor.requires_grad_,
+}  # fmt: skip
+#: Functions whose result has the same axes, and numbers that can differ.
+_CHANGES = {
+    torch.nn.functional.dropout, torch.dropout, torch.dropout_, torch.nan_to_num, Tensor.nan_to_num, Tensor.nan_to_num_,
+    torch.mul, Tensor.mul, Tensor.mul_, Tensor.__mul__, Tensor.__rmul__, Tensor.__imul__, torch.div, Tensor.div,
+    Tensor.div_, Tensor.__truediv__, Tensor.__itruediv__, Tensor.masked_fill, Tensor.masked_fill_, torch.masked_fill,
+    torch.where, Tensor.where, torch.clamp, Tensor.clamp, Tensor.clamp_,
+}  # fmt: skip
+_DROPOUTS = {torch.nn.functional.dropout, torch.dropout, torch.dropout_}
+_SWAPS = {
+    torch.transpose, Tensor.transpose, torch.swapaxes, Tensor.swapaxes, torch.swapdims, Tensor.swapdims,
+}  # fmt: skip
+_PERMUTES = {torch.permute, Tensor.permute}
+_MATRIX_TRANSPOSES = {Tensor.mT.__get__, Tensor.mH.__get__}  # type: ignore[attr-defined]
+_FOLDS = {
+    Tensor.view, Tensor.reshape, torch.reshape, Tensor.flatten, torch.flatten, Tensor.unflatten, torch.unflatten,
+    Tensor.squeeze, torch.squeeze, Tensor.unsqueeze, torch.unsqueeze, Tensor.view_as, Tensor.reshape_as,
+}  # fmt: skip
+
+
+@dataclass
+class _Softmax:
+    """A softmax whose result has not met values yet.
+
+    Attributes:
+        where: the module that ran it.
+        shape: of the call, if it is one.
+        logits: what it took, before any change; None if the result was written over them.
+        result: what it returned. Weak, so that what meets no values is not kept.
+        change: logits that the watcher added, (batch or 1, head or 1, query or 1, key or 1).
+    """
+
+    where: Where
+    shape: CallShape
+    logits: Tensor | None
+    result: weakref.ref[Tensor]
+    change: Tensor | None
+
+
+@dataclass(frozen=True)
+class _Followed:
+    """A tensor that comes from a softmax."""
+
+    tensor: weakref.ref[Tensor]
+    softmax: _Softmax
+    axes: Axes
+    altered: bool
+
+
+@dataclass(frozen=True)
+class SoftmaxTensors:
+    """The tensors of a call by hand.
+
+    Attributes:
+        softmax: what the call began with.
+        product: which axes are what.
+        probabilities: as they were multiplied.
+        altered: whether they differ from the softmax's result by more than rounding and the order of axes.
+        values, outputs: the other operand of the product, and its result.
+    """
+
+    softmax: _Softmax
+    product: Product
+    probabilities: Tensor
+    altered: bool
+    values: Tensor
+    outputs: Tensor
+
+    def value(self) -> Tensor:
+        """Return the values (batch, kv_head, key, dim)."""
+        return self.product.values_of(self.values.detach())
+
+    def output(self) -> Tensor:
+        """Return what the product computed, (batch, head, query, dim)."""
+        return self.product.output_of(self.outputs.detach())
+
+    def rows(self, queries: Positions, batch: Positions) -> Tensor:
+        """Return float32 probabilities (batch, head, query, key) of these queries."""
+        softmax, result = self.softmax, self.softmax.result()
+        if self.altered or softmax.logits is None:
+            return self._part(self.product.rows_of(self.probabilities.detach()), queries, batch).float()
+        if result is not None and torch.finfo(result.dtype).bits >= 32:
+            return self._part(self._in_order(result.detach()), queries, batch).float()
+        # Rounded to the compute precision, probabilities would not sum to 1.
+        logits = self._part(self._in_order(softmax.logits.detach()), queries, batch)
+        logits = logits.to(torch.promote_types(logits.dtype, torch.float32))
+        return normalised(logits if softmax.change is None else logits + part(softmax.change, queries, batch))
+
+    def allowed(self, queries: Positions) -> Tensor:
+        """Return (batch, query, key) bool: where the logits are those of no mask in any head."""
+        if self.softmax.logits is None or self.softmax.logits.shape[-1] != self.product.axes.sizes[-1]:
+            return (self.rows(queries, slice(None)) > 0).any(1)
+        logits = self._part(self._in_order(self.softmax.logits.detach()), queries, slice(None)).float()
+        highest = logits.amax(-1, keepdim=True)
+        return ((logits > highest + MASKED_BELOW) & (highest > MASKED_BELOW)).any(1)
+
+    def _in_order(self, tensor: Tensor) -> Tensor:
+        product, keys = self.product, self.product.axes.key
+        return tensor.reshape(*product.axes.sizes[:-1], tensor.shape[-1]).permute(
+            *product.batch, *product.heads, product.query, keys
+        )
+
+    def _part(self, tensor: Tensor, queries: Positions, batch: Positions) -> Tensor:
+        """Take queries and batch rows of (*batch, *heads, query, key)."""
+        tensor = at_positions(tensor, tensor.ndim - 2, queries)
+        sizes = (self.product.size(self.product.batch), self.product.size(self.product.heads))
+        return at_positions(tensor.reshape(*sizes, *tensor.shape[-2:]), 0, batch)
+
+
+class Softmaxes:
+    """Follows the results of softmaxes in one thread to their products with values."""
+
+    def __init__(self, block: WatchedBlock) -> None:
+        self._block = block
+        self._followed: dict[int, _Followed] = {}
+
+    @property
+    def open(self) -> bool:
+        """Whether a tensor is followed."""
+        return bool(self._followed)
+
+    def softmax(self, function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
+        """Run a softmax, changed if the watcher says so, and follow its result."""
+        if not self._may_attend(function, args, kwargs):
+            return function(*args, **kwargs)
+        name = "self" if "self" in kwargs else "input"
+        logits: Tensor = args[0] if args else kwargs[name]
+        *lead, queries, keys = logits.shape
+        where = self._block.where()
+        # Of (batch, kv_head, group, query, key), the heads are both; of one axis, the module tells the heads.
+        batch, heads = (lead[0], lead[1] * lead[2]) if len(lead) == 3 else batch_and_heads(lead, where.module)
+        shape = self._block.new_shape(where, "softmax", (batch, heads, heads, queries, keys), logits.dtype)
+        change = self._block.change(shape)
+        if change is None:
+            result = function(*args, **kwargs)
+        else:
+            change = fitted_change(change, shape, logits.device)
+            changed = logits + change.expand(batch, heads, queries, keys).reshape(logits.shape).to(logits.dtype)
+            check_keys_left(
+                logits.reshape(batch, heads, queries, keys), changed.reshape(batch, heads, queries, keys), shape
+            )
+            result = function(changed, *args[1:], **kwargs) if args else function(**{**kwargs, name: changed})
+        sizes = (batch, heads, queries, keys) if len(lead) == 1 else tuple(logits.shape)
+        first = ((0, 1), (2,), (3,)) if len(lead) == 1 else tuple((axis,) for axis in range(len(sizes)))
+        overwritten = result.data_ptr() == logits.data_ptr()
+        softmax = _Softmax(where, shape, None if overwritten else logits, weakref.ref(result), change)
+        self._follow(result, _Followed(weakref.ref(result), softmax, Axes(sizes, first), altered=False))
+        return result
+
+    def follow(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
+        """Run any other function, and follow what comes of a softmax's result."""
+        given = next((found for found in map(self._found, (*args, *kwargs.values())) if found is not None), None)
+        result = function(*args, **kwargs)
+        if given is None:
+            return result
+        if function in _MATMULS or function is torch.einsum:
+            self._product(function, args, kwargs, result)
+        elif isinstance(result, Tensor) and result.ndim:
+            axes = _axes_after(function, args, kwargs, given, result)
+            if axes is not None:
+                altered = given.altered or (function not in _SAME_NUMBERS and not _no_dropout(function, args, kwargs))
+                self._follow(result, replace(given, tensor=weakref.ref(result), axes=axes, altered=altered))
+        return result
+
+    def _may_attend(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> bool:
+        logits = args[0] if args else kwargs.get("input", kwargs.get("self"))
+        axis = args[1] if len(args) > 1 else kwargs.get("dim", kwargs.get("axis"))
+        return isinstance(logits, Tensor) and 3 <= logits.ndim <= 5 and axis in (-1, logits.ndim - 1)
+
+    def _found(self, given: object) -> _Followed | None:
+        followed = self._followed.get(id(given))
+        return followed if followed is not None and followed.tensor() is given else None
+
+    def _follow(self, tensor: Tensor, followed: _Followed) -> None:
+        number, all_followed = id(tensor), self._followed
+        reference = weakref.ref(tensor, lambda gone: _forget(all_followed, number, gone))
+        all_followed[number] = replace(followed, tensor=reference)
+
+    def _product(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], result: Any) -> None:
+        if function is torch.einsum:
+            equation, *operands = args
+            if len(operands) == 1 and isinstance(operands[0], list | tuple):
+                operands = list(operands[0])
+        else:
+            equation, operands = None, [*args, *kwargs.values()][:2]
+            if function is Tensor.__rmatmul__:
+                operands.reverse()
+        if len(operands) != 2 or not all(isinstance(operand, Tensor) for operand in operands):
+            return
+        letters = _letters(equation, operands[0].ndim, operands[1].ndim)
+        if letters is None:
+            return
+        first, second, out = letters
+        for given, values, own, other in ((0, 1, first, second), (1, 0, second, first)):
+            followed = self._found(operands[given])
+            if followed is None:
+                continue
+            product = find_product(followed.axes, own, other, out, operands[values].shape)
+            if product is not None:
+                self._saw(followed, product, operands[given], operands[values], result)
+                return
+
+    def _saw(
+        self, followed: _Followed, product: Product, probabilities: Tensor, values: Tensor, result: Tensor
+    ) -> None:
+        softmax = followed.softmax
+        batch, heads, kv_heads, queries, keys = product.sizes
+        before = softmax.shape
+        if softmax.change is not None and (batch, heads, queries) != (before.batch, before.heads, before.queries):
+            raise ChangeRefused(
+                f"The attention call {before} cannot be changed: its product with the values shows other axes "
+                f"(batch {batch}, {heads} heads, {queries} queries) than the softmax. Leave this call out."
+            )
+        shape = replace(before, batch=batch, heads=heads, kv_heads=kv_heads, queries=queries, keys=keys)
+        # Other tensors that come from this softmax need not be followed any more.
+        for number in [number for number, other in self._followed.items() if other.softmax is softmax]:
+            del self._followed[number]
+        tensors = SoftmaxTensors(softmax, product, probabilities, followed.altered, values, result)
+        self._block.saw(AttentionCall(shape, tensors))
+
+
+_SAME_NUMBERS = {*_COPIES, *_SWAPS, *_PERMUTES, *_MATRIX_TRANSPOSES, *_FOLDS}
+
+
+def _axes_after(
+    function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], given: _Followed, result: Tensor
+) -> Axes | None:
+    """Return the axes of what a function made of a followed tensor, None if it cannot be followed."""
+    before, axes = given.tensor(), given.axes
+    assert before is not None
+    if function in _COPIES or function in _CHANGES:
+        return axes if result.shape == before.shape else None
+    if function in _MATRIX_TRANSPOSES:
+        order = list(range(before.ndim))
+        order[-2:] = reversed(order[-2:])
+        return axes.permuted(order)
+    if function in _SWAPS:
+        first, second = [*args[1:], *kwargs.values()][:2]
+        order = list(range(before.ndim))
+        order[first], order[second] = order[second], order[first]
+        return axes.permuted(order)
+    if function in _PERMUTES:
+        positions = args[1:] or tuple(kwargs.values())
+        return axes.permuted(positions if isinstance(positions[0], int) else positions[0])
+    if function in _FOLDS:
+        return axes.refolded(result.shape)
+    if function is Tensor.__getitem__ and result.ndim == before.ndim:
+        # Keys may be cut off, as those of attention sinks are.
+        key = axes.key_position()
+        same = all(result.shape[axis] == before.shape[axis] for axis in range(before.ndim) if axis != key)
+        return axes.with_keys(result.shape[key]) if key is not None and same else None
+    return None
+
+
+def _no_dropout(function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> bool:
+    if function not in _DROPOUTS:
+        return False
+    rate, training = dict(enumerate(args)).get(1, kwargs.get("p", 0.5)), dict(enumerate(args)).get(2)
+    if training is None:
+        training = kwargs.get("training", kwargs.get("train", True))
+    return not training or rate == 0
+
+
+def _letters(equation: str | None, first: int, second: int) -> tuple[str, str, str] | None:
+    """Return the letters of both operands and of the result; of a matmul (equation None) as einsum would write it."""
+    spare = [chr(number) for number in range(0x3B1, 0x3B1 + 24)]
+    if equation is None:
+        if min(first, second) < 2:
+            return None
+        batch = "".join(spare[: max(first, second) - 2])
+        own, other = batch[len(batch) - (first - 2) :], batch[len(batch) - (second - 2) :]
+        return f"{own}mk", f"{other}kn", f"{batch}mn"
+    if not isinstance(equation, str):
+        return None
+    inputs, arrow, out = equation.replace(" ", "").partition("->")
+    operands = inputs.split(",")
+    if len(operands) != 2:
+        return None
+    if not arrow:
+        once = sorted(letter for letter in set(inputs) - {",", "."} if inputs.count(letter) == 1)
+        out = ("..." if "..." in inputs else "") + "".join(once)
+    rest = [ndim - len(operand.replace("...", "")) for ndim, operand in zip((first, second), operands, strict=True)]
+    dots = ["".join(spare[max(rest) - count : max(rest)]) for count in rest]
+    written = [operand.replace("...", dot) for operand, dot in zip(operands, dots, strict=True)]
+    return written[0], written[1], out.replace("...", "".join(spare[: max(rest)]))
+
+
+def _forget(followed: dict[int, _Followed], number: int, gone: weakref.ref[Tensor]) -> None:
+    found = followed.get(number)
+    if found is not None and found.tensor is gone:
+        del followed[number]

@@ -1,0 +1,124 @@
+"""Seeing every attention call of a torch policy while its own code runs.
+
+One `TorchFunctionMode` sees the functions that compute attention. Compiled parts run eager meanwhile, and the fast path
+of `nn.MultiheadAttention`, which nothing sees, is off. The policy's own kernels compute what it returns: with nothing
+changed, actions are bit-equal with those of the same policy run eager with the fast path off.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch.overrides import TorchFunctionMode
+
+from vla_attention.capture.torch_policies import flex_calls, multihead_calls, sdpa_calls, softmax_calls
+from vla_attention.capture.torch_policies.attention_calls import Watcher
+from vla_attention.capture.torch_policies.policy_modules import modules_of
+from vla_attention.capture.torch_policies.watched_block import WatchedBlock
+from vla_attention.schemas.errors import BadArgument
+
+#: Operators that compute attention in a way that gives no rows, by their full names.
+_ATTENTION_OPERATOR = re.compile(
+    r"(flash_attn|flash_attn_\w+|xformers|sageattention|torch_attn|spas_sage_attn)::(?!.*rotary)"
+    r"|.*(attention|attn|fmha)(?!.*(mask|rotary|metadata))"
+)
+_LOAD_WITH_SDPA = (
+    "Load the model with SDPA: attn_implementation='sdpa' in transformers, the option that turns flash attention or "
+    "xformers off elsewhere."
+)
+_OPERATORS = (torch._ops.OpOverload, torch._ops.OpOverloadPacket)
+_ACTIVE = threading.Lock()
+
+
+class AlreadyWatched(BadArgument):
+    """A block inside another one, or two at the same time."""
+
+
+class UnseenAttention(BadArgument):
+    """An operator computes attention in a way that gives no rows."""
+
+
+@contextmanager
+def watch_attention(policy: object, watcher: Watcher) -> Iterator[None]:
+    """Tell `watcher` about every attention call of `policy` inside the block, in whatever thread it runs.
+
+    policy: an `nn.Module`, or an object that holds modules.
+
+    Raises:
+        AlreadyWatched: another block is open in this process.
+        NoModules, CannotRunEager: see `modules_of`.
+        OtherPolicy: attention of a module that the policy does not hold ran in the block.
+        UnseenAttention: an attention operator ran that gives no rows, such as those of flash-attn.
+        ChangeRefused: a change that does not fit its call, or that the call does not allow.
+    """
+    modules = modules_of(policy)
+    if not _ACTIVE.acquire(blocking=False):
+        raise AlreadyWatched(
+            "Attention is already recorded in another block of this process: blocks cannot be inside each other, and "
+            "one block records one policy. Close the other block first."
+        )
+    try:
+        block = WatchedBlock(policy, modules, watcher)
+        with seen_by_python(), block.following_modules(lambda: _Mode(block)), _Mode(block):
+            yield
+        if block.error is not None:
+            raise block.error
+    finally:
+        _ACTIVE.release()
+
+
+@contextmanager
+def seen_by_python() -> Iterator[None]:
+    """Run compiled code eager, with the fast path of `nn.MultiheadAttention` off; both are as before afterwards."""
+    fast_path = torch.backends.mha.get_fastpath_enabled()
+    torch.backends.mha.set_fastpath_enabled(False)
+    try:
+        with torch.compiler.set_stance("force_eager"):
+            yield
+    finally:
+        torch.backends.mha.set_fastpath_enabled(fast_path)
+
+
+class _Mode(TorchFunctionMode):
+    """Sees the torch functions of one thread."""
+
+    def __init__(self, block: WatchedBlock) -> None:
+        super().__init__()
+        self._block = block
+        self._softmaxes = softmax_calls.Softmaxes(block)
+        self._handlers: dict[Any, Callable[..., Any]] = {
+            **{function: self._attend(sdpa_calls.watch_call) for function in sdpa_calls.FUNCTIONS},
+            **{function: self._attend(multihead_calls.watch_call) for function in multihead_calls.FUNCTIONS},
+            **{function: self._attend(flex_calls.watch_call) for function in flex_calls.FUNCTIONS},
+            **dict.fromkeys(softmax_calls.SOFTMAXES, self._softmaxes.softmax),
+        }
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        handler = self._handlers.get(func)
+        if handler is not None:
+            return handler(func, args, kwargs or {})
+        if isinstance(func, _OPERATORS):
+            _refuse_unseen(func)
+        if self._softmaxes.open:
+            return self._softmaxes.follow(func, args, kwargs or {})
+        return func(*args, **kwargs) if kwargs else func(*args)
+
+    def _attend(self, watch_call: Callable[..., Any]) -> Callable[..., Any]:
+        def attend(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+            return watch_call(self._block, func, args, kwargs)
+
+        return attend
+
+
+def _refuse_unseen(operator: Any) -> None:
+    """Raise `UnseenAttention` for an attention operator that no handler knows."""
+    name = str(getattr(operator, "_qualified_op_name", None) or operator.name())
+    if _ATTENTION_OPERATOR.match(name):
+        raise UnseenAttention(f"The operator {name} computes attention in a way that gives no rows. {_LOAD_WITH_SDPA}")

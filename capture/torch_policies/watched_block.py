@@ -1,0 +1,171 @@
+"""One watched block: which module is running, in whatever thread, and what the watcher is told."""
+
+from __future__ import annotations
+
+import functools
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape, Kind, Watcher
+from vla_attention.schemas.errors import BadArgument
+
+
+class OtherPolicy(BadArgument):
+    """Attention of modules that the watched policy does not hold."""
+
+
+@dataclass(frozen=True)
+class Where:
+    """The innermost module that is running: its path in the policy, and itself (None outside every module)."""
+
+    path: str
+    module: nn.Module | None
+
+
+class _ThreadState(threading.local):
+    """What belongs to one thread: the modules whose forward is running, and whether its calls are seen."""
+
+    def __init__(self) -> None:
+        self.running: list[nn.Module] = []
+        self.seen = False
+
+
+class WatchedBlock:
+    """What `watch_attention` and the kinds of calls share during one block."""
+
+    def __init__(self, policy: object, modules: Mapping[str, nn.Module], watcher: Watcher) -> None:
+        self.policy = policy
+        self.paths = {id(module): path for path, module in modules.items()}
+        self.watcher = watcher
+        #: The first error of a thread other than the block's, which the block raises at its end.
+        self.error: BaseException | None = None
+        self._modules = modules
+        self._number = 0
+        self._lock = threading.RLock()
+        self._thread = _ThreadState()
+        self._home = threading.get_ident()
+
+    def where(self) -> Where:
+        """Return the innermost module of the policy whose forward is running in this thread.
+
+        Raises:
+            OtherPolicy: a module that the policy does not hold is running, and none of the policy's is.
+        """
+        if self._thread.running:
+            module = self._thread.running[-1]
+            return Where(self.paths[id(module)], module)
+        foreign = None
+        for owner in _frame_owners():
+            if id(owner) in self.paths:
+                return Where(self.paths[id(owner)], owner if isinstance(owner, nn.Module) else None)
+            if owner is self.policy:
+                return Where("", None)
+            if foreign is None and isinstance(owner, nn.Module):
+                foreign = owner
+        if foreign is None:
+            return Where("", None)
+        raise OtherPolicy(
+            f"Attention ran in a module of class {type(foreign).__name__}, which the watched policy "
+            f"({type(self.policy).__name__}) does not hold: one block records one policy. Call the other model outside "
+            "the block, or give the object that holds both."
+        )
+
+    def new_shape(
+        self, where: Where, kind: Kind, sizes: tuple[int, int, int, int, int], dtype: torch.dtype
+    ) -> CallShape:
+        """Return the shape of the call that comes next; sizes: batch, heads, kv_heads, queries, keys."""
+        batch, heads, kv_heads, queries, keys = sizes
+        return CallShape(
+            module=where.path, kind=kind, number=self._number, batch=batch, heads=heads, kv_heads=kv_heads,
+            queries=queries, keys=keys, dtype=str(dtype).removeprefix("torch."),
+        )  # fmt: skip
+
+    def change(self, shape: CallShape) -> Tensor | None:
+        """Ask the watcher for a change of the call that comes next."""
+        with self._lock, torch.no_grad():
+            return self.watcher.change(shape)
+
+    def saw(self, call: AttentionCall) -> None:
+        """Tell the watcher about a call, and count it."""
+        with self._lock, torch.no_grad():
+            if call.shape.number != self._number:  # another call came in between, in this thread or in another
+                call = AttentionCall(replace(call.shape, number=self._number), call.tensors)
+            self._number += 1
+            self.watcher.saw(call)
+
+    @property
+    def count(self) -> int:
+        """How many attention calls the block has seen so far."""
+        return self._number
+
+    @contextmanager
+    def following_modules(self, mode: Callable[[], AbstractContextManager[object]]) -> Iterator[None]:
+        """Keep track of which modules run, and see the calls of every thread that runs one of them.
+
+        Function modes belong to threads. A module that is called in a thread where none is active enters one for its
+        forward. Hooks would not do: `module.forward(...)` skips them, and so do some fast paths.
+        """
+        kept = [(module, module.__dict__.get("forward")) for module in self._modules.values() if _may_attend(module)]
+        self._thread.seen = True
+        try:
+            for module, _ in kept:
+                module.__dict__["forward"] = self._followed(module, module.forward, mode)
+            yield
+        finally:
+            self._thread.seen = False
+            for module, forward in kept:
+                if forward is None:
+                    module.__dict__.pop("forward", None)
+                else:
+                    module.__dict__["forward"] = forward
+
+    def _followed(
+        self, module: nn.Module, forward: Callable[..., Any], mode: Callable[[], AbstractContextManager[object]]
+    ) -> Callable[..., Any]:
+        thread = self._thread
+
+        @functools.wraps(forward)
+        def followed(*args: Any, **kwargs: Any) -> Any:
+            if not thread.seen:
+                return in_other_thread(args, kwargs)
+            thread.running.append(module)
+            try:
+                return forward(*args, **kwargs)
+            finally:
+                thread.running.pop()
+
+        def in_other_thread(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+            try:
+                with mode():
+                    thread.seen = True
+                    try:
+                        return followed(*args, **kwargs)
+                    finally:
+                        thread.seen = False
+            except BaseException as error:
+                self.error = self.error or error
+                raise
+
+        return followed
+
+
+def _may_attend(module: nn.Module) -> bool:
+    """Whether attention can run in a module's own forward: not in torch's modules without children."""
+    return bool(module._modules) or not type(module).__module__.startswith("torch.nn.")
+
+
+def _frame_owners() -> Iterator[object]:
+    """Yield the `self` of the functions that are running, the innermost first."""
+    frame = sys._getframe(2)
+    while frame is not None:
+        code = frame.f_code
+        if code.co_argcount and code.co_varnames[0] == "self":
+            yield frame.f_locals.get("self")
+        frame = frame.f_back  # type: ignore[assignment]
