@@ -49,6 +49,7 @@ class Role(IntEnum):
     TEXT = 13
     NULL = 14
     ABSENT = 15
+    LEARNED = 16
 
     @property
     def label(self) -> str:

@@ -29,9 +29,9 @@ _COVERAGE_TOLERANCE = 1e-3
 _GRAM_TOLERANCE = 1e-4
 
 _ROLES_OF_KIND: dict[SpanKind, tuple[Role, ...]] = {
-    "image": (Role.IMAGE, Role.MASKED_IMAGE),
+    "image": (Role.IMAGE, Role.MASKED_IMAGE, Role.BLANK),
     "text": (Role.BOS, Role.TEMPLATE, Role.INSTRUCTION, Role.STATE, Role.PADDING, Role.TEXT, Role.NULL),
-    "state": (Role.STATE,),
+    "state": (Role.STATE, Role.LEARNED),
     "action": (Role.ACTION,),
     "latent": (
         Role.IMAGE,
