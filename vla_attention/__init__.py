@@ -5,14 +5,15 @@
     run = va.open("runs/libero_10.zarr")    # a store, or several that are analysed as one
     run.ratios()                            # a polars frame; docs/python.md lists the other methods
 
-Public names: `open` and `OpenStores` (stage two), `UserError` (the base of every error that a user can cause) and
-`__version__`. `vla_attention.datasets` reads data sets of robots. `vla_attention.testing` makes small stores with known
-content. This import loads neither torch nor zarr, polars or numpy.
+Public names: `open` and `OpenStores` (stage two), `inspect` (attention calls of a torch policy), `UserError` (the base
+of every error that a user can cause) and `__version__`. `vla_attention.datasets` reads data sets of robots.
+`vla_attention.testing` makes small stores with known content. This import loads neither torch nor zarr, polars or
+numpy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,8 +21,9 @@ from vla_attention.schemas.errors import UserError
 
 if TYPE_CHECKING:
     from vla_attention.analyze.api import OpenStores
+    from vla_attention.capture.torch_policies.inspect_calls import CallTable
 
-__all__ = ["OpenStores", "UserError", "__version__", "open"]
+__all__ = ["OpenStores", "UserError", "__version__", "inspect", "open"]
 
 
 def open(stores: str | Path | Sequence[str | Path]) -> OpenStores:
@@ -39,6 +41,21 @@ def open(stores: str | Path | Sequence[str | Path]) -> OpenStores:
     from vla_attention.analyze.api import open_stores
 
     return open_stores(stores)
+
+
+def inspect(policy: object, call: Callable[[], object]) -> CallTable:
+    """Return a table of every attention call that `call()` makes in a torch policy; printed, it fits a screen.
+
+        va.inspect(policy, lambda: policy.select_action(batch))
+
+    Raises:
+        NoAttention: no attention was seen.
+        UserError: the policy cannot be watched; the sentence says why, and what to do.
+    """
+    # Imported here: `import vla_attention` loads no torch.
+    from vla_attention.capture.torch_policies.inspect_calls import inspect as inspect_calls
+
+    return inspect_calls(policy, call)
 
 
 def __getattr__(name: str) -> Any:

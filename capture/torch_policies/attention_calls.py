@@ -6,7 +6,8 @@ computed beside it, for the wanted queries only.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -96,12 +97,12 @@ class AttentionCall:
 
     def rows(self, queries: Positions = slice(None), batch: Positions = slice(None)) -> Tensor:
         """Return the probabilities of these queries, (batch, head, query, key) float32, exact zeros where masked."""
-        with torch.no_grad():
+        with _exact():
             return self.tensors.rows(queries, batch)
 
     def allowed(self, queries: Positions = slice(None)) -> Tensor:
         """Return (batch, query, key) bool: keys that the policy's mask lets the query see in any head."""
-        with torch.no_grad():
+        with _exact():
             return self.tensors.allowed(queries)
 
     def product_error(self, rows: Tensor, queries: Positions = slice(None), batch: Positions = slice(None)) -> float:
@@ -110,9 +111,11 @@ class AttentionCall:
         rows: (batch, head, query, key) of the same queries and batch rows. Rows that are those of the kernel give
         rounding errors: some 1e-7 where it computes in float32, some 1e-3 to 1e-2 where in bfloat16.
         """
-        with torch.no_grad():
-            value = at_positions(self.value, 0, batch).float()
-            output = at_positions(at_positions(self.output, 0, batch), 2, queries).float()
+        # Both as the policy computes them, under its autocast if it has one.
+        value, kernel = self.value, self.output
+        with _exact():
+            value = at_positions(value, 0, batch).float()
+            output = at_positions(at_positions(kernel, 0, batch), 2, queries).float()
             size, heads, count, keys = rows.shape
             # Heads that share a value head become extra queries of that head, without copies of the values.
             stacked = rows.reshape(size, value.shape[1], heads // value.shape[1] * count, keys)
@@ -136,6 +139,16 @@ class Watcher(Protocol):
     def saw(self, call: AttentionCall) -> None:
         """Take what is wanted of a call, right after its kernel; in order."""
         ...
+
+
+@contextmanager
+def _exact() -> Iterator[None]:
+    """Compute without gradients, and in the dtypes that are written, whatever autocast the policy runs under."""
+    with torch.no_grad(), ExitStack() as stack:
+        for device in ("cpu", "cuda"):
+            if torch.is_autocast_enabled(device):
+                stack.enter_context(torch.autocast(device, enabled=False))
+        yield
 
 
 def at_positions(tensor: Tensor, axis: int, positions: Positions) -> Tensor:

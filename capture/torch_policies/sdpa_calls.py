@@ -39,6 +39,9 @@ def watch_call(
     """Run one call, changed if the watcher says so, and tell the watcher about it."""
     given = _Arguments(*args, **kwargs)
     query, key = given.query, given.key
+    dtype = query.dtype
+    if torch.is_autocast_enabled(query.device.type):
+        dtype = torch.get_autocast_dtype(query.device.type)
     where = block.where()
     *lead, queries, dim = query.shape
     keys = key.shape[-2]
@@ -46,7 +49,7 @@ def watch_call(
     kv_heads = heads
     if given.enable_gqa and len(lead) >= 2:
         kv_heads = key.shape[-3]
-    shape = block.new_shape(where, "sdpa", (batch, heads, kv_heads, queries, keys), query.dtype)
+    shape = block.new_shape(where, "sdpa", (batch, heads, kv_heads, queries, keys), dtype)
     mask = None
     if given.attn_mask is not None:
         full = (*lead, *given.attn_mask.shape[-2:]) if given.attn_mask.ndim > 2 else given.attn_mask.shape
@@ -61,13 +64,13 @@ def watch_call(
         # As the kernel wants it: as many axes as the queries have.
         logits = after.expand(-1, heads, -1, -1).expand(batch, -1, -1, -1).reshape(*lead, queries, keys)
         output = function(
-            query, key, given.value, logits.to(query.dtype), given.dropout_p, scale=given.scale,
+            query, key, given.value, logits.to(dtype), given.dropout_p, scale=given.scale,
             enable_gqa=given.enable_gqa,
         )  # fmt: skip
     tensors = LogitTensors(
-        query=query.detach().reshape(batch, heads, queries, dim),
-        key=_folded(key, lead, batch, kv_heads),
-        values=_folded(given.value, lead, batch, kv_heads),
+        query=query.detach().to(dtype).reshape(batch, heads, queries, dim),
+        key=_folded(key.to(dtype), lead, batch, kv_heads),
+        values=_folded(given.value.to(dtype), lead, batch, kv_heads),
         outputs=output.detach().reshape(batch, heads, queries, given.value.shape[-1]),
         mask=mask,
         causal=given.is_causal,

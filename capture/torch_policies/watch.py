@@ -7,7 +7,6 @@ changed, actions are bit-equal with those of the same policy run eager with the 
 
 from __future__ import annotations
 
-import re
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,28 +18,21 @@ from torch.overrides import TorchFunctionMode
 from vla_attention.capture.torch_policies import flex_calls, multihead_calls, sdpa_calls, softmax_calls
 from vla_attention.capture.torch_policies.attention_calls import Watcher
 from vla_attention.capture.torch_policies.policy_modules import modules_of
+from vla_attention.capture.torch_policies.unseen_attention import (
+    ATTENTION_OPERATOR,
+    LOAD_WITH_SDPA,
+    UnseenAttention,
+    refuse_unseen_settings,
+)
 from vla_attention.capture.torch_policies.watched_block import WatchedBlock
 from vla_attention.schemas.errors import BadArgument
 
-#: Operators that compute attention in a way that gives no rows, by their full names.
-_ATTENTION_OPERATOR = re.compile(
-    r"(flash_attn|flash_attn_\w+|xformers|sageattention|torch_attn|spas_sage_attn)::(?!.*rotary)"
-    r"|.*(attention|attn|fmha)(?!.*(mask|rotary|metadata))"
-)
-_LOAD_WITH_SDPA = (
-    "Load the model with SDPA: attn_implementation='sdpa' in transformers, the option that turns flash attention or "
-    "xformers off elsewhere."
-)
 _OPERATORS = (torch._ops.OpOverload, torch._ops.OpOverloadPacket)
 _ACTIVE = threading.Lock()
 
 
 class AlreadyWatched(BadArgument):
     """A block inside another one, or two at the same time."""
-
-
-class UnseenAttention(BadArgument):
-    """An operator computes attention in a way that gives no rows."""
 
 
 @contextmanager
@@ -53,10 +45,13 @@ def watch_attention(policy: object, watcher: Watcher) -> Iterator[None]:
         AlreadyWatched: another block is open in this process.
         NoModules, CannotRunEager: see `modules_of`.
         OtherPolicy: attention of a module that the policy does not hold ran in the block.
-        UnseenAttention: an attention operator ran that gives no rows, such as those of flash-attn.
+        StillRunning: the policy still runs in another thread at the end.
+        UnseenAttention: the policy is set to attention that gives no rows, such as flash-attn's, or an operator that
+            computes attention so ran.
         ChangeRefused: a change that does not fit its call, or that the call does not allow.
     """
     modules = modules_of(policy)
+    refuse_unseen_settings(modules)
     if not _ACTIVE.acquire(blocking=False):
         raise AlreadyWatched(
             "Attention is already recorded in another block of this process: blocks cannot be inside each other, and "
@@ -64,10 +59,13 @@ def watch_attention(policy: object, watcher: Watcher) -> Iterator[None]:
         )
     try:
         block = WatchedBlock(policy, modules, watcher)
-        with seen_by_python(), block.following_modules(lambda: _Mode(block)), _Mode(block):
-            yield
-        if block.error is not None:
-            raise block.error
+        try:
+            with seen_by_python(), block.following_modules(lambda: _Mode(block)), _Mode(block):
+                yield
+        except BaseException:
+            block.abandon()
+            raise
+        block.close()
     finally:
         _ACTIVE.release()
 
@@ -105,7 +103,7 @@ class _Mode(TorchFunctionMode):
         if handler is not None:
             return handler(func, args, kwargs or {})
         if isinstance(func, _OPERATORS):
-            _refuse_unseen(func)
+            self._refuse_unseen(func)
         if self._softmaxes.open:
             return self._softmaxes.follow(func, args, kwargs or {})
         return func(*args, **kwargs) if kwargs else func(*args)
@@ -116,9 +114,10 @@ class _Mode(TorchFunctionMode):
 
         return attend
 
-
-def _refuse_unseen(operator: Any) -> None:
-    """Raise `UnseenAttention` for an attention operator that no handler knows."""
-    name = str(getattr(operator, "_qualified_op_name", None) or operator.name())
-    if _ATTENTION_OPERATOR.match(name):
-        raise UnseenAttention(f"The operator {name} computes attention in a way that gives no rows. {_LOAD_WITH_SDPA}")
+    def _refuse_unseen(self, operator: Any) -> None:
+        """Raise `UnseenAttention` for an attention operator that no handler knows."""
+        name = str(getattr(operator, "_qualified_op_name", None) or operator.name())
+        if ATTENTION_OPERATOR.match(name):
+            raise self._block.failed(
+                UnseenAttention(f"The operator {name} computes attention in a way that gives no rows. {LOAD_WITH_SDPA}")
+            )

@@ -21,6 +21,10 @@ class OtherPolicy(BadArgument):
     """Attention of modules that the watched policy does not hold."""
 
 
+class StillRunning(BadArgument):
+    """A block that ends while the policy runs in another thread."""
+
+
 @dataclass(frozen=True)
 class Where:
     """The innermost module that is running: its path in the policy, and itself (None outside every module)."""
@@ -44,13 +48,14 @@ class WatchedBlock:
         self.policy = policy
         self.paths = {id(module): path for path, module in modules.items()}
         self.watcher = watcher
-        #: The first error of a thread other than the block's, which the block raises at its end.
+        #: The first error of watching, which the block raises at its end if the policy's code went on without it.
         self.error: BaseException | None = None
         self._modules = modules
         self._number = 0
         self._lock = threading.RLock()
         self._thread = _ThreadState()
-        self._home = threading.get_ident()
+        self._elsewhere = 0
+        self._closed = False
 
     def where(self) -> Where:
         """Return the innermost module of the policy whose forward is running in this thread.
@@ -71,10 +76,12 @@ class WatchedBlock:
                 foreign = owner
         if foreign is None:
             return Where("", None)
-        raise OtherPolicy(
-            f"Attention ran in a module of class {type(foreign).__name__}, which the watched policy "
-            f"({type(self.policy).__name__}) does not hold: one block records one policy. Call the other model outside "
-            "the block, or give the object that holds both."
+        raise self.failed(
+            OtherPolicy(
+                f"Attention ran in a module of class {type(foreign).__name__}, which the watched policy "
+                f"({type(self.policy).__name__}) does not hold: one block records one policy. Call the other model "
+                "outside the block, or give the object that holds both."
+            )
         )
 
     def new_shape(
@@ -89,21 +96,53 @@ class WatchedBlock:
 
     def change(self, shape: CallShape) -> Tensor | None:
         """Ask the watcher for a change of the call that comes next."""
-        with self._lock, torch.no_grad():
-            return self.watcher.change(shape)
+        with self._lock, torch.no_grad(), self._failing():
+            return None if self._closed else self.watcher.change(shape)
 
     def saw(self, call: AttentionCall) -> None:
         """Tell the watcher about a call, and count it."""
-        with self._lock, torch.no_grad():
+        with self._lock, torch.no_grad(), self._failing():
+            if self._closed:  # a thread that still runs; the block has ended with an error
+                return
             if call.shape.number != self._number:  # another call came in between, in this thread or in another
                 call = AttentionCall(replace(call.shape, number=self._number), call.tensors)
             self._number += 1
             self.watcher.saw(call)
 
-    @property
-    def count(self) -> int:
-        """How many attention calls the block has seen so far."""
-        return self._number
+    def failed(self, error: BaseException) -> BaseException:
+        """Remember an error of watching, and return it."""
+        self.error = self.error or error
+        return error
+
+    @contextmanager
+    def _failing(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException as error:
+            self.failed(error)
+            raise
+
+    def abandon(self) -> None:
+        """End the block after an error."""
+        with self._lock:
+            self._closed = True
+
+    def close(self) -> None:
+        """End the block.
+
+        Raises:
+            StillRunning: the policy still runs in another thread.
+            BaseException: an error of watching that the policy's code caught, or met in another thread.
+        """
+        with self._lock:
+            self._closed = True
+            if self._elsewhere:
+                raise StillRunning(
+                    f"The policy ({type(self.policy).__name__}) still runs in another thread at the end of the block "
+                    "that records it. Wait for its answer inside the block."
+                )
+            if self.error is not None:
+                raise self.error
 
     @contextmanager
     def following_modules(self, mode: Callable[[], AbstractContextManager[object]]) -> Iterator[None]:
@@ -142,6 +181,8 @@ class WatchedBlock:
                 thread.running.pop()
 
         def in_other_thread(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+            with self._lock:
+                self._elsewhere += 1
             try:
                 with mode():
                     thread.seen = True
@@ -149,9 +190,9 @@ class WatchedBlock:
                         return followed(*args, **kwargs)
                     finally:
                         thread.seen = False
-            except BaseException as error:
-                self.error = self.error or error
-                raise
+            finally:
+                with self._lock:
+                    self._elsewhere -= 1
 
         return followed
 

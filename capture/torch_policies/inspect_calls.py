@@ -1,0 +1,197 @@
+"""`va.inspect`: a table of the attention calls that a policy makes in one call of the user's."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+from torch import Tensor
+
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
+from vla_attention.capture.torch_policies.unseen_attention import no_attention
+from vla_attention.capture.torch_policies.watch import watch_attention
+from vla_attention.schemas.errors import BadArgument
+
+#: How many queries of a call the product of rows and values is checked for.
+_CHECKED_QUERIES = 64
+#: Rows of a table on a screen.
+_SCREEN = 40
+#: From this many numbers of keys on, those of one module are written as a range.
+_RANGE = 4
+
+
+class NoAttention(BadArgument):
+    """A policy whose call computed no attention that can be seen."""
+
+
+@dataclass(frozen=True)
+class CallRow:
+    """Attention calls of the same shape, in modules whose paths differ in numbers only.
+
+    Attributes:
+        modules: paths of the modules, in the order of their first calls.
+        kind, batch, heads, kv_heads, queries, dtype: see `CallShape`.
+        keys: the smallest and the largest number of keys.
+        times: how often each module made such a call, the least and the most.
+        product_error: the largest error of rows times values, relative to the kernel's output.
+    """
+
+    modules: tuple[str, ...]
+    kind: str
+    batch: int
+    heads: int
+    kv_heads: int
+    queries: int
+    keys: tuple[int, int]
+    dtype: str
+    times: tuple[int, int]
+    product_error: float
+
+    @property
+    def pattern(self) -> str:
+        """The paths as one: `layers.{0..17}.self_attn`."""
+        return folded_paths(self.modules)
+
+
+@dataclass(frozen=True)
+class CallTable:
+    """All attention calls of one call of a policy.
+
+    Attributes:
+        policy: name of its class.
+        calls: the shapes, in order.
+        errors: of rows times values, one for every call.
+    """
+
+    policy: str
+    calls: tuple[CallShape, ...]
+    errors: tuple[float, ...]
+
+    @property
+    def rows(self) -> tuple[CallRow, ...]:
+        """The calls, those of the same shape in modules of one pattern folded into one row."""
+        return tuple(_rows(self.calls, self.errors))
+
+    def __str__(self) -> str:
+        rows = self.rows
+        heading = ("module", "kind", "queries x keys", "heads", "dtype", "calls", "P·V error")
+        cells = [heading, *(_cells(row) for row in rows[:_SCREEN])]
+        widths = [max(len(line[column]) for line in cells) for column in range(len(heading))]
+        lines = [
+            "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in cells
+        ]
+        if len(rows) > _SCREEN:
+            lines.append(f"... and {len(rows) - _SCREEN} further rows: see `.rows`")
+        batch = sorted({call.batch for call in self.calls})
+        total = f"{len(self.calls)} attention calls of {self.policy}, batch {_listed(batch)}"
+        return "\n".join([total, *lines])
+
+    __repr__ = __str__
+
+
+@dataclass
+class _Shapes:
+    """A watcher that keeps shapes and errors."""
+
+    calls: list[CallShape] = field(default_factory=list)
+    errors: list[float] = field(default_factory=list)
+
+    def change(self, shape: CallShape) -> Tensor | None:
+        return None
+
+    def saw(self, call: AttentionCall) -> None:
+        step = max(1, -(-call.shape.queries // _CHECKED_QUERIES))
+        queries = slice(None, None, step)
+        self.calls.append(call.shape)
+        self.errors.append(call.product_error(call.rows(queries), queries))
+
+
+def inspect(policy: object, call: Callable[[], object]) -> CallTable:
+    """Return a table of every attention call that `call()` makes in `policy`; printed, it fits a screen.
+
+    policy: an `nn.Module`, or an object that holds modules. call: runs it once, as
+    `lambda: policy.select_action(batch)`.
+    The P·V error is the largest difference of rows times values from what the policy's own kernel computed, relative to
+    its largest output: rounding errors say that the rows are those of the kernel.
+
+    Raises:
+        NoAttention: no attention was seen.
+        UserError: see `watch_attention`.
+    """
+    shapes = _Shapes()
+    with watch_attention(policy, shapes):
+        call()
+    if not shapes.calls:
+        raise NoAttention(no_attention(policy))
+    return CallTable(type(policy).__name__, tuple(shapes.calls), tuple(shapes.errors))
+
+
+def _rows(calls: Sequence[CallShape], errors: Sequence[float]) -> Iterator[CallRow]:
+    # Of each module and shape: how often, and the largest error.
+    counts: dict[tuple[Any, ...], list[float]] = {}
+    for call, error in zip(calls, errors, strict=True):
+        counts.setdefault((call.module, *_shape(call), (call.keys, call.keys)), []).append(error)
+    # A module with many numbers of keys, such as a decoder with a cache, gets one row.
+    ranges: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
+    for entry in counts:
+        ranges.setdefault(entry[:-1], []).append(entry)
+    for shape, entries in ranges.items():
+        if len(entries) >= _RANGE:
+            numbers = [entry[-1][0] for entry in entries]
+            merged = [error for entry in entries for error in counts.pop(entry)]
+            counts[(*shape, (min(numbers), max(numbers)))] = merged
+    first = {(call.module, *_shape(call)): number for number, call in reversed(list(enumerate(calls)))}
+    folded: dict[tuple[Any, ...], list[tuple[str, list[float]]]] = {}
+    for entry in sorted(counts, key=lambda entry: first[entry[:-1]]):
+        module = str(entry[0])
+        folded.setdefault((re.sub(r"\d+", "{}", module), *entry[1:]), []).append((module, counts[entry]))
+    for (_, kind, batch, heads, kv_heads, queries, dtype, keys), modules in folded.items():
+        times = [len(found) for _, found in modules]
+        yield CallRow(
+            modules=tuple(module for module, _ in modules), kind=kind, batch=batch, heads=heads, kv_heads=kv_heads,
+            queries=queries, keys=keys, dtype=dtype, times=(min(times), max(times)),
+            product_error=max(error for _, found in modules for error in found),
+        )  # fmt: skip
+
+
+def _shape(call: CallShape) -> tuple[Any, ...]:
+    return call.kind, call.batch, call.heads, call.kv_heads, call.queries, call.dtype
+
+
+def _cells(row: CallRow) -> tuple[str, ...]:
+    keys = str(row.keys[0]) if row.keys[0] == row.keys[1] else f"{row.keys[0]}..{row.keys[1]}"
+    heads = str(row.heads) if row.heads == row.kv_heads else f"{row.heads} on {row.kv_heads}"
+    times = str(row.times[0]) if row.times[0] == row.times[1] else f"{row.times[0]}..{row.times[1]}"
+    calls = f"{len(row.modules)} x {times}" if len(row.modules) > 1 else times
+    pattern = row.pattern or "(policy)"
+    return pattern, row.kind, f"{row.queries} x {keys}", heads, row.dtype, calls, f"{row.product_error:.0e}"
+
+
+def folded_paths(paths: Sequence[str]) -> str:
+    """Return paths that differ in their numbers as one, as `layers.{0..17}.self_attn`.
+
+    Several numbers that differ are written so where every combination is there; else the paths follow one another.
+    """
+    if len(paths) == 1:
+        return paths[0]
+    numbers = [[int(number) for number in re.findall(r"\d+", path)] for path in paths]
+    columns = [sorted(set(column)) for column in zip(*numbers, strict=True)]
+    combinations = 1
+    for column in columns:
+        combinations *= len(column)
+    if combinations != len(paths):
+        return ", ".join(paths)
+    written = iter(_listed(column) if len(column) == 1 else f"{{{_listed(column)}}}" for column in columns)
+    return re.sub(r"\d+", lambda found: next(written), paths[0])
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    """Return numbers as text: `0..17`, `0,2..16` for every second, or one after the other."""
+    steps = {after - before for before, after in pairwise(numbers)}
+    if len(numbers) > 2 and len(steps) == 1:
+        step = steps.pop()
+        return f"{numbers[0]}..{numbers[-1]}" if step == 1 else f"{numbers[0]},{numbers[1]}..{numbers[-1]}"
+    return ",".join(str(number) for number in numbers)

@@ -1,0 +1,85 @@
+"""The table of attention calls."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+from torch.nn.functional import scaled_dot_product_attention as sdpa
+
+import vla_attention as va
+from tests.kit.attention_modules import Attention, Policy
+from vla_attention.capture.torch_policies.inspect_calls import NoAttention, folded_paths
+
+
+class Decoder(nn.Module):
+    """A picture encoder by hand, and a decoder that writes token after token."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.vision = Policy(lambda q, k, v, mask: (q @ k.mT).softmax(-1) @ v, layers=3)
+        self.text = Policy(lambda q, k, v, mask: sdpa(q, k, v, enable_gqa=True), layers=12, kv_heads=2)
+
+    def act(self, pixels):
+        self.vision(pixels, pixels)
+        for written in range(5):
+            self.text(pixels[:, :1], pixels[:, : 4 + written])
+
+
+def test_the_table():
+    torch.manual_seed(0)
+    policy, pixels = Decoder().eval(), torch.randn(2, 9, 32)
+    table = va.inspect(policy, lambda: policy.act(pixels))
+    assert len(table.calls) == 3 + 5 * 12 == len(table.errors)
+    first, second = table.rows
+    assert (first.pattern, first.kind, first.queries, first.keys) == ("vision.layers.{0..2}", "softmax", 9, (9, 9))
+    assert (second.pattern, second.kind, second.queries, second.keys) == ("text.layers.{0..11}", "sdpa", 1, (4, 8))
+    assert (first.times, second.times) == ((1, 1), (5, 5))
+    assert (first.heads, second.heads, second.kv_heads, second.batch) == (4, 4, 2, 2)
+    assert max(table.errors) < 3e-6
+    lines = str(table).splitlines()
+    assert lines[0] == "63 attention calls of Decoder, batch 2"
+    assert lines[1].split() == ["module", "kind", "queries", "x", "keys", "heads", "dtype", "calls", "P·V", "error"]
+    assert lines[2].split()[:9] == ["vision.layers.{0..2}", "softmax", "9", "x", "9", "4", "float32", "3", "x"]
+    assert lines[3].split()[:8] == ["text.layers.{0..11}", "sdpa", "1", "x", "4..8", "4", "on", "2"]
+    assert lines[3].split()[9:12] == ["12", "x", "5"]
+    assert len(lines) == 4
+    assert repr(table) == str(table)
+
+
+def test_a_few_numbers_of_keys_of_one_module_keep_their_rows():
+    policy, pixels = Attention(lambda q, k, v, mask: sdpa(q, k, v)).eval(), torch.randn(1, 9, 32)
+    table = va.inspect(policy, lambda: [policy(pixels, pixels[:, :keys]) for keys in (9, 4, 9)])
+    assert [(row.modules, row.keys, row.times) for row in table.rows] == [
+        (("",), (9, 9), (2, 2)),
+        (("",), (4, 4), (1, 1)),
+    ]
+    assert "(policy)" in str(table)
+
+
+def test_many_rows_end_with_how_many_there_are():
+    policy, pixels = Attention(lambda q, k, v, mask: sdpa(q, k, v)).eval(), torch.randn(1, 60, 32)
+    table = va.inspect(policy, lambda: [policy(pixels[:, :queries], pixels) for queries in range(1, 61)])
+    assert len(table.rows) == 60
+    assert str(table).splitlines()[-1] == "... and 20 further rows: see `.rows`"
+
+
+@pytest.mark.parametrize(
+    ("paths", "folded"),
+    [
+        (["a.1.b"], "a.1.b"),
+        ([f"layers.{n}.attn" for n in range(18)], "layers.{0..17}.attn"),
+        ([f"layers.{n}.attn" for n in range(0, 17, 2)], "layers.{0,2..16}.attn"),
+        (["l.0", "l.3", "l.4"], "l.{0,3,4}"),
+        ([f"t{m}.l.{n}" for m in (0, 1) for n in range(4)], "t{0,1}.l.{0..3}"),
+        (["t0.l.1", "t1.l.2"], "t0.l.1, t1.l.2"),
+    ],
+)
+def test_paths_are_folded(paths, folded):
+    assert folded_paths(paths) == folded
+
+
+def test_a_policy_without_attention():
+    policy = nn.Sequential(nn.Linear(3, 3), nn.ReLU())
+    with pytest.raises(NoAttention, match=r"\(Sequential\) computed no attention.*U-Net.*queue"):
+        va.inspect(policy, lambda: policy(torch.randn(2, 3)))

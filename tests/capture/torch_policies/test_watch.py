@@ -1,0 +1,345 @@
+"""The block: which module, which thread, compiled parts, nothing left behind, and what is refused."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import types
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import pytest
+import torch
+from torch import nn
+from torch.nn.functional import scaled_dot_product_attention as sdpa
+
+from tests.kit.attention_modules import Attention, Policy, Seen
+from vla_attention.capture.torch_policies.call_changes import ChangeRefused
+from vla_attention.capture.torch_policies.policy_modules import CannotRunEager, NoModules, modules_of
+from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
+from vla_attention.capture.torch_policies.watch import AlreadyWatched, watch_attention
+from vla_attention.capture.torch_policies.watched_block import OtherPolicy, StillRunning
+
+
+def attend(query, key, value, mask):
+    return sdpa(query, key, value, mask)
+
+
+def small_policy(**options):
+    torch.manual_seed(0)
+    return Policy(attend, **options).eval().requires_grad_(False)
+
+
+HIDDEN, MEMORY = torch.randn(2, 5, 32), torch.randn(2, 7, 32)
+PATHS = ["layers.0", "layers.1"]
+
+
+def seen_in(policy, call):
+    seen = Seen()
+    with watch_attention(policy, seen):
+        call()
+    return [shape.module for shape in seen.shapes]
+
+
+@dataclass
+class Wrapper:
+    """What people write around a model: no module itself."""
+
+    model: nn.Module
+    others: dict
+
+    def select_action(self, hidden, memory):
+        return self.model(hidden, memory)
+
+
+def test_modules_are_found_in_an_object():
+    policy = Wrapper(small_policy(), {"heads": [nn.Linear(2, 2)]})
+    assert list(modules_of(policy))[:3] == ["model", "model.layers", "model.layers.0"]
+    assert "others.heads.0" in modules_of(policy)
+    assert seen_in(policy, lambda: policy.select_action(HIDDEN, MEMORY)) == [f"model.{path}" for path in PATHS]
+    assert seen_in(policy.select_action, lambda: policy.select_action(HIDDEN, MEMORY)) == [f"model.{p}" for p in PATHS]
+
+
+def test_modules_in_plain_lists_of_a_module_are_found():
+    policy = nn.Module()
+    policy.blocks = [Attention(attend).eval() for _ in range(2)]
+    assert seen_in(policy, lambda: [block(HIDDEN, MEMORY) for block in policy.blocks]) == ["blocks.0", "blocks.1"]
+
+
+def test_a_module_is_found_by_its_first_path_when_it_is_shared():
+    policy = small_policy()
+    policy.layers[1] = policy.layers[0]
+    assert seen_in(policy, lambda: policy(HIDDEN, MEMORY)) == ["layers.0", "layers.0"]
+
+
+class Direct(nn.Module):
+    """Calls `forward` of a module directly, as some policies do, and attends in a method that is no forward."""
+
+    def __init__(self):
+        super().__init__()
+        self.inner = Attention(attend).eval()
+
+    def sample(self, hidden, memory):
+        return self.inner.forward(hidden, memory)
+
+    def attend_here(self, hidden):
+        return sdpa(hidden[:, None], hidden[:, None], hidden[:, None])
+
+
+def test_forward_called_directly_and_methods():
+    policy = Direct()
+    assert seen_in(policy, lambda: policy.sample(HIDDEN, MEMORY)) == ["inner"]
+    assert seen_in(policy, lambda: policy.attend_here(HIDDEN)) == [""]
+    assert seen_in(policy, lambda: sdpa(HIDDEN, HIDDEN, HIDDEN)) == [""]
+
+
+def test_compiled_parts_run_eager_and_are_seen():
+    whole, part, function, method = (small_policy() for _ in range(4))
+    expected = whole(HIDDEN, MEMORY)
+    compiled = torch.compile(whole, backend="eager", fullgraph=True)
+    part.layers[1] = torch.compile(part.layers[1], backend="eager")
+    function.layers[0].attend = torch.compile(attend, backend="eager")
+    method.compile(backend="eager")
+    for policy in (compiled, part, function, method):
+        policy(HIDDEN, MEMORY)  # compiled before the block
+        seen = Seen()
+        with watch_attention(policy, seen):
+            result = policy(HIDDEN, MEMORY)
+        assert torch.equal(result, expected)
+        assert [shape.module for shape in seen.shapes] == PATHS
+        assert torch.equal(policy(HIDDEN, MEMORY), expected)
+
+
+@pytest.mark.parametrize("way", ["call", "forward", "method"])
+def test_other_threads_are_seen(way):
+    policy = small_policy()
+    wrapper = Wrapper(policy, {})
+    call = {"call": policy, "forward": policy.forward, "method": wrapper.select_action}[way]
+    expected = policy(HIDDEN, MEMORY)
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(int).result()  # the thread is older than the block
+        seen = Seen()
+        with watch_attention(wrapper, seen):
+            # What is bound before the block skips it, as a reference to a bound method does.
+            result = pool.submit(lambda: policy(HIDDEN, MEMORY) if way != "method" else call(HIDDEN, MEMORY)).result()
+        assert torch.equal(result, expected)
+        assert [shape.module for shape in seen.shapes] == [f"model.{path}" for path in PATHS]
+        # Nothing is left in the thread.
+        assert pool.submit(lambda: torch._C._len_torch_function_stack()).result() == 0
+        pool.submit(policy, HIDDEN, MEMORY).result()
+    assert len(seen.shapes) == 2
+
+
+def test_two_threads_at_the_same_time_are_both_seen():
+    policy, seen, barrier = small_policy(), Seen(), threading.Barrier(2)
+
+    def call():
+        barrier.wait()
+        return policy(HIDDEN, MEMORY)
+
+    with ThreadPoolExecutor(2) as pool, watch_attention(policy, seen):
+        results = [future.result() for future in [pool.submit(call), pool.submit(call)]]
+    assert torch.equal(*results)
+    assert sorted(shape.module for shape in seen.shapes) == sorted(PATHS * 2)
+    assert [shape.number for shape in seen.shapes] == [0, 1, 2, 3]
+    assert max(seen.errors) < 2e-6
+
+
+def test_a_block_that_ends_before_the_policy_does():
+    started, go_on = threading.Event(), threading.Event()
+
+    def slow(query, key, value, mask):
+        started.set()
+        go_on.wait(10)
+        return sdpa(query, key, value)
+
+    policy, seen, futures = Policy(slow).eval(), Seen(), []
+    with ThreadPoolExecutor(1) as pool:
+        with pytest.raises(StillRunning, match="still runs in another thread"), watch_attention(policy, seen):
+            futures.append((pool.submit(policy, HIDDEN, MEMORY), started.wait(10)))
+        go_on.set()
+        futures[0][0].result()
+    assert not seen.shapes
+
+
+def test_errors_of_the_watcher_are_not_lost():
+    """In another thread nobody may wait for the result, and code may catch errors around its attention."""
+
+    class Failing(Seen):
+        def saw(self, call):
+            raise ValueError("no place left")
+
+    policy = small_policy()
+    with (
+        ThreadPoolExecutor(1) as pool,
+        pytest.raises(ValueError, match="no place left"),
+        watch_attention(policy, Failing()),
+    ):
+        pool.submit(policy, HIDDEN, MEMORY).exception()
+
+    def caught(query, key, value, mask):
+        try:
+            return sdpa(query, key, value)
+        except ValueError:
+            return query
+
+    policy = Policy(caught).eval()
+    with pytest.raises(ValueError, match="no place left"), watch_attention(policy, Failing()):
+        policy(HIDDEN, MEMORY)
+
+
+def test_nothing_is_left_behind():
+    policy = small_policy()
+    policy.layers[0].forward = types.MethodType(Attention.forward, policy.layers[0])  # as some libraries' hooks do
+    own = policy.layers[0].__dict__["forward"]
+    for fails in (False, True):
+        seen = Seen()
+        try:
+            with watch_attention(policy, seen):
+                policy(HIDDEN, MEMORY)
+                if fails:
+                    raise RuntimeError("from the policy's code")
+        except RuntimeError:
+            assert fails
+        assert len(seen.shapes) == 2
+        assert policy.layers[0].__dict__["forward"] is own
+        assert "forward" not in policy.layers[1].__dict__
+        assert torch._C._len_torch_function_stack() == 0
+        assert torch.backends.mha.get_fastpath_enabled()
+        assert torch._dynamo.eval_frame._stance.stance == "default"
+        policy(HIDDEN, MEMORY)
+        assert len(seen.shapes) == 2
+
+
+def test_blocks_inside_each_other_are_refused():
+    policy, seen = small_policy(), Seen()
+    with watch_attention(policy, seen):
+        for other in (policy, small_policy()):
+            with pytest.raises(AlreadyWatched, match="another block"), watch_attention(other, Seen()):
+                pass
+        policy(HIDDEN, MEMORY)
+    assert len(seen.shapes) == 2
+
+
+def test_a_second_policy_in_one_block_is_refused():
+    policy, other = small_policy(), small_policy()
+    with pytest.raises(OtherPolicy, match=r"class Attention.*Policy.*one block records one policy"):  # noqa: SIM117
+        with watch_attention(policy, Seen()):
+            other(HIDDEN, MEMORY)
+
+
+def test_other_models_without_attention_may_run_in_a_block():
+    policy, seen = small_policy(), Seen()
+    with watch_attention(policy, seen):
+        nn.Linear(32, 2)(HIDDEN)
+        policy(HIDDEN, MEMORY)
+    assert len(seen.shapes) == 2
+
+
+def test_what_holds_no_module_is_refused():
+    for nothing in (object(), {"a": 1}, "a path"):
+        with pytest.raises(NoModules, match="holds no torch module"), watch_attention(nothing, Seen()):
+            pass
+
+
+def test_programs_that_cannot_run_eager_are_refused():
+    policy = small_policy()
+    with pytest.warns(DeprecationWarning, match="trace"):
+        policy.head = torch.jit.trace(nn.Linear(32, 3), torch.randn(1, 32))
+    with pytest.raises(CannotRunEager, match=r"head is a compiled program \(torch.jit.*torch.compile is fine"):  # noqa: SIM117
+        with watch_attention(policy, Seen()):
+            pass
+
+
+def test_operators_that_give_no_rows_are_refused():
+    @torch.library.custom_op("flash_attn::_small_forward", mutates_args=())
+    def flash(query: torch.Tensor) -> torch.Tensor:
+        return query.clone()
+
+    def fallback(query, key, value, mask):
+        try:
+            return flash(query)
+        except Exception:
+            return sdpa(query, key, value)
+
+    for function in (lambda query, key, value, mask: flash(query), fallback):
+        policy = Policy(function).eval()
+        with pytest.raises(UnseenAttention, match=r"flash_attn::_small_forward.*SDPA"), watch_attention(policy, Seen()):
+            policy(HIDDEN, MEMORY)
+
+
+def test_operators_whose_names_only_sound_like_it_are_fine():
+    @torch.library.custom_op("small_ops::attention_mask", mutates_args=())
+    def mask_of(query: torch.Tensor) -> torch.Tensor:
+        return query.clone()
+
+    policy, seen = Policy(lambda query, key, value, mask: sdpa(mask_of(query), key, value)).eval(), Seen()
+    with watch_attention(policy, seen):
+        policy(HIDDEN, MEMORY)
+    assert len(seen.shapes) == 2
+
+
+@pytest.mark.parametrize("setting", ["flash_attention_2", "kernels-community/flash-attn3", "paged|sdpa"])
+def test_settings_that_give_no_rows_are_refused(setting):
+    policy = small_policy()
+    policy.layers[1].config = types.SimpleNamespace(_attn_implementation=setting)
+    with pytest.raises(UnseenAttention, match=r"layers\.1 runs attention with.*attn_implementation='sdpa'"):  # noqa: SIM117
+        with watch_attention(policy, Seen()):
+            pass
+    for fine in ("sdpa", "eager", "flex_attention", "my_own"):
+        policy.layers[1].config = types.SimpleNamespace(_attn_implementation=fine)
+        assert seen_in(policy, lambda: policy(HIDDEN, MEMORY)) == PATHS
+
+
+def test_changes_that_do_not_fit_are_refused():
+    policy = small_policy()
+    with pytest.raises(ChangeRefused, match=r"shape \(3,\).*layers\.0: sdpa, 5 x 7"):  # noqa: SIM117
+        with watch_attention(policy, Seen(changes=lambda shape: torch.zeros(3))):
+            policy(HIDDEN, MEMORY)
+
+
+def test_a_query_must_keep_a_key():
+    policy = small_policy()
+    with pytest.raises(ValueError, match=r"leaves a query without any key.*layers.0"):  # noqa: SIM117
+        with watch_attention(policy, Seen(changes=lambda shape: torch.full((1,), float("-inf")))):
+            policy(HIDDEN, MEMORY)
+
+
+def test_autocast_policies():
+    """Rows are float32 and sum to 1, although products run in bfloat16."""
+
+    def by_hand(query, key, value, mask):
+        return (query @ key.mT).softmax(-1) @ value
+
+    for function, kind in ((attend, "sdpa"), (by_hand, "softmax")):
+        policy, seen = Policy(function).eval(), Seen()
+        with torch.autocast("cpu", torch.bfloat16):
+            expected = policy(HIDDEN, MEMORY)
+            with watch_attention(policy, seen):
+                result = policy(HIDDEN, MEMORY)
+        assert torch.equal(result, expected)
+        assert [shape.kind for shape in seen.shapes] == [kind] * 2
+        assert seen.rows[0].dtype is torch.float32
+        torch.testing.assert_close(seen.rows[0].sum(-1), torch.ones(2, 4, 5), rtol=0, atol=2e-6)
+        assert max(seen.errors) < 2e-2
+
+
+def test_gradients_flow_as_before():
+    policy = Policy(attend)
+    policy(HIDDEN, MEMORY).sum().backward()
+    expected = policy.layers[0].q_proj.weight.grad.clone()
+    policy.zero_grad()
+    with watch_attention(policy, Seen()):
+        policy(HIDDEN, MEMORY).sum().backward()
+    assert torch.equal(policy.layers[0].q_proj.weight.grad, expected)
+
+
+def test_inference_mode():
+    policy, seen = small_policy(), Seen()
+    with torch.inference_mode(), watch_attention(policy, seen):
+        policy(HIDDEN, MEMORY)
+    assert max(seen.errors) < 2e-6
+
+
+def test_import_loads_no_transformers():
+    assert "transformers" not in sys.modules
