@@ -7,7 +7,8 @@ into the prompt; they are stored beside the rows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Literal
 
@@ -261,6 +262,26 @@ class Prompt:
     def instruction_text(self) -> str:
         """The instruction as the policy reads it."""
         return self.text[self.instruction[0] : self.instruction[1]]
+
+
+def prompt_at(sites: Sequence[SiteLayout], layout: SiteLayout, prompt: Prompt) -> Prompt:
+    """The prompt with its pieces at the keys of one site.
+
+    Pieces are stored with the keys of the first site that has text. Another site may have the same text spans at other
+    keys: a piece is at the same place of the span of that name. Pieces of spans that the site lacks are left out.
+    """
+    first = next((site for site in sites if any(span.kind == "text" for span in site.spans)), layout)
+    spans = {span.name: span for span in layout.spans if span.kind == "text"}
+    texts = [span for span in first.spans if span.kind == "text"]
+    if all(spans.get(span.name) == span for span in texts):
+        return prompt
+    pieces = []
+    for piece in prompt.pieces:
+        span = next((span for span in texts if span.start <= piece.key < span.stop), None)
+        own = None if span is None else spans.get(span.name)
+        if span is not None and own is not None and piece.key - span.start < own.num_keys:
+            pieces.append(replace(piece, key=piece.key - span.start + own.start))
+    return replace(prompt, pieces=tuple(pieces))
 
 
 def roles_from_spans(layout: SiteLayout, role_of_span: dict[str, Role]) -> NDArray[np.uint8]:

@@ -180,7 +180,7 @@ def _episode_values(run: Run, episodes: Tables, groups: Sequence[str], ignore_se
                 item.store.suite,
                 item.episode.attributes.task_id,
                 item.episode.attributes.episode_index,
-                item.episode.attributes.initial_state_digest,
+                item.episode.attributes.initial_state,
                 # With another seed allowed, episodes pair by their initial state alone.
                 None if ignore_seed else item.store.attributes.protocol.seed,
             )

@@ -150,7 +150,8 @@ _FIELDS: dict[str, tuple[Callable[[Run], Any], str]] = {
     "heads": (lambda run: run.question.selection.head_numbers, "averages over other heads"),
     "queries": (
         lambda run: tuple(
-            getattr(run.stores[0].attributes.recording, name) for name in ("queries", "num_action_queries", "num_pools")
+            getattr(run.stores[0].attributes.recording_of(run.question.site), name)
+            for name in ("queries", "num_action_queries", "num_pools")
         ),
         "averages over other queries",
     ),
@@ -287,7 +288,7 @@ def _layout(run: Run) -> dict[str, str]:
     spans = {}
     for span in site.spans:
         grid = f" of {span.grid.rows} x {span.grid.columns} patches" if span.grid else ""
-        spans[span.name] = f"keys {span.start}-{span.stop - 1}{grid}"
+        spans[span.name] = f"keys {span.start}-{span.stop - 1}{grid}{', growing' if span.growing else ''}"
     return spans
 
 

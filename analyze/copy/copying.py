@@ -26,6 +26,7 @@ from vla_attention.schemas.stores.root import episode_folders, group_attributes
 from vla_attention.schemas.stores.seal import seal_episode
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
+    FORMAT_VERSION,
     PARTIAL_SUFFIX,
     SEAL_GROUP,
     STORE_SUFFIX,
@@ -185,7 +186,8 @@ def _root_document(store: Store, without: tuple[str, ...]) -> bytes:
     provenance = dict(root.provenance) | {"copied_without": ", ".join(everything)}
     # A copy of a copy names the store that was captured, not the copy.
     provenance.setdefault("copied_from", store.run)
-    changed: RootAttributes = replace(root, recording=recording, provenance=provenance)
+    # It is written with this version's fields.
+    changed: RootAttributes = replace(root, format_version=FORMAT_VERSION, recording=recording, provenance=provenance)
     return _with_attributes(content, to_json(changed))
 
 

@@ -12,10 +12,10 @@ from vla_attention.analyze.effects.conditions import GroupOfKeys
 from vla_attention.analyze.measures.contribution_ratios import joint_norm, selected_gram
 from vla_attention.analyze.measures.group_contributions import whole_segments
 from vla_attention.analyze.measures.masses import group_measures
-from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.question import Question, select_again
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, resolve_all, vocabulary_of
 from vla_attention.analyze.measures.steps import MeasuredEpisode, measure_episodes
-from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping, check_names
 
@@ -54,7 +54,11 @@ def group_attention(question: Question, groups: Sequence[GroupOfKeys]) -> dict[G
     for site in (question.site, *others):
         if not left:
             break
-        here = question if site == question.site else _at_site(question, site)
+        try:
+            here = question if site == question.site else _at_site(question, site)
+        except BadArgument as error:  # the chosen layers are none of that site's
+            found |= {group: GroupAttention(None, {}, str(error)) for group in left if group not in found}
+            continue
         fitting, notes = _fitting(here, left)
         found |= {group: GroupAttention(None, {}, note) for group, note in notes.items() if group not in found}
         if fitting:
@@ -65,7 +69,8 @@ def group_attention(question: Question, groups: Sequence[GroupOfKeys]) -> dict[G
 
 def _at_site(question: Question, site: str) -> Question:
     selected = tuple(load_tokens(question.episodes, site))
-    return replace(question, site=site, selected=selected, vocabulary=vocabulary_of(selected))
+    selection = select_again(question, site)
+    return replace(question, site=site, selected=selected, vocabulary=vocabulary_of(selected), selection=selection)
 
 
 def _grouping(groups: Sequence[GroupOfKeys]) -> Grouping:

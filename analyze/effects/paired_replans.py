@@ -17,7 +17,7 @@ from vla_attention.analyze.effects.action_changes import (
 from vla_attention.analyze.effects.conditions import Condition
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.time.alignment import on_episode_time, replan_starts
+from vla_attention.analyze.time.alignment import episode_timing, on_episode_time
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.store_format import StoreError
@@ -58,16 +58,21 @@ class BaseEpisode:
     @classmethod
     def of(cls, item: SelectedEpisode) -> BaseEpisode:
         """Read an episode's actions."""
-        attributes, wait = item.episode.attributes, item.store.attributes.protocol.wait_steps
+        if not item.episode.has("actions"):
+            raise BadArgument(
+                f"{item.episode.name} of {item.store.path} holds no actions, and an effect is a change of the actions; "
+                "record the run with its actions."
+            )
         actions = item.episode.read("actions").astype(np.float64)
         env_step = item.episode.read("env_step").astype(np.int64)
-        starts = replan_starts(env_step, wait, attributes.num_steps, item.episode.name)
-        executed = np.diff(np.append(starts, attributes.num_steps))
+        starts, num_steps = episode_timing(item.store.attributes, item.episode, env_step)
+        executed = np.diff(np.append(starts, num_steps))
         return cls(item, actions, env_step, starts, np.minimum(executed, actions.shape[1]))
 
     def over_phases(self, values: Array) -> dict[str, Array]:
         """Means of values (replan, quantity) over the replans (`ALL`) and over the thirds of the episode's time."""
-        timed = on_episode_time(values, self.starts, self.item.episode.attributes.num_steps, len(PHASES))
+        num_steps = episode_timing(self.item.store.attributes, self.item.episode, self.env_step)[1]
+        timed = on_episode_time(values, self.starts, num_steps, len(PHASES))
         return {ALL: finite_mean(values), **dict(zip(PHASES, timed, strict=True))}
 
 

@@ -53,7 +53,8 @@ def rollout_pairs(condition: Condition, question: Question) -> tuple[pl.DataFram
     for start in shared:
         first, other = base[start].attributes, own[start].attributes
         success = [None if one.success is None else float(one.success) for one in (first, other)]
-        steps = first.num_steps, other.num_steps
+        # 0: not known.
+        steps = [float(one.num_steps) if one.num_steps else None for one in (first, other)]
         rows.append(
             {
                 "suite": suite,
@@ -65,9 +66,9 @@ def rollout_pairs(condition: Condition, question: Question) -> tuple[pl.DataFram
                 "success_base": success[0],
                 "success": success[1],
                 "success_difference": None if success[0] is None or success[1] is None else success[1] - success[0],
-                "steps_base": float(steps[0]),
-                "steps": float(steps[1]),
-                "steps_difference": float(steps[1] - steps[0]),
+                "steps_base": steps[0],
+                "steps": steps[1],
+                "steps_difference": None if steps[0] is None or steps[1] is None else steps[1] - steps[0],
             }
         )
     notes = []
@@ -107,7 +108,7 @@ def _by_start(episodes: Sequence[StoredEpisode]) -> dict[tuple[int, str, int], S
     found: dict[tuple[int, str, int], StoredEpisode] = {}
     for episode in episodes:
         attributes, count = episode.attributes, 0
-        while (attributes.task_id, attributes.initial_state_digest, count) in found:
+        while (attributes.task_id, attributes.initial_state, count) in found:
             count += 1
-        found[attributes.task_id, attributes.initial_state_digest, count] = episode
+        found[attributes.task_id, attributes.initial_state, count] = episode
     return found

@@ -13,7 +13,7 @@ from vla_attention.analyze.statistics.intervals import (
     estimates,
     mean_over_episodes,
 )
-from vla_attention.analyze.time.alignment import on_episode_time
+from vla_attention.analyze.time.alignment import on_episode_time, steps_of_time
 from vla_attention.schemas.groupings.grouping import Grouping
 
 MOST_BINS = 20
@@ -63,7 +63,8 @@ def layer_time_table(
         table = np.full((at.max() + 1, len(layers), len(quantities)), np.nan)
         table[at, column] = part.select(pl.col(quantities).fill_null(float("nan"))).to_numpy()
         starts = part["env_step"].unique().sort().to_numpy()
-        timed = on_episode_time(table.reshape(len(table), -1), starts - starts[0], int(part["num_steps"][0]), bins)
+        starts, num_steps = steps_of_time(starts, int(part["num_steps"][0]))
+        timed = on_episode_time(table.reshape(len(table), -1), starts, num_steps, bins)
         values.append(timed.reshape(bins, len(layers), len(quantities)))
         tasks.append(f"{key[0]}\t{key[1]}")
     stacked = np.stack(values).transpose(0, 3, 2, 1).reshape(len(values), -1)  # (episode, quantity x layer x bin)

@@ -109,7 +109,8 @@ def measure_rows(
     weights = with_valid(resolved.weights, valid)
     # Half of the keys of a usual site are never valid: without them the measures take half the time.
     used = np.flatnonzero(valid.any(axis=0))
-    inside = valid[:, used]
+    inside, counts = valid[:, used], item.key_counts
+    of_used = None if counts is None else counts[:, used]
     columns = [*(resolved.names.index(name) for name in shown), weights.shape[2] - 1]
     within = np.ascontiguousarray(weights[:, used][:, :, columns] * inside[:, :, None])
     for part in layer_rows(item.episode, selection, question.site):
@@ -118,7 +119,7 @@ def measure_rows(
         out.top[:, part.layer, part.denoise] = top_mass(rows, inside, options.top)
         if out.mass is not None:
             out.mass[:, part.layer, part.denoise] = masses(part.rows, weights)
-        out.shares.add(part.layer, rows, inside, options.rule.factor, selection, used)
+        out.shares.add(part.layer, rows, inside, options.rule.factor, selection, used, of_used)
 
 
 def row_tables(

@@ -26,8 +26,8 @@ from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL, NO_LIMITS, POSITIVE, Estimand
 from vla_attention.analyze.stores.selection import Selection
-from vla_attention.schemas.layout import INVALID_ROLES
 from vla_attention.schemas.segments import segment_members
+from vla_attention.schemas.stores.store_format import RootAttributes
 
 Array = NDArray[np.float64]
 
@@ -36,6 +36,11 @@ def selected_gram(item: SelectedEpisode, site: str, selection: Selection) -> NDA
     """The Gram matrices (replan, layer, denoise, part, part) of the selected layers and denoise steps."""
     gram: NDArray[np.float32] = item.episode.read(f"{site}/contribution")
     return gram[:, list(selection.layers)][:, :, list(selection.denoise)]
+
+
+def has_all_heads(root: RootAttributes, site: str) -> bool:
+    """Whether all heads of a site were recorded."""
+    return len(root.recording_of(site).heads) == (root.site(site).heads or root.policy.num_heads)
 
 
 def joint_norm(gram: NDArray[np.floating], chosen: NDArray[np.bool_], weights: Array | None = None) -> Array:
@@ -65,14 +70,14 @@ def uniform_weights(item: SelectedEpisode, site: str, selection: Selection) -> A
     recorded, because contributions are of all heads. The block's whole update, the last part, is in no side: NaN.
     """
     root = item.store.attributes
-    layout = next(layout for layout in root.sites if layout.name == site)
-    segments = item.episode.attributes.segments[site]
-    roles = item.episode.tokens(root, site).static_roles
-    members = segment_members(layout, roles, segments) & ~np.isin(roles, INVALID_ROLES)[:, :, None]
-    keys = members.sum(axis=1, dtype=np.float64)  # (replan or 1, segment)
+    segments, tokens = item.episode.attributes.segments[site], item.episode.tokens(root, site)
+    members = segment_members(tokens.layout, tokens.static_roles, segments) & tokens.valid[:, :, None]
+    counts = tokens.key_counts
+    # (replan or 1, segment)
+    keys = members.sum(axis=1, dtype=np.float64) if counts is None else (members * counts[:, :, None]).sum(axis=1)
     share = (keys / keys.sum(axis=1, keepdims=True))[:, None, None]
     mass = segment_masses(item, site, selection)
-    if len(root.recording.heads) < root.policy.num_heads:
+    if not has_all_heads(root, site):
         mass = np.full_like(mass, np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):
         weights = np.where(share > 0, np.where(mass > 0, share / mass, np.nan), 0.0)
@@ -101,6 +106,30 @@ def episode_means(table: pl.DataFrame, *measures: pl.Expr, by: tuple[str, ...] =
     )
 
 
+def _with_ratio_over_blocks(
+    episodes: pl.DataFrame, table: pl.DataFrame, above: str, below: str, logs: dict[str, pl.Expr]
+) -> pl.DataFrame:
+    """The rows of `episode_means` with ratios of each side's mean over its blocks in "layers_avg"."""
+    once = table.unique([*EPISODE_ID, "replan", "denoise_step", "block"], keep="first", maintain_order=True)
+    sides = (above, below, f"{above}_of_uniform", f"{below}_of_uniform")
+    steps = once.group_by(*EPISODE_ID, "replan", "denoise_step", maintain_order=True).agg(pl.col(sides).mean())
+    steps = steps.with_columns(
+        (pl.col(above) / pl.col(below)).alias("contribution_ratio"),
+        (pl.col(sides[2]) / pl.col(sides[3])).alias("uniform_ratio"),
+    ).with_columns((pl.col("contribution_ratio") / pl.col("uniform_ratio")).alias("ratio_lift"))
+    ratios = steps.group_by(*EPISODE_ID, maintain_order=True).agg(
+        pl.col("contribution_ratio").filter(pl.col("contribution_ratio").is_finite()).mean().alias("ratio_mean"),
+        *(log.filter(log.is_finite()).mean().alias(name) for name, log in logs.items()),
+    )
+    average = pl.col("layer") == LAYERS_AVG
+    whole = (
+        episodes.filter(average)
+        .drop("ratio_mean", *logs)
+        .join(ratios, on=EPISODE_ID, how="left", maintain_order="left")
+    )
+    return pl.concat([episodes.filter(~average), whole.select(episodes.columns)])
+
+
 def contribution_rows(
     table: pl.DataFrame, above: str, below: str, estimand: Estimand, level: float = DEFAULT_LEVEL
 ) -> pl.DataFrame:
@@ -121,6 +150,10 @@ def contribution_rows(
             ratio_mean        mean of the episodes' mean ratios of norms
             ratio_of_means    mean `above` / mean `below`
         Ratios that are infinite or undefined are in no mean but `ratio_of_means`.
+
+        Where the sides are in different blocks (the columns `..._of_uniform`, see `contributions`), single layers have
+        norms and no ratio. The ratios over all of them are, at every replan and denoise step, of the means of each
+        side's norm over its blocks.
     """
     logs = {
         name: pl.col(column).log()
@@ -136,6 +169,8 @@ def contribution_rows(
         pl.col("contribution_ratio").filter(pl.col("contribution_ratio").is_finite()).mean().alias("ratio_mean"),
         *(log.filter(log.is_finite()).mean().alias(name) for name, log in logs.items()),
     )
+    if f"{above}_of_uniform" in table.columns:
+        episodes = _with_ratio_over_blocks(episodes, table, above, below, logs)
     values = dict.fromkeys((above, below, "ratio_mean"), POSITIVE) | dict.fromkeys(logs, NO_LIMITS)
     quotients = {"ratio_of_means": (above, below)}
     rows = means_with_intervals(episodes, ["layer"], values, estimand, level, quotients=quotients)

@@ -9,6 +9,7 @@ the same space, so a norm of self-attention may be divided by one of cross-atten
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
@@ -28,13 +29,24 @@ VISUAL_ROLES = ("image",)
 LINGUISTIC_ROLES = ("bos", "template", "instruction", "text")
 
 
-def contribution_table(selected: Sequence[SelectedEpisode], selection: Selection) -> pl.DataFrame | None:
+def contribution_table(
+    selected: Sequence[SelectedEpisode], selection: Selection, layers: Sequence[int] | None = None
+) -> pl.DataFrame | None:
     """Norms of both sides for every (episode, replan, layer, denoise step); None without recorded contributions.
 
     Columns: suite, task_id, episode_index, replan, env_step, layer, block, denoise_step, visual_norm, linguistic_norm,
     contribution_ratio (visual / linguistic; infinite or null where the denominator is 0), uniform_ratio and ratio_lift
     (see `contribution_ratios`). A side is read at the site that has such keys: both at `joint` for
     pi, `self` and `cross` for Cosmos. None also when a run has no such keys.
+
+    Where the two sites are in different blocks, a ratio inside a block is undefined: the rows then are of the blocks of
+    both, with the norm of the side that the block has, no ratio, and the columns `visual_norm_of_uniform` and
+    `linguistic_norm_of_uniform`, from which `contribution_rows` makes the ratio over blocks.
+
+    Args:
+        selected: the episodes.
+        selection: layers and denoise steps, at the question's site.
+        layers: the layers that the user chose, None for all; needed for sites in other blocks.
     """
     if not all(item.store.attributes.recording.contributions for item in selected):
         return None
@@ -42,6 +54,8 @@ def contribution_table(selected: Sequence[SelectedEpisode], selection: Selection
     def measure(item: SelectedEpisode) -> pl.DataFrame | None:
         root, episode = item.store.attributes, item.episode
         sides = [_parts_of_side(root, episode, roles) for roles in (VISUAL_ROLES, LINGUISTIC_ROLES)]
+        if len({root.recording_of(side[0]).layers for side in sides if side}) > 1:
+            return _of_different_blocks(item, selection, layers, [side for side in sides if side])
         sites = {side[0] for side in sides if side}
         grams = {site: selected_gram(item, site, selection) for site in sites}
         uniform = {site: uniform_weights(item, site, selection) for site in sites}
@@ -58,6 +72,34 @@ def contribution_table(selected: Sequence[SelectedEpisode], selection: Selection
 
     frames = [frame for frame in map_episodes(measure, selected) if frame is not None]
     return pl.concat(frames) if len(frames) == len(selected) else None
+
+
+def _of_different_blocks(
+    item: SelectedEpisode,
+    selection: Selection,
+    layers: Sequence[int] | None,
+    sides: Sequence[tuple[str, NDArray[np.bool_]]],
+) -> pl.DataFrame | None:
+    """The table where the sides are at sites in different blocks; None where no chosen block has one of the sides."""
+    root = item.store.attributes
+    blocks_of = {
+        site: tuple(b for b in root.recording_of(site).layers if layers is None or b in layers) for site, _ in sides
+    }
+    if len(sides) < 2 or not all(blocks_of.values()):
+        return None
+    union = sorted({block for blocks in blocks_of.values() for block in blocks})
+    shape = (item.tokens.num_replans, len(union), len(selection.denoise))
+    values = {}
+    for name, (site, parts) in zip(("visual_norm", "linguistic_norm"), sides, strict=True):
+        recorded = root.recording_of(site).layers
+        own = replace(selection, layers=tuple(recorded.index(block) for block in blocks_of[site]))
+        gram, uniform = selected_gram(item, site, own), uniform_weights(item, site, own)
+        at = [union.index(block) for block in blocks_of[site]]
+        for column, norm in ((name, joint_norm(gram, parts)), (f"{name}_of_uniform", joint_norm(gram, parts, uniform))):
+            values[column] = np.full(shape, np.nan)
+            values[column][:, at] = norm
+    values |= dict.fromkeys(("contribution_ratio", "uniform_ratio", "ratio_lift"), np.full(shape, np.nan))
+    return long_table(item, [replan_axis(item), {"layer": union, "block": union}, denoise_axis(selection)], values)
 
 
 def _parts_of_side(

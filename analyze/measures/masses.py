@@ -53,13 +53,14 @@ def group_measures(
     mass: NDArray[np.float64],
     valid_mass: NDArray[np.float64],
     num_keys: NDArray[np.float64],
-    num_valid: NDArray[np.int64],
+    num_valid: NDArray[np.int64] | NDArray[np.float64],
 ) -> GroupMeasures:
     """Fractions, densities and lifts of masses.
 
     fraction = mass / sum of the masses of all groups; density = mass / number of keys;
     lift = density / (mass of all valid keys / their number), so that attention that is uniform over the valid keys
-    gives 1. Keys of a null sink (Cosmos's padded text) are not valid: their mass is not in the mass of all valid keys.
+    gives 1. Keys that not all queries see count for less (`schemas/groupings/key_counts.py`). Keys of a null sink
+    (Cosmos's padded text) are not valid: their mass is not in the mass of all valid keys.
 
     Args:
         mass: (replan, ..., group).

@@ -101,8 +101,8 @@ def ask(stores: Sequence[Store], settings: AnalysisSettings) -> Question:
     """
     check_combinable(stores)
     root = stores[0].attributes
-    selection = select(root, settings.layers, settings.denoise, settings.heads, settings.per_head)
     site = choose_site(root, settings.site)
+    selection = select(root, settings.layers, settings.denoise, settings.heads, settings.per_head, site)
     chosen = [(store, episode) for store in stores for episode in select_episodes(store, settings.tasks)]
     skipped: list[str] = []
     if settings.skip_corrupt:
@@ -113,6 +113,17 @@ def ask(stores: Sequence[Store], settings: AnalysisSettings) -> Question:
     grouping = choose_grouping(settings, vocabulary)
     notes = _denoise_notes(root, selection, grouping)
     return Question(tuple(stores), settings, selection, site, selected, grouping, vocabulary, tuple(skipped), notes)
+
+
+def select_again(question: Question, site: str) -> Selection:
+    """The question's selection at another site, whose layers and heads may be others.
+
+    Raises:
+        BadArgument: the site lacks layers or heads that the user chose.
+    """
+    settings = question.settings
+    root = question.stores[0].attributes
+    return select(root, settings.layers, settings.denoise, settings.heads, question.selection.per_head, site)
 
 
 def choose_grouping(settings: AnalysisSettings, vocabulary: Vocabulary) -> Grouping:

@@ -19,7 +19,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.contribution_ratios import joint_norm, segment_masses, selected_gram
+from vla_attention.analyze.measures.contribution_ratios import has_all_heads, joint_norm, segment_masses, selected_gram
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.schemas.layout import INVALID_ROLES
@@ -37,7 +37,7 @@ def value_ratios(question: Question, heads: pl.DataFrame) -> pl.DataFrame:
     """
     ratios = []
     recorded = (store.attributes for store in question.stores)
-    if all(root.recording.contributions and len(root.recording.heads) == root.policy.num_heads for root in recorded):
+    if all(root.recording.contributions and has_all_heads(root, question.site) for root in recorded):
         sinks = heads.group_by("suite", "task_id", "key", maintain_order=True).agg(pl.col("block").unique())
         for suite, task, key, blocks in sinks.iter_rows():
             found = _value_ratio(question, suite, task, key, blocks)

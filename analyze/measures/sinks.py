@@ -39,6 +39,7 @@ from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.groupings.key_counts import num_valid_keys
 from vla_attention.schemas.groupings.resolve import describe_key
 from vla_attention.schemas.layout import Role
 
@@ -106,13 +107,15 @@ class KeyShares:
         factor: float,
         selection: Selection,
         keys: NDArray[np.int64] | slice = slice(None),
+        counts: NDArray[np.float64] | None = None,
     ) -> None:
         """Count the rows (replan, head, key) of a layer (position in the selection) at one of its denoise steps.
 
-        A block that was named by two layer numbers counts once. `keys`: which keys the rows are of.
+        A block that was named by two layer numbers counts once. `keys`: which keys the rows are of. `counts`: for how
+        many keys each of them counts, see `key_sums`.
         """
         if selection.is_first_of_block(layer):
-            above, held = key_sums(rows, valid, factor)
+            above, held = key_sums(rows, valid, factor, counts)
             count, at = rows.shape[0] * len(selection.denoise), layers_once(selection).index(layer)
             self.above[at][:, keys] += (above / count).astype(np.float32)
             self.held[at][:, keys] += (held / count).astype(np.float32)
@@ -143,7 +146,10 @@ def layers_once(selection: Selection) -> list[int]:
 
 
 def key_sums(
-    rows: NDArray[np.float32], valid: NDArray[np.bool_], factor: float
+    rows: NDArray[np.float32],
+    valid: NDArray[np.bool_],
+    factor: float,
+    counts: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Number of rows in which a key takes more than factor / n of the mass of the n valid keys, and its summed share.
 
@@ -151,6 +157,8 @@ def key_sums(
         rows: probabilities (replan, head, key).
         valid: (replan or 1, key). A row without any mass counts for nothing.
         factor: multiple of the uniform share.
+        counts: for how many keys each key counts (replan or 1, key), see `schemas/groupings/key_counts.py`; its uniform
+            share is as much smaller. None: every key for one.
 
     Returns:
         Two arrays of shape (head, key): number of rows, and the sum over rows of p_k / S.
@@ -159,20 +167,21 @@ def key_sums(
     total = seen.sum(axis=2, dtype=np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.where(total > 0, 1.0 / total, 0.0).astype(np.float32)
-        limit = np.where(total > 0, factor * total / valid.sum(axis=1)[:, None], np.inf)
+        limit = np.where(total > 0, factor * total / num_valid_keys(valid, counts)[:, None], np.inf)
     # Sums in float32 err by some 1e-6: with a factor of 1, keys that share evenly must not exceed their share.
     limit = (limit * (1.0 + _ROUNDING)).astype(np.float32)
-    above = (seen > limit[:, :, None]).sum(axis=0)
+    scale = np.float32(1.0) if counts is None else counts.astype(np.float32)[:, None, :]
+    above = (seen > limit[:, :, None] * scale).sum(axis=0)
     held = np.matmul(inverse.T[:, None, :], seen.transpose(1, 0, 2))[:, 0]
     return above, held.astype(np.float64)
 
 
 def episode_key_shares(item: SelectedEpisode, selection: Selection, site: str, rule: SinkRule) -> KeyShares:
     """Read an episode's rows once."""
-    valid = item.valid
+    valid, counts = item.valid, item.key_counts
     shares = KeyShares.empty(selection, valid.shape[1])
     for part in layer_rows(item.episode, selection, site):
-        shares.add(part.layer, part.rows, valid, rule.factor, selection)
+        shares.add(part.layer, part.rows, valid, rule.factor, selection, counts=counts)
     return shares
 
 
@@ -201,9 +210,10 @@ def search_of(question: Question, shares: Sequence[KeyShares], rule: SinkRule) -
             for name in ("above", "held")
         )
         valid = [item.valid for item in items]
-        num_valid = float(np.mean([part.sum(axis=1).mean() for part in valid]))
+        num_valid = float(np.mean([item.num_valid.mean() for item in items]))
+        counted = _mean_counts(items, valid)
         keys = np.flatnonzero(np.any([part.any(axis=0) for part in valid], axis=0))
-        by_mass = held > max(rule.mass, 2.0 / num_valid)
+        by_mass = held > np.maximum(rule.mass, 2.0 * counted / num_valid)
         # A share is a mean of quotients: rounding must not put one half below 0.5.
         is_sink = by_mass | (above >= rule.share - _ROUNDING)
         count = is_sink.sum(axis=(0, 1))
@@ -219,7 +229,7 @@ def search_of(question: Question, shares: Sequence[KeyShares], rule: SinkRule) -
                 pl.lit(num_valid).alias("num_valid"),
                 pl.Series("share_of_rows", above.mean(axis=(0, 1))[keys]),
                 pl.Series("mean_mass", mean_mass[keys]),
-                pl.Series("times_uniform", mean_mass[keys] * num_valid),
+                pl.Series("times_uniform", mean_mass[keys] * num_valid / counted[keys]),
                 pl.Series("largest_mass", held.max(axis=(0, 1))[keys]),
                 pl.Series("sink_heads", count[keys]),
                 pl.Series("heads_by_mass", by_mass.sum(axis=(0, 1))[keys]),
@@ -282,7 +292,7 @@ def without_sinks(question: Question, sinks: pl.DataFrame, rule: SinkRule) -> Qu
                 "sinks; give a larger --sink-factor, --sink-mass or --sink-heads."
             )
     grouping = replace(question.grouping, name=f"{question.grouping.name}-without-sinks")
-    num_valid = max(float(item.valid.sum(axis=1).mean()) for item in question.selected)
+    num_valid = max(float(item.num_valid.mean()) for item in question.selected)
     notes = (*question.notes, describe_sinks(sinks, len(_tasks(question)), rule, num_valid))
     return replace(question, selected=selected, grouping=grouping, notes=notes)
 
@@ -338,6 +348,18 @@ def describe_sinks(sinks: pl.DataFrame, num_tasks: int, rule: SinkRule, num_vali
         f"Without sinks: {listing(named, 6)} {'is' if len(named) == 1 else 'are'} out of every group and of the valid "
         f"keys (but not of norms of contributions). A sink takes {of_rule}.{also}"
     )
+
+
+def _mean_counts(items: Sequence[SelectedEpisode], valid: Sequence[NDArray[np.bool_]]) -> NDArray[np.float64]:
+    """For how many keys each key counts, mean over the replans at which it is valid, (key,); 1 at the others."""
+    total = np.zeros(valid[0].shape[1])
+    number = np.zeros_like(total)
+    for item, part in zip(items, valid, strict=True):
+        counts, shape = item.key_counts, (item.tokens.num_replans, len(total))
+        own = np.broadcast_to(part, shape)
+        total += (own * np.broadcast_to(1.0 if counts is None else counts, shape)).sum(axis=0)
+        number += own.sum(axis=0)
+    return np.where((number > 0) & (total > 0), total / np.maximum(number, 1), 1.0)
 
 
 #: Columns that describe a key.

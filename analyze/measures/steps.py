@@ -59,7 +59,7 @@ class MeasuredEpisode:
     valid_mass: NDArray[np.float64]
     row_sum: NDArray[np.float64]
     num_keys: NDArray[np.float64]
-    num_valid: NDArray[np.int64]
+    num_valid: NDArray[np.int64] | NDArray[np.float64]
 
     def over_heads(self) -> MeasuredEpisode:
         """The same with heads averaged."""
@@ -182,7 +182,7 @@ def _episode_steps(measured: MeasuredEpisode, grouping: Grouping) -> Tables:
     )
 
 
-def _per_replan(values: NDArray[np.float64] | NDArray[np.int64]) -> NDArray[np.float64]:
+def _per_replan(values: NDArray[np.int64] | NDArray[np.float64]) -> NDArray[np.float64]:
     """Values (replan or 1,) as (replan or 1, 1, 1, 1)."""
     return values[:, None, None, None]  # type: ignore[return-value]
 

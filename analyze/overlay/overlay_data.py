@@ -159,7 +159,7 @@ def episode_overlay(
         views=views,
         maps=maps,
         image_mass=(mean * image).sum(axis=1),
-        uniform_mass=(mean * valid).sum(axis=1) / valid.sum(axis=1),
+        uniform_mass=(mean * valid).sum(axis=1) / item.num_valid,
         num_image_keys=int(image.sum(axis=1).max()),
         ratio=ratio,
         uniform_ratio=uniform,

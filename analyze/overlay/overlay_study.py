@@ -20,7 +20,7 @@ from vla_attention.analyze.overlay.overlay_data import (
     overlay_table,
     ratios_of,
 )
-from vla_attention.analyze.stores.selection import heads_text
+from vla_attention.analyze.stores.selection import heads_text, site_that
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.reader import Store
@@ -54,7 +54,7 @@ class OverlayStudy:
     def averaged_over(self) -> str:
         """The layers, denoise steps and heads that were averaged, in words."""
         chosen = self.question.selection
-        num_heads = self.question.stores[0].attributes.policy.num_heads
+        _, num_heads = self.question.stores[0].attributes.size_of(self.question.site)
         return (
             f"mean over layers {listing(chosen.layer_labels, 8)}, denoise steps {listing(chosen.denoise_steps, 8)}, "
             f"{heads_text(chosen, num_heads)}"
@@ -93,7 +93,8 @@ def study_overlay(
         UserError: a subclass that says which name or number does not exist.
     """
     outlined = outline_grouping(settings.groups)
-    question = ask(stores, replace(settings, groups=()))
+    seeing = site_that(stores[0].attributes, settings.site, lambda site: bool(site.cameras))
+    question = ask(stores, replace(settings, groups=(), site=seeing or settings.site))
     check_outlines(question, outlined)
     shown = camera_names(question, cameras)
     item = find_episode(question.selected, task, episode)

@@ -21,7 +21,7 @@ def frame_proxy(root: RootAttributes, layout: SiteLayout, grouping: Grouping) ->
     query = root.policy.config.get("query_frame")
     if visual is None or text is None or not isinstance(query, str):
         return None
-    return FrameProxy(layout.num_keys, query, visual, text, root.recording.num_action_queries)
+    return FrameProxy(layout.num_keys, query, visual, text, root.recording.of_site(layout).num_action_queries)
 
 
 def _frame_of(grouping: Grouping, side: tuple[str, ...]) -> str | None:

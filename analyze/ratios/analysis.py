@@ -108,7 +108,7 @@ class Analysis:
     @cached_property
     def contributions(self) -> pl.DataFrame | None:
         """See `measures.contributions.contribution_table`; None when they were not recorded."""
-        return contribution_table(self.question.selected, self.question.selection)
+        return contribution_table(self.question.selected, self.question.selection, self.question.settings.layers)
 
     @cached_property
     def group_contributions(self) -> Tables | None:
@@ -159,7 +159,19 @@ class Analysis:
     def notes(self) -> list[str]:
         """What to know beside the numbers: what was left out, which steps they are of, other sites."""
         question = self.question
-        return [*question.remarks, *_notes(question.stores[0].attributes, question.selection, question.site)]
+        notes = [*question.remarks, *_notes(question.stores[0].attributes, question.selection, question.site)]
+        if self.grouping.ratio is not None and self.without_known_end:
+            notes.append(
+                f"No results file in the published format: it states outcome and number of steps of each episode, and "
+                f"of {self.without_known_end} of {len(question.selected)} episodes these are not known."
+            )
+        return notes
+
+    @property
+    def without_known_end(self) -> int:
+        """Number of episodes whose outcome or number of steps is not known."""
+        ends = (item.episode.attributes for item in self.question.selected)
+        return sum(end.success is None or not end.num_steps for end in ends)
 
     @cached_property
     def summary(self) -> str:
@@ -205,7 +217,7 @@ def _described(analysis: Analysis) -> AnalysedRun:
         policy=f"{policy.name} ({policy.checkpoint_format}: {policy.checkpoint})",
         untrained=policy.untrained,
         denoise_steps=question.selection.denoise_steps,
-        heads=describe_heads(question.selection, policy.num_heads),
+        heads=describe_heads(question.selection, question.stores[0].attributes.size_of(question.site)[1]),
         estimand=question.settings.intervals,
         notes=analysis.notes,
         answer=analysis.answer,
@@ -232,7 +244,7 @@ def write_tables(analysis: Analysis, folder: Path) -> list[Path]:
             recorded["group_contribution_ratios"] = analysis.group_contributions.cells
     written += write_parquet(folder, about, **recorded)
     with writing("results", folder):
-        if grouping.ratio is not None:
+        if grouping.ratio is not None and not analysis.without_known_end:
             question = analysis.question
             proxy = frame_proxy(question.stores[0].attributes, question.selected[0].tokens.layout, grouping)
             steps = question.selection.denoise_steps
@@ -246,6 +258,13 @@ def write_tables(analysis: Analysis, folder: Path) -> list[Path]:
 
 def _notes(root: RootAttributes, selection: Selection, site: str) -> list[str]:
     notes = [selection.note] if selection.note else []
+    kinds = {span.kind for span in root.site(site).spans}
+    missing = [name for name, has in (("image", {"image", "latent"}), ("text", {"text"})) if not kinds & has]
+    if missing and root.site(site).layers:
+        notes.append(
+            f"Site '{site}' has no {' and no '.join(missing)} keys: a ratio of visual to linguistic attention is not "
+            "defined inside of it. Compare norms of contributions, which sites of different blocks share."
+        )
     others = [other.name for other in root.sites if other.name != site]
     if others:
         notes.append(

@@ -209,7 +209,7 @@ def _sinks(sinks: pl.DataFrame | None) -> list[Caveat]:
 
 
 def _queries(question: Question) -> list[Caveat]:
-    recording = question.stores[0].attributes.recording
+    recording = question.stores[0].attributes.recording_of(question.site)
     if recording.queries != "mean" or recording.num_action_queries == 1:
         return []
     sentence = (
@@ -223,10 +223,9 @@ def _parts_of_the_model(question: Question) -> list[Caveat]:
     policy, selection = question.stores[0].attributes.policy, question.selection
     blocks, heads, steps = len(set(selection.blocks)), len(selection.heads), selection.denoise_steps
     found = []
-    if blocks < policy.num_layers or heads < policy.num_heads:
-        sentence = (
-            f"These numbers are of {blocks} of {policy.num_layers} layers and {heads} of {policy.num_heads} heads."
-        )
+    num_layers, num_heads = question.stores[0].attributes.size_of(question.site)
+    if blocks < num_layers or heads < num_heads:
+        sentence = f"These numbers are of {blocks} of {num_layers} layers and {heads} of {num_heads} heads."
         found.append(Caveat("Part of the model", sentence))
     if len(steps) < policy.num_denoise_steps and not question.notes:
         which = "step" if len(steps) == 1 else "steps"

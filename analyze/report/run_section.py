@@ -6,6 +6,7 @@ from vla_attention.analyze.ratios.analysis import Analysis, describe_heads
 from vla_attention.analyze.report.section_parts import Definitions, Item, Part, Section
 from vla_attention.analyze.show.numbers import format_percent, plural
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
+from vla_attention.analyze.stores.contents import own_parts, protocol_text
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
@@ -33,10 +34,6 @@ def _store_items(store: Store) -> list[Item]:
     policy, protocol = root.policy, root.protocol
     untrained = ", untrained weights" if policy.untrained else ""
     libraries = [f"{name} {version}" for name, version in root.provenance.items() if name != "code"]
-    steps = (
-        f"{protocol.name}, seed {protocol.seed}, pictures of {protocol.image_size} pixels, {protocol.wait_steps} "
-        f"waiting steps, a replan every {protocol.replan_steps} steps, at most {protocol.max_steps} steps"
-    )
     return [
         Item("store", store.path, code=True),
         Item("episodes", len(store.episodes)),
@@ -47,7 +44,7 @@ def _store_items(store: Store) -> list[Item]:
         Item("computed in", policy.config.get("dtype", _NOT_STATED)),
         Item("code version at capture", root.provenance.get("code", _NOT_STATED)),
         Item("libraries and machine", ", ".join(libraries) or _NOT_STATED),
-        Item("protocol", steps),
+        Item("protocol", protocol_text(protocol)),
         Item("recording", _recording(store)),
         Item("cameras", "; ".join(map(_camera, policy.cameras)) or "none"),
     ]
@@ -62,6 +59,7 @@ def _recording(store: Store) -> str:
             f"denoise steps {listing(recording.denoise_steps, _MOST_LISTED)}",
             plural(len(recording.heads), "head"),
             f"queries: {recording.queries} of {recording.num_action_queries}",
+            *(own_parts(store.attributes, site.name) for site in store.attributes.sites if site.layers or site.heads),
             "rows exact" if exact else f"rows with {recording.mantissa_bits} bits",
             f"frames {'stored' if recording.frames else 'not stored'}",
             f"contributions {'recorded' if recording.contributions else 'not recorded'}",
@@ -87,7 +85,7 @@ def _question_items(analysis: Analysis) -> list[Item]:
     question, grouping = analysis.question, analysis.grouping
     selection, settings, ratio = question.selection, question.settings, grouping.ratio
     sides = () if ratio is None else (ratio.numerator, ratio.denominator)
-    num_heads = question.stores[0].attributes.policy.num_heads
+    _, num_heads = question.stores[0].attributes.size_of(question.site)
     described = f": {grouping.description}" if grouping.description else ""
     return [
         Item("site", question.site),

@@ -17,6 +17,7 @@ from vla_attention.schemas.layout import Role, Span
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, mass_error_bound
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
+from vla_attention.schemas.stores.store_format import Protocol, RootAttributes
 
 #: Attributes of an episode that are columns of `episodes_table`.
 _EPISODE_COLUMNS = (
@@ -85,11 +86,7 @@ def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
     yield f"  policy     {policy.name} ({policy.family}), {policy.checkpoint_format}: {policy.checkpoint}"
     yield f"  weights    {policy.digest[:16]}{'  UNTRAINED random weights' if policy.untrained else ''}"
     protocol = root.protocol
-    yield (
-        f"  run        suite {protocol.suite}, protocol {protocol.name}, seed {protocol.seed}, pictures of "
-        f"{protocol.image_size} pixels, replan every {protocol.replan_steps} steps, at most {protocol.max_steps} steps "
-        f"after {protocol.wait_steps} waiting steps"
-    )
+    yield f"  run        suite {protocol.suite}, protocol {protocol_text(protocol)}"
     solved = solved_text(episode.attributes.success for episode in episodes)
     yield f"  episodes   {len(episodes)} ({solved}), tasks {listing(store.task_ids, 100)}"
     labels = [
@@ -107,7 +104,8 @@ def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
     yield f"  precision  {recording.mantissa_bits} mantissa bits: {error}"
     for site in root.sites:
         tokens = [episode.tokens(root, site.name) for episode in episodes]
-        yield f"Site '{site.name}': {site.num_keys} keys; span, keys, roles (number of keys, of the first replan)"
+        own = f" ({own_parts(root, site.name)})" if site.layers or site.heads or site.num_action_queries else ""
+        yield f"Site '{site.name}'{own}: {site.num_keys} keys; span, keys, roles (number of keys, of the first replan)"
         for span in site.spans:
             yield f"  {_describe_span(span, tokens[0])}"
         vocabulary = collect_vocabulary(tokens)
@@ -132,4 +130,36 @@ def _describe_span(span: Span, tokens: EpisodeTokens) -> str:
     codes = tokens.key_role[0, span.start : span.stop]
     roles = ", ".join(f"{Role(code).label} {int((codes == code).sum())}" for code in sorted(set(codes.tolist())))
     grid = f"  {span.grid.rows} x {span.grid.columns} patches" if span.grid else ""
-    return f"{span.name:<18} {span.start:>4}..{span.stop - 1:<4} {roles}{grid}"
+    growing = "  growing: generated one after another" if span.growing else ""
+    return f"{span.name:<18} {span.start:>4}..{span.stop - 1:<4} {roles}{grid}{growing}"
+
+
+def protocol_text(protocol: Protocol) -> str:
+    """The protocol on one line; of a loop that is not ours only what is known."""
+    if not protocol.of_other_loop:
+        return (
+            f"{protocol.name}, seed {protocol.seed}, pictures of {protocol.image_size} pixels, {protocol.wait_steps} "
+            f"waiting steps, a replan every {protocol.replan_steps} steps, at most {protocol.max_steps} steps"
+        )
+    loop = "a replayed data set" if protocol.name == "dataset" else "the caller's own loop"
+    known = [
+        (protocol.image_size, f"pictures of {protocol.image_size} pixels"),
+        (protocol.replan_steps, f"a replan every {protocol.replan_steps} steps"),
+        (protocol.max_steps, f"at most {protocol.max_steps} steps"),
+    ]
+    parts = [f"{protocol.name} ({loop})", f"seed {protocol.seed}", *(text for number, text in known if number)]
+    missing = [
+        name
+        for (number, _), name in zip(known, ("picture size", "replan steps", "most steps"), strict=True)
+        if not number
+    ]
+    return ", ".join(parts) + (f"; not known: {listing(missing)}" if missing else "")
+
+
+def own_parts(root: RootAttributes, site: str) -> str:
+    """What is recorded of a site that has layers, heads or action queries of its own."""
+    recording = root.recording_of(site)
+    return (
+        f"site {site}: layers {listing(recording.layers, 40)}, {plural(len(recording.heads), 'head')}, "
+        f"{recording.num_action_queries} action queries"
+    )

@@ -42,9 +42,14 @@ def select(
     denoise: Sequence[str] | None = None,
     heads: Sequence[int] | None = None,
     per_head: bool = False,
+    site: str | None = None,
 ) -> Selection:
-    """Check the wanted layers, denoise steps and heads against what was recorded; None means all of it."""
-    recording = root.recording
+    """Check the wanted layers, denoise steps and heads against what was recorded of a site; None means all of it.
+
+    site: the first one unless it is given.
+    """
+    site = choose_site(root, site)
+    recording = root.recording_of(site)
     if layers is None:
         blocks = block_of_labels(recording.layer_labels, root.policy.num_layers)
         wanted = LayerSelection(blocks, recording.layer_labels)
@@ -55,13 +60,16 @@ def select(
     ]
     if missing:
         raise BadArgument(
-            f"Layers {listing(missing)} were not recorded; recorded blocks: {listing(recording.layers, 40)}."
+            f"Layers {listing(missing)} were not recorded{_at_site(root, site)}; recorded blocks: "
+            f"{listing(recording.layers, 40)}{_other_sites(root, site)}."
         )
     steps = parse_denoise_steps(denoise, recording.denoise_steps)
     head_numbers = recording.heads if heads is None else tuple(heads)
     for head in head_numbers:
         if head not in recording.heads:
-            raise BadArgument(f"Head {head} was not recorded; recorded heads: {listing(recording.heads, 40)}.")
+            raise BadArgument(
+                f"Head {head} was not recorded{_at_site(root, site)}; recorded heads: {listing(recording.heads, 40)}."
+            )
     for what, numbers in (("Denoise steps", steps), ("Heads", head_numbers)):
         if len(set(numbers)) != len(numbers):
             raise BadArgument(f"{what} {listing(numbers)} name one of them twice.")
@@ -76,6 +84,23 @@ def select(
         per_head=per_head,
         note=wanted.note,
     )
+
+
+def _at_site(root: RootAttributes, site: str) -> str:
+    """Which site is meant, where sites have layers of their own."""
+    return f" at site '{site}'" if any(layout.layers or layout.heads for layout in root.sites) else ""
+
+
+def _other_sites(root: RootAttributes, site: str) -> str:
+    """The layers of the other sites, where sites have layers of their own."""
+    if not any(layout.layers for layout in root.sites):
+        return ""
+    others = [
+        f"'{other.name}' {listing(root.recording_of(other.name).layers, 40)}"
+        for other in root.sites
+        if other.name != site
+    ]
+    return f"; other sites (--site) have {'; '.join(others)}" if others else ""
 
 
 def heads_text(selection: Selection, num_heads: int) -> str:

@@ -95,7 +95,8 @@ def _course_section(courses: TimeCourses, settings: TimeSettings) -> str:
 def _gripper_section(courses: TimeCourses, settings: TimeSettings) -> str:
     above = heading("AT THE FIRST GRIPPER CLOSING")
     if courses.closing.is_empty():
-        return f"{above}\nThe stores hold no actions, so there is nothing to align at."
+        none = "The stores hold no actions of a gripper whose commands are known, so there is nothing to align at."
+        return "\n".join([above, *wrap(none)])
     closed = courses.closing.drop_nulls("closing_replan")
     rule = (
         f"The gripper closes in {closed.height} of {courses.closing.height} episodes (the first replan one of whose "

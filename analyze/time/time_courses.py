@@ -37,8 +37,8 @@ from vla_attention.analyze.time.alignment import (
     around_event,
     change_at_event,
     closing_replan,
+    episode_timing,
     on_episode_time,
-    replan_starts,
 )
 from vla_attention.analyze.time.effective_replans import effective_replans_table
 from vla_attention.schemas.errors import BadArgument
@@ -131,7 +131,10 @@ def time_courses(
     of_layer = replans.filter(pl.col("layer") == layer).kept()
     rows, groups = of_layer.cells, of_layer.groups_with_mass()
     quantities = ((RATIO,) if grouping.ratio else ()) + groups
-    has_actions = all("actions" in item.episode.attributes.arrays for item in question.selected)
+    # What closes a gripper is known of our suites only.
+    has_actions = all(
+        item.episode.has("actions") and not item.store.attributes.protocol.of_other_loop for item in question.selected
+    )
     by_name = {episode_id(item): item for item in question.selected}
     episodes = []
     fractions = of_layer.groups.partition_by(EPISODE_ID, as_dict=True)
@@ -164,8 +167,7 @@ def time_courses(
 def _episode(item: SelectedEpisode, level: Tables, quantities: Sequence[str], has_actions: bool) -> _Episode:
     part = level.cells
     attributes = item.episode.attributes
-    wait_steps = item.store.attributes.protocol.wait_steps
-    starts = replan_starts(part["env_step"].to_numpy(), wait_steps, attributes.num_steps, item.episode.name)
+    starts, num_steps = episode_timing(item.store.attributes, item.episode, part["env_step"].to_numpy())
     columns = [
         part["log2_ratio"] * np.log(2.0) if quantity == RATIO else level.of_group(quantity)["fraction"]
         for quantity in quantities
@@ -179,8 +181,8 @@ def _episode(item: SelectedEpisode, level: Tables, quantities: Sequence[str], ha
         values=np.stack([float_values(column) for column in columns], axis=1),
         uniform=uniform if isinstance(uniform, float) else float("nan"),
         starts=starts,
-        num_steps=attributes.num_steps,
-        closing=None if actions is None else closing_replan(actions, starts, attributes.num_steps),
+        num_steps=num_steps,
+        closing=None if actions is None else closing_replan(actions, starts, num_steps),
     )
 
 

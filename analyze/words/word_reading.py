@@ -17,6 +17,7 @@ from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.groupings.resolve import counted_keys
 from vla_attention.schemas.groupings.vocabulary import NO_WORDS
 from vla_attention.schemas.groupings.words import word_class
 from vla_attention.schemas.layout import Role
@@ -109,8 +110,9 @@ def _episode_words(item: SelectedEpisode, selection: Selection, site: str) -> pl
         mass[:, part.layer] += masses(part.of_heads(selection), items.weights) / len(selection.denoise)
     layers = LayerAxis.of(selection, average_one=False)
     mass = layers.with_average(mass)
-    keys = items.weights.sum(axis=1, dtype=np.float64)
-    measures = group_measures(mass[..., :-2], mass[..., -1], keys[:, :-2], keys[:, -1].astype(np.int64))
+    keys = counted_keys(items.weights, item.key_counts)
+    valid = keys[:, -1] if item.key_counts is not None else keys[:, -1].astype(np.int64)
+    measures = group_measures(mass[..., :-2], mass[..., -1], keys[:, :-2], valid)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.where(mass[..., -2:-1] > 0, measures.mass / mass[..., -2:-1], np.nan)
     outside = np.array([name in {Role.STATE.label, Role.IMAGE.label} for _, name, _, _ in items.names])

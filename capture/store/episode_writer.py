@@ -18,7 +18,7 @@ from vla_attention.capture.store.store_root import check_same_run, read_existing
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.jsonable import to_json
-from vla_attention.schemas.layout import Prompt
+from vla_attention.schemas.layout import Prompt, prompt_at
 from vla_attention.schemas.stores.content_rules import (
     camera_picture_problems,
     counter_problems,
@@ -144,7 +144,8 @@ class EpisodeWriter:
         yield from self._misfits(record)
         for name, site in self.sites.items():
             yield from site.problems(record.rows[name], record.key_role[name], replan)
-            yield from piece_role_problems(site.layout, record.key_role[name], record.prompt, replan)
+            prompt = prompt_at(sites, site.layout, record.prompt)
+            yield from piece_role_problems(site.layout, record.key_role[name], prompt, replan)
         if record.prompt not in self.prompts:
             yield from prompt_problems(sites, record.prompt)
         for camera, frame in record.frames.items():

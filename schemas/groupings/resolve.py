@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.schemas.groupings.grouping import REST, Grouping, GroupingError
+from vla_attention.schemas.groupings.key_counts import num_valid_keys
 from vla_attention.schemas.groupings.selector_parser import Atom, Everything, Selector, atoms_of, parse_selector
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS, Membership, SelectorError, no_keys
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
@@ -34,14 +35,15 @@ class ResolvedGrouping:
     Attributes:
         names: group names, in the order of the group axis.
         weights: weight of each key in each group, shape (replan or 1, key, group) float32, 0..1.
-        num_keys: number of keys of each group (the sum of its weights), shape (replan or 1, group) float64.
-        num_valid: number of keys that can hold information, shape (replan or 1,).
+        num_keys: number of keys of each group (the sum of its weights; keys that not all queries see count for less,
+            see `key_counts`), shape (replan or 1, group) float64.
+        num_valid: number of keys that can hold information, counted in the same way, shape (replan or 1,).
     """
 
     names: tuple[str, ...]
     weights: NDArray[np.float32]
     num_keys: NDArray[np.float64]
-    num_valid: NDArray[np.int64]
+    num_valid: NDArray[np.int64] | NDArray[np.float64]
 
 
 def check_names(grouping: Grouping, vocabulary: Vocabulary, layout: SiteLayout) -> None:
@@ -69,9 +71,16 @@ def resolve(grouping: Grouping, tokens: EpisodeTokens) -> ResolvedGrouping:
     return ResolvedGrouping(
         names=grouping.names,
         weights=stacked,
-        num_keys=stacked.sum(axis=1, dtype=np.float64),
-        num_valid=tokens.valid.sum(axis=1),
+        num_keys=counted_keys(stacked, tokens.key_counts),
+        num_valid=num_valid_keys(tokens.valid, tokens.key_counts),
     )
+
+
+def counted_keys(weights: NDArray[np.float32], counts: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """Numbers of keys (replan or 1, group) from weights (replan or 1, key, group) and the `key_counts`."""
+    counted = weights if counts is None else weights * counts[:, :, None]
+    numbers: NDArray[np.float64] = counted.sum(axis=1, dtype=np.float64)
+    return numbers
 
 
 def memberships(grouping: Grouping, tokens: EpisodeTokens) -> dict[str, Membership]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.jsonable import from_json
+from vla_attention.schemas.layout import prompt_at
 from vla_attention.schemas.stores.root import episode_folders, group_attributes, read_run
 from vla_attention.schemas.stores.seal import identity_problem, read_seal
 from vla_attention.schemas.stores.sealed_files import SealedFiles
@@ -189,7 +190,7 @@ class StoredEpisode:
 
     def tokens(self, root: RootAttributes, site: str) -> EpisodeTokens:
         """What every key of a site is in this episode."""
-        layout = next(layout for layout in root.sites if layout.name == site)
+        layout = root.site(site)
         stored = [name.removeprefix("objects/") for name in self.attributes.arrays if name.startswith("objects/")]
         cameras = [camera for camera in stored if camera in layout.cameras]
         # A prompt's pieces are keys of the site that reads it; elsewhere (Cosmos's self-attention) there are no words.
@@ -197,10 +198,11 @@ class StoredEpisode:
         return EpisodeTokens(
             layout=layout,
             key_role=self.read(f"{site}/key_role"),
-            prompts=self.attributes.prompts if reads else (),
+            prompts=tuple(prompt_at(root.sites, layout, prompt) for prompt in self.attributes.prompts) if reads else (),
             prompt_index=self.read("prompt_index"),
             objects=self.attributes.objects,
             coverage=_StoredCoverage(self, cameras),
+            num_queries=root.recording.of_site(layout).num_action_queries,
         )
 
 

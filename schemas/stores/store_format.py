@@ -250,6 +250,11 @@ class RootAttributes:
                 return site
         raise unknown_name("site", name, [site.name for site in self.sites])
 
+    def size_of(self, site: str) -> tuple[int, int]:
+        """How many blocks of the policy have a site, and how many heads they have there."""
+        layout = self.site(site)
+        return len(layout.layers) or self.policy.num_layers, layout.heads or self.policy.num_heads
+
     def recording_of(self, site: str) -> Recording:
         """What is recorded of a site, see `Recording.of_site`."""
         return self.recording.of_site(self.site(site))
@@ -333,6 +338,11 @@ class EpisodeAttributes:
         check_name("task", self.task_name)
         for path in self.arrays:
             check_inner_path(path)
+
+    @property
+    def initial_state(self) -> str:
+        """What episodes of a task that begin alike share: the state's digest, or the number where it is not known."""
+        return self.initial_state_digest or f"episode {self.episode_index}"
 
 
 def episode_name(task_id: int, episode_index: int) -> str:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.schemas.layout import prompt_at
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
 from vla_attention.schemas.stores.content_rules import (
     absent_problems,
@@ -182,8 +183,9 @@ def _token_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[st
     for site in root.sites:
         roles = episode.read(f"{site.name}/key_role")
         yield from role_problems(site, roles)
+        of_site = [prompt_at(root.sites, site, prompt) for prompt in prompts]
         for replan, number in enumerate(index):
-            yield from piece_role_problems(site, roles[replan], prompts[number], replan)
+            yield from piece_role_problems(site, roles[replan], of_site[number], replan)
 
 
 def _camera_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:

@@ -1,0 +1,190 @@
+"""Stores of other policies: sites in some of the blocks, keys that come and go, unknown outcomes, no pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from tests.kit.questions import question_about
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.analyze.measures.contributions import contribution_table
+from vla_attention.analyze.measures.sinks import SinkRule, search_sinks
+from vla_attention.analyze.measures.steps import measure_episodes, step_tables
+from vla_attention.analyze.ratios.analysis import analyse
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.testing import assert_whole
+from vla_attention.testing.site_stores import SiteStoreSpec, key_exists, site_root, write_site_store
+
+KINDS = ("alternating", "split", "growing")
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("stores")
+    made = {
+        kind: write_site_store(folder / f"{kind}.zarr", kind=kind, outcome="some", dataset_actions=0.5)
+        for kind in KINDS
+    }
+    bare = {"actions": False, "state": False, "frames": False, "contributions": False, "outcome": "unknown"}
+    made["bare"] = write_site_store(folder / "bare.zarr", kind="growing", **bare)
+    return made
+
+
+@pytest.mark.parametrize("name", [*KINDS, "bare"])
+def test_stores_are_whole_and_every_site_has_its_own_axes(stores, name):
+    assert_whole(stores[name])
+    store = open_store(stores[name])
+    for site in store.attributes.sites:
+        recording = store.attributes.recording_of(site.name)
+        for episode in store.episodes:
+            rows = episode.read(f"{site.name}/rows")
+            assert rows.shape[1] == len(recording.layers)
+            assert rows.shape[3] == len(recording.heads)
+            assert episode.read(f"{site.name}/layer").tolist() == list(recording.layers)
+
+
+@pytest.mark.parametrize("queries", ["mean", "all"])
+@pytest.mark.parametrize("grouping", ["default", "cameras", "instruction"])
+def test_uniform_attention_has_the_lift_one(tmp_path, queries, grouping):
+    replans = 1 if queries == "all" else 4  # with all queries, every replan has as many
+    path = write_site_store(tmp_path / "a.zarr", kind="growing", spread=0, queries=queries, replans=replans)
+    question = question_about(path, grouping)
+    tables = step_tables(measure_episodes(question), question.grouping)
+    groups = tables.groups.filter(pl.col("keys") > 0)
+    np.testing.assert_allclose(groups["lift"].to_numpy(), 1.0, rtol=2e-3)
+    assert {"action", "linguistic"} <= set(groups["group"])
+    np.testing.assert_allclose(tables.cells["ratio"].to_numpy(), tables.cells["uniform_ratio"].to_numpy(), rtol=2e-3)
+    assert (groups.filter(group="linguistic")["keys"] % 1 == 0).all(), "absent keys of the prompt count for nothing"
+    generated = groups.filter(group="action")["keys"].to_numpy()
+    assert ((generated > 0) & (generated < 6)).all(), "only later queries see them"
+
+
+def test_absent_keys_are_never_called_padding(stores, capsys):
+    question = question_about(stores["growing"])
+    groups = step_tables(measure_episodes(question), question.grouping).groups
+    assert (groups.filter(group="padding")["keys"] == 0).all()
+    analyze(["report", str(stores["growing"]), "--out", str(stores["growing"].parent / "report")])
+    assert "Padding" not in (stores["growing"].parent / "report" / "report.html").read_text()
+
+
+def test_no_key_is_a_sink_of_uniform_attention(tmp_path):
+    path = write_site_store(tmp_path / "a.zarr", kind="growing", spread=0, replans=1)
+    search = search_sinks(question_about(path), SinkRule(factor=1.01))
+    assert search.sinks.is_empty()
+    np.testing.assert_allclose(search.keys["times_uniform"].to_numpy(), 1.0, rtol=2e-3)
+
+
+def test_layers_that_a_site_lacks(stores):
+    with pytest.raises(BadArgument, match=r"Layers 0 were not recorded at site 'cross'; recorded blocks: 1, 3; other"):
+        question_about(stores["alternating"], site="cross", layers=(0, 1))
+    with pytest.raises(BadArgument, match=r"Head 2 was not recorded at site 'cross'; recorded heads: 0, 1\."):
+        question_about(stores["alternating"], site="cross", heads=(2,))
+    question = question_about(stores["alternating"], site="cross", layers=(3,))
+    assert (question.selection.layers, question.selection.blocks) == ((1,), (3,))
+    assert "site 'cross'" not in "".join(question.notes)
+
+
+def test_masses_of_a_site_are_those_of_its_own_rows(stores):
+    question = question_about(stores["alternating"], site="cross", layers=(3,))
+    for measured in measure_episodes(question):
+        rows = measured.item.episode.read("cross/rows")[:, 1]  # block 3 is the second of the site
+        image = rows[..., :16].sum(axis=-1, dtype=np.float64).mean(axis=(2, 3))  # (replan, denoise)
+        np.testing.assert_allclose(measured.mass[:, 0, :, 0, 0], image, rtol=1e-3)
+
+
+def test_contributions_of_sites_in_different_blocks(stores):
+    question = question_about(stores["split"])
+    table = contribution_table(question.selected, question.selection)
+    assert table["block"].unique().sort().to_list() == [0, 1, 2, 3]
+    assert table["contribution_ratio"].is_null().all()
+    of_image = table.filter(pl.col("block").is_in([1, 3]))
+    assert of_image["linguistic_norm"].is_null().all()
+    assert of_image["visual_norm"].is_not_null().all()
+    gram = question.selected[0].episode.read("image/contribution")[0, 1, 1].astype(np.float64)  # block 3, step 1
+    first = of_image.filter(task_id=0, episode_index=0, replan=0, block=3, denoise_step=1)
+    assert first["visual_norm"].item() == pytest.approx(np.sqrt(gram[:-1, :-1].sum()), rel=1e-5)
+    analysis = analyse(question)
+    row = analysis.contribution_rows.filter(layer="layers_avg").row(0, named=True)
+    steps = table.group_by("task_id", "episode_index", "replan", "denoise_step").agg(
+        pl.col("visual_norm", "linguistic_norm").mean()
+    )
+    logs = steps.with_columns((pl.col("visual_norm") / pl.col("linguistic_norm")).log().alias("log"))
+    per_episode = logs.group_by("task_id", "episode_index").agg(pl.col("log").mean())
+    assert row["geometric_mean"] == pytest.approx(np.exp(per_episode["log"].mean()), rel=1e-9)
+    assert row["uniform_ratio"] > 0
+    assert row["ratio_lift"] > 0
+    assert any("a ratio of visual to linguistic attention is not defined" in note for note in analysis.notes)
+    assert contribution_table(question.selected, question.selection, layers=(0, 2)) is None
+
+
+def test_unknown_outcomes_are_in_no_share_of_solved_episodes(stores, capsys):
+    overall = analyse(question_about(stores["alternating"])).overall
+    known = [
+        episode.attributes.success
+        for episode in open_store(stores["alternating"]).episodes
+        if episode.attributes.success is not None
+    ]
+    assert 0 < len(known) < 6
+    # The mean over tasks of each task's known episodes.
+    assert overall["success_rate"] == pytest.approx(0.5)
+    assert "with a known outcome solved" in " ".join(analyse(question_about(stores["alternating"])).answer)
+    assert "outcomes not known" in " ".join(analyse(question_about(stores["bare"])).answer)
+
+
+@pytest.mark.parametrize("name", [*KINDS, "bare"])
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        ("", ""),
+        ("--list", "not known: picture size"),
+        ("heads", ""),
+        ("words", ""),
+        ("time", "gripper whose commands are known"),
+        ("groups", ""),
+        ("overlay", ""),
+        ("verify", "all whole"),
+        ("report", ""),
+    ],
+)
+def test_commands(stores, tmp_path, capsys, name, command, says):
+    given = [str(stores[name]), "--list"] if command == "--list" else [*command.split(), str(stores[name])]
+    if command not in ("--list", "verify"):
+        given += [
+            "--out",
+            str(tmp_path / "out"),
+            *(["--no-plots"] if command in ("", "heads", "words", "time") else []),
+        ]
+    assert analyze(given) == 0
+    printed = capsys.readouterr()
+    assert says in " ".join(printed.out.split())
+
+
+def test_objects_need_coverage(stores, tmp_path, capsys):
+    assert analyze(["objects", str(stores["alternating"]), "--out", str(tmp_path)]) == 2
+    assert "no selected episode has object coverage" in capsys.readouterr().err
+
+
+def test_no_results_file_without_outcomes(stores, tmp_path, capsys):
+    assert analyze([str(stores["growing"]), "--out", str(tmp_path), "--no-plots"]) == 0
+    assert not list(tmp_path.glob("attention_ratio_results_*.json"))
+    assert "No results file in the published format" in (tmp_path / "summary.txt").read_text()
+
+
+def test_runs_are_compared_episode_by_episode_where_the_first_state_is_not_known(stores, tmp_path, capsys):
+    other = write_site_store(tmp_path / "other.zarr", kind="growing", outcome="some", spread=0.5)
+    assert analyze(["compare", str(stores["growing"]), str(other), "--out", str(tmp_path), "--no-plots"]) == 0
+    pairs = pl.read_parquet(tmp_path / "pairs.parquet")
+    assert (pairs["episode_first"] == pairs["episode_other"]).all()
+    assert pairs["episode_first"].n_unique() == 3
+
+
+def test_the_kit_gives_no_mass_to_keys_that_do_not_exist():
+    spec = SiteStoreSpec(kind="growing")
+    (site,) = site_root(spec).sites
+    assert site.growing_span is not None
+    exists = key_exists(site, np.full(site.num_keys, 8, dtype=np.uint8), 7)
+    assert exists[:, site.growing_span.start :].sum(axis=1).tolist() == [0, 1, 2, 3, 4, 5, 6]
