@@ -15,6 +15,7 @@ from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
 from vla_attention.capture.policies.model_arguments import add_threads
 from vla_attention.capture.recording_arguments import add_recording_arguments
+from vla_attention.capture.replay.arguments import REPLAY_EXAMPLES, add_replay_arguments
 from vla_attention.capture.rerun.arguments import RERUN_EXAMPLES, add_rerun_arguments
 from vla_attention.capture.tasks_command import run_tasks_command
 from vla_attention.schemas.command_line import OneSentenceParser
@@ -67,6 +68,16 @@ def build_parser(given: Sequence[str] = ()) -> argparse.ArgumentParser:
         "damaged episode is left in a store.",
     )
     _add_repair_arguments(repair)
+    replay = commands.add_parser(
+        "replay",
+        help="make policy calls on the frames of a data set of a robot",
+        description="Feed the pictures, states and tasks of a LeRobotDataset (2.0, 2.1 or 3.0) to a policy, without a "
+        "simulator, and record its attention into a store like any other, beside the actions that the data set has. "
+        "See docs/data-sets.md.",
+        epilog=f"examples:\n{REPLAY_EXAMPLES}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_replay_arguments(replay, given if "replay" in given[:1] else ())
     rerun = commands.add_parser(
         "rerun",
         help="make the policy calls of a store again, unchanged or with interventions",

@@ -92,6 +92,8 @@ class PolicyFamily:
     analysis_arguments: Callable[[argparse.Namespace], list[str]] = no_arguments
     parity: ParityCases | None = None
     published: PublishedScript | None = None
+    #: Whether `build` takes a `robot_data` among the arguments (`robot.py`), and then gives a policy for data sets.
+    reads_data_sets: bool = False
     #: The kinds of its policies, as stores name them (`PolicyIdentity.family`); empty for the family's name alone.
     kinds: tuple[str, ...] = ()
     #: The identity in a store -> parsed arguments with which `build` makes this policy again.

@@ -87,6 +87,7 @@ def rerun_episode(
                     frames=policy_input.frames if recording.frames else {},
                     camera_frames=policy_input.camera_frames if recording.frames else {},
                     coverage=calls.coverage_of(replan),
+                    dataset_actions=calls.dataset_actions_of(replan),
                 )
             )
             progress.update(replan + 1, calls.num_replans)

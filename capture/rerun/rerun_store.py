@@ -153,4 +153,5 @@ class Rerun:
             provenance=dict(self.machine),
             interventions=interventions,
             rerun_of=RerunSource(run=base.run, name=base.path.name),
+            data_set=base.attributes.data_set,
         )

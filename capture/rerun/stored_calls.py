@@ -37,6 +37,8 @@ class StoredCalls:
     env_step: NDArray[np.int32]
     prompt_index: NDArray[np.int32]
     actions: NDArray[np.float64]
+    #: (replan, horizon, action dim) and (replan,): a data set's own actions, and how many there are; None for none.
+    dataset_actions: tuple[NDArray[np.float64], NDArray[np.int64]] | None = None
 
     @property
     def attributes(self) -> EpisodeAttributes:
@@ -69,6 +71,13 @@ class StoredCalls:
             coverage=self.coverage_of(replan),
         )
 
+    def dataset_actions_of(self, replan: int) -> NDArray[np.float64] | None:
+        """Return the actions (step, action dim) that the data set has from a replan on; None for none."""
+        if self.dataset_actions is None:
+            return None
+        actions, counts = self.dataset_actions
+        return actions[replan, : int(counts[replan])]
+
     def coverage_of(self, replan: int) -> dict[str, NDArray[np.float32]]:
         """Return how much of each patch each object covers, camera -> (patch, object)."""
         return {camera: coverage[replan] for camera, coverage in self.coverage.items()}
@@ -91,6 +100,9 @@ def read_calls(episode: StoredEpisode) -> StoredCalls:
         env_step=episode.read("env_step"),
         prompt_index=episode.read("prompt_index"),
         actions=episode.read("actions"),
+        dataset_actions=(episode.read("dataset_actions"), episode.read("dataset_action_count"))
+        if "dataset_actions" in episode.attributes.arrays
+        else None,
     )
 
 

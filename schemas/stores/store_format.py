@@ -217,12 +217,34 @@ class PolicyIdentity:
 
 
 @dataclass(frozen=True)
+class DataSetSource:
+    """The data set on whose frames a run called its policy.
+
+    `name`: of its folder, or ORG/NAME of the hub. `version`: of its format. `fps`: frames per second. `digest`: over
+    its columns, tasks and episodes. `columns`: which columns the policy's cameras, state and actions are, in words.
+    """
+
+    name: str
+    version: str
+    fps: float
+    robot_type: str
+    digest: str
+    columns: dict[str, str]
+
+    def __post_init__(self) -> None:
+        """Check that the texts are text of one line."""
+        for text in (self.name, self.version, self.robot_type, *self.columns, *self.columns.values()):
+            check_text("data set's text", text)
+
+
+@dataclass(frozen=True)
 class RootAttributes:
     """Attributes of the store's root group: the run's identity. The same for every process that adds episodes.
 
     All of it is the run's configuration, except the fields in `JOB_RECORDS`. `interventions` says what the run changed
     in the policy and its input, `rerun_of` which store's policy calls it repeated. Version 2 has neither of the two,
-    and up to version 3 sites are `joint`, `self` and `cross`, and in all recorded layers.
+    and up to version 3 sites are `joint`, `self` and `cross`, and in all recorded layers. `data_set` is the one that
+    was replayed; None for every other run.
     """
 
     format: str
@@ -234,6 +256,7 @@ class RootAttributes:
     provenance: dict[str, str]
     interventions: Interventions = field(default_factory=Interventions)
     rerun_of: RerunSource | None = None
+    data_set: DataSetSource | None = None
 
     def __post_init__(self) -> None:
         """Check that sites have different names, and that something of each is recorded."""

@@ -265,3 +265,34 @@ def _write_v30(folder, episodes, tables, tasks, fps, video, per_file):
 
 def _write_lines(path: Path, lines: Sequence[object]) -> None:
     path.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+
+
+def episodes_of_store(
+    store: Path, columns: Mapping[str, str], *, own_pictures: bool = False, every: int = 1, state_dtype: str = "float64"
+) -> list[MadeUpEpisode]:
+    """The replans of a store of a simulator as episodes of a data set, in the orientation of LIBERO's data sets.
+
+    columns: policy camera -> column. own_pictures: the cameras' own pictures, turned as the policy turns them. every:
+    between two replans stand as many other frames, with numbers for pictures, as a replay with `--every` leaves out.
+    """
+    import zarr
+
+    group = "camera_frames" if own_pictures else "frames"
+    episodes = []
+    for name in sorted(entry.name for entry in (store / "episodes").iterdir()):
+        if not name.startswith("task"):
+            continue
+        stored = zarr.open_group(store / "episodes" / name, mode="r")
+        replans = stored["env_step"].shape[0]
+        length = (replans - 1) * every + 1
+        images = {}
+        for camera, column in columns.items():
+            pictures = np.asarray(stored[f"{group}/{camera}"])
+            pictures = pictures[:, ::-1, ::-1] if own_pictures else pictures
+            filler = numbered_picture(1, *pictures.shape[1:3])
+            images[column] = np.stack([pictures[i // every] if i % every == 0 else filler for i in range(length)])
+        state, actions = np.asarray(stored["state"]), np.asarray(stored["actions"])[:, 0]
+        repeat = np.arange(length) // every
+        values = {"observation.state": state[repeat].astype(state_dtype), "action": actions[repeat].astype(np.float32)}
+        episodes.append(MadeUpEpisode(images, values, [str(stored.attrs["instruction"])] * length))
+    return episodes

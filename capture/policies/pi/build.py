@@ -9,6 +9,7 @@ import torch
 
 from vla_attention.capture.policies.model_arguments import UNTRAINED, UNTRAINED_TINY, check_not_renamed
 from vla_attention.capture.policies.pi.config import GEMMA_VARIANTS, GemmaConfig, find_config, find_variant
+from vla_attention.capture.policies.pi.data_set_robot import untrained_robot
 from vla_attention.capture.policies.pi.embedded import dummy_policy, embedded_policy
 from vla_attention.capture.policies.pi.formats import detect_format, find_format
 from vla_attention.capture.policies.pi.loading import CheckpointOptions, load_pi_policy
@@ -16,6 +17,7 @@ from vla_attention.capture.policies.pi.locate import find_checkpoint, find_token
 from vla_attention.capture.policies.pi.policy import PiPolicy
 from vla_attention.capture.policies.pi.shipped import SHIPPED
 from vla_attention.capture.policies.precision import find_dtype
+from vla_attention.capture.policies.robot import Robot, RobotData
 from vla_attention.schemas.errors import BadArgument, listing
 
 _UNTRAINED = {UNTRAINED: embedded_policy, UNTRAINED_TINY: dummy_policy}
@@ -34,12 +36,14 @@ def build_pi_policy(
     paligemma_variant: str | None = None,
     action_expert_variant: str | None = None,
     num_image_tokens: int | None = None,
+    data: RobotData | None = None,
+    robot: Robot | None = None,
 ) -> PiPolicy:
     """Build the policy and check the options against it.
 
     `checkpoint` is a folder, a name on a hub, or one of the two untrained policies that come with the package:
-    `untrained`, `untrained-tiny`. Raises `BadArgument` if a variant or the number of image tokens contradicts the
-    policy.
+    `untrained`, `untrained-tiny`. `data` and `robot`: see `load_pi_policy`. Raises `BadArgument` if a variant or the
+    number of image tokens contradicts the policy.
     """
     wanted = {
         "--paligemma-variant": find_variant(paligemma_variant) if paligemma_variant else None,
@@ -61,11 +65,13 @@ def build_pi_policy(
                 f"The policy '{checkpoint}' comes with the program, in float32; --checkpoint-format, --config-name, "
                 "--model-config, --discrete-state-input and --dtype bfloat16 are for checkpoints."
             )
-        policy = _UNTRAINED[checkpoint](device=device)
+        policy = _UNTRAINED[checkpoint](device=device, robot=untrained_robot(data) if data else robot)
     else:
         path = SHIPPED[checkpoint] if checkpoint in SHIPPED else find_checkpoint(checkpoint)
         detect_format(path, options.checkpoint_format)  # a folder without a checkpoint is reported first
-        policy = load_pi_policy(path, find_tokenizer(path, tokenizer), options=options, device=device)
+        policy = load_pi_policy(
+            path, find_tokenizer(path, tokenizer), options=options, device=device, data=data, robot=robot
+        )
         if checkpoint in SHIPPED:
             # Where the package is installed differs between machines; its name does not.
             policy.source = dataclasses.replace(policy.source, checkpoint=checkpoint)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 from vla_attention.capture.policies.pi.flow_time import MAX_PERIOD, MIN_PERIOD, TimeConvention
@@ -125,7 +126,7 @@ class PiConfig:
         return self.prefix_len + self.suffix_len
 
 
-#: Full-size models by openpi's names for its LIBERO configurations.
+#: Full-size models by openpi's names for its configurations of LIBERO and DROID.
 NAMED_CONFIGS: dict[str, PiConfig] = {
     "pi05_libero": PiConfig(
         paligemma=GEMMA_VARIANTS["gemma_2b"],
@@ -143,6 +144,11 @@ NAMED_CONFIGS: dict[str, PiConfig] = {
         pi05=False,
     ),
 }
+# The robot of DROID. pi05_droid reads its state in the prompt, which pi05_libero does not.
+NAMED_CONFIGS["pi05_droid"] = dataclasses.replace(
+    NAMED_CONFIGS["pi05_libero"], action_horizon=15, discrete_state_input=True
+)
+NAMED_CONFIGS["pi0_droid"] = dataclasses.replace(NAMED_CONFIGS["pi0_libero"], action_horizon=10)
 # The same model; its LoRA arrays are merged when a checkpoint is read.
 NAMED_CONFIGS["pi0_libero_low_mem_finetune"] = NAMED_CONFIGS["pi0_libero"]
 

@@ -17,9 +17,10 @@ from vla_attention.capture.policies.pi.config import GemmaConfig, PiConfig, Sigl
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.model_weights import expected_shapes, model_from_state
 from vla_attention.capture.policies.pi.policy import PiPolicy
-from vla_attention.capture.policies.pi.preprocess import NormStats, Statistics
-from vla_attention.capture.policies.pi.processing import OpenpiProcessing
+from vla_attention.capture.policies.pi.preprocess import ENVIRONMENT_ACTION_DIM, NormStats, Statistics
+from vla_attention.capture.policies.pi.processing import STATE_DIM, OpenpiProcessing
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
+from vla_attention.capture.policies.robot import Robot
 from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.capture.policies.strict_loading import Shapes
 from vla_attention.capture.policies.weights import random_tensor
@@ -123,22 +124,40 @@ def build_random_model(config: PiConfig, seed: int, device: str | torch.device =
     return model_from_state(config, random_weights(config, seed), device=device)
 
 
+def _stats_of(robot: Robot | None) -> NormStats:
+    """Return made-up ranges: those of the simulators' arm, or -1 to 1 for every number of a robot of other sizes."""
+    if robot is None or (robot.state_dim, robot.action_dim) == (STATE_DIM, ENVIRONMENT_ACTION_DIM):
+        return builtin_stats()
+
+    def statistics(dim: int) -> Statistics:
+        ones = np.ones(dim)
+        return Statistics(mean=0 * ones, std=ones * 2 / np.sqrt(12), q01=-ones, q99=ones)
+
+    return NormStats(state=statistics(robot.state_dim), actions=statistics(robot.action_dim))
+
+
 def _random_policy(
-    name: str, config: PiConfig, seed: int, device: str | torch.device, replan_steps: int = OPENPI_REPLAN_STEPS
+    name: str,
+    config: PiConfig,
+    seed: int,
+    device: str | torch.device,
+    robot: Robot | None,
+    replan_steps: int = OPENPI_REPLAN_STEPS,
 ) -> PiPolicy:
+    stats = _stats_of(robot)
     return PiPolicy(
         build_random_model(config, seed, device),
         PromptTokenizer(EMBEDDED_TOKENIZER),
-        OpenpiProcessing(config, builtin_stats(), normalisation="quantile", replan_steps=replan_steps),
+        OpenpiProcessing(config, stats, normalisation="quantile", replan_steps=replan_steps, robot=robot),
         PolicySource(name=name, checkpoint=f"random weights, seed {seed}", checkpoint_format="seeded", untrained=True),
     )
 
 
-def embedded_policy(seed: int = 0, device: str | torch.device = "cpu") -> PiPolicy:
-    """Build the untrained policy; the seed draws its weights."""
-    return _random_policy(UNTRAINED, EMBEDDED_CONFIG, seed, device)
+def embedded_policy(seed: int = 0, device: str | torch.device = "cpu", robot: Robot | None = None) -> PiPolicy:
+    """Build the untrained policy; the seed draws its weights. robot: of a data set; None: the simulators' arm."""
+    return _random_policy(UNTRAINED, EMBEDDED_CONFIG, seed, device, robot)
 
 
-def dummy_policy(seed: int = 0, device: str | torch.device = "cpu") -> PiPolicy:
+def dummy_policy(seed: int = 0, device: str | torch.device = "cpu", robot: Robot | None = None) -> PiPolicy:
     """Build the policy of test size; all four actions of a chunk are executed."""
-    return _random_policy(UNTRAINED_TINY, DUMMY_CONFIG, seed, device, replan_steps=DUMMY_CONFIG.action_horizon)
+    return _random_policy(UNTRAINED_TINY, DUMMY_CONFIG, seed, device, robot, DUMMY_CONFIG.action_horizon)

@@ -12,6 +12,8 @@ from vla_attention.capture.environments.episode_protocol import LEROBOT, OPENPI
 from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedScript
 from vla_attention.capture.policies.model_arguments import FORMER_NAMES, UNTRAINED_POLICIES, add_model_arguments
 from vla_attention.capture.policies.pi.shipped import CUBES_POLICY, SHIPPED
+from vla_attention.capture.policies.robot import Robot
+from vla_attention.schemas.jsonable import from_json
 
 if TYPE_CHECKING:
     from vla_attention.capture.policies.pi.policy import PiPolicy
@@ -72,13 +74,16 @@ def _build(arguments: argparse.Namespace, device: str) -> PiPolicy:
         paligemma_variant=arguments.paligemma_variant,
         action_expert_variant=arguments.action_expert_variant,
         num_image_tokens=arguments.num_image_tokens,
+        data=getattr(arguments, "robot_data", None),
+        robot=getattr(arguments, "robot", None),
     )
 
 
 def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
+    of_data_set = {"robot": from_json(Robot, identity.config["robot"])} if "robot" in identity.config else {}
     if identity.checkpoint_format == "seeded":
-        return {"checkpoint": FORMER_NAMES.get(identity.name, identity.name)}
-    settings = {"checkpoint": identity.checkpoint, "dtype": identity.config["dtype"]}
+        return {"checkpoint": FORMER_NAMES.get(identity.name, identity.name), **of_data_set}
+    settings = {"checkpoint": identity.checkpoint, "dtype": identity.config["dtype"], **of_data_set}
     if identity.checkpoint_format in ("openpi_torch", "openpi_jax", "lerobot"):
         settings["checkpoint_format"] = identity.checkpoint_format
     if identity.checkpoint_format.startswith("openpi"):
@@ -124,5 +129,6 @@ FAMILY = PolicyFamily(
         variables={"PROTOCOL": "--protocol"},
     ),
     kinds=("pi0", "pi05"),
+    reads_data_sets=True,
     rebuild=_rebuild,
 )

@@ -21,6 +21,7 @@ from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.openpi_torch import TensorFile, open_tensors
 from vla_attention.capture.policies.pi.sizes import infer_config, is_pi05
 from vla_attention.capture.policies.precision import DTYPES
+from vla_attention.capture.policies.robot import Robot
 
 
 def load_lerobot_weights(
@@ -49,25 +50,30 @@ def load_lerobot(
     sizes: PiConfig | None = None,
     dtype: torch.dtype | None = None,
     device: str | torch.device = "cpu",
+    robot: Robot | None = None,
 ) -> tuple[PiModel, LerobotProcessing]:
     """Load a LeRobot checkpoint: the model, and the processing of images, prompts, states and actions.
 
     sizes: widths and heads, which config.json does not state because it is for full-size models. Only the sizes of
-    the transformers and of the image encoder are taken from it.
+    the transformers and of the image encoder are taken from it. robot: of a data set; None: the arm of the simulators.
     """
     folder = Path(folder)
     detect_format(folder, "lerobot")
     stated = read_lerobot_config(folder)
     pipeline = read_lerobot_pipeline(folder, stated)
-    processing = LerobotProcessing(stated, pipeline)
+    processing = LerobotProcessing(stated, pipeline, robot)
     with open_tensors(folder) as tensors:
-        config = model_config(stated, tensors, pipeline.rename, sizes)
+        config = model_config(stated, tensors, pipeline.rename, sizes, robot)
         model = tensors.build(config, dtype=dtype or DTYPES[stated.dtype], device=device)
     return model, processing
 
 
 def model_config(
-    stated: LerobotConfig, tensors: TensorFile, rename: dict[str, str], sizes: PiConfig | None
+    stated: LerobotConfig,
+    tensors: TensorFile,
+    rename: dict[str, str],
+    sizes: PiConfig | None,
+    robot: Robot | None = None,
 ) -> PiConfig:
     """Return the model's configuration: sizes from the tensors, everything else from config.json."""
     shapes = tensors.shapes
@@ -91,7 +97,7 @@ def model_config(
         max_token_len=stated.tokenizer_max_length,
         num_denoise_steps=stated.num_inference_steps,
         discrete_state_input=stated.pi05,
-        cameras=tuple(slots(stated, rename)),
+        cameras=tuple(slots(stated, rename, robot)),
         time_convention="stepped",
         min_period=stated.min_period,
         max_period=stated.max_period,

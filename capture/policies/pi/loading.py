@@ -11,15 +11,18 @@ from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.parity_case import CASE_FILE
 from vla_attention.capture.policies.pi.case import CONFIG_FILE, read_config, stated_name, states_sizes
 from vla_attention.capture.policies.pi.config import PiConfig, find_config
+from vla_attention.capture.policies.pi.data_set_robot import asset_name, robot_for
 from vla_attention.capture.policies.pi.formats import CheckpointFormat, detect_format
 from vla_attention.capture.policies.pi.lerobot import load_lerobot, load_lerobot_weights
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.openpi_jax import implied_config_name, list_leaves, load_openpi_jax
-from vla_attention.capture.policies.pi.openpi_torch import load_openpi_torch
+from vla_attention.capture.policies.pi.openpi_torch import load_openpi_torch, open_tensors
 from vla_attention.capture.policies.pi.policy import PiPolicy
-from vla_attention.capture.policies.pi.preprocess import read_norm_stats
+from vla_attention.capture.policies.pi.preprocess import RELATIVE_ACTIONS, read_norm_stats
 from vla_attention.capture.policies.pi.processing import OpenpiProcessing, Processing
+from vla_attention.capture.policies.pi.sizes import is_pi05
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
+from vla_attention.capture.policies.robot import Robot, RobotData
 from vla_attention.schemas.errors import BadArgument
 
 
@@ -35,6 +38,10 @@ def load_pi_model(
     found = detect_format(folder, checkpoint_format)
     load = {"openpi_torch": load_openpi_torch, "openpi_jax": load_openpi_jax, "lerobot": load_lerobot_weights}[found]
     return load(folder, config=config, dtype=dtype, device=device), found
+
+
+#: The folder of openpi's statistics of DROID, in `assets/`.
+DROID_ASSET = "droid"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,24 +66,30 @@ def load_pi_policy(
     options: CheckpointOptions | None = None,
     config: PiConfig | None = None,
     device: str | torch.device = "cpu",
+    data: RobotData | None = None,
+    robot: Robot | None = None,
 ) -> PiPolicy:
     """Load a policy from a checkpoint folder of any of the three formats and a tokenizer file.
 
-    config: the model's configuration, for library callers; the command line names one in `options`.
+    config: the model's configuration, for library callers; the command line names one in `options`. data: the data set
+    that the policy is called on, or robot: what was found for it before; with neither it acts in the simulators.
     """
     folder, options = Path(checkpoint), options or CheckpointOptions()
     found = detect_format(folder, options.checkpoint_format)
     if config is not None:
         configuration = "given"
     else:
-        config, configuration = choose_config(folder, found, options)
+        config, configuration = choose_config(folder, found, options, of_data_set=bool(data or robot))
+    if data is not None:
+        relative = RELATIVE_ACTIONS if configuration.startswith("openpi's pi0_libero") else 0
+        robot = robot_for(folder, found, data, relative_actions=relative)
     if options.discrete_state_input and config is not None:
         _check_state_input(config)
     # Small files first: if the tokenizer is missing, the minutes for loading the weights are saved.
     prompt_tokenizer = PromptTokenizer(tokenizer)
     processing: Processing
     if found == "lerobot":
-        model, processing = load_lerobot(folder, sizes=config, dtype=options.dtype, device=device)
+        model, processing = load_lerobot(folder, sizes=config, dtype=options.dtype, device=device, robot=robot)
     else:
         norm_stats = read_norm_stats(folder)
         dtype = options.dtype or torch.float32
@@ -88,7 +101,11 @@ def load_pi_policy(
         # openpi's LIBERO configurations: pi0.5 quantiles and plain actions, pi0 z-scores and actions relative to the
         # state.
         processing = OpenpiProcessing(
-            model.config, norm_stats, normalisation="quantile" if pi05 else "z-score", relative_actions=not pi05
+            model.config,
+            norm_stats,
+            normalisation="quantile" if pi05 else "z-score",
+            relative_actions=not pi05,
+            robot=robot,
         )
     family = "pi05" if model.config.pi05 else "pi0"
     source = PolicySource(
@@ -101,10 +118,13 @@ def load_pi_policy(
     return PiPolicy(model, prompt_tokenizer, processing, source)
 
 
-def choose_config(folder: Path, found: CheckpointFormat, options: CheckpointOptions) -> tuple[PiConfig | None, str]:
+def choose_config(
+    folder: Path, found: CheckpointFormat, options: CheckpointOptions, *, of_data_set: bool = False
+) -> tuple[PiConfig | None, str]:
     """Return the configuration of the options or of a case.json beside the checkpoint, and its source.
 
-    The configuration is None if the checkpoint's own files determine it.
+    The configuration is None if the checkpoint's own files determine it. of_data_set: the policy is for the robot of a
+    data set, which the name of the checkpoint's statistics may tell.
     """
     if options.config_name is not None and options.model_config is not None:
         raise BadArgument("Give --config-name or --model-config, not both.")
@@ -123,10 +143,22 @@ def choose_config(folder: Path, found: CheckpointFormat, options: CheckpointOpti
         return read_config(beside), f"{CASE_FILE} beside the checkpoint"
     if found == "openpi_torch" and states_sizes(folder / CONFIG_FILE):
         return read_config(folder / CONFIG_FILE), CONFIG_FILE
+    if of_data_set and found != "lerobot" and asset_name(folder) == DROID_ASSET:
+        name = _droid_config_name(folder, found)
+        return find_config(name), f"openpi's {name} (its statistics are those of '{DROID_ASSET}')"
     if found == "openpi_jax":
         name = implied_config_name(leaf.path for leaf in list_leaves(folder / "params"))
         return find_config(name), f"openpi's {name} (not stated by the checkpoint)"
     return None, "config.json and the tensors"
+
+
+def _droid_config_name(folder: Path, found: CheckpointFormat) -> str:
+    if found == "openpi_jax":
+        pi05 = implied_config_name(leaf.path for leaf in list_leaves(folder / "params")) == "pi05_libero"
+    else:
+        with open_tensors(folder) as tensors:
+            pi05 = is_pi05(tensors.shapes)
+    return "pi05_droid" if pi05 else "pi0_droid"
 
 
 def _check_state_input(config: PiConfig) -> None:

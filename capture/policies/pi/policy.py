@@ -25,6 +25,8 @@ from vla_attention.capture.policies.policy import GivenInputs, PolicyInput, came
 from vla_attention.capture.policies.precision import dtype_name
 from vla_attention.capture.policies.weights import weights_digest
 from vla_attention.capture.recording.attention import AttentionEditor, RowCollector
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, roles_from_spans
 from vla_attention.schemas.stores.store_format import PolicyCameraView, PolicyIdentity
 
@@ -59,7 +61,7 @@ def patch_grid(config: PiConfig) -> PatchGrid:
 
 
 class PiPolicy:
-    """A pi0 or pi0.5 model with its tokenizer and its processing, for LIBERO-like observations."""
+    """A pi0 or pi0.5 model with its tokenizer and its processing, for the simulators' arm or a data set's robot."""
 
     #: Pictures and prompt read each other once, before the denoise steps.
     has_prefix = True
@@ -70,6 +72,7 @@ class PiPolicy:
         self.model = model
         self.tokenizer = tokenizer
         self.processing = processing
+        self.robot = processing.robot
         self.source = source
         self.name = source.name
         self.family = "pi05" if config.pi05 else "pi0"
@@ -82,9 +85,9 @@ class PiPolicy:
         self.default_protocol = processing.protocol
         self.default_replan_steps = processing.default_replan_steps
         self.cameras = tuple(
-            PolicyCameraView(name, source=processing.environment_cameras[name], upright=True, mirrored=True)
+            PolicyCameraView(name, source=self.robot.cameras[name], upright=True, mirrored=self.robot.turned)
             for name in config.cameras
-            if name in processing.environment_cameras
+            if name in self.robot.cameras
         )
         self._warned: set[str] = set()
 
@@ -115,6 +118,8 @@ class PiPolicy:
             "long_prompts": "cut" if self.processing.cut_long_prompts else "refused",
             "tokenizer_digest": self.tokenizer.digest,
         }
+        if not self.robot.turned:
+            facts["robot"] = to_json(self.robot)
         return describe_policy(self, self.source, self._digest, facts)
 
     @property
@@ -130,6 +135,21 @@ class PiPolicy:
         state = libero_state(observation.eef_pos, observation.eef_quat, observation.gripper_qpos)
         kept = raw if self.needs_camera_frames else {}
         return self._input_of(pictures, kept, state, instruction, may_be_empty=False)
+
+    def prepare_robot(
+        self, pictures: Mapping[str, NDArray[np.uint8]], state: NDArray[np.float64], instruction: str
+    ) -> PolicyInput:
+        """Turn a frame of a data set into the model's input (batch 1).
+
+        pictures: column -> (height, width, 3) uint8, in the orientation of the data set. state: (state of the robot,).
+        """
+        if state.shape != (self.robot.state_dim,):
+            raise BadArgument(f"The state has the shape {state.shape}; expected ({self.robot.state_dim},).")
+        size = self.model.config.siglip.image_size
+        raw = {camera.name: pictures[camera.source] for camera in self.cameras}
+        models = {camera: self.processing.model_picture(frame, size) for camera, frame in raw.items()}
+        kept = raw if self.needs_camera_frames else {}
+        return self._input_of(models, kept, np.asarray(state, dtype=np.float64), instruction, may_be_empty=False)
 
     def prepare_again(self, given: GivenInputs) -> PolicyInput:
         """Turn what a call was given into the model's input (batch 1)."""
@@ -214,7 +234,7 @@ class PiPolicy:
         recorders: Mapping[str, RowCollector] | None = None,
         editors: Mapping[str, AttentionEditor] | None = None,
     ) -> NDArray[np.float64]:
-        """Return the action chunk (horizon, 7) for the environment; the noise depends on `noise_seed` only."""
+        """Return the action chunk (horizon, action dim) for the robot; the noise depends on `noise_seed` only."""
         config, tensors = self.model.config, policy_input.tensors
         noise = initial_noise(noise_seed, (1, config.action_horizon, config.action_dim))
         sampled = self.model.sample_actions(

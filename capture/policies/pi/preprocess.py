@@ -26,6 +26,8 @@ NORMALISATION_EPS = 1e-6
 
 #: Action dimensions that a LIBERO or robosuite arm takes: translation, rotation, gripper.
 ENVIRONMENT_ACTION_DIM = 7
+#: Of these, openpi's pi0_libero gives differences to the state: all but the gripper's.
+RELATIVE_ACTIONS = 6
 
 
 class NormStatsNotFound(UserError, FileNotFoundError):
@@ -121,14 +123,16 @@ class NormStats:
     state: Statistics
     actions: Statistics
 
-    def check(self, mode: NormalisationMode, state_dim: int, padded_dim: int) -> None:
+    def check(
+        self, mode: NormalisationMode, state_dim: int, padded_dim: int, action_dim: int = ENVIRONMENT_ACTION_DIM
+    ) -> None:
         """Raise `UnusableNormStats` unless they fit the state and the environment's actions in this mode.
 
         Older checkpoints hold statistics padded to the model's `padded_dim`; any other length belongs to another robot.
         """
         for name, statistics, needed in (
             ("state", self.state, state_dim),
-            ("actions", self.actions, ENVIRONMENT_ACTION_DIM),
+            ("actions", self.actions, action_dim),
         ):
             if len(statistics.mean) not in (needed, padded_dim):
                 raise UnusableNormStats(
@@ -150,15 +154,17 @@ def environment_actions(
     mode: NormalisationMode,
     *,
     relative_to: NDArray[np.floating] | None = None,
+    action_dim: int = ENVIRONMENT_ACTION_DIM,
+    num_relative: int = RELATIVE_ACTIONS,
 ) -> NDArray[np.float64]:
-    """Return environment actions (..., horizon, 7) of model outputs (..., horizon, action dim).
+    """Return a robot's actions (..., horizon, `action_dim`) of model outputs (..., horizon, action dim of the model).
 
-    `relative_to` (..., 8) is the unnormalised state for policies trained on differences to it (openpi's pi0_libero):
-    its first 6 numbers are added; the gripper is absolute.
+    `relative_to` (..., state) is the unnormalised state for policies trained on differences to it (openpi's
+    pi0_libero): its first `num_relative` numbers are added; the gripper is absolute.
     """
-    actions = stats.actions.unnormalise(model_actions, mode)[..., :ENVIRONMENT_ACTION_DIM]
+    actions = stats.actions.unnormalise(model_actions, mode)[..., :action_dim]
     if relative_to is not None:
-        actions[..., :6] += relative_to[..., None, :6]
+        actions[..., :num_relative] += relative_to[..., None, :num_relative]
     return actions
 
 

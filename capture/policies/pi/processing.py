@@ -6,7 +6,6 @@ different numbers of actions. A `Processing` does this for one policy; `PiPolicy
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,14 +15,29 @@ from torch import Tensor
 
 from vla_attention.capture.environments.episode_protocol import OPENPI, OPENPI_REPLAN_STEPS, EvaluationProtocol
 from vla_attention.capture.policies.pi.config import PiConfig
-from vla_attention.capture.policies.pi.preprocess import NormalisationMode, NormStats, environment_actions, model_image
+from vla_attention.capture.policies.pi.preprocess import (
+    ENVIRONMENT_ACTION_DIM,
+    RELATIVE_ACTIONS,
+    NormalisationMode,
+    NormStats,
+    environment_actions,
+    model_image,
+    resize_with_pad,
+)
 from vla_attention.capture.policies.pi.tokenizer import PromptFormat
+from vla_attention.capture.policies.robot import Robot
 
 #: Slot -> environment camera (openpi's LIBERO inputs); other slots are black and masked.
 CAMERA_OF_SLOT = {"base_0_rgb": "agentview", "left_wrist_0_rgb": "robot0_eye_in_hand"}
 
 #: Numbers of the state in both ecosystems: position, axis-angle, two finger joints.
 STATE_DIM = 8
+
+
+def simulated_arm(cameras: dict[str, str], relative_actions: int = 0) -> Robot:
+    """Return the arm of the simulators; cameras: slot of the model -> camera."""
+    state = ("position", "axis_angle", "gripper")
+    return Robot(cameras, state, STATE_DIM, (), ENVIRONMENT_ACTION_DIM, relative_actions, turned=True)
 
 
 class Processing(Protocol):
@@ -38,8 +52,8 @@ class Processing(Protocol):
         """Whether a prompt with more tokens than slots is cut (with a warning) or refused."""
 
     @property
-    def environment_cameras(self) -> Mapping[str, str]:
-        """Slot of the model -> camera of the environment; other slots are black and masked."""
+    def robot(self) -> Robot:
+        """Cameras, state and actions of the robot: slots of the model without a camera are black and masked."""
 
     @property
     def protocol(self) -> EvaluationProtocol:
@@ -62,16 +76,17 @@ class Processing(Protocol):
     def environment_actions(
         self, model_actions: NDArray[np.floating], state: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the actions (horizon, 7) for the environment of the model's (horizon, action dim)."""
+        """Return the actions (horizon, action dim of the robot) of the model's (horizon, action dim)."""
 
     def provenance(self) -> dict[str, Any]:
         """Return plain JSON values that identify the processing."""
 
 
 class OpenpiProcessing:
-    """openpi's LIBERO client and server transforms.
+    """openpi's client and server transforms: of LIBERO, or of the robot of a data set.
 
     `relative_actions`: the model was trained on differences to the state (openpi's pi0_libero), so the state is added.
+    `robot`: its own number of them replaces `relative_actions`.
     """
 
     def __init__(
@@ -82,23 +97,22 @@ class OpenpiProcessing:
         normalisation: NormalisationMode,
         relative_actions: bool = False,
         replan_steps: int = OPENPI_REPLAN_STEPS,
+        robot: Robot | None = None,
     ):
-        norm_stats.check(normalisation, STATE_DIM, config.action_dim)
+        cameras = {slot: camera for slot, camera in CAMERA_OF_SLOT.items() if slot in config.cameras}
+        self.robot = robot or simulated_arm(cameras, RELATIVE_ACTIONS if relative_actions else 0)
+        norm_stats.check(normalisation, self.robot.state_dim, config.action_dim, self.robot.action_dim)
         self.protocol = OPENPI
         self.norm_stats = norm_stats
         self.normalisation = normalisation
-        self.relative_actions = relative_actions
         self.default_replan_steps = replan_steps
         self.prompt_format: PromptFormat = "task-state-action" if config.discrete_state_input else "instruction-newline"
         self.cut_long_prompts = True
         self.whole_grey_levels = True
-        self.environment_cameras: Mapping[str, str] = {
-            slot: CAMERA_OF_SLOT[slot] for slot in config.cameras if slot in CAMERA_OF_SLOT
-        }
 
     def model_picture(self, frame: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], Tensor]:
-        """Rotate by 180°, resize with PIL's bilinear filter; uint8 all the way."""
-        image = model_image(frame, size)
+        """Rotate pictures of simulators by 180°, resize with PIL's bilinear filter; uint8 all the way."""
+        image = model_image(frame, size) if self.robot.turned else resize_with_pad(frame, size)
         return image, image_tensor(image)
 
     def normalise_state(self, state: NDArray[np.float64]) -> NDArray[np.floating]:
@@ -108,12 +122,14 @@ class OpenpiProcessing:
     def environment_actions(
         self, model_actions: NDArray[np.floating], state: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Undo the normalisation, add the state where actions are relative to it, keep seven dimensions."""
+        """Undo the normalisation, add the state where actions are relative to it, keep the robot's dimensions."""
         return environment_actions(
             model_actions.astype(np.float64),
             self.norm_stats,
             self.normalisation,
-            relative_to=state if self.relative_actions else None,
+            relative_to=state if self.robot.relative_actions else None,
+            action_dim=self.robot.action_dim,
+            num_relative=self.robot.relative_actions,
         )
 
     def provenance(self) -> dict[str, Any]:
@@ -121,7 +137,7 @@ class OpenpiProcessing:
         return {
             "processing": "openpi",
             "normalisation": self.normalisation,
-            "relative_actions": self.relative_actions,
+            "relative_actions": bool(self.robot.relative_actions),
             "image_resize": "PIL bilinear with antialiasing",
         }
 

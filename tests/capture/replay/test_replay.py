@@ -1,0 +1,278 @@
+"""`vla-capture replay`: the rows of a run come back from its pictures, and every robot has its own columns."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from safetensors.numpy import load_file, save_file
+
+from tests.kit.lerobot_data_sets import H264, Encoding, episodes_of_store, made_up_episodes, number_of, write_data_set
+from tests.kit.pi_golden import GOLDEN
+from tests.kit.small_tokenizer import train_small_tokenizer
+from tests.kit.still_scene import capture_without_simulator
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.capture.__main__ import main as capture
+from vla_attention.schemas.stores.reader import open_store
+
+LIBERO_COLUMNS = {"base_0_rgb": "image", "left_wrist_0_rgb": "wrist_image"}
+LEROBOT_COLUMNS = {"image": "observation.images.image", "image2": "observation.images.image2"}
+TINY = ("--checkpoint", "untrained-tiny")
+
+
+@pytest.fixture(scope="module")
+def tokenizer(tmp_path_factory) -> Path:
+    return train_small_tokenizer(tmp_path_factory.mktemp("tokenizer") / "small.model")
+
+
+def run(*arguments: object) -> int:
+    return capture([str(argument) for argument in arguments])
+
+
+def episode(store: Path, task: int, number: int) -> zarr.Group:
+    return zarr.open_group(store / "episodes" / f"task{task:03d}_episode{number:03d}", mode="r")
+
+
+def simulate(monkeypatch, store, *options):
+    """A run of two episodes in a scene in which nothing moves; its noise changes from replan to replan."""
+    capture_without_simulator(monkeypatch)
+    where = ("--task-suite", "robosuite", "--task-id", 0, "--num-episodes", 2, "--max-steps", 15)
+    assert run("pi", *where, "--store", store, *options) == 0
+
+
+def assert_same_calls(one: Path, other: Path, num_episodes: int = 2) -> None:
+    """Fail unless two stores have the same rows, actions, roles and pictures, to the bit."""
+    for number in range(num_episodes):
+        first, second = episode(one, 0, number), episode(other, 0, number)
+        arrays = ("joint/rows", "joint/key_role", "joint/contribution", "actions", "noise_seed")
+        for name in (*arrays, *(f"frames/{camera}" for camera in first["frames"])):
+            np.testing.assert_array_equal(first[name][:], second[name][:], err_msg=name)
+
+
+@pytest.mark.parametrize(("version", "every"), [("v2.1", 1), ("v3.0", 1), ("v3.0", 3)])
+def test_pictures_of_a_run_give_the_rows_of_that_run(tmp_path, monkeypatch, version, every):
+    simulate(monkeypatch, tmp_path / "run.zarr", *TINY)
+    episodes = episodes_of_store(tmp_path / "run.zarr", LIBERO_COLUMNS, every=every)
+    data = write_data_set(tmp_path / "data", version, episodes)
+    assert run("replay", data, *TINY, "--every", every, "--store", tmp_path / "replay.zarr") == 0
+    assert_same_calls(tmp_path / "run.zarr", tmp_path / "replay.zarr")
+    replayed = episode(tmp_path / "replay.zarr", 0, 1)
+    assert replayed["env_step"][:].tolist() == [0, every, 2 * every, 3 * every]
+    assert analyze(["verify", str(tmp_path / "replay.zarr")]) == 0
+
+
+@pytest.mark.parametrize("case", ["pi05_batch2", "pi0_batch2"])
+def test_a_lerobot_policy_gives_the_rows_of_its_run(tmp_path, monkeypatch, tokenizer, case):
+    model = ("--checkpoint", GOLDEN / case / "checkpoint_lerobot", "--tokenizer", tokenizer)
+    simulate(monkeypatch, tmp_path / "run.zarr", *model)
+    episodes = episodes_of_store(tmp_path / "run.zarr", LEROBOT_COLUMNS, own_pictures=True, state_dtype="float32")
+    data = write_data_set(tmp_path / "data", "v3.0", episodes)
+    # the evaluations of LeRobot have another seed
+    assert run("replay", data, *model, "--every", 1, "--seed", 1000, "--store", tmp_path / "replay.zarr") == 0
+    assert_same_calls(tmp_path / "run.zarr", tmp_path / "replay.zarr")
+    for camera in LEROBOT_COLUMNS:
+        own = [episode(tmp_path / f"{name}.zarr", 0, 0)[f"camera_frames/{camera}"][:] for name in ("run", "replay")]
+        np.testing.assert_array_equal(own[0][:, ::-1, ::-1], own[1])
+
+
+@pytest.mark.parametrize("encoding", [H264, Encoding("libsvtav1", {"g": "2", "crf": "30", "preset": "12"})])
+def test_a_video_gives_nearly_the_rows_of_the_run(tmp_path, monkeypatch, encoding):
+    """With the trained policy that comes along; docs/data-sets.md has what was measured on pictures of a simulator."""
+    cubes = ("--checkpoint", "pi05_cubes")
+    simulate(monkeypatch, tmp_path / "run.zarr", *cubes)
+    episodes = episodes_of_store(tmp_path / "run.zarr", LIBERO_COLUMNS)
+    data = write_data_set(tmp_path / "data", "v3.0", episodes, video=encoding)
+    assert run("replay", data, *cubes, "--every", 1, "--store", tmp_path / "replay.zarr") == 0
+    for number in range(2):
+        rows = [episode(tmp_path / f"{name}.zarr", 0, number)["joint/rows"][:] for name in ("run", "replay")]
+        moved = np.abs(rows[0] - rows[1]).sum(axis=-1) / 2  # probability that lies on other keys
+        assert 0 < moved.mean() < 0.03
+        assert moved.max() < 0.2
+
+
+def test_the_store_says_what_was_replayed(tmp_path, capsys):
+    made = made_up_episodes((7, 5, 9), ("observation.images.front", "observation.images.wrist"))
+    data = write_data_set(tmp_path / "so101_pick", "v3.0", made, video=H264)
+    cameras = ("--camera", "base_0_rgb=front", "--camera", "left_wrist_0_rgb=observation.images.wrist")
+    store = tmp_path / "replay.zarr"
+    options = (*TINY, *cameras, "--every", 3, "--store", store)
+    assert run("replay", data, *options, "--episodes", "1-2") == 0
+    said = capsys.readouterr().out
+    assert (
+        "Data set: so101_pick, LeRobotDataset v3.0, 3 episodes of 2 tasks at 10 frames per second, robot so101" in said
+    )
+    assert "camera base_0_rgb = observation.images.front; camera left_wrist_0_rgb = observation.images.wrist" in said
+    assert "Black and masked: right_wrist_0_rgb." in said
+    assert "Policy calls: 5, every 3 frames (0.3 s), of 4 actions each." in said
+    assert "Disk: at most" in said
+    root = open_store(store).attributes
+    assert (root.protocol.name, root.protocol.suite, root.protocol.replan_steps) == ("dataset", "so101_pick", 3)
+    assert root.data_set is not None
+    assert (root.data_set.version, root.data_set.fps, root.data_set.robot_type) == ("v3.0", 10, "so101")
+    assert root.data_set.columns["actions"] == "action"
+    stored = episode(store, 0, 2)  # the third episode has the first task
+    assert (stored.attrs["instruction"], stored.attrs["task_name"]) == (
+        "put the cup on the plate",
+        "put_the_cup_on_the_plate",
+    )
+    assert (stored.attrs["success"], stored.attrs["num_steps"]) == (None, 9)
+    np.testing.assert_array_equal(stored["state"][:], made[2].columns["observation.state"][::3])
+    np.testing.assert_array_equal(stored["dataset_actions"][1], made[2].columns["action"][3:7])
+    assert stored["dataset_action_count"][:].tolist() == [4, 4, 3]
+    np.testing.assert_array_equal(stored["dataset_actions"][2, :3], made[2].columns["action"][6:9])
+    assert stored["actions"].shape == (3, 4, 6)
+    # Pictures of 64 x 96 are fitted into 28 x 28; their stripes are still to be told apart.
+    for camera, first in (("base_0_rgb", 200), ("left_wrist_0_rgb", 250)):
+        frames = stored[f"frames/{camera}"][:]
+        assert [number_of(np.repeat(np.repeat(f[5:23], 8, 0), 8, 1)) for f in frames] == [first, first + 3, first + 6]
+    # with --resume, what is missing is added
+    assert run("replay", data, *options, "--resume") == 0
+    assert "2 of 3 episodes are complete already; 1 to run" in capsys.readouterr().out
+    assert sorted(path.name for path in (store / "episodes").glob("task*")) == [
+        "task000_episode000",
+        "task000_episode002",
+        "task001_episode001",
+    ]
+    assert run("replay", data, *options) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert run("replay", data, *TINY, *cameras, "--every", 2, "--store", store, "--resume") == 2
+    assert "protocol.replan_steps is 3, this run's is 2" in capsys.readouterr().err
+    assert analyze(["verify", str(store)]) == 0
+
+
+def test_another_instruction_and_known_outcomes(tmp_path):
+    made = made_up_episodes((4, 4), tuple(LIBERO_COLUMNS.values()))
+    for number, solved in enumerate((False, True)):
+        made[number].columns["next.success"] = np.array([[False], [False], [False], [solved]])
+    data = write_data_set(tmp_path / "data", "v2.1", made)
+    store = tmp_path / "replay.zarr"
+    words = ("--instruction", "close the box", "--action", "none")
+    assert run("replay", data, *TINY, *words, "--store", store) == 0
+    for number, solved in enumerate((False, True)):
+        stored = episode(store, number, number)
+        assert stored.attrs["success"] is solved
+        assert stored.attrs["instruction"] == "close the box"
+        assert "dataset_actions" not in stored
+
+
+def lerobot_checkpoint(folder: Path, cameras: dict[str, str], state: int, action: int) -> Path:
+    """The small golden pi0.5 of LeRobot, for a robot of other sizes and other names of cameras."""
+    shutil.copytree(GOLDEN / "pi05_batch2" / "checkpoint_lerobot", folder / "checkpoint")
+    shutil.copy(GOLDEN / "pi05_batch2" / "case.json", folder)
+    path = folder / "checkpoint" / "config.json"
+    config = json.loads(path.read_text())
+    picture = {"type": "VISUAL", "shape": [3, 56, 56]}
+    config["input_features"] = {
+        **dict.fromkeys(cameras, picture),
+        "observation.state": {"type": "STATE", "shape": [state]},
+    }
+    config["output_features"] = {"action": {"type": "ACTION", "shape": [action]}}
+    path.write_text(json.dumps(config))
+    for file in (folder / "checkpoint").glob("policy_*.safetensors"):
+        sizes = {"observation.state": state, "action": action}
+        old = load_file(file)
+        tensors = {
+            name: np.resize(values, sizes[name.rpartition(".")[0]]).astype(np.float32) for name, values in old.items()
+        }
+        save_file(tensors, file)
+    path = folder / "checkpoint" / "policy_preprocessor.json"
+    content = json.loads(path.read_text())
+    for step in content["steps"]:
+        if step["registry_name"] == "rename_observations_processor":
+            step["config"]["rename_map"] = {column: feature for feature, column in cameras.items() if column != feature}
+    path.write_text(json.dumps(content))
+    return folder / "checkpoint"
+
+
+def test_a_lerobot_checkpoint_for_a_robot_of_its_own(tmp_path, tokenizer, capsys):
+    top, hand, side = (f"observation.images.{name}" for name in ("top", "hand", "side"))
+    checkpoint = lerobot_checkpoint(tmp_path, {top: "observation.images.overhead", hand: hand, side: side}, 12, 11)
+    made = made_up_episodes((6,), ("observation.images.overhead", hand), state=12, action=11)
+    data = write_data_set(tmp_path / "bimanual", "v3.0", made, video=H264)
+    model = ("--checkpoint", checkpoint, "--tokenizer", tokenizer, "--store", tmp_path / "replay.zarr")
+    assert run("replay", data, *model) == 2
+    error = capsys.readouterr().err
+    assert "The policy's camera 'side' has no pictures in the data set 'bimanual'" in error
+    assert "--camera side=NAME, or --camera side=none" in error
+    assert run("replay", data, *model, "--camera", "side=none") == 0
+    stored = episode(tmp_path / "replay.zarr", 0, 0)
+    assert stored["actions"].shape == (2, 6, 11)
+    assert stored["state"].shape == (2, 12)
+    assert sorted(stored["camera_frames"]) == ["hand", "top"]
+    root = open_store(tmp_path / "replay.zarr").attributes
+    # pictures of present cameras come before the masked ones, as in LeRobot
+    assert [span.name for span in root.sites[0].spans][:3] == ["top", "hand", "side"]
+    assert [(camera.name, camera.source) for camera in root.policy.cameras] == [
+        ("top", "observation.images.overhead"),
+        ("hand", hand),
+    ]
+
+
+def test_a_replay_can_be_rerun_with_interventions(tmp_path, capsys):
+    made = made_up_episodes((8,), tuple(LIBERO_COLUMNS.values()), state=14, action=14)
+    data = write_data_set(tmp_path / "data", "v3.0", made, video=H264)
+    store = tmp_path / "replay.zarr"
+    assert run("replay", data, *TINY, "--store", store) == 0
+    assert run("rerun", store, "--knockout", "camera:base_0_rgb") == 0
+    said = capsys.readouterr().out
+    assert "bit-equal" in said
+    assert "NOT bit-equal" not in said
+    [made_again] = [path for path in tmp_path.glob("*.zarr") if path != store]
+    changed, base = (episode(path, 0, 0) for path in (made_again, store))
+    assert not np.array_equal(changed["actions"][:], base["actions"][:])
+    np.testing.assert_array_equal(changed["dataset_actions"][:], base["dataset_actions"][:])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--every", 0], "Cannot use --every 0; expected at least 1"),
+        (["--episodes", 3], "has no episode 3; its episodes are 0 to 2"),
+        (["--episodes", "1-9"], "has no episode 9"),
+        (["--episodes", "2-1"], "expected a number, or a range as 3-7"),
+        (["--num-episodes", 0], "expected at least 1"),
+        (["--camera", "base_0_rgb"], "expected POLICY=COLUMN"),
+        (["--camera", "base=image"], "Unknown camera of the policy 'base'. Did you mean 'base_0_rgb'?"),
+        (["--camera", "base_0_rgb=front"], "Unknown camera of the data set 'data' 'front'"),
+        (["--camera", "base_0_rgb=image", "--camera", "base_0_rgb=wrist_image"], "twice"),
+        (["--camera", "base_0_rgb=none", "--camera", "left_wrist_0_rgb=none"], "None of the policy's cameras"),
+        (["--state", "joints"], "has no numbers 'joints'"),
+        (["--state", "image"], "has no numbers 'image'"),
+        (["--action", "actions"], "has no numbers 'actions'. Did you mean 'action'?"),
+        (["--relative-actions", 9], "Cannot use --relative-actions 9"),
+        (["--policy", "smolvla"], "Cannot use --policy smolvla; expected pi"),
+        (["--store", "here/name"], "expected a name that ends with '.zarr'"),
+    ],
+)
+def test_mistakes_end_with_one_sentence(tmp_path, capsys, monkeypatch, options, message):
+    monkeypatch.chdir(tmp_path)
+    made = made_up_episodes((3, 3, 3), tuple(LIBERO_COLUMNS.values()), state=8, action=7)
+    data = write_data_set(tmp_path / "data", "v2.1", made)
+    assert run("replay", data, *TINY, "--store", "replay.zarr", *options) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.startswith("vla-capture: ")
+    assert "Traceback" not in error
+    assert not list(tmp_path.rglob("*.zarr"))
+
+
+def test_a_checkpoint_of_another_robot_is_refused(tmp_path, capsys, tokenizer):
+    made = made_up_episodes((3,), tuple(LIBERO_COLUMNS.values()), state=14, action=14)
+    data = write_data_set(tmp_path / "data", "v2.1", made)
+    store = ("--tokenizer", tokenizer, "--store", tmp_path / "replay.zarr")
+    assert run("replay", data, "--checkpoint", GOLDEN / "pi05_batch2/checkpoint_openpi_torch", *store) == 2
+    assert (
+        "states have 8 numbers, and those of the data set 'data' 14: observation.state (14)" in capsys.readouterr().err
+    )
+    lerobot = (
+        *("--camera", "image=image", "--camera", "image2=wrist_image"),
+        *("--checkpoint", GOLDEN / "pi05_batch2/checkpoint_lerobot"),
+    )
+    assert run("replay", data, *lerobot, *store) == 2
+    assert "The policy's states have 8 numbers" in capsys.readouterr().err
+    assert run("replay", tmp_path, *TINY) == 2
+    assert "is no LeRobotDataset" in capsys.readouterr().err
