@@ -5,10 +5,13 @@
     run = va.open("runs/libero_10.zarr")    # a store, or several that are analysed as one
     run.ratios()                            # a polars frame; docs/python.md lists the other methods
 
-Public names: `open` and `OpenStores` (stage two), `inspect` (attention calls of a torch policy), `UserError` (the base
-of every error that a user can cause) and `__version__`. `vla_attention.datasets` reads data sets of robots.
-`vla_attention.testing` makes small stores with known content. This import loads neither torch nor zarr, polars or
-numpy.
+    with va.record("run.zarr", policy, layout=va.layouts.smolvla(policy)) as run:    # docs/your-policy.md
+        ...
+
+Public names: `open` and `OpenStores` (stage two); `record`, `inspect`, `layouts` and the parts of a `PolicyLayout`
+(stage one, from your own code; they need torch); `UserError` (the base of every error that a user can cause) and
+`__version__`. `vla_attention.datasets` reads data sets of robots. `vla_attention.testing` makes small stores with known
+content. This import loads neither torch nor zarr, polars or numpy.
 """
 
 from __future__ import annotations
@@ -23,7 +26,24 @@ if TYPE_CHECKING:
     from vla_attention.analyze.api import OpenStores
     from vla_attention.capture.torch_policies.inspect_calls import CallTable
 
+#: Public names of the recorder by module. They are imported when they are used: the recorder needs torch.
+_RECORDER = {
+    "capture.torch_policies.record": ("record",),
+    "capture.torch_policies.policy_layout": (
+        "CallRule",
+        "CameraPicture",
+        "PolicyLayout",
+        "PromptText",
+        "RecordedSite",
+    ),
+    "schemas.layout": ("PatchGrid", "SiteLayout", "Span"),
+}
+
 __all__ = ["OpenStores", "UserError", "__version__", "inspect", "open"]
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "datasets", "layouts", *(name for names in _RECORDER.values() for name in names)]
 
 
 def open(stores: str | Path | Sequence[str | Path]) -> OpenStores:
@@ -71,4 +91,13 @@ def __getattr__(name: str) -> Any:
         from importlib import import_module
 
         return import_module("vla_attention.datasets")
+    if name == "layouts":
+        from importlib import import_module
+
+        return import_module("vla_attention.capture.torch_policies.layouts")
+    for module, names in _RECORDER.items():
+        if name in names:
+            from importlib import import_module
+
+            return getattr(import_module(f"vla_attention.{module}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

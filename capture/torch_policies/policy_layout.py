@@ -124,6 +124,14 @@ class RecordedSite:
         """The site's name."""
         return self.keys.name
 
+    @property
+    def num_action_queries(self) -> int:
+        """Number of action queries of a call; 0 where it depends on the call."""
+        start, stop = self.action_queries
+        if stop is None:
+            return -start if start < 0 else 0
+        return stop - start if (start < 0) == (stop < 0) else 0
+
     def queries(self, count: int) -> tuple[int, int]:
         """Return (start, stop) of the action queries of a call with `count` queries.
 
@@ -202,6 +210,7 @@ class PolicyLayout:
             queries of one replan. `num_denoise_steps` is 1 then. Each call has the site's `action_queries`; its
             keys are those that exist so far; those of generated tokens are a span with `growing`, the last one.
         num_action_tokens: number of generated tokens of an autoregressive policy.
+        stops_early: it may generate fewer tokens than that; then only the mean over its action queries can be recorded.
         versions: library -> versions that the layout was written for and tried with, for instance {"lerobot":
             ("0.4.4",)}; "5." takes every version that begins with it.
         config: what else distinguishes policies of this family; goes into the store.
@@ -221,6 +230,7 @@ class PolicyLayout:
     action_dim: int = 0
     autoregressive: bool = False
     num_action_tokens: int = 0
+    stops_early: bool = False
     versions: dict[str, tuple[str, ...]] = field(default_factory=dict)
     config: dict[str, str] = field(default_factory=dict)
 
@@ -248,6 +258,12 @@ class PolicyLayout:
                 yield f"its number of {what} is {count}"
         if self.denoise_times and len(self.denoise_times) != self.num_denoise_steps:
             yield f"it has {len(self.denoise_times)} denoise times for {self.num_denoise_steps} denoise steps"
+        for site in self.sites:
+            if not self.autoregressive and not site.num_action_queries:
+                yield (
+                    f"the number of action queries of site '{site.name}' depends on the call ({site.action_queries}); "
+                    "count both ends from the same side, as (0, 50) or (-50, None)"
+                )
         if self.autoregressive and (self.num_denoise_steps != 1 or self.num_action_tokens < 1):
             yield "an autoregressive policy has one denoise step and at least one action token"
         pictured = {camera for site in self.sites for camera in site.keys.cameras}

@@ -1,0 +1,96 @@
+"""The weights of a policy: their digest, device and type, and its output projections."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from vla_attention.capture.policies.weights import weights_digest
+from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
+from vla_attention.capture.torch_policies.policy_modules import modules_of
+from vla_attention.schemas.errors import BadArgument, did_you_mean, unknown_name
+
+
+def find_module(policy: object, path: str, what: str) -> nn.Module:
+    """Return the module at a path; the error says what it was wanted for, and the nearest that exists."""
+    modules = modules_of(policy)
+    if path not in modules:
+        raise unknown_name(f"module for {what}", path, [name for name in modules if name])
+    return modules[path]
+
+
+def _roots(policy: object) -> dict[str, nn.Module]:
+    """The modules of a policy that are in no other one, by path."""
+    inside: set[int] = set()
+    roots = {}
+    for path, module in modules_of(policy).items():
+        if id(module) not in inside:
+            roots[path] = module
+            inside.update(id(part) for part in module.modules())
+    return roots
+
+
+def policy_digest(policy: object) -> str:
+    """Return the SHA-256 (hex) over the weights of all modules of a policy."""
+    roots = _roots(policy)
+    if len(roots) == 1:
+        return weights_digest(next(iter(roots.values())))
+    digest = hashlib.sha256()
+    for name, module in sorted(roots.items()):
+        digest.update(f"{name} {weights_digest(module)}\n".encode())
+    return digest.hexdigest()
+
+
+def device_and_dtype(policy: object) -> tuple[str, str]:
+    """Return the device and the type of most weights, such as `cuda:0` and `bfloat16`."""
+    counts: dict[tuple[str, str], int] = {}
+    for module in _roots(policy).values():
+        for weight in module.parameters():
+            place = str(weight.device), str(weight.dtype).removeprefix("torch.")
+            counts[place] = counts.get(place, 0) + weight.numel()
+    return max(counts, key=lambda place: counts[place]) if counts else ("cpu", "float32")
+
+
+def projections_of(
+    policy: object, layout: PolicyLayout, layers: tuple[int, ...]
+) -> dict[tuple[str, int], Callable[[Tensor], Tensor]]:
+    """Return (site, block) -> the function from (any, head · dim) to (any, width) of a block's output projection.
+
+    A bias is left out: no key gives it.
+    """
+    modules = modules_of(policy)
+    found = {}
+    for site in layout.sites:
+        if site.projection is None:
+            raise BadArgument(
+                f"Contributions need the output projection of site '{site.name}', and the layout '{layout.name}' names "
+                "none: record with contributions=False."
+            )
+        for block in site.keys.layers or range(layout.num_layers):
+            if block not in layers:
+                continue
+            path = site.projection.replace("{block}", str(block))
+            if path not in modules:
+                raise BadArgument(
+                    f"The output projection '{path}' of site '{site.name}' is no module of the policy."
+                    f"{did_you_mean(path, modules)} Change RecordedSite.projection, or record with contributions=False."
+                )
+            found[site.name, block] = _projection(modules[path])
+    return found
+
+
+def _projection(module: nn.Module) -> Callable[[Tensor], Tensor]:
+    if isinstance(module, nn.Linear) and module.weight.is_floating_point():
+        weight = module.weight
+        return lambda mixed: nn.functional.linear(mixed, weight.to(mixed.dtype))
+
+    def project(mixed: Tensor) -> Tensor:
+        # Quantised weights, adapters: the module itself, without what it gives for zeros.
+        dtype = next((weight.dtype for weight in module.parameters() if weight.is_floating_point()), mixed.dtype)
+        both: Tensor = module(torch.cat([mixed.to(dtype), torch.zeros_like(mixed[:1], dtype=dtype)]))
+        return (both[:-1] - both[-1:]).float()
+
+    return project

@@ -1,0 +1,278 @@
+"""`va.record`: from its arguments to a run that is ready to record."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
+
+from vla_attention.capture.provenance import describe_machine
+from vla_attention.capture.torch_policies.knockouts import SessionKnockouts, interventions_of, with_name
+from vla_attention.capture.torch_policies.policy_layout import (
+    LayoutForAnotherVersion,
+    PolicyLayout,
+    RecordedSite,
+    check_versions,
+)
+from vla_attention.capture.torch_policies.policy_weights import device_and_dtype, policy_digest, projections_of
+from vla_attention.capture.torch_policies.prompts import TokenText
+from vla_attention.capture.torch_policies.session import RecordedRun
+from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.layers import select_layers
+from vla_attention.schemas.layout import SiteLayout
+from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
+from vla_attention.schemas.stores.store_format import (
+    FORMAT_NAME,
+    FORMAT_VERSION,
+    PolicyCameraView,
+    PolicyIdentity,
+    Protocol,
+    Recording,
+    RootAttributes,
+)
+
+#: Libraries of policies whose versions can change numbers.
+_LIBRARIES = ("transformers", "lerobot", "diffusers", "timm", "flash-attn", "peft")
+
+
+def record(
+    store: str | Path,
+    policy: object,
+    *,
+    layout: PolicyLayout,
+    suite: str = "recorded",
+    checkpoint: str = "",
+    tokenizer: Any = None,
+    untrained: bool = False,
+    layers: Sequence[int] | None = None,
+    denoise_steps: Sequence[int | str] = ("first", "last"),
+    heads: Sequence[int] | None = None,
+    queries: Literal["mean", "all"] = "mean",
+    bits: int = 10,
+    contributions: bool | None = None,
+    frames: bool = True,
+    knockout: str | Sequence[str] | Interventions | None = None,
+    keep: str | None = None,
+    knockout_layers: Sequence[int] | None = None,
+    knockout_heads: Sequence[int] | None = None,
+    knockout_denoise_steps: Sequence[int] | None = None,
+    knockout_weight: float = 1.0,
+    condition: str = "",
+    allow_empty: bool = False,
+    own_setting: Callable[[], Any] | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    any_version: bool = False,
+    provenance: Mapping[str, str] | None = None,
+    durable: bool = True,
+) -> RecordedRun:
+    """Record the attention of a policy that your own code calls; returns a run for a `with` block.
+
+    >>> import vla_attention as va
+    >>> with va.record(store, policy, layout=layout) as run:
+    ...     for number in range(2):
+    ...         with run.episode(task_id=0, episode_index=number, instruction="pick the bowl") as episode:
+    ...             for step in range(0, 30, 10):
+    ...                 with episode.replan(env_step=step) as replan:
+    ...                     replan.actions = policy.act(step)
+    ...             episode.success = True
+    >>> va.open(store).ratios().filter(scope="task")["instruction"][0]
+    'pick the bowl'
+
+    Args:
+        store: the store to write, `NAME.zarr`.
+        policy: an `nn.Module`, or an object that has modules as attributes.
+        layout: what its attention calls are (`va.layouts`, or docs/your-policy.md).
+        suite: your name for the tasks.
+        checkpoint: where the weights come from, for the store.
+        tokenizer: the policy's own; with it the prompt's tokens have words. None: the layout's text, if it has none.
+        untrained: the weights are random.
+        layers, denoise_steps, heads: what is recorded; None is everything. `first`, `last` and `all` are denoise steps.
+        queries: `mean` over the action queries, or `all` of them.
+        bits: precision of the stored rows in mantissa bits; 23 is exact.
+        contributions: also what the keys' values add to the residual stream; None: where the layout names projections.
+        frames: store the pictures that replans are given.
+        knockout, keep: keys that the action queries do not read, or that alone they read, in the grouping language; or
+            `Interventions`.
+        knockout_layers, knockout_heads, knockout_denoise_steps, knockout_weight: where, and which share of the weights.
+        condition: a short name for a run with a knockout.
+        allow_empty: leave a replan unchanged where the knocked-out group has no key.
+        own_setting: a policy call that can be repeated, `lambda: policy.select_action(batch)`: it is made once as you
+            make it and once as it is recorded, and the difference goes into the store.
+        resume, overwrite: continue a store, or delete it first.
+        any_version: accept other versions of libraries than those that the layout was written for.
+        provenance: further facts for the store.
+        durable: flush every episode to disk, so that it survives a crash of the machine.
+
+    Raises:
+        StoreExists: a store is there, and neither `resume` nor `overwrite` is given.
+        RunMismatch: `resume` with other settings than those of the store.
+        LayoutForAnotherVersion: the layout was written for other libraries than those that are installed.
+        BadArgument: a number of a layer, head or denoise step does not exist; a projection is no module.
+    """
+    if resume and overwrite:
+        raise BadArgument("Give resume=True or overwrite=True, not both.")
+    installed = {library: installed_version(library) for library in (*layout.versions, *_LIBRARIES)}
+    other = check_versions(layout, installed)
+    if other is not None and not any_version:
+        raise LayoutForAnotherVersion(other)
+    recording = plan_recording(
+        layout, layers, denoise_steps, heads, queries, bits, contributions=contributions, frames=frames
+    )
+    changes = with_name(
+        interventions_of(
+            knockout, keep, knockout_layers, knockout_heads, knockout_denoise_steps, knockout_weight, layout
+        ),
+        condition,
+    )
+    device, dtype = device_and_dtype(policy)
+    projections = projections_of(policy, layout, recording.layers) if recording.contributions else {}
+    facts = describe_machine(device)
+    facts |= {library: version for library, version in installed.items() if version is not None}
+    facts |= {"layout for another version": other} if other is not None else {}
+    facts["difference to own setting"] = _difference(policy, own_setting)
+    facts |= dict(provenance or {})
+    attributes = RootAttributes(
+        format=FORMAT_NAME,
+        format_version=FORMAT_VERSION,
+        policy=_identity(policy, layout, checkpoint, dtype, untrained=untrained),
+        protocol=Protocol(
+            suite=suite, seed=0, wait_steps=0, replan_steps=0, max_steps=0, name="recorded", image_size=0
+        ),
+        recording=recording,
+        sites=recorded_sites(layout, recording),
+        provenance=facts,
+        interventions=changes,
+    )
+    return RecordedRun(
+        Path(store),
+        policy,
+        layout,
+        attributes,
+        "resume" if resume else "overwrite" if overwrite else "new",
+        knockouts=SessionKnockouts(changes, allow_empty),
+        tokenizer=None if tokenizer is None else TokenText(tokenizer),
+        projections=projections,
+        durable=durable,
+    )
+
+
+def plan_recording(
+    layout: PolicyLayout,
+    layers: Sequence[int] | None,
+    denoise_steps: Sequence[int | str],
+    heads: Sequence[int] | None,
+    queries: str,
+    bits: int,
+    *,
+    contributions: bool | None,
+    frames: bool,
+) -> Recording:
+    """Return what is recorded; raise `BadArgument` for what the layout does not have."""
+    blocks = select_layers(layers, layout.num_layers, layout.family)
+    chosen_heads = tuple(range(layout.num_heads)) if heads is None else tuple(sorted(set(heads)))
+    for head in chosen_heads:
+        if not 0 <= head < layout.num_heads:
+            raise BadArgument(f"There is no head {head}; expected 0 to {layout.num_heads - 1}.")
+    if queries not in ("mean", "all"):
+        raise BadArgument(f"Cannot record the queries '{queries}'; expected 'mean' or 'all'.")
+    if queries == "all" and layout.stops_early:
+        raise BadArgument(
+            f"Cannot record all action queries of '{layout.name}': it may generate fewer than "
+            f"{layout.num_action_tokens} tokens. Record their mean."
+        )
+    if not 1 <= bits <= FLOAT32_MANTISSA_BITS:
+        raise BadArgument(f"Cannot store rows with {bits} mantissa bits; expected 1 to {FLOAT32_MANTISSA_BITS}.")
+    steps = _denoise_steps(denoise_steps, layout.num_denoise_steps)
+    if contributions is None:
+        contributions = all(site.projection is not None for site in layout.sites)
+    return Recording(
+        layers=tuple(sorted(set(blocks.blocks))),
+        layer_labels=tuple(sorted(blocks.labels, key=lambda label: (label % layout.num_layers, label))),
+        denoise_steps=steps,
+        heads=chosen_heads,
+        queries="mean" if queries == "mean" else "all",
+        num_action_queries=max(num_action_queries(layout, site) for site in layout.sites),
+        mantissa_bits=bits,
+        frames=frames,
+        contributions=contributions,
+    )
+
+
+def num_action_queries(layout: PolicyLayout, site: RecordedSite) -> int:
+    """Return how many action queries a policy call has at a site."""
+    return layout.num_action_tokens if layout.autoregressive else site.num_action_queries
+
+
+def recorded_sites(layout: PolicyLayout, recording: Recording) -> tuple[SiteLayout, ...]:
+    """Return the sites that some recorded layer has, as the store describes them."""
+    stored = []
+    for site in layout.sites:
+        if site.keys.layers and not set(site.keys.layers) & set(recording.layers):
+            continue
+        count = num_action_queries(layout, site)
+        own = 0 if count == recording.num_action_queries else count
+        stored.append(replace(site.keys, num_action_queries=own) if own else site.keys)
+    if not stored:
+        raise BadArgument(f"The layers {listing(recording.layers)} have none of the sites.")
+    return tuple(stored)
+
+
+def _denoise_steps(words: Sequence[int | str], count: int) -> tuple[int, ...]:
+    named = {"first": (0,), "last": (count - 1,), "all": tuple(range(count))}
+    given = [words] if isinstance(words, (int, str)) else words
+    steps: set[int] = set()
+    for word in given:
+        if isinstance(word, str) and word in named:
+            steps.update(named[word])
+        elif not isinstance(word, str) and 0 <= word < count:
+            steps.add(int(word))
+        else:
+            raise BadArgument(
+                f"There is no denoise step {word!r}; expected numbers 0 to {count - 1}, 'first', 'last' or 'all'."
+            )
+    return tuple(sorted(steps))
+
+
+def _identity(policy: object, layout: PolicyLayout, checkpoint: str, dtype: str, *, untrained: bool) -> PolicyIdentity:
+    # Pictures are shown as the policy gets them: row 0 on top.
+    views = tuple(PolicyCameraView(name, name, upright=True, mirrored=False) for name in layout.camera_names)
+    return PolicyIdentity(
+        name=layout.name,
+        family=layout.family,
+        checkpoint=checkpoint or "not given",
+        checkpoint_format="torch modules of the caller",
+        digest=policy_digest(policy),
+        untrained=untrained,
+        num_layers=layout.num_layers,
+        num_heads=layout.num_heads,
+        num_denoise_steps=layout.num_denoise_steps,
+        action_horizon=layout.action_horizon,
+        cameras=views,
+        config={
+            "class": f"{type(policy).__module__}.{type(policy).__qualname__}",
+            "dtype": dtype,
+            **layout.config,
+            "layout": to_json(replace(layout, versions={}, config={})),
+        },
+    )
+
+
+def _difference(policy: object, own_setting: Callable[[], Any] | None) -> str:
+    if own_setting is None:
+        return "not measured"
+    from vla_attention.capture.torch_policies.call_changes import difference_to_own_setting
+
+    return str(difference_to_own_setting(policy, own_setting))
+
+
+def installed_version(library: str) -> str | None:
+    """Return the version of an installed library, or None."""
+    try:
+        return metadata.version(library)
+    except metadata.PackageNotFoundError:
+        return None

@@ -1,0 +1,123 @@
+"""What the caller says of an episode and of a replan, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.capture.environments.coverage import patch_coverage
+from vla_attention.capture.policies.policy import camera_grid
+from vla_attention.capture.torch_policies.pictures import model_picture
+from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
+from vla_attention.schemas.errors import BadArgument, did_you_mean, listing, unknown_name
+from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.layout import Prompt
+
+
+@dataclass(frozen=True)
+class EpisodeFacts:
+    """What is known of an episode before it begins; the arguments of `RecordedRun.episode`."""
+
+    task_id: int
+    episode_index: int
+    instruction: str
+    seed: int | None = None
+    task_name: str | None = None
+    objects: tuple[SceneObject, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        for name in ("task_id", "episode_index"):
+            if getattr(self, name) < 0:
+                raise BadArgument(f"The {name} of an episode is {getattr(self, name)}; expected 0 or more.")
+
+
+@dataclass(frozen=True)
+class ReplanInputs:
+    """What the caller gives to `replan(...)` beside the environment step. All of it is optional.
+
+    Attributes:
+        env_step: the environment step of the call.
+        frames: camera of the layout -> picture as the policy gets it, (height, width, 3) uint8 or (3, height, width)
+            with numbers from 0 to 1; stored in the model's input size.
+        state: (state_dim,) numbers.
+        instruction: the instruction of this call, where it is not that of the episode.
+        prompt: the prompt's pieces, one text for each key of the prompt (None for keys without text), or a `Prompt`;
+            None: from the token ids that the policy embeds.
+        roles: site -> role codes (key,), where the layout's are not those of this call.
+        noise_seed: the seed of this call's noise; None: that of the episode.
+        masks: camera -> (height, width) whole numbers: the number of each pixel's object, counted in the episode's
+            `objects`.
+        coverage: camera -> (patch, object), the share of each patch that each object covers; instead of masks.
+    """
+
+    env_step: int
+    frames: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    state: NDArray[np.float64] | None = None
+    instruction: str = ""
+    prompt: Prompt | Sequence[str | None] | None = None
+    roles: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    noise_seed: int | None = None
+    masks: Mapping[str, NDArray[np.integer]] = field(default_factory=dict)
+    coverage: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+
+
+_NAMES = tuple(part.name for part in fields(ReplanInputs) if part.name != "env_step")
+
+
+def read_inputs(layout: PolicyLayout, facts: EpisodeFacts, env_step: int, given: Mapping[str, Any]) -> ReplanInputs:
+    """Return what a caller gave for one replan, checked and in the store's form.
+
+    Raises:
+        BadArgument: an argument or a camera does not exist, or a value has another shape or type.
+    """
+    for name in given:
+        if name not in _NAMES:
+            raise BadArgument(
+                f"replan() has no argument '{name}'.{did_you_mean(name, _NAMES)} Existing: {listing(_NAMES)}."
+            )
+    values = {name: value for name, value in given.items() if value is not None}
+    sites = [site.keys for site in layout.sites]
+    fits = {camera.name: camera.fit for camera in layout.cameras}
+    cameras = layout.camera_names
+    for what in ("frames", "masks", "coverage"):
+        for camera in values.get(what, ()):
+            if camera not in cameras:
+                raise unknown_name(f"camera of {what}", camera, cameras)
+    frames = {
+        camera: model_picture(values["frames"][camera], camera, camera_grid(sites, camera), fits.get(camera, "stretch"))
+        for camera in cameras
+        if camera in values.get("frames", ())
+    }
+    coverage = {camera: np.asarray(array, dtype=np.float32) for camera, array in values.get("coverage", {}).items()}
+    for camera, mask in values.get("masks", {}).items():
+        grid = camera_grid(sites, camera)
+        coverage[camera] = patch_coverage(
+            np.asarray(mask), len(facts.objects), grid.rows, grid.columns, flip_rows=False, flip_columns=False
+        )
+    seed = values.get("noise_seed", facts.seed)
+    return ReplanInputs(
+        env_step=env_step,
+        frames=frames,
+        state=_state(values.get("state")),
+        instruction=values.get("instruction", facts.instruction),
+        prompt=values.get("prompt"),
+        roles=values.get("roles", {}),
+        noise_seed=None if seed is None else int(seed),
+        coverage={camera: coverage[camera] for camera in cameras if camera in coverage},
+    )
+
+
+def _state(given: Any) -> NDArray[np.float64] | None:
+    if given is None:
+        return None
+    values = given.detach().float().cpu().numpy() if hasattr(given, "detach") else given
+    state = np.asarray(values, dtype=np.float64)
+    state = state[0] if state.ndim == 2 and len(state) == 1 else state
+    if state.ndim != 1:
+        raise BadArgument(f"The state of a replan has the shape {state.shape}; expected (state_dim,).")
+    return state

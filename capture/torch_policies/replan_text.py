@@ -1,0 +1,127 @@
+"""The prompt of the rows of one policy call: token ids that the policy embeds, or what the caller gives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
+from vla_attention.capture.torch_policies.policy_weights import find_module
+from vla_attention.capture.torch_policies.prompts import (
+    TokenText,
+    prompt_from_ids,
+    prompt_from_pieces,
+    prompt_without_pieces,
+    roles_of_keys,
+    text_keys,
+)
+from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs
+from vla_attention.capture.torch_policies.site_recorder import SiteRows
+from vla_attention.schemas.layout import Prompt
+
+
+class ReplanText:
+    """The text of one policy call, by row of the batch.
+
+    inputs: row -> what the caller gave.
+    """
+
+    def __init__(
+        self, layout: PolicyLayout, tokenizer: TokenText | None, batch: int, inputs: Mapping[int, ReplanInputs]
+    ) -> None:
+        self.layout = layout
+        self.tokenizer = tokenizer
+        self.batch = batch
+        self.inputs = inputs
+        #: (row of the batch, token) ids of the longest call of the embedding.
+        self.ids: NDArray[np.int64] | None = None
+        #: Site -> (key,) bool, the keys that its calls had so far.
+        self.present: Mapping[str, NDArray[np.bool_]] = {}
+
+    def saw_ids(self, ids: Tensor) -> None:
+        """Keep the ids of a call of the embedding, (batch, token) or (token,), if it is the longest so far."""
+        if ids.is_floating_point() or ids.ndim not in (1, 2):
+            return
+        rows = ids if ids.ndim == 2 else ids[None]
+        if len(rows) == self.batch and (self.ids is None or rows.shape[1] > self.ids.shape[1]):
+            self.ids = rows.detach().cpu().numpy().astype(np.int64)
+
+    def prompt(self, row: int, found: Mapping[str, SiteRows] | None) -> Prompt:
+        """Return the prompt of a row; `found`: what the call's sites gave, None before the call has ended."""
+        given = self.inputs[row]
+        if isinstance(given.prompt, Prompt):
+            return given.prompt
+        sites = self.layout.text_sites
+        if self.layout.text is None or not sites:
+            return prompt_without_pieces(given.instruction)
+        present = self._present_keys(sites[0], found)
+        keys = text_keys(sites[0], self.layout.text.spans, present)
+        if given.prompt is not None:
+            return prompt_from_pieces(given.prompt, keys, given.instruction)
+        if self.ids is None or self.tokenizer is None:
+            return prompt_without_pieces(given.instruction)
+        valid = None
+        if found is not None:
+            seen = [found[site.name].valid for site in sites if site.name in found]
+            valid = np.logical_or.reduce(seen) if seen else None
+        return prompt_from_ids(self._text_ids(row), keys, self.tokenizer, given.instruction, valid)
+
+    def roles(
+        self,
+        row: int,
+        site: RecordedSite,
+        prompt: Prompt,
+        present: NDArray[np.bool_] | None,
+        valid: NDArray[np.bool_] | None,
+    ) -> NDArray[np.uint8]:
+        """Return the role codes of a site's keys, (key,), see `roles_of_keys`."""
+        bos = None
+        if self.layout.text is not None and self.ids is not None and self.tokenizer is not None:
+            ids, first = self._text_ids(row), text_keys(site, self.layout.text.spans, None) if self._has(site) else []
+            if ids and first and ids[0] == self.tokenizer.bos:
+                bos = first[0]
+        return roles_of_keys(site, self.layout, prompt, present, valid, bos, self.inputs[row].roles)
+
+    def early_roles(self, row: int, site: RecordedSite, present: NDArray[np.bool_]) -> NDArray[np.uint8]:
+        """Return the roles of a site's keys before the masks are known."""
+        return self.roles(row, site, self.prompt(row, None), present, None)
+
+    def _has(self, site: RecordedSite) -> bool:
+        return site in self.layout.text_sites
+
+    def _present_keys(self, site: RecordedSite, found: Mapping[str, SiteRows] | None) -> NDArray[np.bool_] | None:
+        if found is not None and site.name in found:
+            return found[site.name].present
+        return self.present.get(site.name)
+
+    def _text_ids(self, row: int) -> list[int]:
+        assert self.ids is not None
+        assert self.layout.text is not None
+        skipped = set(self.layout.text.skip_ids)
+        return [token for token in self.ids[row].tolist() if token not in skipped]
+
+
+@contextmanager
+def watched_ids(policy: object, text: ReplanText) -> Iterator[None]:
+    """Within the block, the policy's text embedding tells `text` the ids that it is given."""
+    if text.layout.text is None:
+        yield
+        return
+    embedding = find_module(policy, text.layout.text.embedding, "token ids")
+
+    def look(_module: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
+        for value in (*arguments, *named.values()):
+            if isinstance(value, Tensor):
+                text.saw_ids(value)
+                return
+
+    handle = embedding.register_forward_pre_hook(look, with_kwargs=True)
+    try:
+        yield
+    finally:
+        handle.remove()

@@ -1,0 +1,437 @@
+"""`va.record`: a store filled from the caller's own loop over episodes and policy calls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.capture.interventions.resolution import ReplanPlace
+from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
+from vla_attention.capture.store.recorded_rows import RecordedRows
+from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run
+from vla_attention.capture.torch_policies.attention_calls import CallShape
+from vla_attention.capture.torch_policies.call_order import CallPlace
+from vla_attention.capture.torch_policies.knockouts import SessionKnockouts, logit_bias
+from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
+from vla_attention.capture.torch_policies.prompts import TokenText
+from vla_attention.capture.torch_policies.replan_inputs import EpisodeFacts, ReplanInputs, read_inputs
+from vla_attention.capture.torch_policies.replan_text import ReplanText, watched_ids
+from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder, SiteRows, final_contribution
+from vla_attention.capture.torch_policies.watch import watch_attention
+from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.layout import Prompt
+from vla_attention.schemas.stores.store_format import RootAttributes, StoreExists, episode_name
+
+#: More replans than any episode has; the writer collects rows in blocks of two megabytes.
+_MANY_REPLANS = 1_000_000
+
+
+class RecordingStopped(UserError, RuntimeError):
+    """A part of a session was used outside of its block, twice, or inside of another."""
+
+
+class NothingRecorded(UserError, RuntimeError):
+    """An episode in which no attention was seen."""
+
+
+@dataclass
+class Replan:
+    """One policy call, inside of its block.
+
+    actions: (horizon, action_dim) or (action_dim,), set by the caller; None: not stored. With several environments, one
+        of them each, (environment, ...). All replans of an episode have them, or none.
+    recorded: after the block, whether attention ran in it.
+    """
+
+    actions: Any = None
+    recorded: bool = False
+
+
+@dataclass
+class Episode:
+    """An episode that is being recorded. Leaving its block without an exception stores it.
+
+    success: True, False, or None where it is not known. num_steps: number of executed actions; None: the last
+    environment step of a replan, and one. num_replans, num_dropped: recorded replan blocks, and blocks in which no
+    attention ran (the policy answered from a queue).
+    """
+
+    run: RecordedRun
+    facts: EpisodeFacts
+    writer: EpisodeWriter
+    success: bool | None = None
+    num_steps: int | None = None
+    num_dropped: int = 0
+    largest_error: float = 0.0
+    folder: Path | None = None
+    _batch: EpisodeBatch | None = field(default=None, repr=False)
+
+    @property
+    def name(self) -> str:
+        """The episode's name in the store."""
+        return episode_name(self.facts.task_id, self.facts.episode_index)
+
+    @property
+    def num_replans(self) -> int:
+        """Number of recorded replans."""
+        return len(self.writer.records)
+
+    @contextmanager
+    def replan(self, *, env_step: int, **inputs: Any) -> Iterator[Replan]:
+        """Record the policy call in the block; `ReplanInputs` has the other arguments.
+
+        Args:
+            env_step: the environment step at which the call is made; it increases from call to call.
+
+        Raises:
+            CallsDoNotFit: the attention calls are not those of the layout.
+            RowsDoNotMatch: the rows do not reproduce what the policy's kernel gave.
+        """
+        if self._batch is not None:
+            raise RecordingStopped("This episode is one of several; use the replan of run.episodes(...).")
+        given = read_inputs(self.run.layout, self.facts, env_step, inputs)
+        with self.run._replan([self], [given], batch=1, rows=[0]) as replan:
+            yield replan
+
+    def _commit(self) -> None:
+        if not self.writer.records:
+            raise NothingRecorded(
+                f"No attention was seen in the {self.num_dropped} replan blocks of {self.name}: the policy may be "
+                "compiled or use flash-attn (load it with attn_implementation='sdpa' or 'eager'), or have no attention "
+                "at all (va.inspect shows its calls); or no block called it."
+            )
+        last = self.writer.records[-1].env_step + 1
+        facts = {
+            **self.writer.start.provenance,
+            "largest P·V error": f"{self.largest_error:.3g}",
+            "replan blocks without attention": str(self.num_dropped),
+        }
+        self.writer.start = replace(self.writer.start, provenance=facts)
+        self.folder = self.writer.commit(self.success, last if self.num_steps is None else self.num_steps)
+        self.run.largest_error = max(self.run.largest_error, self.largest_error)
+
+
+class EpisodeBatch(Sequence[Episode]):
+    """Several episodes whose policy calls are made together: row i of the batch is episode i."""
+
+    def __init__(self, run: RecordedRun, stack: ExitStack) -> None:
+        self._run = run
+        self._stack = stack
+        self._episodes: list[Episode] = []
+
+    def __len__(self) -> int:
+        return len(self._episodes)
+
+    def __getitem__(self, row: Any) -> Any:
+        return self._episodes[row]
+
+    @contextmanager
+    def replan(
+        self, *, env_step: int | Sequence[int], active: Sequence[bool] | None = None, **inputs: Any
+    ) -> Iterator[Replan]:
+        """Record the policy call of all episodes in the block.
+
+        Args:
+            env_step: environment step of all episodes, or of each.
+            active: which rows are recorded; None: all of them. A row whose episode has ended is left out.
+            inputs: as in `ReplanInputs`, each a sequence with one entry per row.
+        """
+        count = len(self)
+        chosen = [row for row in range(count) if active is None or active[row]]
+        steps = [env_step] * count if isinstance(env_step, int) else list(env_step)
+        for name, values in (("env_step", steps), *(inputs.items())):
+            if values is not None and len(values) != count:
+                raise BadArgument(f"{name} has {len(values)} entries; expected one for each of {count} episodes.")
+        given = [
+            read_inputs(
+                self._run.layout,
+                self[row].facts,
+                int(steps[row]),
+                {name: None if values is None else values[row] for name, values in inputs.items()},
+            )
+            for row in chosen
+        ]
+        if not chosen:
+            raise BadArgument("No row of the batch is active.")
+        with self._run._replan([self[row] for row in chosen], given, batch=count, rows=chosen) as replan:
+            yield replan
+
+    def next_episode(self, row: int, **facts: Any) -> Episode:
+        """Store the episode of a row, and begin another one there; arguments as `run.episode`."""
+        self[row]._commit()
+        self._episodes[row] = self._begin(facts)
+        return self._episodes[row]
+
+    def _begin(self, facts: Mapping[str, Any]) -> Episode:
+        episode = self._run._begin(self._stack, EpisodeFacts(**facts))
+        episode._batch = self
+        return episode
+
+
+class RecordedRun:
+    """A store that is being filled; `va.record` makes it. Use it in a `with` block.
+
+    Attributes:
+        path: the store.
+        attributes: what its root says: policy, sites, recording, interventions.
+        layout: what the policy's calls are.
+        num_dropped: replan blocks in which no attention ran.
+        largest_error: largest difference of P·V from a kernel's output, relative to the largest output, of the stored
+            episodes.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        policy: object,
+        layout: PolicyLayout,
+        attributes: RootAttributes,
+        mode: WriteMode,
+        *,
+        knockouts: SessionKnockouts,
+        tokenizer: TokenText | None,
+        projections: Mapping[tuple[str, int], Callable[[Any], Any]],
+        durable: bool = True,
+    ) -> None:
+        self.path = path
+        self.policy = policy
+        self.layout = layout
+        self.attributes = attributes
+        self.num_dropped = 0
+        self.largest_error = 0.0
+        self.knockouts = knockouts
+        self._mode = mode
+        self._tokenizer = tokenizer
+        self._projections = projections
+        self._durable = durable
+        self._store: RunStore | None = None
+        self._in_block = False
+        self._sites = tuple(layout.site(site.name) for site in attributes.sites)
+
+    def __enter__(self) -> RecordedRun:
+        self._store = open_run(self.path, self.attributes, self._mode, durable=self._durable)
+        self.path = self._store.path
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._store = None
+
+    def has(self, task_id: int, episode_index: int) -> bool:
+        """Whether an episode is in the store already; a resumed loop skips it."""
+        return self._opened().has(task_id, episode_index)
+
+    @contextmanager
+    def episode(
+        self,
+        *,
+        task_id: int,
+        episode_index: int,
+        instruction: str,
+        seed: int | None = None,
+        task_name: str | None = None,
+        objects: Sequence[Any] = (),
+    ) -> Iterator[Episode]:
+        """Record an episode; leaving the block stores it, an exception drops it.
+
+        Args:
+            task_id, episode_index: its place in the store; each pair once.
+            instruction: the task in words, as given to the policy.
+            seed: that of the policy's noise in all calls; None: not known.
+            task_name: short name of the task; None: made of the id.
+            objects: `SceneObject` of the scene, for masks and coverage.
+
+        Raises:
+            StoreExists: the episode is in the store already.
+            NothingRecorded: no attention was seen in the block.
+        """
+        facts = EpisodeFacts(task_id, episode_index, instruction, seed, task_name, tuple(objects))
+        with ExitStack() as stack:
+            episode = self._begin(stack, facts)
+            yield episode
+            episode._commit()
+
+    @contextmanager
+    def episodes(self, episodes: Sequence[Mapping[str, Any]]) -> Iterator[EpisodeBatch]:
+        """Record several episodes whose policy calls are one call with a batch; leaving the block stores them all.
+
+        Args:
+            episodes: for each row of the batch the arguments of `episode`.
+        """
+        with ExitStack() as stack:
+            batch = EpisodeBatch(self, stack)
+            for facts in episodes:
+                batch._episodes.append(batch._begin(facts))
+            yield batch
+            for episode in batch:
+                episode._commit()
+
+    def _opened(self) -> RunStore:
+        if self._store is None:
+            raise RecordingStopped("This run is not open; use it as: with va.record(...) as run.")
+        return self._store
+
+    def _begin(self, stack: ExitStack, facts: EpisodeFacts) -> Episode:
+        store = self._opened()
+        if store.has(facts.task_id, facts.episode_index):
+            name = episode_name(facts.task_id, facts.episode_index)
+            raise StoreExists(
+                f"{name} is in {store.path} already; skip it with run.has(task_id, episode_index), or record into "
+                "another store."
+            )
+        self.knockouts.check_names(self.attributes.sites, facts.instruction, facts.objects)
+        start = EpisodeStart(
+            task_id=facts.task_id,
+            task_name=facts.task_name or f"task{facts.task_id}",
+            instruction=facts.instruction,
+            episode_index=facts.episode_index,
+            initial_state_index=facts.episode_index,
+            initial_state_digest="",
+            objects=facts.objects,
+            provenance=dict(self.attributes.provenance),
+        )
+        steps = self.attributes.recording.denoise_steps
+        times = self.layout.denoise_times or tuple(float(step) for step in range(self.layout.num_denoise_steps))
+        chosen = np.array([times[step] for step in steps])
+        return Episode(self, facts, stack.enter_context(store.episode(start, chosen, _MANY_REPLANS)))
+
+    @contextmanager
+    def _replan(
+        self, episodes: Sequence[Episode], given: Sequence[ReplanInputs], *, batch: int, rows: Sequence[int]
+    ) -> Iterator[Replan]:
+        """Record one policy call of some rows of a batch."""
+        self._opened()
+        if self._in_block:
+            raise RecordingStopped("A replan block stands inside of another; record one policy call after the other.")
+        text = ReplanText(self.layout, self._tokenizer, batch, dict(zip(rows, given, strict=True)))
+        edits = _Edits(self, dict(zip(rows, zip(episodes, given, strict=True), strict=True)), text)
+        recorder = ReplanRecorder(
+            self.layout,
+            self.attributes.recording,
+            batch,
+            rows,
+            self._projections,
+            text.early_roles,
+            edits.bias if self.knockouts.any else None,
+        )
+        edits.recorder = recorder
+        text.present = recorder.order.present
+        replan = Replan()
+        self._in_block = True
+        try:
+            with watched_ids(self.policy, text), watch_attention(self.policy, recorder):
+                yield replan
+        finally:
+            self._in_block = False
+        self._store_replan(replan, recorder, text, episodes, given, rows)
+
+    def _store_replan(
+        self,
+        replan: Replan,
+        recorder: ReplanRecorder,
+        text: ReplanText,
+        episodes: Sequence[Episode],
+        given: Sequence[ReplanInputs],
+        rows: Sequence[int],
+    ) -> None:
+        if not recorder.saw_attention:
+            self.num_dropped += 1
+            for episode in episodes:
+                episode.num_dropped += 1
+            return
+        where = ", ".join(
+            f"replan {episode.num_replans} (environment step {inputs.env_step}) of {episode.name}"
+            for episode, inputs in list(zip(episodes, given, strict=True))[:2]
+        )
+        found = recorder.finish(where)
+        replan.recorded = True
+        for position, (row, episode, inputs) in enumerate(zip(rows, episodes, given, strict=True)):
+            episode.largest_error = max(episode.largest_error, recorder.largest_error)
+            actions = replan.actions
+            if actions is not None and recorder.batch > 1:
+                actions = actions[row]
+            record = self._record(found[position], text, row, inputs, _actions(actions))
+            episode.writer.append(record)
+
+    def _record(
+        self,
+        found: Mapping[str, SiteRows],
+        text: ReplanText,
+        row: int,
+        inputs: ReplanInputs,
+        actions: NDArray[np.float64] | None,
+    ) -> ReplanRecord:
+        prompt = text.prompt(row, found)
+        key_role, stored = {}, {}
+        for site in self._sites:
+            of_site = found[site.name]
+            roles = text.roles(row, site, prompt, of_site.present, of_site.valid)
+            rows, gram = of_site.rows, final_contribution(site, of_site, roles)
+            stored[site.name] = RecordedRows(rows.rows, rows.row_sum, gram)
+            key_role[site.name] = roles
+        return ReplanRecord(
+            env_step=inputs.env_step,
+            noise_seed=inputs.noise_seed,
+            rows=stored,
+            key_role=key_role,
+            prompt=prompt,
+            state=inputs.state,
+            actions=actions,
+            frames=inputs.frames if self.attributes.recording.frames else {},
+            coverage=inputs.coverage,
+        )
+
+
+@dataclass
+class _Edits:
+    """What knockouts add to the logits of the calls of one replan; the keys are looked up at its first call."""
+
+    run: RecordedRun
+    episodes: Mapping[int, tuple[Episode, ReplanInputs]]
+    text: ReplanText
+    recorder: ReplanRecorder | None = None
+    _of_row: dict[int, dict[str, Any]] = field(default_factory=dict)
+
+    def bias(self, row: int, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
+        """Return what is added to the logits of a call in one row of the batch, (head or 1, query, key)."""
+        if row not in self._of_row:
+            self._of_row[row] = self._edits(row)
+        edits = self._of_row[row].get(place.site or "")
+        return None if edits is None else logit_bias(edits, place, shape)
+
+    def _edits(self, row: int) -> dict[str, Any]:
+        episode, inputs = self.episodes[row]
+        prompt: Prompt = self.text.prompt(row, None)
+        sites = self.run._sites
+        assert self.recorder is not None
+        present = self.recorder.order.present
+        roles = {site.name: self.text.roles(row, site, prompt, present.get(site.name), None) for site in sites}
+        place = ReplanPlace(episode.facts.task_id, episode.facts.episode_index, episode.num_replans)
+        return dict(
+            self.run.knockouts.edits(
+                self.run.attributes.sites, roles, prompt, episode.facts.objects, inputs.coverage, place
+            )
+        )
+
+
+def _actions(given: Any) -> NDArray[np.float64] | None:
+    """Actions as (horizon, action_dim) float64; None where the caller gave none."""
+    if given is None:
+        return None
+    values = given.detach().float().cpu().numpy() if hasattr(given, "detach") else given
+    actions = np.asarray(values, dtype=np.float64)
+    actions = actions[0] if actions.ndim == 3 and len(actions) == 1 else actions
+    actions = actions[None] if actions.ndim == 1 else actions
+    if actions.ndim != 2:
+        raise BadArgument(
+            f"The actions of a replan have the shape {actions.shape}; expected (horizon, action_dim) or (action_dim,)."
+        )
+    return actions

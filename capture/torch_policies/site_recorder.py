@@ -1,0 +1,325 @@
+"""The recorder of one replan: it watches the attention calls of a policy and keeps the rows of the action queries."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from vla_attention.capture.recording.contributions import gram_matrix, keys_of_parts, part_contributions
+from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
+from vla_attention.capture.store.recorded_rows import RecordedRows
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
+from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace
+from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
+from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.segments import Segment, segment_members, segments_of
+from vla_attention.schemas.stores.store_format import Recording
+
+#: Copies with more numbers than this move to the CPU immediately instead of waiting on the device.
+_LARGE_COPY = 2**20
+#: Largest difference of the rows' P·V from the kernel's output, relative to the largest output, by the call's dtype. A
+#: float32 kernel leaves 1e-6, one of bfloat16 a few of its roundings; rows with a wrong mask are off by far more.
+_TOLERANCE = {"float32": 1e-3, "float64": 1e-3, "float16": 2e-2, "bfloat16": 6e-2}
+
+#: Site -> what a replan's row of the batch adds to the logits of a call (head or 1, query, key); None for nothing.
+LogitBias = Callable[[int, CallPlace, CallShape], NDArray[np.float32] | None]
+#: Row of the batch, site -> the role codes of its keys (key,), before masks are known.
+EarlyRoles = Callable[[int, RecordedSite, NDArray[np.bool_]], NDArray[np.uint8]]
+
+
+class RowsDoNotMatch(UserError, ArithmeticError):
+    """Rows whose product with the values is not what the policy's own kernel gave."""
+
+
+@dataclass(frozen=True)
+class SiteRows:
+    """What one replan of one episode gave at one site.
+
+    present, valid: (key,) bool; keys that some recorded call had, and that some action query could see.
+    early_roles: (key,) the roles for which contributions were made, which know of no masks; None without contributions.
+    """
+
+    rows: RecordedRows
+    present: NDArray[np.bool_]
+    valid: NDArray[np.bool_]
+    early_roles: NDArray[np.uint8] | None = None
+
+
+@dataclass
+class _Collected:
+    """Of one site: tensors by (block, denoise step), each (row, head, query, key); autoregressive: several.
+
+    grams: by (block, denoise step, row of the batch), (part, part). seen: (row of the batch, key) bool.
+    """
+
+    rows: dict[tuple[int, int], list[Tensor]] = field(default_factory=dict)
+    grams: dict[tuple[int, int, int], list[Tensor]] = field(default_factory=dict)
+    seen: Tensor | None = None
+    roles: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
+    parts: dict[int, list[slice | Tensor]] = field(default_factory=dict)
+
+
+class ReplanRecorder:
+    """Watches the calls of one replan (`Watcher`). Every replan needs a new one.
+
+    Args:
+        layout: what the calls are.
+        recording: what of them is recorded.
+        batch: batch size that every call of the sites must have.
+        rows: the rows of the batch that are recorded.
+        projections: (site, block) -> function from (any, head · dim) to (any, width), for contributions.
+        early_roles: the roles of keys before the masks are known, for contributions.
+        bias: what knockouts add to the logits.
+    """
+
+    def __init__(
+        self,
+        layout: PolicyLayout,
+        recording: Recording,
+        batch: int,
+        rows: Sequence[int],
+        projections: Mapping[tuple[str, int], Callable[[Tensor], Tensor]],
+        early_roles: EarlyRoles,
+        bias: LogitBias | None = None,
+    ) -> None:
+        self.layout = layout
+        self.recordings = {name: found for name, found in recordings_of(recording, layout).items() if found}
+        self.batch = batch
+        self.rows = tuple(rows)
+        self.order = CallOrder(layout)
+        self.projections = projections
+        self.early_roles = early_roles
+        self.bias = bias
+        self.largest_error = 0.0
+        self._collected = {site.name: _Collected() for site in layout.sites}
+
+    @property
+    def saw_attention(self) -> bool:
+        """Whether any attention call ran."""
+        return bool(self.order.seen)
+
+    def change(self, shape: CallShape) -> Tensor | None:
+        """Return what is added to the logits of a call, (batch, head or 1, query, key), or None for nothing."""
+        place = None if self.bias is None else self.order.place(shape, ran=False)
+        if self.bias is None or place is None or place.site is None or shape.batch != self.batch:
+            return None
+        added = {row: self.bias(row, place, shape) for row in self.rows}
+        changed = [values for values in added.values() if values is not None]
+        if not changed:
+            return None
+        heads = max(len(values) for values in changed)
+        total = torch.zeros(self.batch, heads, shape.queries, shape.keys)
+        for row, values in added.items():
+            if values is not None:
+                total[row] = torch.from_numpy(values)
+        return total
+
+    def saw(self, call: AttentionCall) -> None:
+        """Keep the rows of a call, if it is recorded."""
+        shape = call.shape
+        place = self.order.place(shape, ran=True)
+        if place is None or place.site is None:
+            return
+        site = self.layout.site(place.site)
+        if shape.batch != self.batch:
+            self.order.problems[
+                f"a call of site '{site.name}' has a batch of {shape.batch}, and the replan one of {self.batch} "
+                "(several environments in one call: run.episodes)"
+            ] = None
+            return
+        recording = self.recordings.get(site.name)
+        step = 0 if self.layout.autoregressive else place.step
+        if recording is None or place.block not in recording.layers or step not in recording.denoise_steps:
+            return
+        if max(recording.heads) >= shape.heads:
+            self.order.problems[f"a call of site '{site.name}' has {shape.heads} heads"] = None
+            return
+        with torch.no_grad():
+            self._take(call, place, site, recording, (place.block, step))
+
+    def _take(
+        self, call: AttentionCall, place: CallPlace, site: RecordedSite, recording: Recording, cell: tuple[int, int]
+    ) -> None:
+        collected, queries = self._collected[site.name], place.queries
+        rows = call.rows(queries)
+        error = call.product_error(rows, queries)
+        self.largest_error = max(self.largest_error, error) if not math.isnan(error) else math.inf
+        self._check_error(error, call.shape, place)
+        allowed = call.allowed(queries).any(dim=1)
+        keys = None if place.keys is None else torch.from_numpy(place.keys).to(rows.device)
+        if keys is not None:
+            rows, allowed = _spread(rows, keys, site.keys.num_keys), _spread(allowed, keys, site.keys.num_keys)
+        collected.seen = allowed if collected.seen is None else collected.seen | allowed
+        if recording.contributions:
+            self._take_contributions(call, rows, keys, place, site, cell)
+        chosen = rows
+        if len(self.rows) < self.batch:
+            chosen = chosen.index_select(0, torch.tensor(self.rows, device=rows.device))
+        if recording.heads != tuple(range(call.shape.heads)):
+            chosen = chosen.index_select(1, torch.tensor(recording.heads, device=rows.device))
+        if recording.queries == "mean" and not self.layout.autoregressive:
+            chosen = chosen.mean(dim=2, keepdim=True)
+        collected.rows.setdefault(cell, []).append(chosen.cpu() if chosen.numel() > _LARGE_COPY else chosen)
+
+    def _check_error(self, error: float, shape: CallShape, place: CallPlace) -> None:
+        allowed = _TOLERANCE.get(shape.dtype.removeprefix("torch."), 1e-3)
+        if error > allowed:
+            raise RowsDoNotMatch(
+                f"The rows of site '{place.site}', block {place.block}, step {place.step} give a P·V that differs from "
+                f"the kernel's output by {error:.2g} of its largest number; allowed is {allowed:g} for {shape.dtype}. "
+                f"The call of module '{shape.module}' ({shape.kind}) does something else than softmax(q kᵀ + mask) v: "
+                "report it with the library's version."
+            )
+
+    def _take_contributions(
+        self,
+        call: AttentionCall,
+        rows: Tensor,
+        keys: Tensor | None,
+        place: CallPlace,
+        site: RecordedSite,
+        cell: tuple[int, int],
+    ) -> None:
+        collected, project = self._collected[site.name], self.projections[site.name, place.block]
+        values = call.value if keys is None else _spread(call.value, keys, site.keys.num_keys, axis=2)
+        for row in self.rows:
+            if row not in collected.roles:
+                collected.roles[row] = roles = self.early_roles(row, site, self.order.present[site.name])
+                members = segment_members(site.keys, roles[None], segments_of(site.keys, roles))[0]
+                collected.parts[row] = keys_of_parts(members, rows.device)
+            each = part_contributions(rows[row], values[row], collected.parts[row], project)
+            output = call.output[row, :, place.queries].float()
+            update = project(output.transpose(0, 1).reshape(output.shape[1], -1))
+            gram = gram_matrix(each, update)
+            collected.grams.setdefault((*cell, row), []).append(gram)
+
+    def finish(self, where: str) -> list[dict[str, SiteRows]]:
+        """Return for each recorded row of the batch what its sites gave.
+
+        where: the replan, in words.
+
+        Raises:
+            CallsDoNotFit: the calls are not those of the layout.
+            NumbersNotFinite: rows hold NaN or infinity.
+        """
+        self.order.check(where)
+        found: list[dict[str, SiteRows]] = [{} for _ in self.rows]
+        for name, recording in self.recordings.items():
+            site, collected = self.layout.site(name), self._collected[name]
+            cells = [(block, step) for block in recording.layers for step in recording.denoise_steps]
+            stacked = self._stacked(collected, cells, recording)
+            assert collected.seen is not None
+            seen = collected.seen.cpu().numpy()
+            for position, row in enumerate(self.rows):
+                rows = np.ascontiguousarray(stacked[:, position])
+                rows = rows.reshape(len(recording.layers), len(recording.denoise_steps), *rows.shape[1:])
+                self._check_finite(rows, recording, site.name, where)
+                contribution = None
+                if recording.contributions:
+                    grams = [torch.stack(collected.grams[*cell, row]).mean(dim=0) for cell in cells]
+                    gram = torch.stack(grams).cpu().numpy()
+                    contribution = gram.reshape(*rows.shape[:2], *gram.shape[1:])
+                row_sum = rows.sum(axis=-1, dtype=np.float64).astype(np.float32)
+                found[position][site.name] = SiteRows(
+                    RecordedRows(rows, row_sum, contribution),
+                    self.order.present[site.name],
+                    seen[row],
+                    collected.roles.get(row),
+                )
+        return found
+
+    def _stacked(
+        self, collected: _Collected, cells: Sequence[tuple[int, int]], recording: Recording
+    ) -> NDArray[np.float32]:
+        """All rows of a site, (cell, row of the batch, head, query, key), moved off the device in one transfer."""
+        each = []
+        for cell in cells:
+            tensors = collected.rows[cell]
+            joined = tensors[0] if len(tensors) == 1 else torch.cat(tensors, dim=2)
+            if self.layout.autoregressive and recording.queries == "mean":
+                joined = joined.mean(dim=2, keepdim=True)
+            each.append(joined)
+        result: NDArray[np.float32] = torch.stack(each).cpu().numpy()
+        return result
+
+    def _check_finite(self, rows: NDArray[np.float32], recording: Recording, site: str, where: str) -> None:
+        finite = np.isfinite(rows.sum(axis=-1))
+        if finite.all():
+            return
+        # Denoise step by denoise step, as the model computes.
+        step, layer, head = (int(i) for i in np.argwhere(~finite.swapaxes(0, 1))[0][:3])
+        knocked = "An intervention may leave a query without any key: take a smaller group, or fewer heads or layers"
+        weights = "Look at the policy's input and weights, or use float32"
+        raise NumbersNotFinite(
+            f"The rows of site '{site}' turned NaN or infinite at {where}, denoise step "
+            f"{recording.denoise_steps[step]}, layer {recording.layers[layer]}, head {recording.heads[head]}. "
+            f"{weights if self.bias is None else knocked}. Nothing of this episode was kept."
+        )
+
+
+def recordings_of(recording: Recording, layout: PolicyLayout) -> dict[str, Recording | None]:
+    """What is recorded of each site: of the chosen layers and heads those that it has; None where it has none."""
+    found: dict[str, Recording | None] = {}
+    for site in layout.sites:
+        layers = site.keys.layers
+        has_some = not layers or bool(set(layers) & set(recording.layers))
+        found[site.name] = recording.of_site(site.keys) if has_some else None
+    return found
+
+
+def final_contribution(site: RecordedSite, found: SiteRows, key_role: NDArray[np.uint8]) -> NDArray[np.float32] | None:
+    """The contributions by the segments of the final roles, (layer, denoise, part, part).
+
+    They were made for segments that know of no masks. A masked key has a probability of exactly 0, so that the segments
+    of masked and absent keys contribute nothing, and the others what they did with these keys.
+
+    Raises:
+        BadArgument: a segment with contributions would have to be divided.
+    """
+    gram, early = found.rows.contribution, found.early_roles
+    if gram is None or early is None:
+        return gram
+    before, after = segments_of(site.keys, early), segments_of(site.keys, key_role)
+    size = len(after) + 1
+    result = np.zeros((*gram.shape[:2], size, size), dtype=np.float32)
+    sources: list[int] = []
+    targets: list[int] = []
+    hidden = ~(found.valid & found.present)
+    for target, segment in enumerate(after):
+        members = _members(site, key_role, segment)
+        if hidden[members].all():
+            continue
+        origins = {source for source, other in enumerate(before) if (_members(site, early, other) & members).any()}
+        if len(origins) != 1 or origins & set(sources):
+            raise BadArgument(
+                f"The contributions of site '{site.name}' cannot be given for the roles of span '{segment.span}': the "
+                "roles given differ from those that were known during the call; record without contributions."
+            )
+        sources.append(origins.pop())
+        targets.append(target)
+    sources.append(len(before))
+    targets.append(len(after))
+    result[..., np.ix_(targets, targets)[0], np.ix_(targets, targets)[1]] = gram[
+        ..., np.ix_(sources, sources)[0], np.ix_(sources, sources)[1]
+    ]
+    return result
+
+
+def _members(site: RecordedSite, roles: NDArray[np.uint8], segment: Segment) -> NDArray[np.bool_]:
+    members: NDArray[np.bool_] = segment_members(site.keys, roles[None], (segment,))[0, :, 0]
+    return members
+
+
+def _spread(values: Tensor, keys: Tensor, count: int, axis: int = -1) -> Tensor:
+    """Values with their key axis at the places `keys` of an axis of `count`; 0 elsewhere."""
+    shape = list(values.shape)
+    shape[axis] = count
+    result = values.new_zeros(shape)
+    result.index_copy_(axis % values.ndim, keys, values)
+    return result

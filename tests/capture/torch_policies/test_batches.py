@@ -1,0 +1,119 @@
+"""Several episodes whose policy calls are one call with a batch: each row is stored as if it had been alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from tests.kit.small_torch_policy import SmallPolicy, given, small_layout
+from vla_attention.capture.torch_policies.record import record
+from vla_attention.capture.torch_policies.session import NothingRecorded, RecordingStopped
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.verify import verify_store
+
+TEXTS = ["pick the bowl", "pick up the plate", "pick the red bowl"]
+
+
+def start(path, policy, **changes):
+    changes = {"layout": small_layout(), "tokenizer": policy.tokenizer, "bits": 23, "durable": False} | changes
+    return record(path / "a.zarr", policy, **changes)
+
+
+def joined(step):
+    """What the policy is given for all three rows."""
+    rows = [given(seed=10 * step + row, text=text) for row, text in enumerate(TEXTS)]
+    whole = {name: torch.cat([row[name] for row in rows]) for name in ("pictures", "states", "noise")}
+    return whole | {"texts": [row["texts"][0] for row in rows]}
+
+
+def episodes(first=0):
+    return [
+        {"task_id": row, "episode_index": first, "instruction": text, "seed": row} for row, text in enumerate(TEXTS)
+    ]
+
+
+def stored(path):
+    store = open_store(path / "a.zarr")
+    assert verify_store(store) == []
+    return {one.name: one for one in store.episodes}
+
+
+@pytest.mark.parametrize("changes", [{}, {"knockout": "word:pick"}])
+def test_rows_of_a_batch_are_those_of_single_calls(tmp_path, changes):
+    policy = SmallPolicy()
+    with start(tmp_path / "batch", policy, **changes) as run, run.episodes(episodes()) as batch:
+        for step in range(2):
+            inputs = joined(step)
+            expected = policy.act(**inputs)
+            with batch.replan(
+                env_step=step, state=inputs["states"], frames=[{"front": p} for p in inputs["pictures"]]
+            ) as replan:
+                replan.actions = policy.act(**inputs)
+            assert changes or torch.equal(replan.actions, expected)
+        for row, episode in enumerate(batch):
+            episode.success = row == 1
+    with start(tmp_path / "single", policy, **changes) as run:
+        for row, facts in enumerate(episodes()):
+            with run.episode(**facts) as episode:
+                for step in range(2):
+                    inputs = given(seed=10 * step + row, text=TEXTS[row])
+                    with episode.replan(
+                        env_step=step, state=inputs["states"], frames={"front": inputs["pictures"]}
+                    ) as replan:
+                        replan.actions = policy.act(**inputs)
+                episode.success = row == 1
+    together, alone = stored(tmp_path / "batch"), stored(tmp_path / "single")
+    assert list(together) == list(alone) == [f"task00{row}_episode000" for row in range(3)]
+    for name, episode in alone.items():
+        other = together[name]
+        assert other.attributes.prompts == episode.attributes.prompts
+        assert other.attributes.success == episode.attributes.success
+        assert set(other.attributes.arrays) == set(episode.attributes.arrays)
+        for array in episode.attributes.arrays:
+            np.testing.assert_allclose(other.read(array), episode.read(array), atol=1e-5, err_msg=array)
+
+
+def test_rows_that_have_ended_and_episodes_that_follow(tmp_path):
+    policy = SmallPolicy()
+    with start(tmp_path, policy) as run, run.episodes(episodes()) as batch:
+        for step in range(3):
+            with batch.replan(env_step=step, active=[True, step < 2, True]):
+                policy.act(**joined(step))
+        batch[2].success = True
+        follower = batch.next_episode(2, task_id=2, episode_index=1, instruction=TEXTS[2])
+        with batch.replan(env_step=[3, 0, 0], active=[True, False, True]):
+            policy.act(**joined(3))
+        assert follower is batch[2]
+    found = stored(tmp_path)
+    counts = {name: episode.attributes.num_replans for name, episode in found.items()}
+    assert counts == {
+        "task000_episode000": 4,
+        "task001_episode000": 2,
+        "task002_episode000": 3,
+        "task002_episode001": 1,
+    }
+    assert found["task002_episode000"].attributes.success is True
+
+
+def test_mistakes_are_sentences(tmp_path):
+    policy = SmallPolicy()
+    with start(tmp_path, policy) as run:
+        with pytest.raises(BadArgument, match="state has 2 entries; expected one for each of 3 episodes"):
+            record_one(run, policy, state=[[0.0], [0.0]])
+        with pytest.raises(BadArgument, match="No row of the batch is active"):
+            record_one(run, policy, active=[False] * 3)
+        with pytest.raises(RecordingStopped, match="one of several"):
+            record_one(run, policy, alone=True)
+        with pytest.raises(NothingRecorded, match="task001_episode000"):
+            record_one(run, policy, active=[True, False, True])
+        # Episode 0 was stored before that of row 1 failed.
+        assert [run.has(row, 0) for row in range(3)] == [True, False, False]
+
+
+def record_one(run, policy, alone=False, **inputs):
+    with run.episodes(episodes()) as batch:
+        block = batch[0].replan(env_step=0) if alone else batch.replan(env_step=0, **inputs)
+        with block:
+            policy.act(**joined(0))

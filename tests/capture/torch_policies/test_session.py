@@ -1,0 +1,404 @@
+"""Sessions of `va.record`: what is in the store is what the policy computed, and nothing changes the policy."""
+
+from __future__ import annotations
+
+import doctest
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import vla_attention as va
+from tests.kit.small_torch_policy import BLOCKS, HEADS, HORIZON, PROMPT, STEPS, SmallPolicy, given, small_layout
+from vla_attention.capture.torch_policies import record as record_module
+from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
+from vla_attention.capture.torch_policies.policy_layout import CallRule, LayoutForAnotherVersion
+from vla_attention.capture.torch_policies.prompts import PromptDoesNotFit
+from vla_attention.capture.torch_policies.record import record
+from vla_attention.capture.torch_policies.session import NothingRecorded, RecordingStopped
+from vla_attention.schemas.errors import BadArgument, UnknownName
+from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.layout import Role
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import RunMismatch, StoreExists
+from vla_attention.schemas.stores.verify import verify_store
+
+KEYS = 4 + PROMPT + 1 + HORIZON
+
+
+@pytest.fixture
+def policy() -> SmallPolicy:
+    return SmallPolicy()
+
+
+def start(path, policy, **changes):
+    changes = {
+        "layout": small_layout(),
+        "tokenizer": policy.tokenizer,
+        "denoise_steps": "all",
+        "durable": False,
+    } | changes
+    return record(path / "a.zarr", policy, **changes)
+
+
+def fill(run, policy, replans=2, number=0, text="pick the bowl", broken=False, **facts):
+    facts = {"task_id": 0, "episode_index": number, "instruction": text, "seed": 7} | facts
+    with run.episode(**facts) as episode:
+        for step in range(replans):
+            inputs = given(seed=10 * number + step, text=text)
+            with episode.replan(
+                env_step=5 * step, frames={"front": inputs["pictures"]}, state=inputs["states"]
+            ) as replan:
+                replan.actions = policy.act(**inputs)
+                if broken and step == 1:
+                    raise TypeError("no pixels")
+        episode.success = True
+    return episode
+
+
+def one_call(run, policy, inputs=None, calls=1, **replan):
+    """An episode of one replan."""
+    with (
+        run.episode(task_id=0, episode_index=0, instruction="pick the bowl") as episode,
+        episode.replan(env_step=0, **replan),
+    ):
+        for _ in range(calls):
+            policy.act(**(inputs or given()))
+    return episode
+
+
+def stored(path):
+    store = open_store(path / "a.zarr")
+    assert verify_store(store) == []
+    return store
+
+
+def computed(policy, inputs):
+    """Logits and values by the block's number and denoise step, of the action queries, computed by hand."""
+    for block in policy.blocks:
+        block.attention.kept = []
+    policy.act(**inputs)
+    found = [block.attention.kept[1:] for block in policy.blocks]
+    for block in policy.blocks:
+        block.attention.kept = None
+    return found
+
+
+def test_the_rows_are_those_that_the_policy_computes(tmp_path, policy):
+    with start(tmp_path, policy, bits=23) as run:
+        fill(run, policy)
+    episode = stored(tmp_path).episodes[0]
+    rows = episode.read("joint/rows")
+    assert rows.shape == (2, BLOCKS, STEPS, HEADS, 1, KEYS)
+    for replan in range(2):
+        for layer, calls in enumerate(computed(policy, given(seed=replan))):
+            for step, (logits, _) in enumerate(calls):
+                expected = logits.softmax(-1)[0].mean(1).numpy()
+                np.testing.assert_allclose(rows[replan, layer, step, :, 0], expected, atol=2e-6)
+    assert 0 < run.largest_error < 1e-5
+    assert float(episode.attributes.provenance["largest P·V error"]) == pytest.approx(run.largest_error, rel=1e-2)
+
+
+def test_all_queries_of_chosen_layers_heads_and_steps(tmp_path, policy):
+    with start(tmp_path, policy, bits=23, queries="all", layers=[2, 0], heads=[1], denoise_steps=("last", 1)) as run:
+        fill(run, policy, replans=1)
+    rows = stored(tmp_path).episodes[0].read("joint/rows")
+    assert rows.shape == (1, 2, 2, 1, HORIZON, KEYS)
+    calls = computed(policy, given(seed=0))
+    for i, layer in enumerate((0, 2)):
+        for j, step in enumerate((1, STEPS - 1)):
+            np.testing.assert_allclose(rows[0, i, j, 0], calls[layer][step][0].softmax(-1)[0, 1].numpy(), atol=2e-6)
+
+
+def test_actions_are_bit_equal_with_recording(tmp_path, policy):
+    expected = [policy.act(**given(seed=step)) for step in range(2)]
+    with (
+        start(tmp_path, policy) as run,
+        run.episode(task_id=0, episode_index=0, instruction="pick the bowl") as episode,
+    ):
+        for step in range(2):
+            with episode.replan(env_step=step):
+                assert torch.equal(policy.act(**given(seed=step)), expected[step])
+    assert torch.equal(policy.act(**given(seed=0)), expected[0])
+
+
+def test_contributions_are_those_of_the_values_and_the_projection(tmp_path, policy):
+    with start(tmp_path, policy) as run:
+        fill(run, policy, replans=1)
+    episode = stored(tmp_path).episodes[0]
+    gram = episode.read("joint/contribution")[0]
+    segments, roles = episode.attributes.segments["joint"], episode.read("joint/key_role")[0]
+    spans = small_layout().sites[0].keys
+    members = [
+        [
+            key
+            for key in range(KEYS)
+            if spans.spans[spans.span_of_key()[key]].name == one.span and Role(roles[key]).label == one.role
+        ]
+        for one in segments
+    ]
+    for layer, calls in enumerate(computed(policy, given(seed=0))):
+        weight = policy.blocks[layer].attention.out.weight.detach()
+        for step, (logits, values) in enumerate(calls):
+            rows = logits.softmax(-1)[0]
+            parts = [rows[:, :, keys] @ values[0][:, keys] for keys in [*members, list(range(KEYS))]]
+            vectors = torch.stack([part.transpose(0, 1).flatten(1) @ weight.T for part in parts], dim=1)
+            expected = (vectors @ vectors.transpose(1, 2)).mean(0)
+            np.testing.assert_allclose(gram[layer, step], expected.detach().numpy(), atol=1e-5)
+
+
+def test_masks_pieces_and_the_callers_facts_are_stored(tmp_path, policy):
+    with start(tmp_path, policy, suite="my_robot", checkpoint="mine", untrained=True) as run:
+        fill(run, policy, task_name="bowl")
+    store = stored(tmp_path)
+    episode = store.episodes[0]
+    labels = [Role(code).label for code in episode.read("joint/key_role")[0]]
+    assert labels[4:10] == ["bos", "instruction", "instruction", "instruction", "template", "padding"]
+    prompt = episode.attributes.prompts[0]
+    assert prompt.text == " pick the bowl\n"
+    assert prompt.instruction_text == "pick the bowl"
+    assert [(piece.key, piece.text) for piece in prompt.pieces] == [(5, " pick"), (6, " the"), (7, " bowl"), (8, "\n")]
+    assert episode.read("noise_seed").tolist() == [7, 7]
+    assert episode.read("env_step").tolist() == [0, 5]
+    assert episode.attributes.success is True
+    assert episode.attributes.num_steps == 6
+    assert episode.attributes.task_name == "bowl"
+    np.testing.assert_array_equal(episode.read("actions")[1], policy.act(**given(seed=1))[0].double().numpy())
+    np.testing.assert_allclose(episode.read("state")[1], given(seed=1)["states"][0].numpy())
+    picture = (given(seed=1)["pictures"][0].permute(1, 2, 0) * 255).round().byte().numpy()
+    np.testing.assert_array_equal(episode.read("frames/front")[1], picture)
+    root = store.attributes
+    assert (root.protocol.name, root.protocol.suite) == ("recorded", "my_robot")
+    assert root.policy.untrained
+    assert root.provenance["difference to own setting"] == "not measured"
+    assert np.allclose(episode.read("denoise_time"), [1, 0.75, 0.5, 0.25])
+
+
+def test_an_episode_may_know_almost_nothing(tmp_path, policy):
+    with (
+        start(tmp_path, policy, tokenizer=None) as run,
+        run.episode(task_id=3, episode_index=0, instruction="") as episode,
+        episode.replan(env_step=0),
+    ):
+        policy.act(**given())
+    store = stored(tmp_path)
+    attributes = store.episodes[0].attributes
+    assert attributes.success is None
+    assert not {"state", "actions", "noise_seed"} & set(attributes.arrays)
+    labels = [Role(code).label for code in store.episodes[0].read("joint/key_role")[0]]
+    assert labels[4:10] == ["instruction"] * 5 + ["padding"]
+    assert va.open(tmp_path / "a.zarr").ratios() is not None
+
+
+def test_blocks_that_answer_from_a_queue_are_dropped_and_counted(tmp_path, policy):
+    with (
+        start(tmp_path, policy) as run,
+        run.episode(task_id=0, episode_index=0, instruction="pick the bowl") as episode,
+    ):
+        for step in range(6):
+            with episode.replan(env_step=step) as replan:
+                if step % 3 == 0:
+                    policy.act(**given(seed=step))
+            assert replan.recorded is (step % 3 == 0)
+    assert (run.num_dropped, episode.num_dropped, episode.num_replans) == (4, 4, 2)
+    episode = stored(tmp_path).episodes[0]
+    assert episode.read("env_step").tolist() == [0, 3]
+    assert episode.attributes.provenance["replan blocks without attention"] == "4"
+
+
+def test_an_episode_without_attention_is_an_error(tmp_path, policy):
+    with start(tmp_path, policy) as run:
+        with pytest.raises(NothingRecorded, match="No attention was seen in the 1 replan blocks"):
+            one_call(run, policy, calls=0)
+        assert not run.has(0, 0)
+
+
+def without_rule(layout, number):
+    return replace(layout, rules=tuple(rule for i, rule in enumerate(layout.rules) if i != number))
+
+
+@pytest.mark.parametrize(
+    ("layout", "sentence"),
+    [
+        (without_rule(small_layout(), 1), "no rule names the call of module 'blocks.0.attention' (sdpa)"),
+        (small_layout(num_denoise_steps=3, denoise_times=()), "must compute 3 times a policy call"),
+        (small_layout(num_layers=2), "is block 2, which site 'joint' does not have"),
+        (
+            small_layout(rules=(CallRule(r"layers\.(?P<block>\d+)", "joint"), CallRule(".*", None))),
+            "the site 'joint' did not fire",
+        ),
+        (small_layout(rules=(CallRule(r"blocks\.(?P<block>\d+)\.attention", "joint"),)), "has 11 keys"),
+        (small_layout(num_heads=3), "has 2 heads"),
+    ],
+)
+def test_calls_that_do_not_fit_are_shown(tmp_path, policy, layout, sentence):
+    with (
+        start(tmp_path, policy, layout=layout, contributions=False, denoise_steps="first") as run,
+        pytest.raises(CallsDoNotFit) as error,
+    ):
+        one_call(run, policy)
+    message = str(error.value)
+    assert sentence in message
+    assert "replan 0 (environment step 0) of task000_episode000" in message
+    assert "3 x 14" in message  # the table
+    assert not list((tmp_path / "a.zarr" / "episodes").glob("task*"))
+
+
+def test_two_policy_calls_in_one_block_are_an_error(tmp_path, policy):
+    sentence = r"must compute 4 times a policy call.*block 0: 8"
+    with start(tmp_path, policy) as run, pytest.raises(CallsDoNotFit, match=sentence):
+        one_call(run, policy, calls=2)
+
+
+def test_a_batch_in_a_single_episode_is_an_error(tmp_path, policy):
+    sentence = r"has a batch of 2, and the replan one of 1 .*run\.episodes"
+    with start(tmp_path, policy) as run, pytest.raises(CallsDoNotFit, match=sentence):
+        one_call(run, policy, given(batch=2))
+
+
+def test_blocks_inside_of_blocks_and_outside_of_runs(tmp_path, policy):
+    run = start(tmp_path, policy)
+    with pytest.raises(RecordingStopped, match="not open"):
+        run.has(0, 0)
+    with run, run.episode(task_id=0, episode_index=0, instruction="") as episode, episode.replan(env_step=0):
+        policy.act(**given())
+        with pytest.raises(RecordingStopped, match="inside of another"), episode.replan(env_step=1):
+            pass
+    assert stored(tmp_path).episodes[0].attributes.num_replans == 1
+
+
+def test_an_exception_drops_the_episode_and_only_it(tmp_path, policy):
+    with start(tmp_path, policy) as run:
+        fill(run, policy)
+        with pytest.raises(TypeError, match="pixels"):
+            fill(run, policy, number=1, replans=2, broken=True)
+        assert run.has(0, 0)
+        assert not run.has(0, 1)
+        fill(run, policy, number=1)
+    assert [one.name for one in stored(tmp_path).episodes] == ["task000_episode000", "task000_episode001"]
+    assert not (tmp_path / "a.zarr.partial").exists()
+
+
+def test_resuming_goes_on_and_refuses_another_run(tmp_path, policy):
+    with start(tmp_path, policy) as run:
+        fill(run, policy)
+        with pytest.raises(StoreExists, match=r"is in .* already; skip it with"):
+            fill(run, policy)
+    with pytest.raises(StoreExists), start(tmp_path, policy):
+        pass
+    with start(tmp_path, policy, resume=True) as run:
+        assert run.has(0, 0)
+        fill(run, policy, number=1)
+    with (
+        pytest.raises(RunMismatch, match="mantissa_bits is 10, this run's is 12"),
+        start(tmp_path, policy, resume=True, bits=12),
+    ):
+        pass
+    with pytest.raises(RunMismatch, match="digest"), start(tmp_path, SmallPolicy(seed=1), resume=True):
+        pass
+    other = small_layout(rules=(*small_layout().rules, CallRule("vision.*", None)))
+    with pytest.raises(RunMismatch, match="layout"), start(tmp_path, policy, resume=True, layout=other):
+        pass
+    with start(tmp_path, policy, overwrite=True, bits=12) as run:
+        assert not run.has(0, 0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "sentence"),
+    [
+        ({"heads": [2]}, BadArgument, "There is no head 2; expected 0 to 1"),
+        ({"layers": [3]}, BadArgument, "There is no layer 3"),
+        ({"denoise_steps": [4]}, BadArgument, "There is no denoise step 4"),
+        ({"queries": "steps"}, BadArgument, "expected 'mean' or 'all'"),
+        ({"bits": 0}, BadArgument, "0 mantissa bits"),
+        ({"resume": True, "overwrite": True}, BadArgument, "not both"),
+        ({"tokenizer": 3}, BadArgument, "has no decode"),
+        ({"layout": small_layout(versions={"torch": ("1.0",)})}, LayoutForAnotherVersion, "written for torch 1.0"),
+        (
+            {
+                "layout": small_layout(
+                    sites=(replace(small_layout().sites[0], projection="blocks.{block}.attention.o"),)
+                )
+            },
+            BadArgument,
+            "The output projection 'blocks.0.attention.o' of site 'joint' is no module of the policy. Did you mean "
+            "'blocks.0.attention.out'?",
+        ),
+    ],
+)
+def test_wrong_arguments_are_sentences(tmp_path, policy, changes, error, sentence):
+    with pytest.raises(error) as caught:
+        start(tmp_path, policy, **changes)
+    assert sentence in str(caught.value)
+    assert not (tmp_path / "a.zarr").exists()
+
+
+def test_another_version_may_be_allowed(tmp_path, policy):
+    with start(tmp_path, policy, layout=small_layout(versions={"torch": ("1.0",)}), any_version=True) as run:
+        fill(run, policy)
+    assert "written for torch 1.0" in stored(tmp_path).attributes.provenance["layout for another version"]
+
+
+@pytest.mark.parametrize(
+    ("inputs", "error", "sentence"),
+    [
+        ({"frame": {}}, BadArgument, "replan() has no argument 'frame'. Did you mean 'frames'?"),
+        ({"frames": {"wrist": np.zeros((8, 8, 3), np.uint8)}}, UnknownName, "Unknown camera of frames 'wrist'"),
+        ({"frames": {"front": np.zeros((8, 8), np.uint8)}}, BadArgument, "has the shape (8, 8)"),
+        ({"frames": {"front": torch.randn(3, 8, 8) * 9}}, BadArgument, "give it before normalising"),
+        ({"state": np.zeros((2, 2))}, BadArgument, "The state of a replan has the shape (2, 2)"),
+        ({"prompt": ["a"]}, PromptDoesNotFit, "given as 1 pieces, and the layout's prompt has 6 keys"),
+        ({"instruction": "open the door"}, PromptDoesNotFit, "does not contain the instruction 'open the door'"),
+        ({"roles": {"joint": [1]}}, BadArgument, "The roles given for site 'joint' have the shape (1,)"),
+    ],
+)
+def test_wrong_inputs_are_sentences(tmp_path, policy, inputs, error, sentence):
+    with start(tmp_path, policy) as run, pytest.raises(error) as caught:
+        one_call(run, policy, **inputs)
+    assert sentence in str(caught.value)
+
+
+def test_other_pictures_are_made_as_large_as_the_models(tmp_path, policy):
+    with start(tmp_path, policy) as run:
+        one_call(run, policy, frames={"front": np.full((32, 16, 3), 200, np.uint8)})
+    assert (stored(tmp_path).episodes[0].read("frames/front") == 200).all()
+
+
+def test_masks_give_the_coverage_of_objects(tmp_path, policy):
+    objects = [SceneObject("table", "fixture", False), SceneObject("bowl", "object", True)]
+    mask = np.zeros((16, 16), int)
+    mask[:8, :4] = 1
+    with (
+        start(tmp_path, policy) as run,
+        run.episode(task_id=0, episode_index=0, instruction="pick the bowl", objects=objects) as episode,
+        episode.replan(env_step=0, masks={"front": mask}),
+    ):
+        policy.act(**given())
+    coverage = stored(tmp_path).episodes[0].read("objects/front")
+    np.testing.assert_allclose(coverage[0, :, 1], [0.5, 0, 0, 0])
+
+
+def test_a_prompt_may_be_given_as_pieces(tmp_path, policy):
+    pieces = [None, "pick", " the", " bowl", None, None]
+    with start(tmp_path, policy, tokenizer=None) as run:
+        one_call(run, policy, prompt=pieces)
+    episode = stored(tmp_path).episodes[0]
+    assert [piece.key for piece in episode.attributes.prompts[0].pieces] == [5, 6, 7]
+    labels = [Role(code).label for code in episode.read("joint/key_role")[0]]
+    assert labels[4:10] == ["template", "instruction", "instruction", "instruction", "template", "padding"]
+
+
+def test_the_example_of_the_documentation(tmp_path):
+    policy = SmallPolicy()
+    example = type("Example", (), {"act": lambda self, step: policy.act(**given(seed=step, text="pick the bowl"))})()
+    example.network = policy
+    layout = small_layout(
+        rules=tuple(replace(rule, modules=rf"network\.{rule.modules}") for rule in small_layout().rules),
+        sites=(replace(small_layout().sites[0], projection="network.blocks.{block}.attention.out"),),
+        text=replace(small_layout().text, embedding="network.words"),
+    )
+    names = {"store": str(tmp_path / "a.zarr"), "policy": example, "layout": layout}
+    [test] = doctest.DocTestFinder().find(record_module.record, "record", globs=names)
+    assert test.examples
+    assert doctest.DocTestRunner().run(test).failed == 0
