@@ -26,7 +26,7 @@ def calls_table(calls: Sequence[CallShape]) -> str:
         )
         counts[line] += 1
         numbers.setdefault(line, {}).update(dict.fromkeys([".".join(re.findall(r"(?<=\.)\d+(?=\.|$)", call.module))]))
-    rows = [("module", "kind", "queries x keys", "heads", "batch", "dtype", "calls", "{} is")]
+    rows: list[tuple[str, ...]] = [("module", "kind", "queries x keys", "heads", "batch", "dtype", "calls", "{} is")]
     for line, count in counts.items():
         found = [name for name in numbers[line] if name]
         rows.append((*line, str(count), f"{found[0]}..{found[-1]}" if len(found) > 1 else "".join(found)))

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from vla_attention.capture.provenance import describe_machine
 from vla_attention.capture.torch_policies.knockouts import SessionKnockouts, interventions_of, with_name
+from vla_attention.capture.torch_policies.own_setting import difference_to_own_setting
 from vla_attention.capture.torch_policies.policy_layout import (
     LayoutForAnotherVersion,
     PolicyLayout,
@@ -263,11 +264,7 @@ def _identity(policy: object, layout: PolicyLayout, checkpoint: str, dtype: str,
 
 
 def _difference(policy: object, own_setting: Callable[[], Any] | None) -> str:
-    if own_setting is None:
-        return "not measured"
-    from vla_attention.capture.torch_policies.call_changes import difference_to_own_setting
-
-    return str(difference_to_own_setting(policy, own_setting))
+    return "not measured" if own_setting is None else str(difference_to_own_setting(policy, own_setting))
 
 
 def installed_version(library: str) -> str | None:
