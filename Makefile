@@ -3,6 +3,7 @@
 #   make capture     run a policy in simulation and record its attention (installs torch and the simulators)
 #   make analyze     masses, ratios, tables and pictures from a store (installs the laptop's small set only)
 #   make test        formatting, types, all tests, and the package as others install it
+#   make test-policies   policies of transformers 5 and LeRobot, in environments of their own (.venv-transformers, .venv-lerobot)
 #   make test-slurm  an array job on the SLURM that sbatch reaches from here (opt-in; installs nothing)
 #   make setup       the whole environment        make setup-analyze   the laptop's part of it
 #
@@ -34,7 +35,7 @@ WORKERS ?= 2
 # An empty PYTHONDONTWRITEBYTECODE: where it is set, both processes compile all tests anew at every run.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: capture analyze test test-slurm test-thorough check unit package setup setup-analyze schemas clean
+.PHONY: capture analyze test test-policies test-slurm test-thorough check unit package setup setup-analyze schemas clean
 
 capture: .venv/capture-installed
 	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --store $(STORE) \
@@ -62,6 +63,12 @@ test-thorough: .venv/capture-installed
 # Source distribution, wheel, and their use from environments outside the checkout.
 package: .venv/capture-installed
 	$(BIN)/python scripts/check_package.py
+
+# Layouts of policies on small random models of the real classes. Neither environment fits constraints.txt, nor the other:
+# transformers 5 and LeRobot 0.4.4 want different versions of the same libraries.
+test-policies: .venv-transformers/installed .venv-lerobot/installed
+	.venv-transformers/bin/pytest tests/policies $(ARGS)
+	.venv-lerobot/bin/pytest tests/policies $(ARGS)
 
 # Takes about ten minutes, most of it waiting: SLURM holds a requeued job back for two. Works with any environment that is active.
 test-slurm:
@@ -93,5 +100,19 @@ setup-analyze: .venv/analyze-installed
 	sh scripts/ensure_rendering.sh
 	@touch $@
 
+.venv-transformers/installed: pyproject.toml tests/policies/requirements-transformers.txt
+	@echo "Installing transformers 5 and vla-eval into .venv-transformers ..."
+	$(PYTHON) -m venv .venv-transformers
+	.venv-transformers/bin/python -m pip install --quiet --disable-pip-version-check -e . -r tests/policies/requirements-transformers.txt
+	@touch $@
+
+# LeRobot itself without what it asks for: that would bring torchvision, and with it another torch.
+.venv-lerobot/installed: pyproject.toml tests/policies/requirements-lerobot.txt
+	@echo "Installing LeRobot 0.4.4 into .venv-lerobot ..."
+	$(PYTHON) -m venv .venv-lerobot
+	.venv-lerobot/bin/python -m pip install --quiet --disable-pip-version-check -e . -r tests/policies/requirements-lerobot.txt
+	.venv-lerobot/bin/python -m pip install --quiet --disable-pip-version-check --no-deps lerobot==0.4.4 av==15.0.0
+	@touch $@
+
 clean:
-	rm -rf .venv build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-transformers .venv-lerobot build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -181,12 +181,14 @@ class PromptText:
         spans: the spans that hold the prompt's tokens, in the order of the tokens.
         embedding: path of the module whose first argument is the token ids; its longest call in a replan is the prompt.
         skip_ids: ids that are no text (placeholders for patches): they have no key in `spans`.
-        site: the site whose spans these are; None for every site that has them.
+        skip_first: number of ids before the first that has a key (placeholders that the policy replaced by another id).
+        site: the site whose spans these are; None for every site that has them, at the same keys.
     """
 
     spans: tuple[str, ...]
     embedding: str
     skip_ids: tuple[int, ...] = ()
+    skip_first: int = 0
     site: str | None = None
 
 
@@ -277,6 +279,19 @@ class PolicyLayout:
                         yield f"the prompt's span '{span}' is not in site '{site.name}'"
             if not self.text_sites:
                 yield f"no site has the prompt's spans {listing(self.text.spans)}"
+            yield from self._prompts_elsewhere()
+
+    def _prompts_elsewhere(self) -> Iterator[str]:
+        # The store keeps one prompt of a replan, whose pieces name keys.
+        places: dict[tuple[tuple[int, int], ...], str] = {}
+        for site in self.text_sites:
+            spans = [span for span in site.keys.spans if self.text is not None and span.name in self.text.spans]
+            places.setdefault(tuple((span.start, span.stop) for span in spans), site.name)
+        if len(places) > 1:
+            yield (
+                f"the prompt has other keys at the sites {listing(places.values())}; say with PromptText(site=...) "
+                "at which of them its words are known"
+            )
 
     @property
     def text_sites(self) -> tuple[RecordedSite, ...]:

@@ -67,8 +67,11 @@ class ReplanText:
             return prompt_without_pieces(given.instruction)
         valid = None
         if found is not None:
-            seen = [found[site.name].valid for site in sites if site.name in found]
-            valid = np.logical_or.reduce(seen) if seen else None
+            # The prompt has the same keys at every site; what else the sites hold differs.
+            valid = np.zeros(max(site.keys.num_keys for site in sites), dtype=bool)
+            for site in sites:
+                if site.name in found:
+                    valid[: site.keys.num_keys] |= found[site.name].valid
         return prompt_from_ids(self._text_ids(row), keys, self.tokenizer, given.instruction, valid)
 
     def roles(
@@ -103,7 +106,7 @@ class ReplanText:
         assert self.ids is not None
         assert self.layout.text is not None
         skipped = set(self.layout.text.skip_ids)
-        return [token for token in self.ids[row].tolist() if token not in skipped]
+        return [token for token in self.ids[row, self.layout.text.skip_first :].tolist() if token not in skipped]
 
 
 @contextmanager

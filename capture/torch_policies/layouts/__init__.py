@@ -1,0 +1,15 @@
+"""Layouts of policies that people run: a function of a policy object returns its `PolicyLayout`.
+
+What is fixed by the policy's configuration is read from it; what a call decides (prompt, cameras of a processor) is an
+argument. docs/policies.md says with which versions each was tried, and what was checked.
+"""
+
+from vla_attention.capture.torch_policies.layouts.act import act
+from vla_attention.capture.torch_policies.layouts.gr00t import gr00t
+from vla_attention.capture.torch_policies.layouts.openvla import openvla, openvla_oft
+from vla_attention.capture.torch_policies.layouts.pi0_fast import pi0_fast
+from vla_attention.capture.torch_policies.layouts.pi0_transformers import pi0_transformers
+from vla_attention.capture.torch_policies.layouts.smolvla import smolvla
+from vla_attention.capture.torch_policies.layouts.xvla import xvla
+
+__all__ = ["act", "gr00t", "openvla", "openvla_oft", "pi0_fast", "pi0_transformers", "smolvla", "xvla"]

@@ -1,0 +1,169 @@
+"""GR00T N1.5 and N1.7: a diffusion transformer over state and action tokens, which reads a vision-language model.
+
+N1.5 (LeRobot 0.4): even blocks read all tokens of that model (`cross`), odd ones the state, learned and action tokens
+(`self`). N1.7 (LeRobot's main branch): even blocks take turns between the text only (`cross_text`) and the
+pictures only (`cross_image`), so that a ratio of both inside one block is undefined.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from vla_attention.capture.torch_policies.layouts.find_policy import (
+    NotThisPolicy,
+    find_policy,
+    inside,
+    rule_path,
+    square,
+)
+from vla_attention.capture.torch_policies.layouts.key_order import KeyOrder
+from vla_attention.capture.torch_policies.policy_layout import (
+    CallRule,
+    CameraPicture,
+    PolicyLayout,
+    PromptText,
+    RecordedSite,
+)
+from vla_attention.schemas.errors import BadArgument
+
+_NAME = "gr00t"
+
+
+def gr00t(
+    policy: object,
+    input_ids: Sequence[int],
+    *,
+    cameras: Sequence[str],
+    picture_size: int = 224,
+    prompt_tokens: int = 0,
+    image_token: int | None = None,
+    state_tokens: int = 1,
+) -> PolicyLayout:
+    """Return the layout of a `GR00TN15` or `GR00TN17` model, or of an object that holds one (LeRobot's `GrootPolicy`).
+
+    Where the pictures are among the text is read from one call's ids: its chat template is the processor's.
+
+    Args:
+        input_ids: the ids of one call without padding, (token,): `batch["eagle_input_ids"][0]`, or `input_ids`.
+        cameras: names of the pictures, in the order of their tokens.
+        picture_size: height and width of the pictures as the model gets them.
+        prompt_tokens: the longest text after the last picture, in tokens; 0: twice that of `input_ids`.
+        image_token: the id of the placeholder for a patch; None: the model's configuration says it.
+        state_tokens: number of state tokens.
+
+    Raises:
+        NotThisPolicy: no GR00TN15 or GR00TN17.
+        BadArgument: the ids do not hold one picture for each camera.
+    """
+    path, found = find_policy(policy, ("GR00TN15", "GR00TN17"), _NAME)
+    head = found.action_head
+    placeholder = _placeholder(found) if image_token is None else image_token
+    ids = [int(token) for token in input_ids]
+    keys, texts = _encoder_keys(ids, placeholder, cameras, picture_size, prompt_tokens)
+    blocks = len(head.model.transformer_blocks)
+    interleaved = bool(head.model.config.interleave_self_attention)
+    own = tuple(range(1, blocks, 2)) if interleaved else ()
+    cross = tuple(block for block in range(blocks) if block not in own)
+    horizon = int(head.action_horizon)
+    learned = head.future_tokens.num_embeddings if hasattr(head, "future_tokens") else 0
+    queries = (-horizon, None)
+    output = inside(path, "action_head.model.transformer_blocks.{block}.attn1.to_out.0")
+    every = getattr(head.model, "attend_text_every_n_blocks", None)
+    groups = {"cross": cross} if every is None else _by_turns(cross, every)
+    sites: list[RecordedSite] = [
+        keys.site(name, queries, layers=layers, projection=output, variable=texts[-1])
+        for name, layers in groups.items()
+        if layers
+    ]
+    if own:
+        tokens = KeyOrder()
+        tokens.add("state", "state", state_tokens, "state")
+        tokens.add("learned", "state", learned, "learned")
+        tokens.add("actions", "action", horizon, "action")
+        sites.append(tokens.site("self", queries, layers=own, projection=output))
+    steps = int(head.num_inference_timesteps)
+    return PolicyLayout(
+        name="gr00t_n1.7" if every is not None else "gr00t_n1.5",
+        family="gr00t",
+        sites=tuple(sites),
+        rules=(
+            *(_block_rule(path, layers, name) for name, layers in (*groups.items(), ("self", own)) if layers),
+            CallRule(rule_path(path, r"action_head\.vl_self_attention\..*"), None),
+            CallRule(rule_path(path, r"backbone\..*"), None),
+        ),
+        num_layers=blocks,
+        num_heads=head.model.config.num_attention_heads,
+        num_denoise_steps=steps,
+        denoise_times=tuple(step / steps for step in range(steps)),
+        cameras=tuple(CameraPicture(camera) for camera in cameras),
+        text=PromptText(tuple(texts), _embedding(path, found), skip_ids=(placeholder,)),
+        action_horizon=horizon,
+        action_dim=int(head.action_dim),
+        versions={"lerobot": ("0.4.",)} if every is None else {},
+    )
+
+
+def _block_rule(path: str, layers: tuple[int, ...], site: str) -> CallRule:
+    numbers = "|".join(str(block) for block in layers)
+    return CallRule(rule_path(path, rf"action_head\.model\.transformer_blocks\.(?P<block>{numbers})\.attn1"), site)
+
+
+def _by_turns(cross: tuple[int, ...], every: int) -> dict[str, tuple[int, ...]]:
+    text = tuple(block for block in cross if block % (2 * every) == 0)
+    return {"cross_text": text, "cross_image": tuple(block for block in cross if block not in text)}
+
+
+def _placeholder(found: Any) -> int:
+    backbone = found.backbone
+    for model, name in (("eagle_model", "image_token_index"), ("model", "config.image_token_id")):
+        thing: Any = getattr(backbone, model, None)
+        for part in name.split("."):
+            thing = getattr(thing, part, None)
+        if thing is not None:
+            return int(thing)
+    raise NotThisPolicy("The model does not say which id stands for a patch; give gr00t(..., image_token=...).")
+
+
+def _embedding(path: str, found: Any) -> str:
+    names = (
+        *("backbone.eagle_model.language_model.model.embed_tokens", "backbone.model.language_model.embed_tokens"),
+        "backbone.model.model.language_model.embed_tokens",
+    )
+    for name in names:
+        thing: Any = found
+        for part in name.split("."):
+            thing = getattr(thing, part, None)
+        if thing is not None:
+            return inside(path, name)
+    raise NotThisPolicy(
+        f"The model's text embedding is at none of the places of GR00T N1.5 and N1.7: {', '.join(names)}."
+    )
+
+
+def _encoder_keys(
+    ids: list[int], placeholder: int, cameras: Sequence[str], size: int, longest: int
+) -> tuple[KeyOrder, list[str]]:
+    """The keys of the vision-language model's tokens, and the names of its text spans in order."""
+    runs: list[tuple[bool, int]] = []
+    for token in ids:
+        picture = token == placeholder
+        if runs and runs[-1][0] == picture:
+            runs[-1] = picture, runs[-1][1] + 1
+        else:
+            runs.append((picture, 1))
+    if sum(picture for picture, _ in runs) != len(cameras) or not runs or runs[-1][0]:
+        raise BadArgument(
+            f"The ids of one call hold {sum(picture for picture, _ in runs)} runs of placeholders for patches (id "
+            f"{placeholder}), and the text must end them; expected one for each of the cameras {list(cameras)}."
+        )
+    keys, texts, names = KeyOrder(), [], iter(cameras)
+    for number, (picture, count) in enumerate(runs):
+        if picture:
+            side = square(count, "pictures", _NAME)
+            keys.add_picture(next(names), side, side, size, size)
+            continue
+        last = number == len(runs) - 1
+        texts.append("prompt" if last else f"template_{number}")
+        keys.add(texts[-1], "text", (longest or 2 * count) if last else count, "instruction" if last else "template")
+    return keys, texts

@@ -1,0 +1,149 @@
+"""OpenVLA and OpenVLA-OFT: a Llama whose keys are BOS, the patches, the prompt, and action tokens.
+
+OpenVLA writes one token per action dimension; the first one's query is the prompt's last token. OFT computes the whole
+chunk at once, on placeholders, without a causal mask: the query of placeholder i is the position before it, as its code
+reads the hidden states (prismatic/extern/hf/modeling_prismatic.py, `_regression_or_discrete_prediction`).
+
+Both are read from their code; no installable package has their classes, so the tests use a stand-in with these calls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from vla_attention.capture.torch_policies.layouts.find_policy import find_policy, inside, rule_path, square
+from vla_attention.capture.torch_policies.layouts.key_order import KeyOrder
+from vla_attention.capture.torch_policies.policy_layout import CallRule, CameraPicture, PolicyLayout, PromptText
+from vla_attention.schemas.errors import BadArgument
+
+_CLASSES = ("OpenVLAForActionPrediction",)
+
+
+def openvla(
+    policy: object, *, camera: str = "image", action_dim: int = 7, prompt_tokens: int = 64, patches: int = 256
+) -> PolicyLayout:
+    """Return the layout of OpenVLA's `OpenVLAForActionPrediction`, or of an object that holds one.
+
+    Site `joint`: BOS, the camera's patches, the prompt, and the action tokens written so far. One row per action token.
+
+    Args:
+        camera: a name for the picture.
+        action_dim: number of action tokens, the dimensions of an action of the checkpoint's data set.
+        prompt_tokens: the longest prompt in tokens, without BOS.
+        patches: number of patches of the picture.
+
+    Raises:
+        NotThisPolicy: no OpenVLAForActionPrediction.
+    """
+    path, found = find_policy(policy, _CLASSES, "openvla")
+    keys = _prefix([camera], prompt_tokens, patches, _picture_size(found), 0, "openvla")
+    keys.add_growing("action_tokens", action_dim - 1)
+    return _layout(
+        "openvla",
+        path,
+        found,
+        keys,
+        (-1, None),
+        [camera],
+        action_horizon=1,
+        action_dim=action_dim,
+        autoregressive=True,
+        num_action_tokens=action_dim,
+    )
+
+
+def openvla_oft(
+    policy: object,
+    *,
+    cameras: Sequence[str] = ("image", "wrist_image"),
+    action_dim: int = 7,
+    chunk: int = 8,
+    prompt_tokens: int = 64,
+    patches: int = 256,
+    proprio: bool = True,
+    diffusion_steps: int = 0,
+) -> PolicyLayout:
+    """Return the layout of OpenVLA-OFT's `OpenVLAForActionPrediction`, or of an object that holds one.
+
+    Site `joint`: BOS, the cameras' patches, the state (and the diffusion step's token), the prompt, a placeholder for
+    each number of the chunk, and a stop token.
+
+    Args:
+        cameras: names for the pictures, in the order in which they are given.
+        action_dim, chunk: dimensions of an action, and actions of a chunk (LIBERO: 7 and 8, ALOHA: 14 and 25).
+        prompt_tokens: the longest prompt in tokens, without BOS.
+        patches: number of patches of one picture.
+        proprio: the state is given.
+        diffusion_steps: number of diffusion steps; 0 for regression or discrete tokens, which need one pass.
+
+    Raises:
+        NotThisPolicy: no OpenVLAForActionPrediction.
+    """
+    path, found = find_policy(policy, _CLASSES, "openvla_oft")
+    placeholders = action_dim * chunk
+    keys = _prefix(cameras, prompt_tokens, patches, _picture_size(found), int(proprio), "openvla_oft", diffusion_steps)
+    keys.add("actions", "action", placeholders, "action")
+    keys.add("stop", "text", 1, "template")
+    return _layout(
+        "openvla_oft",
+        path,
+        found,
+        keys,
+        (-(placeholders + 2), -2),
+        cameras,
+        num_denoise_steps=max(1, diffusion_steps),
+        action_horizon=chunk,
+        action_dim=action_dim,
+    )
+
+
+def _picture_size(found: Any) -> int:
+    sizes = getattr(found.config, "image_sizes", None) or [224]
+    return int(sizes[0] if isinstance(sizes, list | tuple) else sizes)
+
+
+def _prefix(
+    cameras: Sequence[str], prompt: int, patches: int, size: int, state: int, layout: str, diffusion: int = 0
+) -> KeyOrder:
+    if not cameras or prompt < 1:
+        raise BadArgument(f"{layout} needs at least one camera and one prompt token; got {list(cameras)}, {prompt}.")
+    keys = KeyOrder()
+    keys.add("bos", "text", 1, "bos")
+    for camera in cameras:
+        side = square(patches, "pictures", layout)
+        keys.add_picture(camera, side, side, size, size)
+    keys.add("state", "state", state, "state")
+    keys.add("diffusion_step", "state", int(diffusion > 0), "learned")
+    keys.add("prompt", "text", prompt, "instruction")
+    return keys
+
+
+def _layout(
+    name: str,
+    path: str,
+    found: Any,
+    keys: KeyOrder,
+    queries: tuple[int, int | None],
+    cameras: Sequence[str],
+    **of_policy: Any,
+) -> PolicyLayout:
+    llama = inside(path, "language_model.model")
+    site = keys.site("joint", queries, projection=f"{llama}.layers.{{block}}.self_attn.o_proj", variable="prompt")
+    text = found.config.text_config
+    # OFT embeds its placeholders and the stop token with the prompt.
+    after = [span.name for span in keys.spans if span.name in ("actions", "stop")]
+    return PolicyLayout(
+        name=name,
+        family=name,
+        sites=(site,),
+        rules=(
+            CallRule(rule_path(llama, r"layers\.(?P<block>\d+)\.self_attn"), "joint"),
+            CallRule(rule_path(path, r"vision_backbone\..*"), None),
+        ),
+        num_layers=text.num_hidden_layers,
+        num_heads=text.num_attention_heads,
+        cameras=tuple(CameraPicture(camera) for camera in cameras),
+        text=PromptText(("bos", "prompt", *after), f"{llama}.embed_tokens"),
+        **of_policy,
+    )

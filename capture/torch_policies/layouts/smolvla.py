@@ -1,0 +1,135 @@
+"""SmolVLA of LeRobot: an action expert whose blocks alternate between `self` and `cross`.
+
+Keys of a prefix: for each camera two tokens that begin it (where the checkpoint has them), its patches, one that ends
+it; the prompt; the state. Blocks of `self` see the prefix and the action tokens up to the query's own, those of `cross`
+the prefix only. All of them compute in one module, `vlm_with_expert`, with a softmax by hand.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from vla_attention.capture.torch_policies.layouts.find_policy import (
+    NotThisPolicy,
+    camera_name,
+    find_policy,
+    inside,
+    rule_path,
+    square,
+)
+from vla_attention.capture.torch_policies.layouts.key_order import KeyOrder
+from vla_attention.capture.torch_policies.policy_layout import (
+    CallRule,
+    CameraPicture,
+    PolicyLayout,
+    PromptText,
+    RecordedSite,
+)
+
+_NAME = "smolvla"
+_SEPARATORS = {"begin": 2, "end": 1}
+
+
+def smolvla(policy: object) -> PolicyLayout:
+    """Return the layout of a `SmolVLAPolicy`, or of an object that holds one.
+
+    Sites: `self` (keys: prefix and action tokens) and `cross` (keys: prefix), where the policy has blocks of both.
+
+    Raises:
+        NotThisPolicy: no SmolVLAPolicy, or one whose calls cannot be told from the prefix's by their numbers.
+    """
+    path, found = find_policy(policy, ("SmolVLAPolicy",), _NAME)
+    config, model = found.config, found.model.vlm_with_expert
+    prompt = config.tokenizer_max_length
+    if config.prefix_length > 0 and config.pad_language_to != "max_length":
+        raise NotThisPolicy(
+            f"This SmolVLA pads its prefix to {config.prefix_length} keys after prompts of different lengths "
+            f"(pad_language_to='{config.pad_language_to}'), so that no key has a place of its own; expected "
+            "pad_language_to='max_length', or no prefix_length."
+        )
+    if not config.use_cache:
+        raise NotThisPolicy("This SmolVLA has use_cache=False, with which it cannot act; set use_cache=True.")
+    order, cameras = _sequence(config, model), [camera_name(feature) for feature in config.image_features]
+    kinds = list(dict.fromkeys(site for site, _ in order))
+    fewest = _prefix(config, model, cameras, prompt).num_keys - (
+        0 if config.pad_language_to == "max_length" else prompt
+    )
+    most = fewest if config.pad_language_to == "max_length" else fewest + prompt
+    if fewest <= config.chunk_size <= most:
+        raise NotThisPolicy(
+            f"This SmolVLA's prefix of {fewest} to {most} keys may be as long as its chunk of {config.chunk_size} "
+            "actions; then its two passes cannot be told apart."
+        )
+    expert = inside(path, "model.vlm_with_expert")
+    both = tuple(_site(kind, config, model, cameras, prompt, expert, order) for kind in kinds)
+    return PolicyLayout(
+        name=_NAME,
+        family="smolvla",
+        sites=both,
+        rules=(
+            CallRule(rule_path("", _escaped(expert)), None, queries=config.chunk_size, sequence=tuple(order)),
+            CallRule(_escaped(expert), None),
+            CallRule(_escaped(expert) + r"\.vlm\..*", None),
+        ),
+        num_layers=max(block for _, block in order) + 1,
+        num_heads=model.num_attention_heads,
+        num_denoise_steps=config.num_steps,
+        denoise_times=tuple(1.0 - step / config.num_steps for step in range(config.num_steps)),
+        cameras=tuple(CameraPicture(camera, "pad_left_top") for camera in cameras),
+        text=PromptText(("prompt",), inside(expert, "vlm.model.text_model.embed_tokens")),
+        action_horizon=config.chunk_size,
+        action_dim=config.action_feature.shape[0],
+        versions={"lerobot": ("0.4.",)},
+    )
+
+
+def _escaped(path: str) -> str:
+    return rule_path(path, "")[:-2]
+
+
+def _sequence(config: Any, model: Any) -> list[tuple[str, int]]:
+    """The site and block of each call of a denoise step, in order; the block is the expert's layer."""
+    calls = []
+    multiple = model.num_vlm_layers // model.num_expert_layers
+    every = model.self_attn_every_n_layers
+    for layer in range(model.num_vlm_layers):
+        if multiple > 1 and layer % multiple:
+            continue
+        own = "cross" not in model.attention_mode or (every > 0 and layer % every == 0)
+        calls.append(("self" if own else "cross", layer // max(multiple, 1)))
+    return calls
+
+
+def _prefix(config: Any, model: Any, cameras: list[str], prompt: int) -> KeyOrder:
+    keys = KeyOrder()
+    vision = model.config.vision_config
+    for feature, camera in zip(config.image_features, cameras, strict=True):
+        size = config.resize_imgs_with_padding
+        width, height = size if size is not None else reversed(config.image_features[feature].shape[1:])
+        patches = (height // vision.patch_size) * (width // vision.patch_size)
+        side = square(patches, "pictures", _NAME) // model.config.scale_factor
+        if config.add_image_special_tokens:
+            keys.add(f"{camera}_begin", "text", _SEPARATORS["begin"], "template")
+        keys.add_picture(camera, side, side, height, width)
+        if config.add_image_special_tokens:
+            keys.add(f"{camera}_end", "text", _SEPARATORS["end"], "template")
+    keys.add("prompt", "text", prompt, "instruction")
+    keys.add("state", "state", 1, "state")
+    keys.add("prefix_padding", "text", max(0, config.prefix_length - keys.num_keys), "padding")
+    return keys
+
+
+def _site(
+    kind: str, config: Any, model: Any, cameras: list[str], prompt: int, expert: str, order: list[tuple[str, int]]
+) -> RecordedSite:
+    keys = _prefix(config, model, cameras, prompt)
+    if kind == "self":
+        keys.add("actions", "action", config.chunk_size, "action")
+    blocks = tuple(block for site, block in order if site == kind)
+    return keys.site(
+        kind,
+        (0, config.chunk_size),
+        layers=blocks,
+        projection=f"{expert}.lm_expert.layers.{{block}}.self_attn.o_proj",
+        variable="prompt",
+    )

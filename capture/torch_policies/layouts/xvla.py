@@ -1,0 +1,110 @@
+"""X-VLA of LeRobot: one sequence without a mask. Actions come first, then Florence 2's tokens, further views, prompts.
+
+Florence 2's encoder has mixed the first camera's tokens and the text before: keys are named by their positions. An
+empty view has features of zero; its keys hold no picture but take attention, as Cosmos's blank frames do. Padding of
+the prompt is not masked either.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from vla_attention.capture.torch_policies.layouts.find_policy import (
+    NotThisPolicy,
+    camera_name,
+    find_policy,
+    inside,
+    rule_path,
+)
+from vla_attention.capture.torch_policies.layouts.key_order import KeyOrder
+from vla_attention.capture.torch_policies.policy_layout import CallRule, CameraPicture, PolicyLayout, PromptText
+
+_NAME = "xvla"
+
+
+def xvla(policy: object) -> PolicyLayout:
+    """Return the layout of an `XVLAPolicy`, or of an object that holds one.
+
+    Site `joint`: action tokens, the first camera (its mean, then its patches), the prompt, further cameras, empty
+    views, soft prompts.
+
+    Raises:
+        NotThisPolicy: no XVLAPolicy, or one with other picture features than means and patches.
+    """
+    path, found = find_policy(policy, ("XVLAPolicy",), _NAME)
+    config, vision = found.config, found.model.vlm.config.vision_config
+    cameras = [(camera_name(feature), config.image_features[feature].shape) for feature in config.image_features]
+    views = max(config.num_image_views or 0, len(cameras))
+    keys = KeyOrder()
+    keys.add("actions", "action", config.chunk_size, "action")
+    for number in range(views):
+        if number < len(cameras):
+            _add_view(keys, *cameras[number], config, vision)
+        else:
+            rows, columns = _patches(*_picture_size(cameras[0][1], config), vision)
+            count = sum(_tokens_of(source, rows * columns) for source in vision.image_feature_source)
+            keys.add(f"empty_view_{number}", "image", count, "blank")
+        if number == 0:
+            keys.add("prompt", "text", config.tokenizer_max_length, "instruction")
+    keys.add("soft_prompts", "state", config.len_soft_prompts, "learned")
+    site = keys.site(
+        "joint",
+        (0, config.chunk_size),
+        projection=inside(path, "model.transformer.blocks.{block}.attn.proj"),
+        variable="prompt",
+    )
+    return PolicyLayout(
+        name=_NAME,
+        family="xvla",
+        sites=(site,),
+        rules=(
+            CallRule(rule_path(path, r"model\.transformer\.blocks\.(?P<block>\d+)\.attn"), "joint"),
+            CallRule(rule_path(path, r"model\.vlm\..*"), None),
+        ),
+        num_layers=config.depth,
+        num_heads=config.num_heads,
+        num_denoise_steps=max(1, config.num_denoising_steps),
+        denoise_times=tuple(step / config.num_denoising_steps for step in range(config.num_denoising_steps, 0, -1)),
+        cameras=tuple(
+            CameraPicture(name, "pad_left_top" if config.resize_imgs_with_padding else "stretch") for name, _ in cameras
+        ),
+        text=PromptText(("prompt",), inside(path, "model.vlm.language_model.model.shared")),
+        action_horizon=config.chunk_size,
+        action_dim=found.model.dim_action,
+        versions={"lerobot": ("0.4.",)},
+    )
+
+
+def _picture_size(shape: tuple[int, ...], config: Any) -> tuple[int, int]:
+    height, width = config.resize_imgs_with_padding or shape[1:]
+    return height, width
+
+
+def _patches(height: int, width: int, vision: Any) -> tuple[int, int]:
+    """Rows and columns of the picture network's last stage."""
+    for size, stride, padding in zip(vision.patch_size, vision.patch_stride, vision.patch_padding, strict=True):
+        height, width = ((side + 2 * padding - size) // stride + 1 for side in (height, width))
+    return height, width
+
+
+def _tokens_of(source: str, patches: int) -> int:
+    counts = {"spatial_avg_pool": 1, "temporal_avg_pool": patches, "last_frame": patches}
+    if source not in counts:
+        raise NotThisPolicy(f"The layout '{_NAME}' does not know the picture features '{source}'.")
+    return counts[source]
+
+
+def _add_view(keys: KeyOrder, camera: str, shape: tuple[int, ...], config: Any, vision: Any) -> None:
+    height, width = _picture_size(shape, config)
+    rows, columns = _patches(height, width, vision)
+    sources = [(source, _tokens_of(source, rows * columns)) for source in vision.image_feature_source]
+    if sum(source != "spatial_avg_pool" for source, _ in sources) != 1:
+        raise NotThisPolicy(
+            f"The layout '{_NAME}' is for one token a patch; this policy's picture features are "
+            f"{', '.join(vision.image_feature_source)}."
+        )
+    for source, count in sources:
+        if source == "spatial_avg_pool":
+            keys.add(f"{camera}_mean", "image", count, "image")
+        else:
+            keys.add_picture(camera, rows, columns, height, width)

@@ -1,0 +1,193 @@
+"""Small random policies of LeRobot 0.4.4's real classes. Import `stand_in_torchvision` and install it first."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+from unittest import mock
+
+import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.utils.constants import (
+    ACTION,
+    OBS_LANGUAGE_ATTENTION_MASK,
+    OBS_LANGUAGE_TOKENS,
+    OBS_STATE,
+)
+
+from tests.policies.word_tokenizer import INSTRUCTION, WordTokenizer
+
+CAMERAS = ("top", "wrist")
+STATE_DIM, ACTION_DIM = 6, 4
+
+
+def features(height: int, width: int, cameras: tuple[str, ...] = CAMERAS) -> dict[str, Any]:
+    """Return the features of a data set with these cameras, a state and actions, as arguments of a configuration."""
+    pictures = {
+        f"observation.images.{camera}": PolicyFeature(type=FeatureType.VISUAL, shape=(3, height, width))
+        for camera in cameras
+    }
+    return {
+        "input_features": {**pictures, OBS_STATE: PolicyFeature(type=FeatureType.STATE, shape=(STATE_DIM,))},
+        "output_features": {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_DIM,))},
+        "device": "cpu",
+    }
+
+
+def observation(
+    height: int,
+    width: int,
+    padding: int = 0,
+    cameras: tuple[str, ...] = CAMERAS,
+    batch: int = 1,
+    seed: int = 3,
+    instruction: str = INSTRUCTION,
+) -> dict[str, torch.Tensor]:
+    """Return a preprocessed observation: pictures in [0, 1], a state, the instruction's ids and then padding."""
+    generator = torch.Generator().manual_seed(seed)
+    words = WordTokenizer().encode(instruction)
+    ids = torch.tensor([words + [0] * padding] * batch)
+    pictures = {
+        f"observation.images.{camera}": torch.rand(batch, 3, height, width, generator=generator) for camera in cameras
+    }
+    return {
+        **pictures,
+        OBS_STATE: torch.randn(batch, STATE_DIM, generator=generator),
+        OBS_LANGUAGE_TOKENS: ids,
+        OBS_LANGUAGE_ATTENTION_MASK: torch.arange(ids.shape[1]).expand(batch, -1) < len(words),
+    }
+
+
+def frames_of(observation: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Return the pictures of the first row by camera."""
+    prefix = "observation.images."
+    return {name.removeprefix(prefix): value[0] for name, value in observation.items() if name.startswith(prefix)}
+
+
+def chunk_of(policy: Any, seed: int = 0) -> Any:
+    """Return a function that makes one policy call, with the same noise every time."""
+
+    def call(batch: dict[str, torch.Tensor]) -> torch.Tensor:
+        torch.manual_seed(seed)
+        return policy.predict_action_chunk(dict(batch))
+
+    return call
+
+
+def small_smolvla(folder: Path, **changes: Any) -> Any:
+    """A SmolVLAPolicy of four blocks; `folder` is where the configuration of its vision-language model is written."""
+    from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
+    from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
+    from transformers import SmolVLMConfig
+
+    vlm = SmolVLMConfig(
+        text_config={
+            "model_type": "llama",
+            **{"hidden_size": 48, "intermediate_size": 64, "num_hidden_layers": 4, "num_attention_heads": 3},
+            **{"num_key_value_heads": 1, "head_dim": 16, "vocab_size": 100, "pad_token_id": 0},
+        },
+        vision_config={
+            **{"hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 2},
+            **{"image_size": 64, "patch_size": 8},
+        },
+        scale_factor=2,
+        image_token_id=98,
+        pad_token_id=0,
+    )
+    vlm.save_pretrained(folder)
+    processor = SimpleNamespace(tokenizer=SimpleNamespace(fake_image_token_id=96, global_image_token_id=97))
+    settings: dict[str, Any] = {
+        **features(48, 64),
+        **{"chunk_size": 5, "n_action_steps": 5, "num_steps": 3, "resize_imgs_with_padding": (64, 64)},
+        **{"vlm_model_name": str(folder), "load_vlm_weights": False, "num_vlm_layers": 4, "max_state_dim": 8},
+        **{"max_action_dim": 8, "add_image_special_tokens": True, "tokenizer_max_length": 12},
+    }
+    torch.manual_seed(0)
+    with mock.patch("transformers.AutoProcessor.from_pretrained", return_value=processor):
+        return SmolVLAPolicy(SmolVLAConfig(**{**settings, **changes})).eval()
+
+
+def small_xvla(**changes: Any) -> Any:
+    """An XVLAPolicy of three blocks on a small Florence 2."""
+    from lerobot.policies.xvla.configuration_xvla import XVLAConfig
+    from lerobot.policies.xvla.modeling_xvla import XVLAPolicy
+
+    vision = {
+        **{"model_type": "davit", "dim_embed": [8, 8, 16, 16], "num_heads": [2, 2, 2, 2], "num_groups": [2, 2, 2, 2]},
+        **{"depths": [1, 1, 1, 1], "window_size": 4, "projection_dim": 32},
+        "visual_temporal_embedding": {"type": "COSINE", "max_temporal_embeddings": 10},
+        "image_pos_embed": {"type": "learned_abs_2d", "max_pos_embeddings": 10},
+        "image_feature_source": ["spatial_avg_pool", "temporal_avg_pool"],
+    }
+    text = {
+        **{"vocab_size": 100, "d_model": 32, "encoder_layers": 2, "decoder_layers": 1, "encoder_attention_heads": 2},
+        **{"decoder_attention_heads": 2, "encoder_ffn_dim": 48, "decoder_ffn_dim": 48, "max_position_embeddings": 64},
+    }
+    settings: dict[str, Any] = {
+        **features(64, 64),
+        **{"chunk_size": 5, "n_action_steps": 5, "num_denoising_steps": 3, "hidden_size": 32, "depth": 3},
+        **{"num_heads": 4, "len_soft_prompts": 3, "num_domains": 2, "dim_time": 8, "max_len_seq": 96},
+        **{"tokenizer_max_length": 12, "max_state_dim": 20, "num_image_views": 3, "action_mode": "ee6d"},
+        "florence_config": {"vision_config": vision, "text_config": text, "vocab_size": 100, "projection_dim": 32},
+    }
+    torch.manual_seed(0)
+    return XVLAPolicy(XVLAConfig(**{**settings, **changes})).eval()
+
+
+def small_act(**changes: Any) -> Any:
+    """An ACTPolicy of three decoder blocks, on the stand-in for torchvision's ResNet."""
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.act.modeling_act import ACTPolicy
+
+    settings: dict[str, Any] = {
+        **features(64, 96),
+        **{"chunk_size": 5, "n_action_steps": 5, "dim_model": 32, "n_heads": 4, "dim_feedforward": 48},
+        **{"n_encoder_layers": 2, "n_decoder_layers": 3, "latent_dim": 8, "pretrained_backbone_weights": None},
+    }
+    torch.manual_seed(0)
+    return ACTPolicy(ACTConfig(**{**settings, **changes})).eval()
+
+
+def small_pi0_fast(**changes: Any) -> Any:
+    """A PI0FastPolicy of three blocks. The check for LeRobot's own transformers is answered, its tokenizers are none.
+
+    The class fixes sizes that a small model cannot have: its configuration and its projector are made smaller here.
+    """
+    from lerobot.policies.pi0_fast import modeling_pi0_fast as module
+    from lerobot.policies.pi0_fast.configuration_pi0_fast import PI0FastConfig
+    from transformers import PaliGemmaConfig
+
+    check = ModuleType("transformers.models.siglip.check")
+    check.check_whether_transformers_replace_is_installed_correctly = lambda: True  # type: ignore[attr-defined]
+
+    def configuration() -> Any:
+        vision = {
+            **{"model_type": "siglip_vision_model", "hidden_size": 32, "intermediate_size": 48},
+            **{"num_hidden_layers": 2, "num_attention_heads": 2, "image_size": 56, "patch_size": 14},
+            "vision_use_head": False,
+        }
+        return PaliGemmaConfig(vision_config=vision, text_config={"model_type": "gemma"}, projection_dim=32)
+
+    sizes = module.GemmaConfig(width=32, depth=3, mlp_dim=48, num_heads=4, num_kv_heads=1, head_dim=8)
+    settings: dict[str, Any] = {
+        **features(56, 56),
+        **{"n_action_steps": 3, "chunk_size": 3, "max_decoding_steps": 5, "tokenizer_max_length": 9},
+        **{"image_resolution": (56, 56)},
+    }
+    tokenizer = SimpleNamespace(bos_token_id=2)
+    torch.manual_seed(0)
+    with (
+        mock.patch.dict(sys.modules, {"transformers.models.siglip.check": check}),
+        mock.patch("transformers.models.siglip.check", check, create=True),
+        mock.patch.object(module, "CONFIG_MAPPING", {"paligemma": configuration}),
+        mock.patch.object(module, "get_gemma_config", return_value=sizes),
+        mock.patch("transformers.AutoProcessor.from_pretrained", return_value=tokenizer),
+        mock.patch("transformers.AutoTokenizer.from_pretrained", return_value=tokenizer),
+    ):
+        policy = module.PI0FastPolicy(PI0FastConfig(**{**settings, **changes}))
+    policy.model.paligemma_with_expert.paligemma.model.multi_modal_projector.linear = torch.nn.Linear(32, 32)
+    # The tokens themselves, as actions: what turns them into actions is another network's tokenizer.
+    policy.detokenize_actions = lambda tokens, action_horizon, action_dim: tokens[:, :action_horizon, None].float()
+    return policy.eval()

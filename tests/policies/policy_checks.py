@@ -1,0 +1,167 @@
+"""What is checked of every policy with a layout: by other means than the recorder's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import vla_attention as va
+from tests.policies.word_tokenizer import INSTRUCTION, WordTokenizer
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
+from vla_attention.capture.torch_policies.call_order import CallOrder
+from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
+from vla_attention.capture.torch_policies.watch import seen_by_python, watch_attention
+from vla_attention.schemas.layout import Role
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.verify import verify_store
+
+#: Rows of the kernel's own logits in float32, computed twice.
+ROW_TOLERANCE = 2e-6
+#: Where the policy computes in float32.
+PRODUCT_TOLERANCE = 1e-5
+
+
+@dataclass
+class PolicyCase:
+    """A policy and how it is called.
+
+    call: makes one policy call from an observation and returns the actions; the same numbers at every call.
+    observation: what `call` takes. frames: camera -> picture (3, height, width) with numbers from 0 to 1.
+    """
+
+    policy: Any
+    layout: PolicyLayout
+    call: Callable[[Any], Tensor]
+    observation: Any
+    frames: Mapping[str, Tensor] = field(default_factory=dict)
+    state: Tensor | None = None
+    instruction: str = INSTRUCTION
+
+
+def record(case: PolicyCase, path: Path, replans: int = 2, **settings: Any) -> Any:
+    """Record one episode and return the opened store; checks that actions are bit-equal and that the store is whole."""
+    with seen_by_python():
+        expected = case.call(case.observation)
+    settings = {"tokenizer": WordTokenizer(), "bits": 23, "durable": False, "queries": "all", "layers": None} | settings
+    settings.setdefault("denoise_steps", ["all"])
+    with (
+        va.record(path / "run.zarr", case.policy, layout=case.layout, untrained=True, **settings) as run,
+        run.episode(task_id=0, episode_index=0, instruction=case.instruction, seed=7) as episode,
+    ):
+        for step in range(replans):
+            with episode.replan(env_step=10 * step, frames=case.frames, state=case.state) as replan:
+                actions = case.call(case.observation)
+                replan.actions = actions[0]
+            assert replan.recorded
+            if "knockout" not in settings:
+                torch.testing.assert_close(actions, expected, rtol=0, atol=0)
+        episode.success = True
+    store = open_store(path / "run.zarr")
+    assert verify_store(store) == []
+    if "knockout" not in settings:
+        assert run.largest_error < PRODUCT_TOLERANCE
+    return store
+
+
+def rows_of(store: Any, site: str) -> np.ndarray:
+    """Rows (replan, layer, denoise, head, query, key) of the first episode."""
+    return np.asarray(store.episodes[0].read(f"{site}/rows"))
+
+
+def roles_of(store: Any, site: str, replan: int = 0) -> list[str]:
+    """Roles of a site's keys at one replan."""
+    return [Role(int(code)).label for code in store.episodes[0].read(f"{site}/key_role")[replan]]
+
+
+def check_rows(store: Any, site: str, expected: np.ndarray) -> None:
+    """Compare the first replan's rows with rows (layer, denoise, head, query, key) that were computed by hand."""
+    np.testing.assert_allclose(rows_of(store, site)[0], expected, atol=ROW_TOLERANCE, rtol=0)
+
+
+class _Values:
+    """Keeps the values of the recorded calls of one block and denoise step."""
+
+    def __init__(self, layout: PolicyLayout, site: str, block: int) -> None:
+        self.order, self.site, self.block = CallOrder(layout), site, block
+        self.values: Tensor | None = None
+        self.keys: np.ndarray | None = None
+
+    def change(self, shape: CallShape) -> None:
+        """Change nothing."""
+
+    def saw(self, call: AttentionCall) -> None:
+        """Keep the values of the first call of the block."""
+        place = self.order.place(call.shape, ran=True)
+        if place is not None and (place.site, place.block) == (self.site, self.block) and self.values is None:
+            self.values = call.value.detach().clone()
+            self.keys = place.keys
+
+
+def values_of(case: PolicyCase, site: str, block: int, observation: Any) -> np.ndarray:
+    """Return the values (key of the site, number) of a block's first call; NaN for keys that the call does not have."""
+    watcher = _Values(case.layout, site, block)
+    with watch_attention(case.policy, watcher):
+        case.call(observation)
+    assert watcher.values is not None
+    numbers = watcher.values[0].transpose(0, 1).flatten(1).float().numpy()
+    keys = np.arange(len(numbers)) if watcher.keys is None else watcher.keys
+    values = np.full((case.layout.site(site).keys.num_keys, numbers.shape[1]), np.nan, dtype=np.float32)
+    values[keys] = numbers
+    return values
+
+
+def changed_spans(case: PolicyCase, site: str, observation: Any, block: int = 0) -> list[str]:
+    """Return the spans whose keys change with the observation, at a block whose keys are not mixed yet.
+
+    Fails unless all keys of a span change or none does.
+    """
+    before, after = (values_of(case, site, block, given) for given in (case.observation, observation))
+    moved = ~np.isclose(before, after, atol=1e-7, rtol=1e-5, equal_nan=True).all(axis=1)
+    names = []
+    for span in case.layout.site(site).keys.spans:
+        part = moved[span.start : span.stop]
+        if part.any():
+            assert part.all(), f"{span.name}: keys {np.flatnonzero(~part).tolist()} do not change"
+            names.append(span.name)
+    return names
+
+
+@contextmanager
+def kept_outputs(modules: Sequence[Any], pick: Callable[[Any, tuple[Any, ...], Any], Any]) -> Any:
+    """Collect `pick(module, inputs, output)` of every forward of the modules: a list for each module."""
+    kept: list[list[Any]] = [[] for _ in modules]
+
+    def hook_of(number: int) -> Any:
+        return lambda module, inputs, output: kept[number].append(pick(module, inputs, output))
+
+    handles = [module.register_forward_hook(hook_of(number)) for number, module in enumerate(modules)]
+    try:
+        yield kept
+    finally:
+        for handle in handles:
+            handle.remove()
+
+
+def softmax_rows(query: Tensor, key: Tensor, scale: float, mask: Tensor | None = None) -> np.ndarray:
+    """Rows (head, query, key) of (head, query, dim) and (head, key, dim) in float64; mask: True where a key is seen."""
+    logits = query.double() @ key.double().transpose(-1, -2) * scale
+    if mask is not None:
+        logits = logits.masked_fill(~mask, float("-inf"))
+    return torch.softmax(logits, dim=-1).detach().numpy()
+
+
+def check_analysis(path: Path, sites: Sequence[str], *, ratios: bool = True) -> None:
+    """Run the questions of the analysis that a store of one episode can answer, at every site."""
+    run = va.open(path / "run.zarr")
+    for site in sites:
+        masses = run.masses(site=site)
+        assert masses.height > 0
+        if ratios:
+            assert run.ratios(site=site).height > 0
