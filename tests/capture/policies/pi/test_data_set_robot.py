@@ -1,0 +1,139 @@
+"""The robot of a data set for each kind of pi checkpoint: cameras, sizes, relative actions, openpi's DROID."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from tests.kit.pi_golden import GOLDEN
+from tests.kit.small_tokenizer import train_small_tokenizer
+from vla_attention.capture.policies.pi.case import read_config
+from vla_attention.capture.policies.pi.config import find_config
+from vla_attention.capture.policies.pi.data_set_robot import openpi_robot, untrained_robot
+from vla_attention.capture.policies.pi.lerobot_processing import lerobot_image
+from vla_attention.capture.policies.pi.loading import CheckpointOptions, choose_config, load_pi_policy
+from vla_attention.capture.policies.robot import Robot, RobotData
+from vla_attention.schemas.errors import BadArgument
+
+DROID = RobotData(
+    name="droid",
+    cameras=("exterior_image_1_left", "exterior_image_2_left", "wrist_image_left"),
+    numbers={"joint_position": 7, "gripper_position": 1, "actions": 8},
+)
+DROID_ROBOT = Robot(
+    cameras={"base_0_rgb": "exterior_image_1_left", "left_wrist_0_rgb": "wrist_image_left"},
+    state=("joint_position", "gripper_position"),
+    state_dim=8,
+    actions=("actions",),
+    action_dim=8,
+)
+
+
+def openpi_checkpoint(folder, case, asset, state, actions):
+    """A golden checkpoint in openpi's PyTorch format with the statistics of another robot.
+
+    The golden pi0 is LeRobot's, whose tensors are the same.
+    """
+    stored = GOLDEN / case / "checkpoint_openpi_torch"
+    shutil.copytree(stored if stored.is_dir() else GOLDEN / case / "checkpoint_lerobot", folder / "checkpoint")
+    shutil.rmtree(folder / "checkpoint" / "assets", ignore_errors=True)
+    generator = np.random.default_rng(0)
+
+    def statistics(size):
+        low = generator.uniform(-1, 0, size)
+        numbers = {"mean": low + 0.5, "std": np.full(size, 0.4), "q01": low, "q99": low + 1}
+        return {name: values.tolist() for name, values in numbers.items()}
+
+    path = folder / "checkpoint" / "assets" / asset / "norm_stats.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps({"norm_stats": {"state": statistics(state), "actions": statistics(actions)}}))
+    return folder / "checkpoint"
+
+
+@pytest.fixture(scope="module")
+def tokenizer(tmp_path_factory):
+    return train_small_tokenizer(tmp_path_factory.mktemp("tokenizer") / "small.model")
+
+
+def test_openpi_s_conversion_of_droid_is_known_by_its_columns(tmp_path):
+    folder = openpi_checkpoint(tmp_path, "pi05_batch2", "droid", 8, 8)
+    assert openpi_robot(folder, DROID, relative_actions=0) == DROID_ROBOT
+
+
+@pytest.mark.parametrize(("case", "name"), [("pi05_batch2", "pi05_droid"), ("pi0_batch2", "pi0_droid")])
+def test_openpi_s_configuration_of_droid_is_known_by_its_statistics(tmp_path, case, name):
+    folder = openpi_checkpoint(tmp_path, case, "droid", 8, 8)
+    # This one states small sizes of its own in config.json; a released one does not.
+    (folder / "config.json").write_text(json.dumps({"action_dim": 32, "action_horizon": 15}))
+    config, source = choose_config(folder, "openpi_torch", CheckpointOptions(), of_data_set=True)
+    assert config == find_config(name)
+    assert name in source
+    assert choose_config(folder, "openpi_torch", CheckpointOptions())[0] is None
+
+
+def test_openpi_s_numbers_of_droid():
+    # openpi/training/config.py: Pi0Config(action_horizon=15, pi05=True) and Pi0Config(action_horizon=10)
+    new, old = find_config("pi05_droid"), find_config("pi0_droid")
+    assert (new.action_horizon, new.max_token_len, new.discrete_state_input, new.pi05) == (15, 200, True, True)
+    assert (old.action_horizon, old.max_token_len, old.discrete_state_input, old.pi05) == (10, 48, False, False)
+
+
+def test_actions_of_a_robot_are_unnormalised_and_made_absolute(tmp_path, tokenizer):
+    folder = openpi_checkpoint(tmp_path, "pi05_batch2", "trossen", 14, 14)
+    data = RobotData(
+        "bimanual", ("observation.images.cam_high",), {"observation.state": 14, "action": 14},
+        chosen_cameras={"left_wrist_0_rgb": "none"}, relative_actions=6,
+    )  # fmt: skip
+    config = read_config(GOLDEN / "pi05_batch2" / "case.json")
+    policy = load_pi_policy(folder, tokenizer, config=config, data=data)
+    assert policy.robot.cameras == {"base_0_rgb": "observation.images.cam_high"}
+    state = np.linspace(-0.5, 0.5, 14)
+    model = np.random.default_rng(1).uniform(-1, 1, (config.action_horizon, config.action_dim))
+    stats = json.loads(next(folder.rglob("norm_stats.json")).read_text())["norm_stats"]["actions"]
+    low, high = (np.array(stats[name]) for name in ("q01", "q99"))
+    expected = (model[:, :14] + 1) / 2 * (high - low + 1e-6) + low
+    expected[:, :6] += state[:6]
+    np.testing.assert_allclose(policy.processing.environment_actions(model, state), expected, atol=1e-12)
+    picture = np.random.default_rng(2).integers(0, 255, (56, 56, 3)).astype(np.uint8)
+    prepared = policy.prepare_robot({"observation.images.cam_high": picture}, state, "fold the towel")
+    np.testing.assert_array_equal(prepared.frames["base_0_rgb"], picture)  # not turned around
+    assert policy.act(prepared, 0).shape == (config.action_horizon, 14)
+    with pytest.raises(BadArgument, match=r"shape \(8,\); expected \(14,\)"):
+        policy.prepare_robot({"observation.images.cam_high": picture}, state[:8], "fold the towel")
+
+
+def test_pictures_of_data_sets_are_not_turned():
+    picture = np.random.default_rng(0).integers(0, 255, (40, 60, 3)).astype(np.uint8)
+    turned = lerobot_image(np.ascontiguousarray(picture[::-1, ::-1]), 28)
+    assert np.array_equal(lerobot_image(picture, 28, turned=False), turned)
+
+
+def test_padded_statistics_say_nothing_of_the_robot(tmp_path):
+    folder = openpi_checkpoint(tmp_path, "pi05_batch2", "anything", 32, 32)
+    robot = openpi_robot(folder, DROID, relative_actions=0)
+    assert (robot.state_dim, robot.action_dim) == (8, 8)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"numbers": {"joint_position": 6, "gripper_position": 1, "actions": 8}}, "states have 8 numbers, .* 7:"),
+        ({"numbers": {"joint_position": 7, "gripper_position": 1, "actions": 7}}, "actions have 8 numbers, .* 7:"),
+        ({"numbers": {"joints": 7, "actions": 8}}, "the state is not known; give --state COLUMN"),
+        ({"numbers": {"joint_position": 7, "gripper_position": 1}}, "the actions is not known; give --action COLUMN"),
+        ({"relative_actions": -1}, "Cannot use --relative-actions -1"),
+        ({"cameras": ()}, "'base_0_rgb' has no pictures .* whose cameras are none"),
+    ],
+)
+def test_what_does_not_fit_the_checkpoint_is_said(tmp_path, changes, message):
+    folder = openpi_checkpoint(tmp_path, "pi05_batch2", "droid", 8, 8)
+    with pytest.raises(BadArgument, match=message):
+        openpi_robot(folder, RobotData(**{**vars(DROID), **changes}), relative_actions=0)
+
+
+def test_a_robot_with_more_numbers_than_a_model_takes_is_refused():
+    with pytest.raises(BadArgument, match=r"state of the data set 'droid' have 40 numbers; openpi's models take 32"):
+        untrained_robot(RobotData("droid", DROID.cameras, {"state": 40, "actions": 7}))
