@@ -8,7 +8,7 @@ the seed and its own number only: parts are made by any number of processes, and
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -87,14 +87,17 @@ class Demonstrator:
         for environment in self._environments.values():
             environment.close()
 
-    def part(self, number: int) -> Arrays:
-        """Return the samples of one part; failed episodes are left out."""
+    def part(self, number: int, after_episode: Callable[[int], None] = lambda samples: None) -> Arrays:
+        """Return the samples of one part; failed episodes are left out.
+
+        after_episode: is told after every episode how many samples it gave.
+        """
         first = number * self.settings.episodes_per_part
-        samples = [
-            sample
-            for episode in range(first, first + self.settings.episodes_per_part)
-            for sample in self._episode(episode)
-        ]
+        samples: list[dict[str, NDArray[Any]]] = []
+        for episode in range(first, first + self.settings.episodes_per_part):
+            of_episode = list(self._episode(episode))
+            samples += of_episode
+            after_episode(len(of_episode))
         return {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
 
     def _draw_task(self, generator: np.random.Generator) -> tuple[int, CubeTask]:

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from vla_attention.capture.environments.base import EnvironmentSettings, Suite, check_initial_state_index, check_task_id
 from vla_attention.capture.environments.cubes.environment import CubesEnvironment
 from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS
-from vla_attention.capture.environments.suites import find_suite, list_tasks
+from vla_attention.capture.environments.suites import SUITES, find_suite, list_tasks
 from vla_attention.capture.small_policy.processes import share_among_processes
 from vla_attention.capture.small_policy.rollouts import (
     CONDITIONS,
@@ -45,7 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--max-steps", type=int, metavar="N", help="steps of an episode (default: the suite's)")
     parser.add_argument("--seed", type=int, default=7, metavar="N", help="seed of the policy's noise (default: 7)")
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default: 2)")
-    parser.add_argument("--output", type=Path, metavar="FILE", help="JSON file of every episode, which is continued")
+    parser.add_argument(
+        "--output", type=Path, metavar="FILE", help="JSON file of every episode; the same command goes on with it"
+    )
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,8 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.output is not None and len(outcomes) % 20 == 0:
             _write(arguments.output, evaluation, outcomes)
 
+    if evaluation.checkpoint != EXPERT and missing:
+        _check_policy(evaluation)  # once, before every process would fail at it
     with tqdm(total=len(missing), unit="episode", disable=None) as bar:
         work = partial(_evaluate, evaluation, condition)
         complete = share_among_processes(work, missing, arguments.workers, keep, bar)
@@ -91,7 +95,10 @@ def run(arguments: argparse.Namespace) -> int:
 def _planned(arguments: argparse.Namespace, suite: Suite) -> tuple[Evaluation, list[Job]]:
     """Return what is evaluated and its tasks with initial states; raise `BadArgument` for options that cannot be."""
     if suite.kind != "cubes":
-        raise BadArgument(f"Cannot evaluate in the suite '{suite.name}'; expected one of cubes.")
+        raise BadArgument(
+            f"Cannot evaluate in the suite '{suite.name}'; expected one with the cubes: "
+            f"{listing(known.name for known in SUITES if known.kind == 'cubes')}."
+        )
     if arguments.condition not in CONDITIONS:
         raise unknown_name("condition", arguments.condition, CONDITIONS)
     if arguments.checkpoint == EXPERT and arguments.condition != "normal":
@@ -102,6 +109,10 @@ def _planned(arguments: argparse.Namespace, suite: Suite) -> tuple[Evaluation, l
         given = getattr(arguments, option)
         if given is not None and given < 1:
             raise BadArgument(f"Cannot use --{option.replace('_', '-')} {given}; expected at least 1.")
+    if arguments.seed < 0:
+        raise BadArgument(f"Cannot use --seed {arguments.seed}; expected at least 0.")
+    if arguments.output is not None and not arguments.output.absolute().parent.is_dir():
+        raise BadArgument(f"Cannot write '{arguments.output}': there is no folder '{arguments.output.parent}'.")
     tasks = list_tasks(suite)
     numbers = arguments.task_id if arguments.task_id is not None else list(range(suite.num_tasks))
     for number in numbers:
@@ -119,6 +130,18 @@ def _planned(arguments: argparse.Namespace, suite: Suite) -> tuple[Evaluation, l
     return evaluation, [(task, state) for task in numbers for state in range(arguments.episodes)]
 
 
+def _check_policy(evaluation: Evaluation) -> None:
+    """Raise a `UserError` if the policy cannot be built, or gives fewer actions than are to be executed."""
+    from vla_attention.capture.policies.pi.build import build_pi_policy
+
+    policy = build_pi_policy(evaluation.checkpoint, tokenizer=None, device="cpu")
+    if (evaluation.replan_steps or 1) > policy.action_horizon:
+        raise BadArgument(
+            f"Cannot use --replan-steps {evaluation.replan_steps}: a policy call of '{evaluation.checkpoint}' gives "
+            f"{policy.action_horizon} actions."
+        )
+
+
 def _evaluate(
     evaluation: Evaluation, condition: Condition, jobs: Sequence[Job], results: multiprocessing.Queue[Outcome]
 ) -> None:
@@ -130,10 +153,6 @@ def _evaluate(
     is_expert = evaluation.checkpoint == EXPERT
     policy = None if is_expert else build_pi_policy(evaluation.checkpoint, tokenizer=None, device="cpu")
     replan_steps = evaluation.replan_steps or (1 if policy is None else policy.default_replan_steps)
-    if policy is not None and replan_steps > policy.action_horizon:
-        raise BadArgument(
-            f"Cannot use --replan-steps {replan_steps}: the policy gives {policy.action_horizon} actions a call."
-        )
     settings = RolloutSettings(evaluation.max_steps, replan_steps, evaluation.seed, condition)
     tasks = list_tasks(find_suite(evaluation.suite))
     environment: CubesEnvironment | None = None
@@ -188,8 +207,8 @@ def _read(path: Path | None, evaluation: Evaluation) -> list[Outcome]:
         return []
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        of, episodes = content["evaluation"], [Outcome(**entry) for entry in content["episodes"]]
-    except (ValueError, TypeError, KeyError):
+        of, episodes = dict(content["evaluation"]), [Outcome(**entry) for entry in content["episodes"]]
+    except (OSError, ValueError, TypeError, KeyError):
         raise BadArgument(
             f"Cannot go on with '{path}': it is no file of this command, or of a version that did not say what its "
             "episodes are of; give another --output."

@@ -18,6 +18,7 @@ from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.preprocess import ENVIRONMENT_ACTION_DIM
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
 from vla_attention.capture.small_policy.network import small_config
+from vla_attention.capture.small_policy.processes import new_folder
 from vla_attention.capture.small_policy.training import SETTINGS, TOKENIZER, read_average
 from vla_attention.schemas.errors import BadArgument
 
@@ -69,6 +70,7 @@ def export(training: Path, folder: Path, name: str) -> dict[str, Any]:
     }
     partial = folder.with_name(folder.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
+    new_folder(partial, "checkpoint")
     (partial / "assets" / "cubes").mkdir(parents=True)
     rounded = {key: tensor.to(torch.bfloat16).contiguous() for key, tensor in weights.items()}
     save_file(rounded, partial / "model.safetensors")

@@ -22,4 +22,5 @@ def run(arguments: argparse.Namespace) -> int:
     print(
         f"{arguments.folder}: {card['parameters']:,} parameters after {card['steps']} steps, control {card['control']}"
     )
+    print(f"Next: python -m vla_attention.capture.small_policy evaluate {arguments.folder}")
     return 0

@@ -77,7 +77,10 @@ class LossLog:
                 ("held_out", "held-out scenes (averaged weights)", _HELD_OUT, 2.0),
             ):
                 points = [(int(row["step"]), float(row[f"{prefix}_{part}"])) for row in rows if row[f"{prefix}_{part}"]]
-                axis.plot(*zip(*points, strict=True), color=colour, linewidth=width, label=label) if points else None
+                # One measurement is a line without length: its marker shows it.
+                marker = "o" if len(points) == 1 else ""
+                x, y = zip(*points, strict=True) if points else ((), ())
+                axis.plot(x, y, color=colour, linewidth=width, marker=marker, label=label)
             axis.set_yscale("log")
             axis.set_title(title, fontsize=9)
             axis.set_xlabel("step")

@@ -5,14 +5,25 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.errors import BadArgument, UserError
 
 #: Takes the jobs of one process and the queue of its results.
 Work = Callable[[Sequence[Any], "multiprocessing.Queue[Any]"], None]
+
+
+def new_folder(folder: Path, content: str) -> None:
+    """Make a folder if there is none; raises `BadArgument`, which says for what it was meant."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadArgument(
+            f"Cannot make the folder '{folder}' for the {content} ({error.strerror}); give another one."
+        ) from error
 
 
 class WorkRefused(UserError):

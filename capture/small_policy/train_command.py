@@ -43,6 +43,8 @@ def run(arguments: argparse.Namespace) -> int:
     num_tasks = len(CUBE_TASKS) if arguments.tasks is None else arguments.tasks
     if not 1 <= num_tasks <= len(CUBE_TASKS):
         raise BadArgument(f"Cannot use --tasks {num_tasks}; expected 1 to {len(CUBE_TASKS)}.")
+    if arguments.new_demonstrations and not arguments.resume:
+        raise BadArgument("--new-demonstrations is for a training that goes on; give --resume too.")
     import torch
 
     from vla_attention.capture.small_policy.training import TrainingSettings, train
@@ -57,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     instructions = tuple(task.instruction for task in CUBE_TASKS)
     demonstrations = read_demonstrations(arguments.demonstrations, _say)
-    train(
+    training = train(
         demonstrations,
         instructions,
         arguments.output,
@@ -66,6 +68,8 @@ def run(arguments: argparse.Namespace) -> int:
         new_demonstrations=arguments.new_demonstrations,
         say=_say,
     )
+    _say(f"{training.step} steps are done; {arguments.output} has checkpoint.pt, log.csv and loss.png.")
+    _say(f"Next: python -m vla_attention.capture.small_policy export {arguments.output} FOLDER")
     return 0
 
 

@@ -25,6 +25,7 @@ from vla_attention.capture.small_policy.dataset import Control, Demonstrations, 
 from vla_attention.capture.small_policy.loss_log import LossLog
 from vla_attention.capture.small_policy.network import initial_model, small_config
 from vla_attention.capture.small_policy.objectives import Heads, losses, total
+from vla_attention.capture.small_policy.processes import new_folder
 from vla_attention.capture.small_policy.vocabulary import make_tokenizer
 from vla_attention.schemas.errors import BadArgument, UserError
 
@@ -62,6 +63,8 @@ class TrainingSettings:
     checkpoint_minutes: float = 3.0
 
     def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise BadArgument(f"seed is {self.seed}; it must be at least 0.")
         for name in ("steps", "num_tasks", "batch_size", "log_every", "evaluate_every"):
             if getattr(self, name) < 1:
                 raise BadArgument(f"{name} is {getattr(self, name)}; it must be at least 1.")
@@ -192,7 +195,7 @@ def train(
     with others than before; the statistics of the states stay. stop_at: end before this step, as a kill would after a
     checkpoint.
     """
-    output.mkdir(parents=True, exist_ok=True)
+    new_folder(output, "training")
     tokenizer_file = output / TOKENIZER
     tokenizer_file.write_bytes(make_tokenizer())
     tokenizer = PromptTokenizer(tokenizer_file)

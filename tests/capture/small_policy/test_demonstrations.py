@@ -13,11 +13,12 @@ from vla_attention.capture.small_policy.demonstrations import HORIZON, Demonstra
 @pytest.mark.simulator
 def test_a_part_depends_on_its_number_alone() -> None:
     demonstrator = Demonstrator(DemonstrationSettings(episodes_per_part=1))
-    first = demonstrator.part(0)
+    given: list[int] = []
+    first = demonstrator.part(0, after_episode=given.append)
     demonstrator.part(1)
     again = demonstrator.part(0)
     demonstrator.close()
-    assert len(first["task"]) > 0
+    assert given == [len(first["task"])] != [0]
     assert first["actions"].shape[1:] == (HORIZON, 7)
     assert np.abs(first["actions"]).max() <= 1.0
     for name, values in first.items():

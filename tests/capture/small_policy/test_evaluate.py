@@ -109,6 +109,10 @@ def refused(capsys, *words: str) -> str:
         (("--episodes", "0"), "--episodes 0; expected at least 1"),
         (("--max-steps", "0"), "--max-steps 0; expected at least 1"),
         (("--replan-steps", "0"), "--replan-steps 0; expected at least 1"),
+        (("--replan-steps", "11"), "--replan-steps 11: a policy call of 'pi05_cubes' gives 10 actions"),
+        (("--seed", "-1"), "--seed -1; expected at least 0"),
+        (("--suite", "libero_10"), "cubes, cubes_harder, cubes_marked, cubes_mark_only"),
+        (("--output", "/nowhere/rates.json"), "there is no folder '/nowhere'"),
         (("--episodes", "51"), "Initial state 50 does not exist"),
         (("--condition", "switched", "--task-id", "12"), "(lift_leftmost) with another colour"),
     ],
@@ -117,8 +121,12 @@ def test_what_cannot_be_evaluated_is_one_sentence(capsys, words, message) -> Non
     assert message in refused(capsys, "pi05_cubes", *words)
 
 
-def test_a_mistake_that_a_process_finds_is_one_sentence(capsys) -> None:
-    assert "There is no checkpoint folder at '/nowhere'" in refused(capsys, "/nowhere", "--workers", "1")
+def test_a_wrong_checkpoint_is_found_before_any_process_starts(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(evaluate_command, "share_among_processes", None)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    assert "There is no checkpoint folder at '/nowhere'" in refused(capsys, "/nowhere")
+    assert "'empty' is not a pi checkpoint" in refused(capsys, "empty")
 
 
 def test_a_file_of_another_evaluation_is_not_continued(tmp_path, capsys) -> None:
