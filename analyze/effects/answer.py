@@ -28,7 +28,11 @@ def answer_lines(study: EffectStudy) -> list[str]:
     lines = [noise_sentence(study)]
     lines += [side_sentence(rows[name], name) for name in sides if name in rows]
     if study.analysis.headline is not None:
-        lines.append(f"Attention in the same replans: {_uncapitalised(ratio_sentence(study.analysis.headline))}")
+        measured, every = study.measured[0], study.analysis.overall["num_episodes"]
+        where = "the same replans"
+        if measured < every:
+            where = f"all {every} episodes of the base, of which effects were measured in {measured}"
+        lines.append(f"Attention in {where}: {_uncapitalised(ratio_sentence(study.analysis.headline))}")
     lines.append(beyond(study, "minus_noise", "an effect beyond the noise"))
     return lines
 

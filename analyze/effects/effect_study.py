@@ -108,6 +108,12 @@ class EffectStudy:
         """Success and length of paired rollouts, see `rollouts.rollout_summary`."""
         return rollout_summary(self.rollout_episodes, self.question.settings.intervals)
 
+    @property
+    def measured(self) -> tuple[int, int]:
+        """The numbers of episodes and tasks in which any effect was measured: a rerun may have a part of the base's."""
+        whole = self.episodes.select("suite", "task_id", "episode_index").unique()
+        return len(whole), len(whole.select("suite", "task_id").unique())
+
     def of(self, condition: Condition) -> dict[str, Any]:
         """The row of `summary` over all tasks and replans."""
         return self.summary.row(

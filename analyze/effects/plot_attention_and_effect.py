@@ -34,8 +34,7 @@ def plot_attention_and_effect(study: EffectStudy, folder: Path) -> list[Path]:
     """Draw groups by mass and by lift (x) and by the effect of knocking them out (y); returns png, pdf and csv."""
     rows = [row for row in group_rows(study) if row.without is not None and row.attention["mass"]]
     figure = new_figure(9.4, 4.6)
-    overall = study.analysis.overall
-    n = of_tasks(overall["num_episodes"], overall["num_tasks"])
+    n = of_tasks(*study.measured)
     note = (
         f"Each point: a group of keys that was knocked out; n = {n}. Bars: {interval_name(DEFAULT_LEVEL)}s, about "
         f"{study.question.settings.intervals.words}. Attention is the base's, in the same replans. "

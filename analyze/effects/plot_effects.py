@@ -76,9 +76,8 @@ def plot_effects(study: EffectStudy, folder: Path) -> list[Path]:
 
 
 def _title(figure: Figure, study: EffectStudy, num_rows: int) -> None:
-    overall = study.analysis.overall
     note = (
-        f"n = {of_tasks(overall['num_episodes'], overall['num_tasks'])}. Bars: {interval_name(DEFAULT_LEVEL)}s, about "
+        f"n = {of_tasks(*study.measured)}. Bars: {interval_name(DEFAULT_LEVEL)}s, about "
         f"{study.question.settings.intervals.words}; none where there can be none, and very long ones are cut."
     )
     headline = study.analysis.headline

@@ -365,3 +365,11 @@ def test_what_is_seen_and_read_is_told_without_a_ratio_too(folder):
     study = study_effects(folder / "base.zarr", series, AnalysisSettings(groups=("image=role:image",)))
     assert study.analysis.grouping.ratio is None
     assert "Without visual the action changes by 1.2" in " ".join(effects_text(study).split())
+
+
+def test_a_rerun_of_a_part_is_not_said_to_be_of_all(study):
+    part = replace(study, episodes=study.episodes.filter(pl.col("task_id") == 0))
+    assert (study.measured, part.measured) == ((6, 3), (2, 1))
+    text = " ".join(effects_text(part).split())
+    assert "Attention in all 6 episodes of the base, of which effects were measured in 2: the ratio" in text
+    assert "in the same replans" not in text
