@@ -144,7 +144,7 @@ def check_selectors(interventions: Interventions, vocabularies: Mapping[str, Voc
 def empty_replans(
     interventions: Interventions, tokens: Mapping[str, EpisodeTokens], vocabularies: Mapping[str, Vocabulary]
 ) -> dict[str, NDArray[np.bool_]]:
-    """Return for every selector the replans in which its group has no key at any site, (replan,) bool.
+    """Return for every selector the replans in which its group has no valid key at any site, (replan,) bool.
 
     tokens: site -> the tokens of an episode or of one replan.
     """
@@ -152,7 +152,8 @@ def empty_replans(
     replans = next(iter(tokens.values())).num_replans
     for selector in selectors_of(interventions):
         weights = selector_weights(selector, tokens, vocabularies)
-        counts = [np.broadcast_to(there.sum(axis=1), replans) for there in weights.values()]
+        # Keys that are masked, such as those of a camera that the suite has not, are none.
+        counts = [np.broadcast_to((there * tokens[site].valid).sum(axis=1), replans) for site, there in weights.items()]
         empty[selector] = np.asarray(sum(counts) == 0)
     return empty
 

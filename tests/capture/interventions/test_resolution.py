@@ -155,6 +155,14 @@ def test_empty_groups():
     assert editors == {}
 
 
+def test_a_camera_whose_keys_are_all_masked_is_an_empty_group():
+    roles = {"joint": np.array([P, P, P, P, B, W, W, W, P, A, A], dtype=np.uint8)}
+    tokens = site_tokens((JOINT,), roles, prompt(4), OBJECTS, COVERAGE)
+    change = Interventions(keys=(KeyKnockout("camera:base"),))
+    with pytest.raises(EmptyGroup, match="'camera:base' of an intervention has no key"):
+        check_not_empty(change, tokens, vocabularies(tokens), PLACE)
+
+
 def test_replans_of_an_episode_in_which_an_object_is_out_of_view():
     coverage = np.stack([COVERAGE["base"], COVERAGE["base"] * 0])
     one = joint()["joint"]
