@@ -19,7 +19,7 @@ from vla_attention.schemas.groupings.words import split_words
 from vla_attention.schemas.interventions import AttentionScale, AttentionUniform, Interventions, KeyKnockout
 from vla_attention.schemas.layers import select_layers
 from vla_attention.schemas.layout import Prompt, Role, SiteLayout
-from vla_attention.schemas.stores.store_format import episode_name
+from vla_attention.schemas.stores.store_format import PolicyIdentity, episode_name
 
 _Edit = KeyKnockout | AttentionScale | AttentionUniform
 _AnyEdit = TypeVar("_AnyEdit", bound=_Edit)
@@ -41,15 +41,25 @@ class ReplanPlace:
         return f"replan {self.replan} of {episode_name(self.task_id, self.episode_index)}"
 
 
+def check_places(interventions: Interventions, policy: Policy | PolicyIdentity) -> None:
+    """Raise `BadArgument` for layers, heads, denoise steps and cameras that a policy, or a store's policy, lacks."""
+    for edit in (*interventions.keys, *interventions.attention):
+        select_layers(edit.layers, policy.num_layers, policy.family)
+        _check_numbers(edit, "head", edit.heads, policy.num_heads)
+        _check_numbers(edit, "denoise step", edit.denoise_steps, policy.num_denoise_steps)
+    for change in interventions.images:
+        if change.camera not in (names := [camera.name for camera in policy.cameras]):
+            raise unknown_name("camera", change.camera, names)
+
+
 def interventions_for(interventions: Interventions, policy: Policy) -> Interventions:
     """Return the interventions with block indices for layer numbers; raise `BadArgument` for what the policy lacks."""
+    check_places(interventions, policy)
 
     def placed(edit: _AnyEdit) -> _AnyEdit:
         if edit.layers is not None:
             blocks = select_layers(edit.layers, policy.num_layers, policy.family).blocks
             edit = replace(edit, layers=tuple(sorted(set(blocks))))
-        _check_numbers(edit, "head", edit.heads, policy.num_heads)
-        _check_numbers(edit, "denoise step", edit.denoise_steps, policy.num_denoise_steps)
         if edit.queries == "prefix" and not policy.has_prefix:
             raise BadArgument(
                 f"The intervention on '{edit.selector}' is on the queries of a prefix, and the policy '{policy.name}' "
@@ -62,9 +72,6 @@ def interventions_for(interventions: Interventions, policy: Policy) -> Intervent
             )
         return edit
 
-    for change in interventions.images:
-        if change.camera not in (names := [camera.name for camera in policy.cameras]):
-            raise unknown_name("camera", change.camera, names)
     return replace(
         interventions,
         keys=tuple(placed(edit) for edit in interventions.keys),
@@ -181,7 +188,7 @@ def make_editors(
 ) -> dict[str, SiteEditor]:
     """Return the editors of one replan, by site; sites whose attention does not change have none.
 
-    An intervention whose group has no key changes nothing.
+    An intervention whose group has no valid key changes nothing.
 
     Args:
         tokens: site -> the replan's tokens, from `site_tokens`.
@@ -195,7 +202,7 @@ def make_editors(
         if isinstance(edit, KeyKnockout) and edit.query_selector:
             readers = selector_weights(edit.query_selector, tokens, vocabularies)
         for site_number, (site, group) in enumerate(weights.items()):
-            if not group.any():
+            if not (group[0] * tokens[site].valid[0]).any():
                 continue
             seed = (place.task_id, place.episode_index, place.replan, number, site_number)
             values = _values(edit, group[0], tokens[site], seed, place)

@@ -8,7 +8,7 @@ from pathlib import Path
 from vla_attention.capture.capture_run import plan_recording
 from vla_attention.capture.command_line import check_writable
 from vla_attention.capture.device import load_torch
-from vla_attention.capture.interventions.resolution import interventions_for
+from vla_attention.capture.interventions.resolution import check_places, interventions_for
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.provenance import describe_machine
@@ -42,14 +42,17 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
     _refuse_options_of_series(arguments)
     interventions = rerun_interventions(arguments)
     check_may_change(base, interventions)
+    # All mistakes that need no model are errors now, before the minutes for loading one. Those of the changes come
+    # first: whoever asks for a layer that there is not would not be helped by another place for the store.
+    check_places(interventions, base.attributes.policy)
+    nothing_changes = check_on_store(interventions, base, allow_empty=arguments.allow_empty)
     target = _target(arguments, base, interventions)
     mode: WriteMode = "overwrite" if arguments.overwrite else "resume" if arguments.resume else "new"
     if target is not None:
-        # An existing store or an unwritable place is an error now, before the minutes for loading a model.
         if mode == "new" and target.exists():
             refuse_existing(target)
         check_writable(target.parent, "--store")
-    for line in check_on_store(interventions, base, allow_empty=arguments.allow_empty):
+    for line in nothing_changes:
         say(line)
     rerun = _prepare(arguments, base, threads, termination)
     interventions = interventions_for(interventions, rerun.policy)

@@ -10,7 +10,7 @@ from pathlib import Path
 from vla_attention.capture.command_line import check_writable
 from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
-from vla_attention.capture.interventions.resolution import TooFewKeys, interventions_for
+from vla_attention.capture.interventions.resolution import TooFewKeys, check_places, interventions_for
 from vla_attention.capture.rerun.base_store import check_may_change
 from vla_attention.capture.rerun.rerun_store import Rerun
 from vla_attention.capture.rerun.series import Series, SeriesCondition, plan_series
@@ -34,10 +34,12 @@ class SeriesRun:
     def planned(cls, arguments: argparse.Namespace, base: Store) -> SeriesRun:
         """Plan the series of the arguments. Needs no policy; errors come before the minutes for loading one."""
         _refuse_own_interventions(arguments)
+        template = _template(arguments)
+        check_places(Interventions(keys=(template,)), base.attributes.policy)
         series = plan_series(
             base,
             arguments.series,
-            _template(arguments),
+            template,
             base.attributes.protocol.seed + 1 if arguments.noise_seed is None else arguments.noise_seed,
             words=arguments.words,
             objects=arguments.objects,

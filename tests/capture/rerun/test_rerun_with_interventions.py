@@ -40,7 +40,7 @@ def test_a_knockout_is_exact_stored_and_applied_again(pi_store, tmp_path, capsys
     store = rerun(pi_store, target, "--knockout", "camera:base_0_rgb", "--knockout-layers", "0", "1")
     knockout = KeyKnockout("camera:base_0_rgb", layers=(0, 1))
     assert store.attributes.interventions.keys == (knockout,)
-    assert store.attributes.interventions.name == "without_camera_base_0_rgb"
+    assert store.attributes.interventions.name == "without_camera_base_0_rgb_layers_0_1"
     assert store.attributes.rerun_of.run == open_store(pi_store).run
     [old], [new] = open_store(pi_store).episodes[:1], store.episodes
     span = store.attributes.sites[0].camera_span("base_0_rgb")
@@ -56,7 +56,8 @@ def test_a_knockout_is_exact_stored_and_applied_again(pi_store, tmp_path, capsys
 
 
 def test_a_knockout_of_keys_without_mass_changes_nothing(pi_store, tmp_path):
-    store = rerun(pi_store, tmp_path / "nothing.zarr", "--knockout", "camera:right_wrist_0_rgb | role:padding")
+    masked = ("--knockout", "camera:right_wrist_0_rgb | role:padding", "--allow-empty")
+    store = rerun(pi_store, tmp_path / "nothing.zarr", *masked)
     [old], [new] = open_store(pi_store).episodes[:1], store.episodes
     np.testing.assert_array_equal(old.read("actions"), new.read("actions"))
     np.testing.assert_array_equal(old.read("joint/rows"), new.read("joint/rows"))
@@ -124,7 +125,32 @@ def test_wrong_interventions_are_one_sentence_and_leave_no_store(pi_store, cosmo
     assert "has no episode of it" in said("--prompt", "task:5")
     assert "There is no head 8" in said("--knockout", "role:image", "--knockout-heads", "8")
     assert "--words belongs to a series" in said("--words")
+    masked = "The group 'camera:right_wrist_0_rgb' of an intervention has no key in 12 of 12 replans"
+    assert masked in said("--knockout", "camera:right_wrist_0_rgb")
+    assert masked in said("--keep", "camera:right_wrist_0_rgb")
     assert "has none" in said("--knockout", "role:instruction", "--knockout-queries", "prefix", base=cosmos_store)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--knockout", "role:image", "--knockout-layers", "99"), "There is no layer 99"),
+        (("--knockout", "role:image", "--knockout-heads", "99"), "There is no head 99"),
+        (("--knockout", "role:image", "--knockout-steps", "99"), "There is no denoise step 99"),
+        (("--knockout", "camera:bsae"), "there is no camera 'bsae'"),
+        (("--image", "bsae=blank"), "Unknown camera 'bsae'"),
+        (("--noise-seed", "3"), "--overwrite"),
+    ],
+)
+def test_mistakes_of_the_changes_come_before_a_store_that_exists(pi_store, cosmos_store, capsys, words, message):
+    sentence = refused(capsys, "rerun", pi_store, "--store", cosmos_store, *words)
+    assert message in sentence
+
+
+def test_a_series_checks_its_places_before_the_policy_is_loaded(pi_store, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("vla_attention.capture.rerun.command._prepare", None)
+    words = ("--series", "default", "--output-dir", tmp_path / "series", "--knockout-layers", "99")
+    assert "There is no layer 99" in refused(capsys, "rerun", pi_store, *words)
 
 
 @pytest.mark.parametrize("option", ["--knockout", "--store", "--prompt"])
