@@ -33,12 +33,14 @@ from vla_attention.analyze.effects.paired_replans import (
     changes_of,
     mean_over_phases,
     pair_episodes,
+    stores_executed,
 )
 from vla_attention.analyze.effects.reruns import BaseAndReruns, open_reruns
 from vla_attention.analyze.effects.rollouts import ROLLOUT_COLUMNS, rollout_pairs, rollout_summary
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens
 from vla_attention.analyze.ratios.analysis import Analysis, analyse
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
 from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE, SHARE, Estimand
@@ -145,30 +147,23 @@ def study_effects(
 def study_of(analysis: Analysis, opened: BaseAndReruns, dimensions: Sequence[int] | None = None) -> EffectStudy:
     """As `study_effects`, of a base that was analysed already."""
     question = analysis.question
-    members = [BaseEpisode.of(item) for item in question.selected]
-    spread = _spread(opened.base, members, question.settings, dimensions)
+    everything = _all_episodes(question, opened.base)
+    all_members = [BaseEpisode.of(item) for item in everything if item.episode.attributes.num_replans]
+    selected = {item.episode.name for item in question.selected}
+    members = [member for member in all_members if member.name in selected]
     names = [episode.name for episode in opened.base.episodes]
     pairings = [pair_episodes(condition, members, names) for condition in opened.reruns]
+    spread = _spread(opened, all_members, question.settings, dimensions)
     notes = [*opened.notes]
-    noise = [pairing for pairing in pairings if pairing.condition.kind == Kind.NOISE]
-    if noise:
-        pairs = [
-            (one.actions, actions_of(one, rerun, pairing.condition))
-            for pairing in noise
-            for one, rerun in pairing.pairs
-        ]
-        spread = with_noise(spread, change_per_dimension(pairs, spread.spread), leave_out=dimensions is None)
+    if not stores_executed(opened.base):
+        notes.append("The base does not store how many steps of a chunk were executed: effects are over whole chunks.")
     groups = [condition.group for condition in opened.reruns if condition.group is not None]
-    attention = group_attention(question, groups) if groups else {}
+    attention = group_attention(question, groups, everything) if groups else {}
     measured = [(pairing, _episodes_of(pairing, spread, attention)) for pairing in pairings]
-    empty = [pairing.condition.name for pairing, rows in measured if not rows.height]
-    if empty:
-        notes.append(
-            f"{listing(empty)} {'is' if len(empty) == 1 else 'are'} left out: in the replans that are compared, the "
-            "group has no key in the base."
-        )
-        if len(empty) == len(measured) and not opened.rollouts:
-            raise BadArgument(f"No rerun of {opened.base.path} can be compared: {notes[-1].rstrip('.')}.")
+    left_out = _left_out([pairing for pairing, rows in measured if not rows.height])
+    if left_out and not any(rows.height for _, rows in measured) and not opened.rollouts:
+        raise BadArgument(f"No rerun of {opened.base.path} can be compared: {' '.join(left_out)}")
+    notes += left_out
     pairings = [pairing for pairing, rows in measured if rows.height]
     opened = replace(opened, reruns=tuple(pairing.condition for pairing in pairings))
     episodes = pl.concat([pl.DataFrame(schema=_EPISODE_SCHEMA), *(rows for _, rows in measured)])
@@ -187,37 +182,76 @@ def study_of(analysis: Analysis, opened: BaseAndReruns, dimensions: Sequence[int
     )
 
 
-def _spread(
-    base: Store, members: Sequence[BaseEpisode], settings: AnalysisSettings, dimensions: Sequence[int] | None
-) -> ActionSpread:
-    """The units, from every episode of the base: they do not change with --tasks.
-
-    With `skip_corrupt`, episodes with damaged actions are left out.
-    """
-    read = {member.name: member.actions for member in members}
-    actions = []
+def _all_episodes(question: Question, base: Store) -> list[SelectedEpisode]:
+    """All episodes of the base, selected or not; with `skip_corrupt`, damaged ones are left out."""
+    known = {item.episode.name: item for item in question.selected}
+    found = []
     for episode in base.episodes:
         try:
-            known = read.get(episode.name)
-            actions.append(episode.read("actions").astype(np.float64) if known is None else known)
+            if episode.name in known:
+                found.append(known[episode.name])
+                continue
+            episode.read("actions")
+            found += load_tokens([(base, episode)], question.site)
         except CorruptEpisode:
-            if not settings.skip_corrupt:
+            if not question.settings.skip_corrupt:
                 raise
-    number = actions[0].shape[2]
+    return found
+
+
+def _left_out(pairings: Sequence[Pairing]) -> list[str]:
+    """Why conditions without any compared replan are left out: a sentence for each reason."""
+    elsewhere = [pairing.condition.name for pairing in pairings if not pairing.pairs]
+    empty = [pairing.condition.name for pairing in pairings if pairing.pairs]
+    reasons = (
+        (elsewhere, "none of the selected episodes was run again."),
+        (empty, "in the replans that are compared, the group has no key in the base."),
+    )
+    return [f"{listing(names)} {_are(names)} left out: {reason}" for names, reason in reasons if names]
+
+
+def _are(names: Sequence[str]) -> str:
+    return "is" if len(names) == 1 else "are"
+
+
+def _spread(
+    opened: BaseAndReruns,
+    members: Sequence[BaseEpisode],
+    settings: AnalysisSettings,
+    dimensions: Sequence[int] | None,
+) -> ActionSpread:
+    """The units, and which dimensions are compared. `members`: every episode of the base.
+
+    Neither changes with --tasks. With `skip_corrupt`, episodes of reruns with damaged actions are left out.
+    """
+    base = opened.base
+    number = members[0].actions.shape[2]
     for dimension in dimensions or ():
         if not 0 <= dimension < number:
             raise BadArgument(
                 f"There is no dimension {dimension} of the action; the actions of {base.path} have the dimensions 0 to "
                 f"{number - 1}."
             )
-    spread = action_spread(actions, dimensions)
+    spread = action_spread([member.actions for member in members], dimensions)
     if not spread.used.any():
         which = f"the dimensions {listing(dimensions)} of the actions" if dimensions else "the actions"
         raise BadArgument(
             f"In {base.path}, {which} are the same in every replan and step, so a change has no unit; give a base that "
             "moves, or other --dimensions."
         )
-    return spread
+    pairs = []
+    for condition in opened.reruns:
+        own = {episode.name: episode for episode in condition.store.episodes if condition.kind == Kind.NOISE}
+        for member in members:
+            try:
+                if member.name in own:
+                    pairs.append((member.actions, actions_of(member, own[member.name], condition)))
+            except CorruptEpisode:
+                if not settings.skip_corrupt:
+                    raise
+    if not pairs:
+        return spread
+    return with_noise(spread, change_per_dimension(pairs, spread.spread), leave_out=dimensions is None)
 
 
 def _episodes_of(pairing: Pairing, spread: ActionSpread, attention: dict[Any, GroupAttention]) -> pl.DataFrame:

@@ -31,7 +31,8 @@ class GroupAttention:
 
     Attributes:
         site: the softmax family whose rows it is of; None where no site has such keys.
-        values: by the name of an episode, (replan, measure) in the order of `MEASURES`; NaN where there is none.
+        values: by the name of an episode, (replan, measure) in the order of `MEASURES`; NaN where there is none. Of a
+            group that has no key in any selected episode, the keys are 0.
         note: why there is no attention, or nothing.
     """
 
@@ -40,37 +41,55 @@ class GroupAttention:
     note: str = ""
 
 
-def group_attention(question: Question, groups: Sequence[GroupOfKeys]) -> dict[GroupOfKeys, GroupAttention]:
+def group_attention(
+    question: Question, groups: Sequence[GroupOfKeys], everything: Sequence[SelectedEpisode] | None = None
+) -> dict[GroupOfKeys, GroupAttention]:
     """Attention of a question's episodes to groups, each in the layers, heads and denoise steps where it was changed.
+
+    `everything`: all of the base's episodes, whose words and objects are the names that exist; those of the question
+    unless given.
 
     A group is read at the question's site, or where it has no keys there and the user chose no site, at the next one
     that has. `lift` is mass per key / mass per valid key, `norm` that of the group's contribution where the group is
     made of whole segments and contributions were recorded.
     """
     names = [site.name for site in question.stores[0].attributes.sites]
-    others = [] if question.settings.site is not None else [name for name in names if name != question.site]
+    others = [name for name in names if name != question.site]
     found: dict[GroupOfKeys, GroupAttention] = {}
+    known: set[GroupOfKeys] = set()
     left = list(dict.fromkeys(groups))
     for site in (question.site, *others):
         if not left:
             break
         try:
-            here = question if site == question.site else _at_site(question, site)
+            here = _at_site(question, site, question.selected if everything is None else everything)
         except BadArgument as error:  # the chosen layers are none of that site's
             found |= {group: GroupAttention(None, {}, str(error)) for group in left if group not in found}
             continue
-        fitting, notes = _fitting(here, left)
+        fitting, empty, notes = _fitting(here, left)
         found |= {group: GroupAttention(None, {}, note) for group, note in notes.items() if group not in found}
-        if fitting:
+        if fitting and (site == question.site or question.settings.site is None):
             found |= _measured(here, fitting)
-        left = [group for group in left if group not in found or found[group].site is None]
-    return found
+        known.update(empty)
+        left = [group for group in left if group not in fitting]
+    # A name that exists in the base, and has no key in the selected episodes: there, nothing was changed.
+    nothing = {item.episode.name: _without_keys(item) for item in question.selected}
+    return found | {group: replace(found[group], values=nothing) for group in left if group in known}
 
 
-def _at_site(question: Question, site: str) -> Question:
+def _at_site(question: Question, site: str, everything: Sequence[SelectedEpisode]) -> Question:
+    if site == question.site:
+        return replace(question, vocabulary=vocabulary_of(everything))
     selected = tuple(load_tokens(question.episodes, site))
+    there = load_tokens([(item.store, item.episode) for item in everything], site)
     selection = select_again(question, site)
-    return replace(question, site=site, selected=selected, vocabulary=vocabulary_of(selected), selection=selection)
+    return replace(question, site=site, selected=selected, vocabulary=vocabulary_of(there), selection=selection)
+
+
+def _without_keys(item: SelectedEpisode) -> Array:
+    values = np.full((item.episode.attributes.num_replans, len(MEASURES)), np.nan)
+    values[:, MEASURES.index("keys")] = 0.0
+    return values
 
 
 def _grouping(groups: Sequence[GroupOfKeys]) -> Grouping:
@@ -82,9 +101,11 @@ def _grouping(groups: Sequence[GroupOfKeys]) -> Grouping:
     return Grouping("conditions", members, overlap=True, allow_empty=tuple(members))
 
 
-def _fitting(question: Question, groups: Sequence[GroupOfKeys]) -> tuple[list[GroupOfKeys], dict[GroupOfKeys, str]]:
-    """The groups that have keys at a site, and why the others have none."""
-    fitting, notes = [], {}
+def _fitting(
+    question: Question, groups: Sequence[GroupOfKeys]
+) -> tuple[list[GroupOfKeys], list[GroupOfKeys], dict[GroupOfKeys, str]]:
+    """The groups that have keys at a site, those whose names exist without any key, and why the others have none."""
+    fitting, empty, notes = [], [], {}
     for group in groups:
         try:
             grouping = _grouping([group])
@@ -96,8 +117,9 @@ def _fitting(question: Question, groups: Sequence[GroupOfKeys]) -> tuple[list[Gr
         if any(one.num_keys.any() for one in resolved):
             fitting.append(group)
         else:
+            empty.append(group)
             notes[group] = f"'{group.text}' has no key at site '{question.site}'."
-    return fitting, notes
+    return fitting, empty, notes
 
 
 def _measured(question: Question, groups: Sequence[GroupOfKeys]) -> dict[GroupOfKeys, GroupAttention]:

@@ -19,7 +19,7 @@ from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.time.alignment import episode_timing, on_episode_time
 from vla_attention.schemas.errors import BadArgument, listing
-from vla_attention.schemas.stores.reader import StoredEpisode
+from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import StoreError
 
 Array = NDArray[np.float64]
@@ -41,7 +41,8 @@ class BaseEpisode:
         actions: (replan, step, dimension).
         env_step: (replan,).
         starts: (replan,) policy steps before each replan.
-        executed: (replan,) how many steps of each chunk were executed.
+        executed: (replan,) how many steps of each chunk were executed; all of them where that is not known
+            (`stores_executed`).
     """
 
     item: SelectedEpisode
@@ -66,14 +67,28 @@ class BaseEpisode:
         actions = item.episode.read("actions").astype(np.float64)
         env_step = item.episode.read("env_step").astype(np.int64)
         starts, num_steps = episode_timing(item.store.attributes, item.episode, env_step)
-        executed = np.diff(np.append(starts, num_steps))
-        return cls(item, actions, env_step, starts, np.minimum(executed, actions.shape[1]))
+        executed = np.full(len(starts), actions.shape[1])
+        if stores_executed(item.store):
+            known = item.store.attributes.protocol.replan_steps
+            until_next = np.diff(np.append(starts, num_steps))
+            executed = np.minimum(executed, np.minimum(until_next, known))
+        return cls(item, actions, env_step, starts, executed)
 
     def over_phases(self, values: Array) -> dict[str, Array]:
         """Means of values (replan, quantity) over the replans (`ALL`) and over the thirds of the episode's time."""
         num_steps = episode_timing(self.item.store.attributes, self.item.episode, self.env_step)[1]
         timed = on_episode_time(values, self.starts, num_steps, len(PHASES))
         return {ALL: finite_mean(values), **dict(zip(PHASES, timed, strict=True))}
+
+
+def stores_executed(store: Store) -> bool:
+    """Whether a store says how many steps of each chunk were executed.
+
+    Of the caller's own loop that is not known where it gave no number, and a replayed data set executes none: there
+    `replan_steps` is the number of frames from one policy call to the next.
+    """
+    protocol = store.attributes.protocol
+    return protocol.name != "dataset" and protocol.replan_steps > 0
 
 
 @dataclass(frozen=True)
@@ -97,21 +112,19 @@ class Pairing:
 
 
 def pair_episodes(condition: Condition, base: Sequence[BaseEpisode], all_names: Sequence[str]) -> Pairing:
-    """Pair a rerun's episodes with the selected ones of its base, by name.
+    """Pair a rerun's episodes with the selected ones of its base, by name; there may be no pair.
 
     `all_names`: the base's episodes, selected or not.
 
     Raises:
-        BadArgument: they share none.
-        StoreError: an episode has other replans than in the base.
+        BadArgument: the rerun holds none of the base's episodes, selected or not.
     """
     own = {episode.name: episode for episode in condition.store.episodes}
     pairs = tuple((one, own[one.name]) for one in base if one.name in own)
-    if not pairs:
+    if not any(name in own for name in all_names):
         raise BadArgument(
-            f"The rerun {condition.store.path} holds none of the {len(base)} selected episodes of its base "
-            f"({listing([one.name for one in base], 3)}); it holds {listing(own, 3)}: let vla-capture rerun finish, or "
-            "choose other --tasks."
+            f"The rerun {condition.store.path} holds none of the {len(all_names)} episodes of its base "
+            f"({listing(all_names, 3)}); it holds {listing(own, 3)}: let vla-capture rerun finish."
         )
     missing = tuple(one.name for one in base if one.name not in own)
     return Pairing(condition, pairs, missing, tuple(name for name in own if name not in all_names))
@@ -132,6 +145,8 @@ def actions_of(base: BaseEpisode, rerun: StoredEpisode, condition: Condition) ->
             "rerun again."
         )
     # A base that was recorded again with the same settings has the digest of the one that was rerun.
+    if not (base.item.episode.has("state") and rerun.has("state")):
+        return actions
     own, others = base.item.episode.read("state"), rerun.read("state")
     if own.shape != others.shape or not np.allclose(own, others, rtol=1e-5, atol=1e-6):
         raise StoreError(

@@ -10,9 +10,9 @@ from vla_attention.analyze.effects.answer import answer_lines, beyond
 from vla_attention.analyze.effects.conditions import FLOORS, Condition, Kind
 from vla_attention.analyze.effects.effect_study import EffectStudy
 from vla_attention.analyze.effects.group_rows import GroupRow, group_rows
-from vla_attention.analyze.effects.paired_replans import ALL, PHASES
+from vla_attention.analyze.effects.paired_replans import ALL, PHASES, stores_executed
 from vla_attention.analyze.show.headings import heading, interval_note, note_lines, wrap
-from vla_attention.analyze.show.numbers import format_number, format_percent, format_signed, row_interval
+from vla_attention.analyze.show.numbers import format_number, format_percent, format_signed, of_tasks, row_interval
 from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
@@ -20,9 +20,14 @@ from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 #: Conditions beside each other in the table of tasks.
 _MOST_IN_TASKS = 4
 _EFFECT_NOTE = (
-    "Effect: root mean square change of the executed actions, each dimension in its standard deviation in the base. "
+    "Effect: root mean square change of the {which} actions, each dimension in its standard deviation in the base. "
     "x noise: times that of another noise seed; random: of equally many random keys. mass, lift: the base's."
 )
+
+
+def counted_actions(study: EffectStudy) -> str:
+    """Which actions of a chunk effects are about, as an adjective."""
+    return "executed" if stores_executed(study.given.base) else "chunk's"
 
 
 def effects_text(study: EffectStudy) -> str:
@@ -43,6 +48,8 @@ def effects_text(study: EffectStudy) -> str:
 def _header(study: EffectStudy) -> str:
     title = "EFFECTS: what the action does without what it could look at or read"
     lines = study.question.header(title, study.analysis.overall["layer"])
+    if study.conditions:
+        lines += wrap(f"Effects were measured in {of_tasks(*study.measured)}.")
     return "\n".join([*lines, "", *(line for text in answer_lines(study) for line in wrap(text))])
 
 
@@ -56,7 +63,7 @@ def _groups(study: EffectStudy) -> str:
     header += ["without", "interval", "x noise", "random", "only", "interval"]
     body = [_group_cells(row, with_norm) for row in rows]
     lines = [heading("WITHOUT IT, AND WITH IT ALONE  effect on the action"), text_table(header, body, left=(0,))]
-    lines += wrap(_EFFECT_NOTE)
+    lines += wrap(_EFFECT_NOTE.format(which=counted_actions(study)))
     lines += wrap(interval_note(DEFAULT_LEVEL, study.question.settings.intervals.words) + " Effects do not add up.")
     return "\n".join(lines)
 
@@ -235,7 +242,10 @@ def _notes(study: EffectStudy) -> str:
 def _attention_notes(study: EffectStudy) -> str:
     """Where attention is of another site, and why a group has none."""
     lines: list[str] = []
+    told = [condition.group for condition in study.conditions]
     for group, found in study.attention.items():
+        if group not in told:
+            continue
         if found.site is None:
             lines += note_lines([f"no attention beside '{group.text}': {found.note}"])
         elif found.site != study.question.site:

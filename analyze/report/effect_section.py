@@ -12,6 +12,7 @@ from vla_attention.analyze.effects.group_rows import GroupRow, group_rows
 from vla_attention.analyze.effects.plot_attention_and_effect import plot_attention_and_effect
 from vla_attention.analyze.effects.plot_effects import plot_effects
 from vla_attention.analyze.effects.reruns import open_reruns
+from vla_attention.analyze.effects.text import counted_actions
 from vla_attention.analyze.ratios.analysis import Analysis
 from vla_attention.analyze.report.pictures import drawn
 from vla_attention.analyze.report.section_parts import (
@@ -32,7 +33,7 @@ from vla_attention.schemas.errors import BadArgument
 _INTERVAL = interval_name(DEFAULT_LEVEL)
 _MEANING = (
     "A group of keys was knocked out, or everything but it, and the same policy calls were run again. The effect is "
-    "the root mean square change of the executed actions, each dimension in its standard deviation in the base; "
+    "the root mean square change of the {which} actions, each dimension in its standard deviation in the base; "
     "effects do not add up. An effect is held against that of another noise seed on the same inputs, and of as many "
     "random keys."
 )
@@ -52,7 +53,10 @@ def effect_section(analysis: Analysis, given: Sequence[Path], folder: Path) -> S
             f"--effects goes with one store, and the report is about {len(stores)}; make a report for each."
         )
     study = study_of(analysis, open_reruns(stores[0], given))
-    parts: list[Part] = [Paragraph(_MEANING, quiet=True), *(Paragraph(line) for line in answer_lines(study) if line)]
+    parts: list[Part] = [
+        Paragraph(_MEANING.format(which=counted_actions(study)), quiet=True),
+        *(Paragraph(line) for line in answer_lines(study) if line),
+    ]
     rows = group_rows(study)
     if study.conditions:
         told = [f"{row.name} {format_number(row.without['effect'])}" for row in rows if row.without is not None]

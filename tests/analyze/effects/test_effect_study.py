@@ -25,6 +25,7 @@ from tests.kit.reruns import (
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.effects.effect_study import study_effects
 from vla_attention.analyze.effects.group_rows import group_rows
+from vla_attention.analyze.effects.paired_replans import BaseEpisode
 from vla_attention.analyze.effects.text import effects_text
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.schemas.errors import BadArgument
@@ -274,7 +275,7 @@ def test_what_does_not_fit_is_refused_in_one_sentence(folder, tmp_path):
     assert "holds no store" in refused(tmp_path / "empty", StoreNotFound)
     assert "There is no store at" in refused(tmp_path / "missing.zarr", StoreNotFound)
     elsewhere = write_rerun(tmp_path / "elsewhere.zarr", base, PLANTED["noise"], tasks=(7,))
-    assert "holds none of the 6 selected episodes of its base" in refused(elsewhere)
+    assert "holds none of the 6 episodes of its base" in refused(elsewhere)
     shorter = write_rerun(tmp_path / "shorter.zarr", base, PLANTED["noise"], replans=2)
     assert "these are not the same replans" in refused(shorter, StoreError)
     recorded_again = write_rerun(tmp_path / "again.zarr", base, PLANTED["noise"], seed=5)
@@ -373,3 +374,78 @@ def test_a_rerun_of_a_part_is_not_said_to_be_of_all(study):
     text = " ".join(effects_text(part).split())
     assert "Attention in all 6 episodes of the base, of which effects were measured in 2: the ratio" in text
     assert "in the same replans" not in text
+
+
+def test_the_header_says_in_how_many_episodes_effects_were_measured(study):
+    assert "Effects were measured in 6 episodes of 3 tasks." in effects_text(study).splitlines()
+    part = replace(study, episodes=study.episodes.filter(pl.col("task_id") == 0))
+    assert "Effects were measured in 2 episodes of 1 task." in effects_text(part).splitlines()
+
+
+def test_a_word_that_no_selected_task_has_leaves_its_rerun_out(folder, tmp_path):
+    """With --allow-empty all episodes are there, unchanged where the word is not; in a series they are not."""
+    planted = PlantedRerun(knockout("without_bowl", "word:bowl"), 0.0)
+    write_rerun(tmp_path / "all.zarr", folder / "base.zarr", planted)
+    write_rerun(tmp_path / "own.zarr", folder / "base.zarr", planted, tasks=(0,))
+    for name, reason in (("all", "the group has no key in the base"), ("own", "none of the selected episodes")):
+        given = [tmp_path / f"{name}.zarr", folder / "series" / "noise.zarr"]
+        study = study_effects(folder / "base.zarr", given, AnalysisSettings(tasks=(1, 2)))
+        assert [condition.name for condition in study.conditions] == ["noise"]
+        assert study.episodes["condition"].unique().to_list() == ["noise"]
+        text = " ".join(effects_text(study).split())
+        assert "note: without_bowl is left out" in text
+        assert reason in text
+        assert "no attention beside" not in text
+        with pytest.raises(BadArgument, match=r"No rerun of .*base.zarr can be compared: without_bowl is left out"):
+            study_effects(folder / "base.zarr", given[:1], AnalysisSettings(tasks=(1, 2)))
+
+
+def test_dimensions_that_are_left_out_do_not_change_with_the_selected_tasks(folder, tmp_path):
+    """Dimension 4 is noise in tasks 0 and 2 only: whoever looks at task 1 has the same units."""
+
+    def plant(task, episode, replans):
+        actions = changed_actions(PLANTED["noise"])(task, episode, replans)
+        if task != 1:
+            actions[..., 4] += np.random.default_rng([task, episode]).normal(0, 2 * 0.05, actions.shape[:2])
+        return actions
+
+    spec = replace(
+        BASE,
+        plant_actions=plant,
+        interventions=PLANTED["noise"].interventions,
+        rerun_of=rerun_source(folder / "base.zarr"),
+    )
+    given = [write_store(tmp_path / "noise.zarr", spec=spec)]
+    whole = study_effects(folder / "base.zarr", given, AnalysisSettings())
+    one = study_effects(folder / "base.zarr", given, AnalysisSettings(tasks=(1,)))
+    assert one.spread.left_out == whole.spread.left_out == (4,)
+    np.testing.assert_array_equal(one.spread.noise, whole.spread.noise)
+    of_task = whole.episodes.filter(task_id=1)["effect"].to_list()
+    assert one.episodes["effect"].to_list() == of_task
+
+
+def test_only_executed_steps_count_where_the_base_stores_how_many(folder):
+    [item, *_] = study_effects(
+        folder / "base.zarr", [folder / "series" / "noise.zarr"], AnalysisSettings()
+    ).question.selected
+
+    def executed(**fields) -> list[int]:
+        protocol = replace(item.store.attributes.protocol, **fields)
+        attributes = replace(item.store.attributes, protocol=protocol)
+        return BaseEpisode.of(replace(item, store=replace(item.store, attributes=attributes))).executed.tolist()
+
+    assert item.store.attributes.protocol.replan_steps == 5
+    assert executed() == [5] * REPLANS
+    assert executed(replan_steps=2) == [2] * REPLANS
+    # The frames between the calls of a replayed data set are no executed steps; nor is a number known that is 0.
+    assert executed(name="dataset", replan_steps=2) == [5] * REPLANS
+    assert executed(name="recorded", replan_steps=0) == [5] * REPLANS
+
+
+def test_it_is_said_where_the_number_of_executed_steps_is_not_known(study):
+    base = study.given.base
+    protocol = replace(base.attributes.protocol, name="recorded", replan_steps=0)
+    other = replace(base, attributes=replace(base.attributes, protocol=protocol))
+    text = " ".join(effects_text(replace(study, given=replace(study.given, base=other))).split())
+    assert "root mean square change of the chunk's actions" in text
+    assert "root mean square change of the executed actions" in " ".join(effects_text(study).split())
