@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import types
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import nn
 
+from vla_attention.capture.torch_policies.unseen_attention import refuse_unseen_settings
 from vla_attention.schemas.errors import BadArgument
 
 #: How deep modules are looked for in objects that are no modules.
@@ -25,6 +27,40 @@ class NoModules(BadArgument):
 
 class CannotRunEager(BadArgument):
     """A policy, or a part of it, that is compiled so that its attention cannot be seen."""
+
+
+@dataclass(frozen=True)
+class FoundPolicy:
+    """A policy whose modules are known already: `watch_attention` looks for them once and not at every block.
+
+    Attributes:
+        policy: what was given.
+        modules: by path, see `modules_of`.
+        attending: those in whose own forward attention can run.
+    """
+
+    policy: object
+    modules: Mapping[str, nn.Module]
+    attending: tuple[nn.Module, ...]
+
+
+def find_policy(policy: object) -> FoundPolicy:
+    """Look for the modules of a policy, once for many blocks.
+
+    Raises:
+        NoModules, CannotRunEager: see `modules_of`.
+        UnseenAttention: it is set to attention that gives no rows.
+    """
+    if isinstance(policy, FoundPolicy):
+        return policy
+    modules = modules_of(policy)
+    refuse_unseen_settings(modules)
+    return FoundPolicy(policy, modules, tuple(module for module in modules.values() if _may_attend(module)))
+
+
+def _may_attend(module: nn.Module) -> bool:
+    """Whether attention can run in a module's own forward: not in torch's modules without children."""
+    return bool(module._modules) or not type(module).__module__.startswith("torch.nn.")
 
 
 def modules_of(policy: object) -> dict[str, nn.Module]:

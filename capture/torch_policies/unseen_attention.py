@@ -32,8 +32,10 @@ class UnseenAttention(BadArgument):
 def refuse_unseen_settings(modules: Mapping[str, nn.Module]) -> None:
     """Raise `UnseenAttention` if transformers or diffusers are set to kernels of other packages."""
     for path, module in modules.items():
-        setting = getattr(getattr(module, "config", None), "_attn_implementation", None)
-        processor = type(getattr(module, "processor", None)).__name__
+        # Not getattr on the module: what it lacks is slow to ask for, and there are thousands of modules.
+        attributes = module.__dict__
+        setting = getattr(attributes.get("config"), "_attn_implementation", None)
+        processor = type(attributes.get("processor")).__name__
         if isinstance(setting, str) and _UNSEEN_SETTING.match(setting):
             found = f"attn_implementation='{setting}'"
         elif re.search(r"XFormers|Flash|Sage", processor):

@@ -17,12 +17,11 @@ from torch.overrides import TorchFunctionMode
 
 from vla_attention.capture.torch_policies import flex_calls, multihead_calls, sdpa_calls, softmax_calls
 from vla_attention.capture.torch_policies.attention_calls import Watcher
-from vla_attention.capture.torch_policies.policy_modules import modules_of
+from vla_attention.capture.torch_policies.policy_modules import find_policy
 from vla_attention.capture.torch_policies.unseen_attention import (
     ATTENTION_OPERATOR,
     LOAD_WITH_SDPA,
     UnseenAttention,
-    refuse_unseen_settings,
 )
 from vla_attention.capture.torch_policies.watched_block import WatchedBlock
 from vla_attention.schemas.errors import BadArgument
@@ -39,7 +38,8 @@ class AlreadyWatched(BadArgument):
 def watch_attention(policy: object, watcher: Watcher) -> Iterator[None]:
     """Tell `watcher` about every attention call of `policy` inside the block, in whatever thread it runs.
 
-    policy: an `nn.Module`, or an object that holds modules.
+    policy: an `nn.Module`, an object that holds modules, or what `find_policy` made of one, which spares the search for
+    modules at every block.
 
     Raises:
         AlreadyWatched: another block is open in this process.
@@ -50,15 +50,14 @@ def watch_attention(policy: object, watcher: Watcher) -> Iterator[None]:
             computes attention so ran.
         ChangeRefused: a change that does not fit its call, or that the call does not allow.
     """
-    modules = modules_of(policy)
-    refuse_unseen_settings(modules)
+    found = find_policy(policy)
     if not _ACTIVE.acquire(blocking=False):
         raise AlreadyWatched(
             "Attention is already recorded in another block of this process: blocks cannot be inside each other, and "
             "one block records one policy. Close the other block first."
         )
     try:
-        block = WatchedBlock(policy, modules, watcher)
+        block = WatchedBlock(found, watcher)
         try:
             with seen_by_python(), block.following_modules(lambda: _Mode(block)), _Mode(block):
                 yield

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape, Kind, Watcher
+from vla_attention.capture.torch_policies.policy_modules import FoundPolicy
 from vla_attention.schemas.errors import BadArgument
 
 
@@ -44,13 +44,13 @@ class _ThreadState(threading.local):
 class WatchedBlock:
     """What `watch_attention` and the kinds of calls share during one block."""
 
-    def __init__(self, policy: object, modules: Mapping[str, nn.Module], watcher: Watcher) -> None:
-        self.policy = policy
-        self.paths = {id(module): path for path, module in modules.items()}
+    def __init__(self, found: FoundPolicy, watcher: Watcher) -> None:
+        self.policy = found.policy
+        self.paths = {id(module): path for path, module in found.modules.items()}
         self.watcher = watcher
         #: The first error of watching, which the block raises at its end if the policy's code went on without it.
         self.error: BaseException | None = None
-        self._modules = modules
+        self._attending = found.attending
         self._number = 0
         self._lock = threading.RLock()
         self._thread = _ThreadState()
@@ -151,7 +151,7 @@ class WatchedBlock:
         Function modes belong to threads. A module that is called in a thread where none is active enters one for its
         forward. Hooks would not do: `module.forward(...)` skips them, and so do some fast paths.
         """
-        kept = [(module, module.__dict__.get("forward")) for module in self._modules.values() if _may_attend(module)]
+        kept = [(module, module.__dict__.get("forward")) for module in self._attending]
         self._thread.seen = True
         try:
             for module, _ in kept:
@@ -170,7 +170,6 @@ class WatchedBlock:
     ) -> Callable[..., Any]:
         thread = self._thread
 
-        @functools.wraps(forward)
         def followed(*args: Any, **kwargs: Any) -> Any:
             if not thread.seen:
                 return in_other_thread(args, kwargs)
@@ -194,12 +193,8 @@ class WatchedBlock:
                 with self._lock:
                     self._elsewhere -= 1
 
+        followed.__wrapped__ = forward  # type: ignore[attr-defined]  # its signature stays what it was
         return followed
-
-
-def _may_attend(module: nn.Module) -> bool:
-    """Whether attention can run in a module's own forward: not in torch's modules without children."""
-    return bool(module._modules) or not type(module).__module__.startswith("torch.nn.")
 
 
 def _frame_owners() -> Iterator[object]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 import threading
 import types
@@ -15,7 +16,7 @@ from torch.nn.functional import scaled_dot_product_attention as sdpa
 
 from tests.kit.attention_modules import Attention, Policy, Seen
 from vla_attention.capture.torch_policies.call_changes import ChangeRefused
-from vla_attention.capture.torch_policies.policy_modules import CannotRunEager, NoModules, modules_of
+from vla_attention.capture.torch_policies.policy_modules import CannotRunEager, NoModules, find_policy, modules_of
 from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
 from vla_attention.capture.torch_policies.watch import AlreadyWatched, watch_attention
 from vla_attention.capture.torch_policies.watched_block import OtherPolicy, StillRunning
@@ -343,3 +344,19 @@ def test_inference_mode():
 
 def test_import_loads_no_transformers():
     assert "transformers" not in sys.modules
+
+
+def test_modules_are_looked_for_once_for_many_blocks():
+    policy = small_policy()
+    found = find_policy(policy)
+    assert find_policy(found) is found
+    for _ in range(2):
+        assert seen_in(found, lambda: policy(HIDDEN, MEMORY)) == PATHS
+    assert [type(module) for module in found.attending] == [Policy, nn.ModuleList, Attention, Attention]
+
+
+def test_the_signature_of_forward_stays():
+    policy = small_policy()
+    signature = inspect.signature(policy.forward)
+    with watch_attention(policy, Seen()):
+        assert inspect.signature(policy.forward) == signature
