@@ -20,6 +20,7 @@ from vla_attention.capture.torch_policies.attention_calls import CallShape
 from vla_attention.capture.torch_policies.call_order import CallPlace
 from vla_attention.capture.torch_policies.knockouts import SessionKnockouts, logit_bias
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
+from vla_attention.capture.torch_policies.policy_modules import find_policy
 from vla_attention.capture.torch_policies.prompts import TokenText
 from vla_attention.capture.torch_policies.replan_inputs import EpisodeFacts, ReplanInputs, read_inputs
 from vla_attention.capture.torch_policies.replan_text import ReplanText, watched_ids
@@ -202,6 +203,7 @@ class RecordedRun:
     ) -> None:
         self.path = path
         self.policy = policy
+        self._found = find_policy(policy)
         self.layout = layout
         self.attributes = attributes
         self.num_dropped = 0
@@ -327,7 +329,7 @@ class RecordedRun:
         replan = Replan()
         self._in_block = True
         try:
-            with watched_ids(self.policy, text), watch_attention(self.policy, recorder):
+            with watched_ids(self.policy, text), watch_attention(self._found, recorder):
                 yield replan
         finally:
             self._in_block = False
