@@ -94,7 +94,7 @@ def mixing_changes(episode: StoredEpisode) -> dict[str, Interventions]:
     """The changes of question 3: knockouts for the action queries, beside cuts between text and pictures in the prefix.
 
     Names end with what is cut in the prefix: `blind` is text that cannot read pictures, `deaf` pictures that cannot
-    read text, `apart` both.
+    read text, `apart` both. The last of them take the words from one kind of queries each.
     """
     blind = KeyKnockout(VISUAL, queries="prefix", query_selector=TEXT)
     deaf = KeyKnockout(TEXT, queries="prefix", query_selector=VISUAL)
@@ -108,5 +108,21 @@ def mixing_changes(episode: StoredEpisode) -> dict[str, Interventions]:
         for group, selector in groups.items():
             own = () if selector is None else (KeyKnockout(selector),)
             changes[f"{group}_{cut}"] = Interventions(keys=(*keys, *own))
-    changes["instruction_everywhere"] = without(INSTRUCTION, "all")
+    for name, selector in (("instruction", INSTRUCTION), ("colour", groups.get("colour"))):
+        if selector is not None:
+            for reader, knockout in readers_of(selector).items():
+                changes[f"{name}_{reader}"] = Interventions(keys=(knockout,))
     return changes
+
+
+def readers_of(selector: str) -> dict[str, KeyKnockout]:
+    """Reader -> the knockout of a group of keys for these queries alone; the last is the control of the one before.
+
+    In the prefix the queries of pictures or of text read the group, and carry it on to the action queries.
+    """
+    return {
+        "by_pictures": KeyKnockout(selector, queries="prefix", query_selector=VISUAL),
+        "by_text": KeyKnockout(selector, queries="prefix", query_selector=TEXT),
+        "everywhere": KeyKnockout(selector, queries="all"),
+        "random": KeyKnockout(selector, queries="all", random_seed=0),
+    }

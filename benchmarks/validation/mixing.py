@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,15 @@ CUTS = {
     "deaf": "pictures cannot read text",
     "apart": "neither can read the other",
 }
+#: Words that are taken from one kind of queries each, and these queries.
+READ = {"instruction": "the instruction's words", "colour": "the colour's word"}
+READERS = {
+    "whole": "the action queries",
+    "by_pictures": "the queries of pictures, in the prefix",
+    "by_text": "the queries of text, in the prefix",
+    "everywhere": "all queries",
+    "random": "all queries; as many random keys",
+}
 GROUPS = {
     "instruction": "the instruction's words",
     "colour": "the colour's word",
@@ -35,7 +45,8 @@ def mixing(
     """Effects of cuts in the prefix, and of groups that the action queries cannot read under each cut.
 
     Rows: cut, group (empty: the cut by itself, against the stored actions), value with low and high; the effect of a
-    group is against the same cut with all groups there.
+    group is against the same cut with all groups there. Rows whose cut is one of `READERS` are knockouts of a group for
+    these queries.
     """
     suite = store.attributes.protocol.suite
     rows: list[tuple[str, str, str, int, int, float]] = []
@@ -48,7 +59,8 @@ def mixing(
                 if f"{group}_{cut}" in episode.actions:
                     effect = episode.effect(f"{group}_{cut}", spread, f"nothing_{cut}")
                     rows.append((cut, group, *place, float(np.mean(effect))))
-        everywhere = episode.effect("instruction_everywhere", spread)
-        rows.append(("whole", "instruction everywhere", *place, float(np.mean(everywhere))))
+        for group, reader in product(READ, READERS):
+            if reader != "whole" and f"{group}_{reader}" in episode.actions:
+                rows.append((reader, group, *place, float(np.mean(episode.effect(f"{group}_{reader}", spread)))))
     table = pl.DataFrame(rows, schema=["cut", "group", "suite", "task_id", "episode_index", "value"], orient="row")
     return means(table, ["cut", "group"])

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.validation.known import CONTRASTS, NUMBERS, OTHER
-from benchmarks.validation.mixing import CUTS, GROUPS
+from benchmarks.validation.mixing import CUTS, GROUPS, READ, READERS
 from benchmarks.validation.policies import SHIPPED, TITLES
 from benchmarks.validation.prediction import ATTENTION, BASELINE, FAMILIES
 from vla_attention.analyze.show.numbers import format_number
@@ -95,11 +95,13 @@ def mixing_table(results: Results) -> str:
     for cut, what in CUTS.items():
         cells = [with_interval(of.get((cut, group))) for group in GROUPS]
         rows.append((what, with_interval(of.get((cut, ""))), *cells))
-    everywhere = of.get(("whole", "instruction everywhere"))
-    rows.append(
-        ("nothing is cut; no query reads the words", "-", with_interval(everywhere), *["-"] * (len(GROUPS) - 1))
-    )
     return markdown(("in the prefix", "effect of the cut", *(f"without {what}" for what in GROUPS.values())), rows)
+
+
+def readers_table(results: Results) -> str:
+    of = {(row["cut"], row["group"]): row for row in results["mixing"]}
+    rows = [(what, *(with_interval(of.get((reader, group))) for group in READ)) for reader, what in READERS.items()]
+    return markdown(("who cannot read them", *(f"without {what}" for what in READ.values())), rows)
 
 
 def success_table(results: Results) -> str:
@@ -120,8 +122,13 @@ def blocks(results: Results) -> dict[str, str]:
         made["other"] = lambda: other_table(results)
     if results.get("prediction_everywhere"):
         made["prediction everywhere"] = lambda: prediction_table(results, "prediction_everywhere")
-    for name, make in (("prediction", prediction_table), ("mixing", mixing_table), ("success", success_table)):
-        if results.get(name):
+    for name, key, make in (
+        ("prediction", "prediction", prediction_table),
+        ("mixing", "mixing", mixing_table),
+        ("readers", "mixing", readers_table),
+        ("success", "success", success_table),
+    ):
+        if results.get(key):
             made[name] = partial(make, results)
     return {name: make() for name, make in made.items()}
 
