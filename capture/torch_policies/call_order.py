@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.torch_policies.attention_calls import CallShape
-from vla_attention.capture.torch_policies.calls_table import calls_table
+from vla_attention.capture.torch_policies.inspect_calls import CallTable
 from vla_attention.capture.torch_policies.policy_layout import CallRule, PolicyLayout, RecordedSite
 from vla_attention.schemas.errors import BadArgument, UserError, listing
 
@@ -42,8 +42,9 @@ class CallPlace:
 class CallOrder:
     """Gives the calls of one replan their places, one after the other. Every replan needs a new one."""
 
-    def __init__(self, layout: PolicyLayout) -> None:
+    def __init__(self, layout: PolicyLayout, policy: str) -> None:
         self.layout = layout
+        self.policy = policy
         self.sites = {site.name: site for site in layout.sites}
         self.seen: list[CallShape] = []
         self.problems: dict[str, None] = {}
@@ -146,7 +147,7 @@ class CallOrder:
             raise CallsDoNotFit(
                 f"The attention calls at {where} do not fit the layout '{self.layout.name}': "
                 f"{listing_of_sentences(problems)}. Change the layout's rules and sites to the calls, which were:\n"
-                f"{calls_table(self.seen)}"
+                f"{CallTable(self.policy, tuple(self.seen))}"
             )
 
     def _missing(self) -> Iterator[str]:

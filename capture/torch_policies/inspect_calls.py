@@ -63,23 +63,24 @@ class CallTable:
     Attributes:
         policy: name of its class.
         calls: the shapes, in order.
-        errors: of rows times values, one for every call.
+        errors: of rows times values, one for every call; empty where they were not looked at, and then not shown.
     """
 
     policy: str
     calls: tuple[CallShape, ...]
-    errors: tuple[float, ...]
+    errors: tuple[float, ...] = ()
 
     @property
     def rows(self) -> tuple[CallRow, ...]:
         """The calls, those of the same shape in modules of one pattern folded into one row."""
-        return tuple(_rows(self.calls, self.errors))
+        return tuple(_rows(self.calls, self.errors or (float("nan"),) * len(self.calls)))
 
     def __str__(self) -> str:
         rows = self.rows
         heading = ("module", "kind", "queries x keys", "heads", "dtype", "calls", "P·V error")
-        cells = [heading, *(_cells(row) for row in rows[:_SCREEN])]
-        widths = [max(len(line[column]) for line in cells) for column in range(len(heading))]
+        shown = len(heading) if self.errors else len(heading) - 1
+        cells = [line[:shown] for line in (heading, *(_cells(row) for row in rows[:_SCREEN]))]
+        widths = [max(len(line[column]) for line in cells) for column in range(shown)]
         lines = [
             "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in cells
         ]

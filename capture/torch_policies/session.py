@@ -25,6 +25,7 @@ from vla_attention.capture.torch_policies.prompts import TokenText
 from vla_attention.capture.torch_policies.replan_inputs import EpisodeFacts, ReplanInputs, read_inputs
 from vla_attention.capture.torch_policies.replan_text import ReplanText, watched_ids
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder, SiteRows, final_contribution
+from vla_attention.capture.torch_policies.unseen_attention import no_attention
 from vla_attention.capture.torch_policies.watch import watch_attention
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.layout import Prompt
@@ -104,9 +105,8 @@ class Episode:
     def _commit(self) -> None:
         if not self.writer.records:
             raise NothingRecorded(
-                f"No attention was seen in the {self.num_dropped} replan blocks of {self.name}: the policy may be "
-                "compiled or use flash-attn (load it with attn_implementation='sdpa' or 'eager'), or have no attention "
-                "at all (va.inspect shows its calls); or no block called it."
+                f"No attention was seen in the {self.num_dropped} replan blocks of {self.name}. "
+                f"{no_attention(self.run.policy)}"
             )
         last = self.writer.records[-1].env_step + 1
         facts = {
@@ -317,6 +317,7 @@ class RecordedRun:
         edits = _Edits(self, dict(zip(rows, zip(episodes, given, strict=True), strict=True)), text)
         recorder = ReplanRecorder(
             self.layout,
+            type(self.policy).__name__,
             self.attributes.recording,
             batch,
             rows,

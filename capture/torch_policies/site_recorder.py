@@ -70,6 +70,7 @@ class ReplanRecorder:
 
     Args:
         layout: what the calls are.
+        policy: the name of the policy's class, for errors.
         recording: what of them is recorded.
         batch: batch size that every call of the sites must have.
         rows: the rows of the batch that are recorded.
@@ -81,6 +82,7 @@ class ReplanRecorder:
     def __init__(
         self,
         layout: PolicyLayout,
+        policy: str,
         recording: Recording,
         batch: int,
         rows: Sequence[int],
@@ -92,7 +94,7 @@ class ReplanRecorder:
         self.recordings = {name: found for name, found in recordings_of(recording, layout).items() if found}
         self.batch = batch
         self.rows = tuple(rows)
-        self.order = CallOrder(layout)
+        self.order = CallOrder(layout, policy)
         self.projections = projections
         self.early_roles = early_roles
         self.bias = bias
