@@ -1,0 +1,30 @@
+"""docs/your-policy.md, from `inspect` to a verified store, on a policy that no layout knows."""
+
+import doctest
+import re
+from itertools import count
+from pathlib import Path
+
+from tests.kit.small_torch_policy import SmallPolicy, given
+
+GUIDE = Path(__file__).parents[3] / "docs" / "your-policy.md"
+
+
+def test_the_guides_examples(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    numbers = count()
+    names = {
+        "policy": SmallPolicy(),
+        "batch": given(),
+        "observe": lambda batch=1: given(batch, seed=next(numbers)),
+    }
+    result = doctest.testfile(str(GUIDE), module_relative=False, globs=names, optionflags=doctest.NORMALIZE_WHITESPACE)
+    assert result.failed == 0
+    assert result.attempted > 12
+
+
+def test_from_inspect_to_a_verified_store_are_twenty_lines():
+    text = GUIDE.read_text(encoding="utf-8")
+    steps = text[text.index("## 1.") : text.index("## When the layout")]
+    lines = re.findall(r"^(?:>>>|\.\.\.) .*\S", steps, re.MULTILINE)
+    assert len(lines) <= 32
