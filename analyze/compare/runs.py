@@ -132,6 +132,8 @@ def open_runs(arguments: Sequence[RunArgument], settings: AnalysisSettings, allo
 
 #: Entries of the provenance that affect what the policy sees; differences in others are only noted.
 _SIMULATOR = ("mujoco", "robosuite", "hf-libero", "assets")
+#: Entries that are measured anew in every episode; they say nothing about how runs were captured.
+_MEASURED = ("largest P·V error", "replan blocks without attention", "difference to own setting")
 #: Entries of the policy's configuration that belong to the weights.
 _NAMES_OF_WEIGHTS = ("configuration", "statistics")
 
@@ -221,7 +223,8 @@ def noted_differences(runs: Sequence[Run]) -> list[str]:
     first, notes = runs[0], []
     for run in runs[1:]:
         mine, theirs = _provenance(first), _provenance(run)
-        names = [name for name in {**mine, **theirs} if name not in _SIMULATOR and mine.get(name) != theirs.get(name)]
+        others = [name for name in {**mine, **theirs} if name not in (*_SIMULATOR, *_MEASURED)]
+        names = [name for name in others if mine.get(name) != theirs.get(name)]
         if names:
             pairs = [f"{name} {mine.get(name, 'unknown')} and {theirs.get(name, 'unknown')}" for name in names]
             notes.append(f"{first.name} and {run.name} were captured with different {listing(pairs)}.")

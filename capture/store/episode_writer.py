@@ -26,6 +26,7 @@ from vla_attention.schemas.stores.content_rules import (
     picture_problems,
     piece_role_problems,
     prompt_problems,
+    sites_with_text,
 )
 from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.reader import StoredEpisode
@@ -142,10 +143,11 @@ class EpisodeWriter:
                 yield f"it has {what} of the sites {listing(given)}; expected {listing(self.sites)}"
                 return
         yield from self._misfits(record)
+        only_site = len(sites_with_text(sites)) == 1
         for name, site in self.sites.items():
             yield from site.problems(record.rows[name], record.key_role[name], replan)
             prompt = prompt_at(sites, site.layout, record.prompt)
-            yield from piece_role_problems(site.layout, record.key_role[name], prompt, replan)
+            yield from piece_role_problems(site.layout, record.key_role[name], prompt, replan, only_site=only_site)
         if record.prompt not in self.prompts:
             yield from prompt_problems(sites, record.prompt)
         for camera, frame in record.frames.items():

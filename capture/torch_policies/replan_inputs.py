@@ -121,3 +121,18 @@ def _state(given: Any) -> NDArray[np.float64] | None:
     if state.ndim != 1:
         raise BadArgument(f"The state of a replan has the shape {state.shape}; expected (state_dim,).")
     return state
+
+
+def read_actions(given: Any) -> NDArray[np.float64] | None:
+    """Return actions as (horizon, action_dim) float64; None where the caller gave none."""
+    if given is None:
+        return None
+    values = given.detach().float().cpu().numpy() if hasattr(given, "detach") else given
+    actions = np.asarray(values, dtype=np.float64)
+    actions = actions[0] if actions.ndim == 3 and len(actions) == 1 else actions
+    actions = actions[None] if actions.ndim == 1 else actions
+    if actions.ndim != 2:
+        raise BadArgument(
+            f"The actions of a replan have the shape {actions.shape}; expected (horizon, action_dim) or (action_dim,)."
+        )
+    return actions

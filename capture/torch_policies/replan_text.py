@@ -66,7 +66,7 @@ class ReplanText:
         if self.ids is None or self.tokenizer is None:
             return prompt_without_pieces(given.instruction)
         valid = None
-        if found is not None:
+        if found is not None and any(site.name in found for site in sites):
             # The prompt has the same keys at every site; what else the sites hold differs.
             valid = np.zeros(max(site.keys.num_keys for site in sites), dtype=bool)
             for site in sites:

@@ -12,23 +12,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.interventions.resolution import ReplanPlace
 from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run
-from vla_attention.capture.torch_policies.attention_calls import CallShape
-from vla_attention.capture.torch_policies.call_order import CallPlace
-from vla_attention.capture.torch_policies.knockouts import SessionKnockouts, logit_bias
+from vla_attention.capture.torch_policies.knockouts import SessionKnockouts
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
 from vla_attention.capture.torch_policies.policy_modules import find_policy
 from vla_attention.capture.torch_policies.prompts import TokenText
-from vla_attention.capture.torch_policies.replan_inputs import EpisodeFacts, ReplanInputs, read_inputs
+from vla_attention.capture.torch_policies.replan_edits import ReplanEdits
+from vla_attention.capture.torch_policies.replan_inputs import EpisodeFacts, ReplanInputs, read_actions, read_inputs
 from vla_attention.capture.torch_policies.replan_text import ReplanText, watched_ids
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder, SiteRows, final_contribution
 from vla_attention.capture.torch_policies.unseen_attention import no_attention
 from vla_attention.capture.torch_policies.watch import watch_attention
 from vla_attention.schemas.errors import BadArgument, UserError
-from vla_attention.schemas.layout import Prompt
 from vla_attention.schemas.stores.store_format import RootAttributes, StoreExists, episode_name
 
 #: More replans than any episode has; the writer collects rows in blocks of two megabytes.
@@ -314,7 +311,7 @@ class RecordedRun:
         if self._in_block:
             raise RecordingStopped("A replan block stands inside of another; record one policy call after the other.")
         text = ReplanText(self.layout, self._tokenizer, batch, dict(zip(rows, given, strict=True)))
-        edits = _Edits(self, dict(zip(rows, zip(episodes, given, strict=True), strict=True)), text)
+        edits = ReplanEdits(self, dict(zip(rows, zip(episodes, given, strict=True), strict=True)), text)
         recorder = ReplanRecorder(
             self.layout,
             type(self.policy).__name__,
@@ -361,7 +358,7 @@ class RecordedRun:
             actions = replan.actions
             if actions is not None and recorder.batch > 1:
                 actions = actions[row]
-            record = self._record(found[position], text, row, inputs, _actions(actions))
+            record = self._record(found[position], text, row, inputs, read_actions(actions))
             episode.writer.append(record)
 
     def _record(
@@ -391,50 +388,3 @@ class RecordedRun:
             frames=inputs.frames if self.attributes.recording.frames else {},
             coverage=inputs.coverage,
         )
-
-
-@dataclass
-class _Edits:
-    """What knockouts add to the logits of the calls of one replan; the keys are looked up at its first call."""
-
-    run: RecordedRun
-    episodes: Mapping[int, tuple[Episode, ReplanInputs]]
-    text: ReplanText
-    recorder: ReplanRecorder | None = None
-    _of_row: dict[int, dict[str, Any]] = field(default_factory=dict)
-
-    def bias(self, row: int, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
-        """Return what is added to the logits of a call in one row of the batch, (head or 1, query, key)."""
-        if row not in self._of_row:
-            self._of_row[row] = self._edits(row)
-        edits = self._of_row[row].get(place.site or "")
-        return None if edits is None else logit_bias(edits, place, shape)
-
-    def _edits(self, row: int) -> dict[str, Any]:
-        episode, inputs = self.episodes[row]
-        prompt: Prompt = self.text.prompt(row, None)
-        sites = self.run._sites
-        assert self.recorder is not None
-        present = self.recorder.order.present
-        roles = {site.name: self.text.roles(row, site, prompt, present.get(site.name), None) for site in sites}
-        place = ReplanPlace(episode.facts.task_id, episode.facts.episode_index, episode.num_replans)
-        return dict(
-            self.run.knockouts.edits(
-                self.run.attributes.sites, roles, prompt, episode.facts.objects, inputs.coverage, place
-            )
-        )
-
-
-def _actions(given: Any) -> NDArray[np.float64] | None:
-    """Actions as (horizon, action_dim) float64; None where the caller gave none."""
-    if given is None:
-        return None
-    values = given.detach().float().cpu().numpy() if hasattr(given, "detach") else given
-    actions = np.asarray(values, dtype=np.float64)
-    actions = actions[0] if actions.ndim == 3 and len(actions) == 1 else actions
-    actions = actions[None] if actions.ndim == 1 else actions
-    if actions.ndim != 2:
-        raise BadArgument(
-            f"The actions of a replan have the shape {actions.shape}; expected (horizon, action_dim) or (action_dim,)."
-        )
-    return actions

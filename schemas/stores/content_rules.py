@@ -204,16 +204,27 @@ def prompt_problems(sites: Sequence[SiteLayout], prompt: Prompt) -> Iterator[str
 
 
 def piece_role_problems(
-    layout: SiteLayout, key_role: NDArray[np.integer], prompt: Prompt, replan: int
+    layout: SiteLayout, key_role: NDArray[np.integer], prompt: Prompt, replan: int, *, only_site: bool = True
 ) -> Iterator[str]:
-    """Role codes (key,) of one replan and its prompt: a key that holds a piece of text is not padding."""
-    for piece in prompt.pieces:
-        if any(_holds(span, piece) for span in layout.spans) and key_role[piece.key] in INVALID_ROLES:
+    """Role codes (key,) of one replan and its prompt: a key that holds a piece of text is not padding.
+
+    only_site: no other site has text. Of several, one may have all text masked: GR00T's blocks that read pictures.
+    """
+    held = [piece for piece in prompt.pieces if any(_holds(span, piece) for span in layout.spans)]
+    if not only_site and all(key_role[piece.key] in INVALID_ROLES for piece in held):
+        return
+    for piece in held:
+        if key_role[piece.key] in INVALID_ROLES:
             yield (
                 f"{layout.name}/key_role gives key {piece.key} the role '{Role(key_role[piece.key]).label}' at replan "
                 f"{replan}, but it holds the prompt's piece {piece.text!r}"
             )
             return
+
+
+def sites_with_text(sites: Sequence[SiteLayout]) -> list[str]:
+    """The names of the sites that have a span of text."""
+    return [site.name for site in sites if any(span.kind == "text" for span in site.spans)]
 
 
 def _holds(span: Span, piece: Piece) -> bool:

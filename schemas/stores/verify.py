@@ -25,6 +25,7 @@ from vla_attention.schemas.stores.content_rules import (
     role_problems,
     row_problems,
     row_sum_problems,
+    sites_with_text,
 )
 from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
@@ -180,12 +181,13 @@ def _token_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[st
     if not np.isin(index, np.arange(len(prompts))).all():
         yield "prompt_index names prompts that the attributes do not have"
         return
+    only_site = len(sites_with_text(root.sites)) == 1
     for site in root.sites:
         roles = episode.read(f"{site.name}/key_role")
         yield from role_problems(site, roles)
         of_site = [prompt_at(root.sites, site, prompt) for prompt in prompts]
         for replan, number in enumerate(index):
-            yield from piece_role_problems(site, roles[replan], of_site[number], replan)
+            yield from piece_role_problems(site, roles[replan], of_site[number], replan, only_site=only_site)
 
 
 def _camera_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:

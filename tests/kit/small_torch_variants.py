@@ -142,3 +142,59 @@ def one_module_layout() -> PolicyLayout:
         num_denoise_steps=2,
         action_horizon=3,
     )
+
+
+class TurnsPolicy(nn.Module):
+    """Two blocks over the same tokens, of pictures and of text: the first reads the text only, the second the pictures.
+
+    As in GR00T N1.7: 4 patches, then 5 words.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.embed = nn.Embedding(len(WORDS), WIDTH)
+        self.blocks = nn.ModuleList(Cross() for _ in range(2))
+        self.tokenizer = WordTokenizer()
+
+    @torch.no_grad()
+    def act(self, patches: Tensor, text: str, noise: Tensor) -> Tensor:
+        words = self.embed(torch.tensor([self.tokenizer.encode(text)]))
+        tokens = torch.cat([patches, words], dim=1)
+        is_text = torch.arange(tokens.shape[1]) >= PATCHES
+        for block, mask in zip(self.blocks, (is_text, ~is_text), strict=True):
+            noise = noise + block(noise, tokens, mask[None, None, None].expand(1, 1, noise.shape[1], -1))
+        return noise
+
+
+class Cross(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.out = nn.Linear(WIDTH, WIDTH)
+
+    def forward(self, queries: Tensor, tokens: Tensor, mask: Tensor) -> Tensor:
+        q, k = split_heads(queries), split_heads(tokens)
+        mixed = nn.functional.scaled_dot_product_attention(q, k, k, attn_mask=mask)
+        return self.out(mixed.transpose(1, 2).flatten(2))
+
+
+def turns_layout() -> PolicyLayout:
+    """The layout of `TurnsPolicy` with three words, a start and an end."""
+    spans = (
+        Span("image_front", "image", 0, PATCHES, "front", PatchGrid(2, 2, 8, 8)),
+        Span("prompt", "text", PATCHES, PATCHES + 5),
+    )
+    roles = {"image_front": "image", "prompt": "instruction"}
+    names = ("cross_text", "cross_image")
+    return PolicyLayout(
+        name="turns",
+        family="turns",
+        sites=tuple(
+            RecordedSite(SiteLayout(name, spans, layers=(block,)), (0, 3), roles, "blocks.{block}.out")
+            for block, name in enumerate(names)
+        ),
+        rules=tuple(CallRule(rf"blocks\.(?P<block>{block})", name) for block, name in enumerate(names)),
+        num_layers=2,
+        num_heads=HEADS,
+        text=PromptText(("prompt",), "embed"),
+    )

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import nn
 
-import vla_attention as va
 from tests.kit.small_torch_policy import HORIZON, SmallPolicy, given, small_layout
 from tests.kit.small_torch_variants import TokenPolicy, token_layout
+from vla_attention.analyze.__main__ import main
 from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
 from vla_attention.capture.torch_policies.knockouts import CannotIntervene
 from vla_attention.capture.torch_policies.record import record
@@ -101,14 +101,18 @@ def test_keeping_one_group_and_factors_of_attention(tmp_path, monkeypatch):
     torch.testing.assert_close(actions, act_changed(policy, monkeypatch, bias), rtol=0, atol=1e-6)
 
 
-def test_a_knockout_is_a_part_of_the_runs_configuration(tmp_path):
+def test_a_knockout_is_a_part_of_the_runs_configuration(tmp_path, capsys):
     policy = SmallPolicy()
     act_recorded(tmp_path, policy, knockout="word:bowl")
     with pytest.raises(RunMismatch, match="interventions"):
         act_recorded(tmp_path, policy, resume=True)
     # An unchanged run beside it: the two are compared as conditions of one suite.
     act_recorded(tmp_path / "base", policy)
-    assert va.open(tmp_path / "a.zarr").ratios() is not None
+    arguments = [str(tmp_path / "base" / "a.zarr"), f"without={tmp_path / 'a.zarr'}", "--output", str(tmp_path / "out")]
+    assert main(["compare", *arguments]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "differ in their interventions (none; the keys of 'word:bowl' knocked out" in text
+    assert "P·V" not in text
 
 
 @pytest.mark.parametrize(
