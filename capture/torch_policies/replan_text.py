@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
-from vla_attention.capture.torch_policies.policy_weights import find_module
 from vla_attention.capture.torch_policies.prompts import (
     TokenText,
     prompt_from_ids,
@@ -110,12 +109,11 @@ class ReplanText:
 
 
 @contextmanager
-def watched_ids(policy: object, text: ReplanText) -> Iterator[None]:
-    """Within the block, the policy's text embedding tells `text` the ids that it is given."""
-    if text.layout.text is None:
+def watched_ids(embedding: nn.Module | None, text: ReplanText) -> Iterator[None]:
+    """Within the block, the policy's text embedding, if there is one, tells `text` the ids that it is given."""
+    if embedding is None:
         yield
         return
-    embedding = find_module(policy, text.layout.text.embedding, "token ids")
 
     def look(_module: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
         for value in (*arguments, *named.values()):

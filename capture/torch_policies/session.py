@@ -18,6 +18,7 @@ from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_r
 from vla_attention.capture.torch_policies.knockouts import SessionKnockouts
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
 from vla_attention.capture.torch_policies.policy_modules import find_policy
+from vla_attention.capture.torch_policies.policy_weights import find_module
 from vla_attention.capture.torch_policies.prompts import TokenText
 from vla_attention.capture.torch_policies.replan_edits import ReplanEdits
 from vla_attention.capture.torch_policies.replan_inputs import EpisodeFacts, ReplanInputs, read_actions, read_inputs
@@ -201,6 +202,7 @@ class RecordedRun:
         self.path = path
         self.policy = policy
         self._found = find_policy(policy)
+        self._embedding = None if layout.text is None else find_module(policy, layout.text.embedding, "token ids")
         self.layout = layout
         self.attributes = attributes
         self.num_dropped = 0
@@ -327,7 +329,7 @@ class RecordedRun:
         replan = Replan()
         self._in_block = True
         try:
-            with watched_ids(self.policy, text), watch_attention(self._found, recorder):
+            with watched_ids(self._embedding, text), watch_attention(self._found, recorder):
                 yield replan
         finally:
             self._in_block = False

@@ -13,7 +13,7 @@ import vla_attention as va
 from tests.kit.small_torch_policy import BLOCKS, HEADS, HORIZON, PROMPT, STEPS, SmallPolicy, given, small_layout
 from vla_attention.capture.torch_policies import record as record_module
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
-from vla_attention.capture.torch_policies.policy_layout import CallRule, LayoutForAnotherVersion
+from vla_attention.capture.torch_policies.policy_layout import CallRule, LayoutForAnotherVersion, PromptText
 from vla_attention.capture.torch_policies.prompts import PromptDoesNotFit
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.session import NothingRecorded, RecordingStopped
@@ -314,6 +314,11 @@ def test_resuming_goes_on_and_refuses_another_run(tmp_path, policy):
         ({"bits": 0}, BadArgument, "0 mantissa bits"),
         ({"resume": True, "overwrite": True}, BadArgument, "not both"),
         ({"tokenizer": 3}, BadArgument, "has no decode"),
+        (
+            {"layout": small_layout(text=PromptText(("prompt",), "word"))},
+            UnknownName,
+            "Unknown module for token ids 'word'. Did you mean 'words'?",
+        ),
         ({"layout": small_layout(versions={"torch": ("1.0",)})}, LayoutForAnotherVersion, "written for torch 1.0"),
         (
             {
