@@ -353,6 +353,29 @@ class OpenStores:
         paths = [Path(reruns)] if isinstance(reruns, (str, Path)) else [Path(path) for path in reruns]
         return _frame(study_effects(self.stores[0].path, paths, settings_from_keywords(**settings), dimensions), table)
 
+    def deviation(
+        self,
+        table: Literal["summary", "dimensions", "attention", "replans"] = "summary",
+        **settings: Unpack[SettingKeywords],
+    ) -> pl.DataFrame:
+        """How far the policy's actions are from the data set's that it was replayed over, in the data set's spread.
+
+        "summary": over everything, by task and phase. "dimensions": of the action. "attention": correlation with the
+        ratio and with lifts over replans. "replans": every replan.
+
+        >>> deviation = va.open(replayed).deviation()
+        >>> deviation.filter(scope="all", phase="all").select("num_episodes", "first_episodes").rows()
+        [(6, 6)]
+
+        Raises:
+            BadArgument: the stores hold no actions of a data set.
+        """
+        from vla_attention.analyze.deviation.deviation_study import study_deviation
+
+        _check_name("table", table, ("summary", "dimensions", "attention", "replans"))
+        study = study_deviation(self.ask(**settings))
+        return _frame(study, {"summary": "phases", "attention": "correlations"}.get(table, table))
+
     def overlay(
         self,
         task: int | None = None,
@@ -423,7 +446,7 @@ class OpenStores:
         lines = [
             *header_lines(self.stores),
             "ask with .ratios() .masses() .summary() .groups() .heads() .words() .objects() .time() .compare(other)",
-            "         .effects(reruns) .overlay() .report(path) .to_xarray()",
+            "         .effects(reruns) .deviation() .overlay() .report(path) .to_xarray()",
         ]
         return "\n  ".join([str(self), *lines])
 

@@ -15,6 +15,7 @@ COMMANDS: dict[str, str] = {
     "objects": "which objects are looked at: shares, pointing game, IoU with their masks",
     "time": "over the course of an episode: phases, gripper, success against failure",
     "effects": "how much actions change under interventions, beside attention and noise",
+    "deviation": "how far actions are from the data set's, beside attention",
     "overlay": "attention on the stored pictures: strips, GIF or MP4",
     "report": "one self-contained HTML file",
     "export": "tables as CSV or Parquet, masses or rows as NetCDF",

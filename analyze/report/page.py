@@ -14,6 +14,7 @@ from vla_attention.analyze.measures.role_masses import role_masses
 from vla_attention.analyze.measures.sinks import SinkSearch, merged_sinks, search_sinks
 from vla_attention.analyze.ratios.analysis import Analysis, analyse
 from vla_attention.analyze.report.caveats import Caveat, caveat_section, caveats
+from vla_attention.analyze.report.deviation_section import deviation_section
 from vla_attention.analyze.report.effect_section import effect_section
 from vla_attention.analyze.report.headline import headline_section
 from vla_attention.analyze.report.methods import method_section
@@ -85,6 +86,7 @@ def _section_makers(
         lambda: headline_section(analysis, notes),
         lambda: caveat_section(notes),
         lambda: effect_section(analysis, settings.effects, folder),
+        lambda: deviation_section(analysis, folder),
         lambda: task_section(analysis, folder),
         lambda: layer_section(analysis, folder),
         lambda: time_section(analysis, folder),

@@ -23,6 +23,7 @@ from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions, KeyKnockout
 from vla_attention.schemas.precision import mass_error_bound
 from vla_attention.schemas.stores.store_format import StoreError, StoreNotFound
+from vla_attention.testing.site_stores import write_site_store
 from vla_attention.testing.stores import StoreSpec, rerun_source, write_store
 from vla_attention.testing.tokens import small_layout
 
@@ -47,6 +48,11 @@ def rerun(tmp_path_factory, store) -> Path:
 
 
 @pytest.fixture(scope="module")
+def replayed(tmp_path_factory) -> Path:
+    return write_site_store(tmp_path_factory.mktemp("replayed") / "d.zarr", protocol="dataset", dataset_actions=0.5)
+
+
+@pytest.fixture(scope="module")
 def run(store) -> OpenStores:
     return va.open(store)
 
@@ -60,8 +66,8 @@ def examples(module: ModuleType) -> list[doctest.DocTest]:
     [test for module in MODULES for test in examples(module)],
     ids=lambda test: test.name,
 )
-def test_examples(test, store, other, rerun, tmp_path):
-    test.globs.update(store=store, other=other, rerun=rerun, folder=tmp_path, va=va, pl=pl)
+def test_examples(test, store, other, rerun, replayed, tmp_path):
+    test.globs.update(store=store, other=other, rerun=rerun, replayed=replayed, folder=tmp_path, va=va, pl=pl)
     result = doctest.DocTestRunner(verbose=False).run(test)
     assert result.failed == 0
     assert result.attempted > 0
@@ -198,7 +204,7 @@ def test_an_empty_store_can_be_opened_and_says_that_it_is_empty(tmp_path):
         run.ratios()
 
 
-def test_the_guide_names_every_column(run, other, rerun, tmp_path):
+def test_the_guide_names_every_column(run, other, rerun, replayed, tmp_path):
     guide = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
     levels = ("steps", "replans", "episodes", "tasks")
     tables = [ask(level) for level in levels for ask in (run.ratios, run.masses)]
@@ -212,6 +218,7 @@ def test_the_guide_names_every_column(run, other, rerun, tmp_path):
     tables += [run.compare(other, name) for name in ("differences", "estimates", "pairs", "unpaired")]
     tables += [run.groups(name) for name in ("groups", "words", "overlaps")]
     tables += [run.effects(rerun, name) for name in ("episodes", "summary", "rollouts", "rollout_episodes")]
+    tables += [va.open(replayed).deviation(name) for name in ("summary", "dimensions", "attention", "replans")]
     norms = run.analysis().group_contributions
     assert norms is not None
     tables += [norms.cells, norms.groups, run.overlay()]

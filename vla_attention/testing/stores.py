@@ -220,10 +220,13 @@ def episode_records(spec: StoreSpec, task: int, episode: int) -> tuple[EpisodeSt
                 size = (span.grid.image_height, span.grid.image_width, 3)
                 frames[span.camera] = generator.integers(0, 256, size, dtype=np.uint8)
                 coverage[span.camera] = covered[span.camera][replan]
+        noise_seed, state = int(generator.integers(2**63 - 1)), generator.normal(size=8)
+        # Drawn also where others are planted: a rerun with other actions was made from the same states.
+        drawn = generator.normal(size=(5, 7))
         records.append(
             ReplanRecord(
                 env_step=10 + 5 * replan,
-                noise_seed=int(generator.integers(2**63 - 1)),
+                noise_seed=noise_seed,
                 rows={
                     "joint": RecordedRows(
                         rows[replan],
@@ -233,8 +236,8 @@ def episode_records(spec: StoreSpec, task: int, episode: int) -> tuple[EpisodeSt
                 },
                 key_role={"joint": tokens.key_role[replan]},
                 prompt=tokens.prompts[tokens.prompt_index[replan]],
-                state=generator.normal(size=8),
-                actions=generator.normal(size=(5, 7)) if actions is None else actions[replan],
+                state=state,
+                actions=drawn if actions is None else actions[replan],
                 frames=frames if spec.frames else {},
                 coverage=coverage if spec.coverage else {},
             )

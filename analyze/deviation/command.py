@@ -1,0 +1,63 @@
+"""`vla-analyze deviation`: how far the policy's actions are from the data set's, beside attention."""
+
+from __future__ import annotations
+
+import argparse
+
+from vla_attention.analyze.arguments import (
+    add_grouping,
+    add_intervals,
+    add_output,
+    add_selection,
+    add_stores,
+    output_folder,
+    settings_of,
+    stores_of,
+)
+from vla_attention.analyze.show.output_files import write_parquet
+from vla_attention.analyze.show.screen import fitted, write_whole
+from vla_attention.schemas.command_line import command_parser
+
+_EXAMPLES = """examples:
+  vla-analyze deviation runs/droid.zarr
+  vla-analyze deviation runs/droid.zarr --grouping cameras --layers 10 11 12
+  vla-analyze deviation runs/droid.zarr --group bowl=word:bowl --ratio visual/bowl
+
+The store needs the data set's own actions: vla-capture replay stores them.
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of `vla-analyze deviation STORE ...`."""
+    parser = command_parser(
+        "vla-analyze deviation",
+        "How far the policy's actions are from those of the data set that it was replayed over:\n"
+        "by dimension in units of the data set's spread, first action and chunk, by task and phase,\n"
+        "and whether the deviation goes with where the policy looks.",
+        _EXAMPLES,
+    )
+    add_stores(parser)
+    add_selection(parser)
+    add_grouping(parser)
+    add_intervals(parser)
+    add_output(parser, "results/STORE/deviation")
+    return parser
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compare the actions; print the comparison, write the tables and the picture."""
+    from vla_attention.analyze.deviation.deviation_study import study_deviation
+    from vla_attention.analyze.deviation.text import deviation_text
+    from vla_attention.analyze.measures.question import ask
+
+    study = study_deviation(ask(stores_of(arguments), settings_of(arguments)))
+    text = deviation_text(study)
+    folder = output_folder(arguments, "deviation")
+    files = write_parquet(folder, **study.tables())
+    files.append(write_whole(folder, text))
+    if not arguments.no_plots:
+        from vla_attention.analyze.deviation.plot_deviation import plot_deviation
+
+        files += plot_deviation(study, folder)
+    print(fitted(text, folder, files))
+    return 0
