@@ -9,7 +9,8 @@
         frame.values["observation.state"]            # (number,) float64
         frame.instruction, frame.seconds, frame.index
 
-`vla-capture replay` records policy calls on such frames; docs/data-sets.md describes both.
+`vla-capture replay` records policy calls on such frames; `ReplayPolicy` is what its `--policy FILE.py` returns.
+docs/data-sets.md describes both.
 """
 
 from __future__ import annotations
@@ -17,5 +18,6 @@ from __future__ import annotations
 from vla_attention.capture.replay.data_set_errors import DataSetError
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, DataSetFrame, LeRobotDataset
 from vla_attention.capture.replay.lerobot_dataset import open_dataset as open
+from vla_attention.capture.replay.policy_file import ReplayPolicy
 
-__all__ = ["DataSetEpisode", "DataSetError", "DataSetFrame", "LeRobotDataset", "open"]
+__all__ = ["DataSetEpisode", "DataSetError", "DataSetFrame", "LeRobotDataset", "ReplayPolicy", "open"]

@@ -86,7 +86,8 @@ class RobotData:
         for camera in policy_cameras:
             column = chosen[camera]
             if column is None:
-                known = [name for name in (camera, *usual.get(camera, ())) if name in self.cameras]
+                same = (camera, IMAGES + camera)
+                known = [name for name in (*same, *usual.get(camera, ())) if name in self.cameras]
                 column = known[0] if known else NONE if camera in set(optional) else None
             if column is None:
                 raise BadArgument(

@@ -9,6 +9,7 @@ from pathlib import Path
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.policies.family import PolicyFamily
+from vla_attention.capture.policies.model_arguments import add_threads
 from vla_attention.capture.policies.robot import NONE
 from vla_attention.capture.recording_arguments import add_recording_arguments
 from vla_attention.schemas.errors import BadArgument, listing
@@ -18,6 +19,7 @@ REPLAY_EXAMPLES = """\
   vla-capture replay data/so101_pick --checkpoint my/pi05_so101 --every 15 --episodes 0 1 2-5
   vla-capture replay lerobot/droid_100 --checkpoint gs://openpi-assets/checkpoints/pi05_droid \\
       --action action.joint_velocity action.gripper_position
+  vla-capture replay data/so101_pick --policy my_smolvla.py --every 15
   vla-capture replay data/bimanual --checkpoint my/pi0 --camera left_wrist_0_rgb=wrist --camera right_wrist_0_rgb=none
 """
 
@@ -30,37 +32,55 @@ def add_replay_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) 
     parser.add_argument(
         "--policy",
         default=families[0].name,
-        metavar="NAME",
-        help=f"{listing(family.name for family in families)} (default: %(default)s)",
+        metavar="NAME|FILE.py",
+        help=f"{listing(family.name for family in families)}, or a file with a function load(device) that returns any "
+        "torch policy as a va.datasets.ReplayPolicy, see docs/data-sets.md (default: %(default)s)",
     )
-    family.add_arguments(parser)
-    parser.set_defaults(family=family)
-    _add_column_arguments(parser)
-    _add_frame_arguments(parser, family)
-    add_recording_arguments(parser, f"block indices (default: all){family.layers_note}")
+    of_file = is_policy_file(_policy_among(given))
+    if of_file:
+        group = parser.add_argument_group("model")
+        group.add_argument("--device", default="auto", help="auto (default: a GPU if there is one), cpu, cuda ...")
+        add_threads(group)
+    else:
+        family.add_arguments(parser)
+        parser.set_defaults(family=family)
+    _add_column_arguments(parser, of_file=of_file)
+    _add_frame_arguments(parser, "as the file says, else 1" if of_file else family.replan_default)
+    add_recording_arguments(parser, f"block indices (default: all){'' if of_file else family.layers_note}")
     _add_output_arguments(parser)
     parser.set_defaults(command=_run)
 
 
+def is_policy_file(name: str) -> bool:
+    """Whether a `--policy` names a file."""
+    return name.endswith(".py")
+
+
 def _family_among(given: Sequence[str], families: Sequence[PolicyFamily]) -> PolicyFamily:
     """Return the family that `--policy` names; the first one if nothing does, or an error comes later."""
+    named = _policy_among(given)
+    return next((family for family in families if family.name == named), families[0])
+
+
+def _policy_among(given: Sequence[str]) -> str:
+    """Return what a command line gives as `--policy`; empty for nothing."""
     named = ""
     for position, word in enumerate(given):
         if word.startswith("--policy="):
             named = word.removeprefix("--policy=")
         elif word == "--policy":
             named = " ".join(given[position + 1 : position + 2])
-    return next((family for family in families if family.name == named), families[0])
+    return named
 
 
 def check_policy_name(name: str) -> None:
-    """Raise `BadArgument` unless a family that reads data sets has this name."""
+    """Raise `BadArgument` unless this is a file, or the name of a family that reads data sets."""
     families = [family.name for family in policy_families() if family.reads_data_sets]
-    if name not in families:
-        raise BadArgument(f"Cannot use --policy {name}; expected {listing(families)}.")
+    if name not in families and not is_policy_file(name):
+        raise BadArgument(f"Cannot use --policy {name}; expected {listing(families)}, or a file FILE.py.")
 
 
-def _add_column_arguments(parser: argparse.ArgumentParser) -> None:
+def _add_column_arguments(parser: argparse.ArgumentParser, *, of_file: bool) -> None:
     group = parser.add_argument_group("what the policy reads of the data set")
     group.add_argument(
         "--camera",
@@ -86,23 +106,24 @@ def _add_column_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"columns of the recorded actions, which are kept beside the policy's; {NONE} keeps none (default: action "
         "or actions)",
     )
-    group.add_argument(
-        "--relative-actions",
-        type=int,
-        metavar="N",
-        help="the first N numbers of openpi's actions are differences to the state (default: as its configuration "
-        "says, 6 for pi0_libero, else 0)",
-    )
+    if not of_file:
+        group.add_argument(
+            "--relative-actions",
+            type=int,
+            metavar="N",
+            help="the first N numbers of openpi's actions are differences to the state (default: as its configuration "
+            "says, 6 for pi0_libero, else 0)",
+        )
     group.add_argument("--instruction", metavar="TEXT", help="what the policy reads instead of the data set's tasks")
 
 
-def _add_frame_arguments(parser: argparse.ArgumentParser, family: PolicyFamily) -> None:
+def _add_frame_arguments(parser: argparse.ArgumentParser, every: str) -> None:
     group = parser.add_argument_group("which frames")
     group.add_argument(
         "--every",
         type=int,
         metavar="N",
-        help=f"a policy call at frame 0, N, 2N ... of each episode (default: {family.replan_default})",
+        help=f"a policy call at frame 0, N, 2N ... of each episode (default: {every})",
     )
     group.add_argument(
         "--episodes", nargs="+", metavar="N", help="numbers of episodes, and ranges as 3-7 (default: all)"
@@ -123,6 +144,7 @@ def _run(arguments: argparse.Namespace, termination: Termination) -> int:
     check_policy_name(arguments.policy)
     threads = use_threads(arguments.threads)  # before torch is loaded
 
+    # Imported here: the command line's help needs neither torch nor polars.
     from vla_attention.capture.replay.command import run_replay
 
     return run_replay(arguments, threads, termination)

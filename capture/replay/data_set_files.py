@@ -28,6 +28,8 @@ INFO = "meta/info.json"
 #: Versions with one file per episode, and those with several episodes per file.
 FILE_PER_EPISODE, FILE_OF_MANY = ("v2.0", "v2.1"), ("v3.0",)
 VERSIONS = (*FILE_PER_EPISODE, *FILE_OF_MANY)
+#: Columns that every data set has, and that are numbers of its own.
+INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 #: What is read before the episodes are known.
 META_FILES = ("meta/*.json", "meta/*.jsonl", "meta/*.parquet", "meta/episodes/**")
 

@@ -22,6 +22,8 @@ SUCCESS_COLUMN = "next.success"
 
 #: Called before every policy call with the number of calls done; an exception that it raises drops the episode.
 BeforeCall = Callable[[int], None]
+#: Makes the policy calls of an episode and commits them.
+EpisodeReplay = Callable[[DataSetEpisode, BeforeCall], object]
 
 
 @dataclass(frozen=True)
@@ -59,11 +61,11 @@ def replay_episode(replay: Replay, episode: DataSetEpisode, before_call: BeforeC
     """
     policy, recording = replay.policy, replay.store.attributes.recording
     instruction = replay.instruction if replay.instruction is not None else episode.instructions[0]
-    state = _joined(episode, policy.robot.state)
-    actions = _joined(episode, policy.robot.actions) if policy.robot.actions else None
+    state = joined(episode, policy.robot.state)
+    actions = joined(episode, policy.robot.actions) if policy.robot.actions else None
     start = EpisodeStart(
         task_id=task_of(episode),
-        task_name=_task_name(instruction, task_of(episode)),
+        task_name=task_name(instruction, task_of(episode)),
         instruction=instruction,
         episode_index=episode.index,
         initial_state_index=episode.index,
@@ -77,7 +79,7 @@ def replay_episode(replay: Replay, episode: DataSetEpisode, before_call: BeforeC
         for frame in episode.frames(replay.every, cameras):
             before_call(len(writer.records))
             _append_call(replay, writer, frame, task_of(episode), state[frame.index], actions)
-        return writer.commit(_success(episode), episode.length)
+        return writer.commit(success_of(episode), episode.length)
 
 
 def _append_call(
@@ -110,17 +112,18 @@ def _append_call(
     )
 
 
-def _joined(episode: DataSetEpisode, columns: tuple[str, ...]) -> NDArray[np.float64]:
+def joined(episode: DataSetEpisode, columns: tuple[str, ...]) -> NDArray[np.float64]:
     """Return columns of numbers side by side, (frame, number)."""
     return np.concatenate([episode.column(name) for name in columns], axis=1)
 
 
-def _success(episode: DataSetEpisode) -> bool | None:
+def success_of(episode: DataSetEpisode) -> bool | None:
+    """Return whether the task was solved at some frame; None if the data set has no such column."""
     if SUCCESS_COLUMN not in episode.dataset.features:
         return None
     return bool(episode.column(SUCCESS_COLUMN).any())
 
 
-def _task_name(instruction: str, task_id: int) -> str:
+def task_name(instruction: str, task_id: int) -> str:
     """Return a name that can be a part of a path: the words of the instruction."""
     return re.sub(r"\W+", "_", instruction.strip()).strip("_")[:60] or f"task_{task_id}"

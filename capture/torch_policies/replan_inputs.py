@@ -53,6 +53,7 @@ class ReplanInputs:
         masks: camera -> (height, width) whole numbers: the number of each pixel's object, counted in the episode's
             `objects`.
         coverage: camera -> (patch, object), the share of each patch that each object covers; instead of masks.
+        dataset_actions: (step, action_dim), the actions that a data set has from this call on.
     """
 
     env_step: int
@@ -64,6 +65,7 @@ class ReplanInputs:
     noise_seed: int | None = None
     masks: Mapping[str, NDArray[np.integer]] = field(default_factory=dict)
     coverage: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    dataset_actions: NDArray[np.float64] | None = None
 
 
 _NAMES = tuple(part.name for part in fields(ReplanInputs) if part.name != "env_step")
@@ -109,7 +111,19 @@ def read_inputs(layout: PolicyLayout, facts: EpisodeFacts, env_step: int, given:
         roles=values.get("roles", {}),
         noise_seed=None if seed is None else int(seed),
         coverage={camera: coverage[camera] for camera in cameras if camera in coverage},
+        dataset_actions=_dataset_actions(values.get("dataset_actions")),
     )
+
+
+def _dataset_actions(given: Any) -> NDArray[np.float64] | None:
+    if given is None:
+        return None
+    actions = np.asarray(given, dtype=np.float64)
+    if actions.ndim != 2 or not len(actions):
+        raise BadArgument(
+            f"The dataset_actions of a replan have the shape {actions.shape}; expected (step, action_dim)."
+        )
+    return actions
 
 
 def _state(given: Any) -> NDArray[np.float64] | None:

@@ -389,4 +389,5 @@ class RecordedRun:
             actions=actions,
             frames=inputs.frames if self.attributes.recording.frames else {},
             coverage=inputs.coverage,
+            dataset_actions=inputs.dataset_actions,
         )

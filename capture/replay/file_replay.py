@@ -1,0 +1,136 @@
+"""A replay with any torch policy, recorded by `va.record`."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, replace
+
+import torch
+
+from vla_attention.capture.policies.noise import noise_seed
+from vla_attention.capture.policies.policy import camera_grid
+from vla_attention.capture.policies.robot import NONE, RobotData
+from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode
+from vla_attention.capture.replay.policy_file import ReplayPolicy
+from vla_attention.capture.replay.replay_episodes import BeforeCall, joined, success_of, task_name, task_of
+from vla_attention.capture.replay.replay_plan import ReplayPlan, announce, columns_of, record_episodes
+from vla_attention.capture.rollout.progress import say
+from vla_attention.capture.run_settings import recording_settings
+from vla_attention.capture.torch_policies.record import record
+from vla_attention.capture.torch_policies.session import RecordedRun
+from vla_attention.schemas.errors import BadArgument
+
+
+@dataclass(frozen=True)
+class FileReplay:
+    """One policy of a file on one data set. cameras: camera of the layout -> column. state, actions: columns."""
+
+    given: ReplayPolicy
+    run: RecordedRun
+    plan: ReplayPlan
+    every: int
+    cameras: dict[str, str]
+    state: tuple[str, ...]
+    actions: tuple[str, ...]
+
+    def replay_episode(self, episode: DataSetEpisode, before_call: BeforeCall) -> None:
+        """Make the policy calls of one episode, and commit them."""
+        own = self.plan.instruction
+        instruction = episode.instructions[0] if own is None else own
+        state = joined(episode, self.state) if self.state else None
+        actions = joined(episode, self.actions) if self.actions else None
+        task = task_of(episode)
+        # What the policy reads is not known of every policy: with no camera in the layout, all columns are decoded.
+        columns = tuple(self.cameras.values()) or None
+        with self.run.episode(
+            task_id=task,
+            episode_index=episode.index,
+            instruction=instruction,
+            task_name=task_name(instruction, task),
+        ) as recorded:
+            for number, frame in enumerate(episode.frames(self.every, columns)):
+                before_call(number)
+                frame = frame if own is None else replace(frame, instruction=own)
+                seed = noise_seed(self.plan.seed, task, episode.index, number)
+                torch.manual_seed(seed)
+                horizon = self.given.layout.action_horizon or 1
+                with recorded.replan(
+                    env_step=frame.index,
+                    frames={camera: frame.images[column] for camera, column in self.cameras.items()},
+                    state=None if state is None else state[frame.index],
+                    instruction=frame.instruction,
+                    noise_seed=seed,
+                    dataset_actions=None if actions is None else actions[frame.index : frame.index + horizon],
+                ) as replan:
+                    replan.actions = self.given.act(frame)
+            recorded.success = success_of(episode)
+            recorded.num_steps = episode.length
+
+
+def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: ReplayPolicy) -> int:
+    """Record the calls of the policy; returns the number of new episodes."""
+    offered = _offered(plan.robot_data, given)
+    layout = given.layout
+    cameras = offered.match_cameras(layout.camera_names, {}, ()) if layout.camera_names else {}
+    state, actions = _columns(offered, "state"), _columns(offered, "action")
+    plan.data.check_files(plan.wanted, tuple(cameras.values()) or plan.data.cameras)
+    every = plan.every or given.every
+    settings = recording_settings(arguments)
+    if settings.queries not in ("mean", "all"):
+        raise BadArgument(f"Cannot use --queries {settings.queries} with --policy FILE.py; expected mean or all.")
+    run = record(
+        plan.store,
+        given.policy,
+        layout=layout,
+        checkpoint=given.checkpoint,
+        tokenizer=given.tokenizer,
+        untrained=given.untrained,
+        layers=settings.layers,
+        denoise_steps=[int(word) if word.isdigit() else word for word in settings.denoise_steps],
+        heads=settings.heads,
+        queries="mean" if settings.queries == "mean" else "all",
+        bits=settings.mantissa_bits,
+        contributions=None if settings.contributions else False,
+        frames=settings.frames,
+        resume=plan.mode == "resume",
+        overwrite=plan.mode == "overwrite",
+    )
+    run.attributes = replace(
+        run.attributes, protocol=plan.protocol(every), data_set=plan.source(columns_of(cameras, state, actions))
+    )
+    grids = [camera_grid(run.attributes.sites, camera) for camera in cameras]
+    sizes = [grid.image_height * grid.image_width * 3 for grid in grids]
+    with run:
+        todo = announce(plan, run.attributes, layout.action_horizon, sizes)
+        replay = FileReplay(given, run, plan, every, cameras, state, actions)
+        added = record_episodes(plan, todo, every, replay.replay_episode)
+    if run.num_dropped:
+        say(f"In {run.num_dropped} policy calls no attention ran; they are not in the store.")
+    if added:
+        say(
+            f"Largest difference of P·V from the policy's own attention: {run.largest_error:.2g} of its largest output."
+        )
+    return added
+
+
+def _offered(data: RobotData, given: ReplayPolicy) -> RobotData:
+    """Return the data set's columns with the choices of the file, which those of the command line replace."""
+    return replace(
+        data,
+        chosen_cameras={**given.cameras, **data.chosen_cameras},
+        chosen_state=data.chosen_state or given.state,
+        chosen_actions=data.chosen_actions or given.actions,
+    )
+
+
+def _columns(data: RobotData, what: str) -> tuple[str, ...]:
+    """Return the columns of state or actions: those that were chosen, else the usual ones, none if there are none."""
+    chosen = data.chosen_state if what == "state" else data.chosen_actions
+    if chosen == (NONE,):
+        return ()
+    try:
+        return data.state_columns() if what == "state" else data.action_columns()
+    except BadArgument:
+        if chosen:
+            raise
+        return ()
