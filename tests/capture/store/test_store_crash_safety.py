@@ -6,7 +6,6 @@ Failures are injected from here, into the calls that reach the disk: the product
 from __future__ import annotations
 
 import errno
-import functools
 import os
 import shutil
 import signal
@@ -24,6 +23,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from zarr.storage import LocalStore
 
 from tests.kit.crashes import PROCESSES, before_call, die, run_child
+from tests.kit.durable_stores import SPEC, leftovers, names, store_bytes, write_store
 from tests.kit.examples import examples
 from tests.kit.slow import slow_except
 from vla_attention.capture.store.durable_files import StoreWriteFailed
@@ -31,8 +31,6 @@ from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import (
-    FORMAT_VERSION,
-    FormatTooNew,
     RunMismatch,
     StoreError,
     StoreExists,
@@ -40,35 +38,12 @@ from vla_attention.schemas.stores.store_format import (
 )
 from vla_attention.schemas.stores.verify import verify_store
 from vla_attention.testing.stores import (
-    StoreSpec,
     commit,
     denoise_times,
     episode_records,
     root_attributes,
     write_episode,
 )
-from vla_attention.testing.stores import write_store as write_made_up_store
-
-#: Everything here is about durability.
-write_store = functools.partial(write_made_up_store, durable=True)
-SPEC = StoreSpec(tasks=(0,), episodes=2, replans=9, layers=(0,), heads=(0,), frames=False)
-
-
-def store_bytes(path: Path) -> dict[str, bytes]:
-    return {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
-
-
-def names(path: Path) -> list[str]:
-    return [episode.name for episode in open_store(path).episodes]
-
-
-def leftovers(path: Path) -> list[Path]:
-    return list(path.with_name(path.name + ".partial").glob("*"))
-
-
-@pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory) -> dict[str, bytes]:
-    return store_bytes(write_store(tmp_path_factory.mktemp("reference") / "a.zarr", spec=SPEC))
 
 
 def write_and_die(path: Path, kind: str, number: int) -> None:
@@ -237,56 +212,6 @@ def test_many_processes_create_and_fill_one_store(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [
-        ({"seed": 1}, "protocol.seed is 0"),
-        ({"suite": "libero_10"}, "protocol.suite"),
-        ({"mantissa_bits": 7}, "recording.mantissa_bits is 10, this run's is 7"),
-        ({"layers": (0, 1)}, "recording.layers"),
-        ({"queries": "all"}, "recording.queries"),
-        ({"frames": True}, "recording.frames"),
-        ({"policy": "other"}, "policy.name"),
-        ({"num_layers": 5}, "policy.num_layers"),
-    ],
-)
-def test_a_different_run_cannot_be_resumed(tmp_path, uninterrupted, change, field):
-    path = write_store(tmp_path / "a.zarr", spec=SPEC)
-    with pytest.raises(RunMismatch, match=field) as caught:
-        write_store(path, mode="resume", spec=SPEC, **change)
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 300 + len(str(path))
-    assert store_bytes(path) == uninterrupted
-
-
-def test_a_different_layout_names_the_span(tmp_path):
-    path = write_store(tmp_path / "a.zarr", spec=SPEC)
-    attributes = root_attributes(SPEC)
-    (site,) = attributes.sites
-    other = replace(site, spans=(*site.spans[:-1], replace(site.spans[-1], stop=site.spans[-1].stop + 1)))
-    with pytest.raises(RunMismatch, match=r"sites\[0\]\.spans\[4\]\.stop is 39, this run's is 40"):
-        open_run(path, replace(attributes, sites=(other,)), "resume")
-
-
-def test_other_provenance_and_another_checkpoint_path_may_resume(tmp_path, uninterrupted):
-    path = write_store(tmp_path / "a.zarr", spec=replace(SPEC, episodes=1))
-    attributes = root_attributes(SPEC)
-    moved = replace(attributes, provenance={"numpy": "9"}, policy=replace(attributes.policy, checkpoint="elsewhere"))
-    store = open_run(path, moved, "resume")
-    assert store.attributes == attributes  # what the store says, not what this process is
-    write_episode(store, SPEC, 0, 1)
-    assert store_bytes(path) == uninterrupted
-
-
-def test_an_existing_store_is_refused_resumed_or_overwritten(tmp_path, uninterrupted):
-    path = write_store(tmp_path / "a.zarr", spec=replace(SPEC, seed=5))
-    with pytest.raises(StoreExists, match=r"holds 2 episodes.*--resume.*--overwrite"):
-        write_store(path, spec=SPEC)
-    write_store(path, mode="overwrite", spec=SPEC)
-    assert store_bytes(path) == uninterrupted
-    assert list(tmp_path.iterdir()) == [path]
-
-
 def test_a_crash_while_overwriting_leaves_no_half_store(tmp_path, monkeypatch, uninterrupted):
     path = write_store(tmp_path / "a.zarr", spec=replace(SPEC, seed=5))
 
@@ -300,112 +225,6 @@ def test_a_crash_while_overwriting_leaves_no_half_store(tmp_path, monkeypatch, u
             open_run(path, root_attributes(SPEC), "overwrite")
     assert not path.exists()
     assert store_bytes(write_store(path, mode="overwrite", spec=SPEC)) == uninterrupted
-
-
-def test_overwriting_where_nothing_is(tmp_path, uninterrupted):
-    assert store_bytes(write_store(tmp_path / "new/folder/a.zarr", mode="overwrite", spec=SPEC)) == uninterrupted
-
-
-def test_an_episode_is_not_added_to_another_run_that_took_the_place(tmp_path):
-    path = tmp_path / "a.zarr"
-    store = open_run(path, root_attributes(SPEC), "new")
-    start, records = episode_records(SPEC, 0, 0)
-    with store.episode(start, denoise_times(SPEC), 9) as writer:
-        writer.append(records[0])
-        open_run(path, root_attributes(replace(SPEC, seed=3)), "overwrite")
-        with pytest.raises(RunMismatch, match=r"protocol\.seed"):
-            writer.commit(False, 5)
-        shutil.rmtree(path)
-    with store.episode(start, denoise_times(SPEC), 9) as writer:
-        writer.append(records[0])
-        with pytest.raises(StoreError, match="has been removed"):
-            writer.commit(False, 5)
-
-
-def make_foreign(path: Path, kind: str) -> None:
-    if kind == "file":
-        path.write_text("mine")
-        return
-    path.mkdir()
-    if kind == "folder with files":
-        (path / "thesis.txt").write_text("mine")
-    elif kind == "other Zarr group":
-        (path / "zarr.json").write_text('{"zarr_format": 3, "node_type": "group", "attributes": {"mine": 1}}')
-    elif kind == "Zarr array":
-        (path / "zarr.json").write_text('{"zarr_format": 3, "node_type": "array", "attributes": {}}')
-    elif kind == "unreadable zarr.json":
-        (path / "zarr.json").write_bytes(b"\xff{")
-
-
-@pytest.mark.parametrize("mode", ["new", "resume", "overwrite"])
-@pytest.mark.parametrize(
-    "kind",
-    ["file", "empty folder", "folder with files", "other Zarr group", "Zarr array", "unreadable zarr.json"],
-)
-def test_what_is_not_a_store_is_never_touched(tmp_path, kind, mode):
-    path = tmp_path / "a.zarr"
-    make_foreign(path, kind)
-    before = store_bytes(tmp_path)
-    with pytest.raises(StoreError):
-        write_store(path, mode=mode, spec=SPEC)
-    assert store_bytes(tmp_path) == before
-    assert path.exists()
-
-
-@pytest.mark.parametrize("mode", ["new", "resume", "overwrite"])
-def test_a_store_of_a_later_format_is_never_touched(tmp_path, mode):
-    path = write_store(tmp_path / "a.zarr", spec=SPEC)
-    root = path / "zarr.json"
-    versions = (f'"format_version": {version}' for version in (FORMAT_VERSION, FORMAT_VERSION + 1))
-    root.write_text(root.read_text().replace(*versions))
-    before = store_bytes(path)
-    with pytest.raises(FormatTooNew):
-        write_store(path, mode=mode, spec=SPEC)
-    assert store_bytes(path) == before
-
-
-@pytest.mark.parametrize("name", ["a", "a.zarr.zip", "a.zar", ".zarr.d"])
-def test_a_path_without_the_suffix_is_refused(tmp_path, name):
-    with pytest.raises(BadArgument, match=r"ends with '\.zarr'"):
-        write_store(tmp_path / name, spec=SPEC)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_that_cannot_be_written(tmp_path):
-    if os.geteuid() == 0:
-        pytest.skip("root may write everywhere")
-    tmp_path.chmod(0o500)
-    try:
-        with pytest.raises(BadArgument, match="Permission denied"):
-            write_store(tmp_path / "a.zarr", spec=SPEC)
-    finally:
-        tmp_path.chmod(0o700)
-
-
-@pytest.mark.parametrize("parent", ["file/a.zarr", "file/b/a.zarr"])
-def test_a_parent_that_is_a_file(tmp_path, parent):
-    (tmp_path / "file").write_text("mine")
-    with pytest.raises(BadArgument, match="Cannot write a store"):
-        write_store(tmp_path / parent, spec=SPEC)
-
-
-def test_permission_denied_is_one_sentence(tmp_path, monkeypatch):
-    def refuse(*_: object, **__: object) -> None:
-        raise PermissionError(errno.EACCES, "Permission denied")
-
-    monkeypatch.setattr(Path, "mkdir", refuse)
-    with pytest.raises(BadArgument, match="Permission denied; give another --store"):
-        open_run(tmp_path / "a.zarr", root_attributes(SPEC), "new")
-
-
-def test_a_link_to_a_store_is_followed(tmp_path, uninterrupted):
-    (tmp_path / "elsewhere").mkdir()
-    link = tmp_path / "a.zarr"
-    link.symlink_to(tmp_path / "elsewhere/real.zarr")
-    for mode in ("new", "resume", "overwrite"):
-        write_store(link, mode=mode, spec=SPEC)
-        assert store_bytes(tmp_path / "elsewhere/real.zarr") == uninterrupted
-        assert link.is_symlink()
 
 
 def test_only_dead_processes_of_this_machine_lose_their_partials(tmp_path):
