@@ -13,7 +13,7 @@ from vla_attention.analyze.effects.effect_study import EffectStudy
 from vla_attention.analyze.effects.group_rows import GroupRow, group_rows
 from vla_attention.analyze.effects.plot_effects import bounded_axis
 from vla_attention.analyze.show.numbers import interval_name, of_tasks
-from vla_attention.analyze.show.plot_axes import uniform_line
+from vla_attention.analyze.show.plot_axes import legend_above, uniform_line
 from vla_attention.analyze.show.plot_colours import DATA_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, shortened, title
@@ -27,6 +27,12 @@ _NOISE_COLOR = "#C9B8D8"
 _LABELS = {"mass": "mass of its attention (log)", "lift": "lift of its attention (log; 1: uniform)"}
 #: Sizes of the names, in widths and heights of the axes: of a character, of the gap to a point, of a line.
 _CHARACTER, _GAP, _LINE = 0.0155, 0.014, 0.042
+#: What is drawn over what: bars, names on their white ground, points.
+_BARS, _NAMES, _POINTS = 2.0, 3.0, 4.0
+#: Where a name may stand: right or left of its point, and how many lines above it. Beside the bars before across one.
+_PLACES = (("left", 0.6), ("right", 0.6), ("left", -0.6), ("right", -0.6), ("left", 0.0), ("right", 0.0), ("left", 1.3))
+#: Left, right, bottom and top, in widths and heights of the axes.
+_Box = tuple[float, float, float, float]
 
 
 @drawn_in_our_style
@@ -73,33 +79,67 @@ def _panel(axes: Axes, rows: list[GroupRow], measure: str, noise: list[dict[str,
             if low is not None and high is not None:
                 along = [row["effect"]] * 2 if across else [row[measure]] * 2
                 x, y = ([low, high], along) if across else (along, [low, high])
-                axes.plot(x, y, color=DATA_COLOR, linewidth=0.9, alpha=0.6)
-        axes.plot(row[measure], row["effect"], "o", color=DATA_COLOR, markersize=5)
+                axes.plot(x, y, color=DATA_COLOR, linewidth=0.9, alpha=0.6, zorder=_BARS)
+        axes.plot(row[measure], row["effect"], "o", color=DATA_COLOR, markersize=5, zorder=_POINTS)
     if measure == "lift":
         uniform_line(axes, along="x")
     if noise and measure == "mass":
-        axes.legend(loc="best")
+        legend_above(axes)
     axes.set_xlabel(_LABELS[measure])
     axes.grid()
 
 
 def _name_points(axes: Axes, rows: list[GroupRow], measure: str) -> None:
-    """Names beside points where there is room, those of larger effects first."""
+    """Names beside points where there is room, those of larger effects first.
+
+    A name covers no other name and no point. It stands where the fewest bars are, on a white ground over them.
+    """
     (left, right), (bottom, top) = np.log(axes.get_xlim()), axes.get_ylim()
-    taken: list[tuple[float, float, float, float]] = []
-    points = [(row.name, row.without[measure], row.without["effect"]) for row in rows if row.without is not None]
-    for name, value, effect in sorted(points, key=lambda point: -point[2]):
-        x, y = (np.log(value) - left) / (right - left), (effect - bottom) / (top - bottom)
+
+    def across(value: float) -> float:
+        return float((np.log(value) - left) / (right - left))
+
+    def up(effect: float) -> float:
+        return (effect - bottom) / (top - bottom)
+
+    shown = [(row.name, row.without) for row in rows if row.without is not None]
+    places = [(across(row[measure]), up(row["effect"])) for _, row in shown]
+    points = [(x - _GAP / 2, x + _GAP / 2, y - _LINE / 4, y + _LINE / 4) for x, y in places]
+    bars: list[_Box] = []
+    for (_, row), (x, y) in zip(shown, places, strict=True):
+        if row[f"{measure}_low"] is not None and row[f"{measure}_high"] is not None:
+            bars.append((across(row[f"{measure}_low"]), across(row[f"{measure}_high"]), y, y))
+        if row["effect_low"] is not None and row["effect_high"] is not None:
+            bars.append((x, x, up(row["effect_low"]), up(row["effect_high"])))
+    names: list[_Box] = []
+    for (name, _), (x, y) in sorted(zip(shown, places, strict=True), key=lambda item: -item[1][1]):
         text = shortened(name, 20)
         width = _CHARACTER * len(text)
-        for align, start, up in (("left", x + _GAP, 0.0), ("right", x - _GAP - width, 0.0), ("left", x + _GAP, _LINE)):
-            box = (start, start + width, y + up - _LINE / 2, y + up + _LINE / 2)
-            free = all(box[1] < o[0] or box[0] > o[1] or box[3] < o[2] or box[2] > o[3] for o in taken)
-            if free and box[0] >= 0 and box[1] <= 1:
-                where = start if align == "left" else start + width
-                axes.text(where, y + up, text, transform=axes.transAxes, ha=align, va="center", size=7)
-                taken.append(box)
-                break
+        found: list[tuple[int, str, float, _Box]] = []
+        for align, lines in _PLACES:
+            start, height = x + _GAP if align == "left" else x - _GAP - width, y + lines * _LINE
+            box = (start, start + width, height - _LINE / 2, height + _LINE / 2)
+            inside = box[0] >= 0 and box[1] <= 1 and box[2] >= 0 and box[3] <= 1
+            if inside and not any(_overlap(box, other) for other in (*names, *points)):
+                found.append((sum(_overlap(box, bar) for bar in bars), align, height, box))
+        if found:
+            _, align, height, box = min(found, key=lambda place: place[0])
+            axes.text(
+                box[0] if align == "left" else box[1],
+                height,
+                text,
+                transform=axes.transAxes,
+                ha=align,
+                va="center",
+                size=7,
+                zorder=_NAMES,
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.4},
+            )
+            names.append(box)
+
+
+def _overlap(one: _Box, other: _Box) -> bool:
+    return one[0] <= other[1] and other[0] <= one[1] and one[2] <= other[3] and other[2] <= one[3]
 
 
 def _table(rows: list[GroupRow]) -> pl.DataFrame:
