@@ -35,6 +35,8 @@ from vla_attention.schemas.errors import BadArgument
 
 #: Of an episode in the suites of cubes, where most are solved within half of them.
 MAX_STEPS = 100
+#: Of each task, and of each episode.
+_EPISODES, _REPLANS = 1, 3
 STAGES = ("known", "prediction", "mixing", "success")
 
 
@@ -134,6 +136,15 @@ def run(plan: Plan) -> dict[str, Any]:
 
 def _plan(arguments: argparse.Namespace) -> Plan:
     stages = tuple(arguments.stages)
+    for option in ("num_episodes", "replans", "max_steps"):
+        given = getattr(arguments, option)
+        if given is not None and given < 1:
+            raise BadArgument(f"--{option.replace('_', '-')} is {given}; it must be at least 1.")
+    for option in ("num_episodes", "replans", "max_steps", "rollouts"):
+        if arguments.reduced and getattr(arguments, option) is not None:
+            raise BadArgument(
+                f"--{option.replace('_', '-')} does not go with --reduced, which has its own numbers; leave one out."
+            )
     if arguments.checkpoint is not None:
         shipped = KnownPolicy(
             Path(arguments.checkpoint).name, arguments.checkpoint, arguments.suite, family=arguments.family
@@ -150,7 +161,8 @@ def _plan(arguments: argparse.Namespace) -> Plan:
             shipped = KnownPolicy(name, arguments.shipped, "cubes", SHIPPED)
         tasks = arguments.task_id or list(range(NUM_BASE_TASKS))
     max_steps = arguments.max_steps or (MAX_STEPS if policies else None)
-    plan = Plan(policies, shipped, arguments.work, stages, tasks, arguments.num_episodes, arguments.replans, max_steps)
+    episodes, replans = arguments.num_episodes or _EPISODES, arguments.replans or _REPLANS
+    plan = Plan(policies, shipped, arguments.work, stages, tasks, episodes, replans, max_steps)
     if arguments.rollouts is not None:
         chosen = tuple(tuple(CONDITIONS)[number] for number in arguments.rollouts)
         plan = replace(plan, conditions=chosen, control_rollouts=False)
@@ -186,8 +198,8 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
         help="rollouts of the shipped policy alone, under these conditions of success.py, from 1 (default: all)",
     )
     parser.add_argument("--task-id", type=int, nargs="+", metavar="N", help="default: the base tasks; of your own: all")
-    parser.add_argument("--num-episodes", type=int, default=1, metavar="N", help="of each task (default: 1)")
-    parser.add_argument("--replans", type=int, default=3, metavar="N", help="policy calls of each episode (default: 3)")
+    parser.add_argument("--num-episodes", type=int, metavar="N", help=f"of each task (default: {_EPISODES})")
+    parser.add_argument("--replans", type=int, metavar="N", help=f"policy calls of each episode (default: {_REPLANS})")
     parser.add_argument("--max-steps", type=int, metavar="N", help=f"default: {MAX_STEPS}; of your own: the suite's")
     return parser.parse_args(argv)
 

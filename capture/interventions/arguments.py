@@ -180,6 +180,8 @@ def _prompt(text: str) -> PromptChange:
     if kind == "task" and value.isdecimal():
         return PromptChange("task", task_id=int(value))
     if kind == "text" and separator:
+        if not value.strip():
+            raise BadArgument(f"--prompt '{text}' has no text; give some behind the colon, or --prompt empty for none.")
         return PromptChange("text", text=value)
     if kind == "synonyms" and value:
         from vla_attention.capture.interventions.prompts import read_synonyms

@@ -89,7 +89,8 @@ def read_synonyms(path: Path) -> dict[str, str]:
         text = path.read_text(encoding="utf-8")
         content = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
     except (OSError, ValueError) as error:
-        raise SynonymsUnreadable(f"Cannot read the synonyms '{path}' ({error}); expected JSON or TOML.") from None
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise SynonymsUnreadable(f"Cannot read the synonyms '{path}' ({reason}); expected JSON or TOML.") from None
     if not isinstance(content, dict) or not content or not all(isinstance(value, str) for value in content.values()):
         raise SynonymsUnreadable(f'The synonyms \'{path}\' are no table; expected for instance {{"bowl": "dish"}}.')
     several = [word for word in content if len(split_words(word)) != 1]

@@ -24,10 +24,15 @@ from vla_attention.capture.environments.episode_protocol import CAMERAS, WAIT_AC
 from vla_attention.capture.environments.suites import find_suite, list_tasks
 from vla_attention.capture.policies.pi.preprocess import libero_state, model_image
 from vla_attention.capture.small_policy.experts import CLOSED, OPEN, expert_action, move_to, read_state
+from vla_attention.schemas.errors import UserError
 
 #: Height and width of the pictures, in pixels, and length of the action chunks.
 PICTURE_SIZE, HORIZON = 64, 10
 _MOST_EPISODES = 10**9
+
+
+class NoDemonstration(UserError):
+    """A part in which the expert solved no episode."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +96,9 @@ class Demonstrator:
         """Return the samples of one part; failed episodes are left out.
 
         after_episode: is told after every episode how many samples it gave.
+
+        Raises:
+            NoDemonstration: all of them failed.
         """
         first = number * self.settings.episodes_per_part
         samples: list[dict[str, NDArray[Any]]] = []
@@ -98,6 +106,11 @@ class Demonstrator:
             of_episode = list(self._episode(episode))
             samples += of_episode
             after_episode(len(of_episode))
+        if not samples:
+            raise NoDemonstration(
+                f"Part {number} has no demonstration: the expert solved none of its {self.settings.episodes_per_part} "
+                f"episodes with the seed {self.settings.seed}; give another --seed and another folder."
+            )
         return {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
 
     def _draw_task(self, generator: np.random.Generator) -> tuple[int, CubeTask]:

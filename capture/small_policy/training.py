@@ -219,6 +219,11 @@ def train(
     }
     training = Training(settings, config, number_ids(tokenizer).tolist())
     facts = _begin(training, output, facts, resume=resume, new_demonstrations=new_demonstrations, say=say)
+    say(
+        f"trains {sum(parameter.numel() for parameter in training.model.parameters()):,} parameters on "
+        f"{len(training_part):,} samples to step {settings.steps}, with {len(held_out):,} samples of other scenes held "
+        f"out; a line every {settings.log_every} steps"
+    )
     statistics = _as_statistics(facts["state"])
 
     def batches(part: np.ndarray, seed: int, jitter: bool) -> Batches:

@@ -36,7 +36,7 @@ def read_run(path: Path) -> tuple[RootAttributes, str]:
         nearby = sorted(str(found) for found in path.parent.glob("*.zarr")) if path.parent.is_dir() else []
         raise StoreNotFound(
             f"There is no store at {path}.{did_you_mean(str(path), nearby)} "
-            f"Stores in {path.parent}: {listing(nearby)}. Make one with vla-capture."
+            f"Stores in {path.parent}: {listing(nearby, 5)}. Make one with vla-capture."
         )
     try:
         attributes = group_attributes((path / "zarr.json").read_bytes())

@@ -39,6 +39,22 @@ def numbers_of(values):
     return pl.DataFrame(rows, schema=names, orient="row")
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--reduced", "--replans", "2"), "--replans does not go with --reduced"),
+        (("--reduced", "--num-episodes", "2"), "--num-episodes does not go with --reduced"),
+        (("--reduced", "--max-steps", "50"), "--max-steps does not go with --reduced"),
+        (("--reduced", "--rollouts", "1"), "--rollouts does not go with --reduced"),
+        (("--replans", "0"), "--replans is 0; it must be at least 1"),
+    ],
+)
+def test_options_that_would_be_ignored_are_refused(words, message, tmp_path, capsys):
+    assert main(["--checkpoint", "pi05_cubes", "--work", str(tmp_path / "work"), *words]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "work").exists()
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_rank_correlation_is_that_of_scipy(seed):
     scipy_stats = pytest.importorskip("scipy.stats")

@@ -121,7 +121,10 @@ def test_the_loss_falls(demonstrations, tmp_path):
 
 def test_a_training_that_was_stopped_goes_on_the_same(demonstrations, whole, tmp_path):
     expected, folder = whole
-    train(demonstrations, INSTRUCTIONS, tmp_path, SETTINGS, stop_at=3, say=quiet)
+    said: list[str] = []
+    train(demonstrations, INSTRUCTIONS, tmp_path, SETTINGS, stop_at=3, say=said.append)
+    assert said[0].startswith("trains ")  # at once, not with the first line of losses
+    assert f"samples to step {SETTINGS.steps}" in said[0]
     found = train(demonstrations, INSTRUCTIONS, tmp_path, SETTINGS, resume=True, say=quiet)
     for name, tensor in expected.average.state_dict().items():
         torch.testing.assert_close(found.average.state_dict()[name], tensor, rtol=0, atol=1e-6)

@@ -182,6 +182,13 @@ def test_a_missing_store_names_its_neighbours(path):
         open_store(path.parent / "nowhere" / "a.zarr")
 
 
+def test_a_missing_store_names_five_neighbours_at_most(tmp_path):
+    for number in range(7):
+        (tmp_path / f"run{number}.zarr").mkdir()
+    with pytest.raises(StoreNotFound, match=r"run0\.zarr, .*run4\.zarr and 2 more\. Make one"):
+        open_store(tmp_path / "none.zarr")
+
+
 def test_a_folder_or_file_that_is_no_store(tmp_path):
     with pytest.raises(StoreError, match=r"is not a store: it has no zarr\.json"):
         open_store(tmp_path)
