@@ -191,3 +191,70 @@ def small_pi0_fast(**changes: Any) -> Any:
     # The tokens themselves, as actions: what turns them into actions is another network's tokenizer.
     policy.detokenize_actions = lambda tokens, action_horizon, action_dim: tokens[:, :action_horizon, None].float()
     return policy.eval()
+
+
+class StandInBackbone(torch.nn.Module):
+    """A mean over neighbours in the place of GR00T's vision-language model, whose class needs flash-attn."""
+
+    def __init__(self, width: int = 24, image_token: int = 98) -> None:
+        super().__init__()
+        language = torch.nn.Module()
+        language.model = torch.nn.Module()
+        language.model.embed_tokens = torch.nn.Embedding(100, width)
+        self.eagle_model = torch.nn.Module()
+        self.eagle_model.language_model = language
+        self.eagle_model.image_token_index = image_token
+        self.patches = torch.nn.Linear(12, width)
+
+    def prepare_input(self, batch: dict[str, Any]) -> Any:
+        """Return the batch as the real class does."""
+        from transformers.feature_extraction_utils import BatchFeature
+
+        return BatchFeature(data=batch)
+
+    def forward(self, batch: Any) -> Any:
+        """Return features (batch, token, width), and which tokens are no padding."""
+        from transformers.feature_extraction_utils import BatchFeature
+
+        ids = batch["eagle_input_ids"]
+        embedded = self.eagle_model.language_model.model.embed_tokens(ids)
+        pictures = batch["eagle_pixel_values"].unfold(2, 2, 2).unfold(3, 2, 2)
+        pieces = pictures.permute(0, 2, 3, 1, 4, 5).reshape(len(ids), -1, 12)
+        embedded = embedded.masked_scatter((ids == self.eagle_model.image_token_index)[..., None], self.patches(pieces))
+        return BatchFeature(
+            data={"backbone_features": embedded, "backbone_attention_mask": batch["eagle_attention_mask"]}
+        )
+
+
+def small_groot() -> Any:
+    """LeRobot's GrootPolicy with the real action head of GR00T N1.5, on a stand-in for its vision-language model."""
+    from lerobot.policies.groot import groot_n1
+    from lerobot.policies.groot.configuration_groot import GrootConfig
+    from lerobot.policies.groot.modeling_groot import GrootPolicy
+
+    blocks = {"num_attention_heads": 4, "attention_head_dim": 8, "dropout": 0.0, "final_dropout": True}
+    head = {
+        "diffusion_model_cfg": {
+            **{**blocks, "num_layers": 4, "output_dim": 16, "norm_type": "ada_norm", "positional_embeddings": None},
+            **{"interleave_self_attention": True, "cross_attention_dim": 24},
+        },
+        "vl_self_attention_cfg": {**blocks, "attention_head_dim": 6, "num_layers": 1, "positional_embeddings": None},
+        **{"input_embedding_dim": 32, "backbone_embedding_dim": 24, "hidden_size": 16, "max_seq_len": 32},
+        **{"action_dim": ACTION_DIM, "action_horizon": 5, "num_inference_timesteps": 3, "max_num_embodiments": 2},
+        **{"num_target_vision_tokens": 2, "max_state_dim": STATE_DIM},
+    }
+    torch.manual_seed(0)
+    with mock.patch.object(groot_n1, "EagleBackbone", lambda **_: StandInBackbone()):
+        model = groot_n1.GR00TN15(
+            groot_n1.GR00TN15Config(
+                backbone_cfg={}, action_head_cfg=head, action_horizon=5, action_dim=ACTION_DIM, compute_dtype="float32"
+            ),
+            local_model_path="",
+        )
+    settings: dict[str, Any] = {
+        **features(8, 8),
+        **{"use_bf16": False, "chunk_size": 5, "n_action_steps": 5, "max_state_dim": STATE_DIM},
+        "max_action_dim": ACTION_DIM,
+    }
+    with mock.patch.object(GrootPolicy, "_create_groot_model", return_value=model):
+        return GrootPolicy(GrootConfig(**settings)).eval()
