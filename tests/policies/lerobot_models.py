@@ -244,7 +244,7 @@ def small_groot() -> Any:
         **{"num_target_vision_tokens": 2, "max_state_dim": STATE_DIM},
     }
     torch.manual_seed(0)
-    with mock.patch.object(groot_n1, "EagleBackbone", lambda **_: StandInBackbone()):
+    with mock.patch.object(groot_n1, "EagleBackbone", return_value=StandInBackbone()):
         model = groot_n1.GR00TN15(
             groot_n1.GR00TN15Config(
                 backbone_cfg={}, action_head_cfg=head, action_horizon=5, action_dim=ACTION_DIM, compute_dtype="float32"

@@ -139,7 +139,7 @@ def _layout(
         sites=(site,),
         rules=(
             CallRule(rule_path(llama, r"layers\.(?P<block>\d+)\.self_attn"), "joint"),
-            CallRule(rule_path(path, r"vision_backbone\..*"), None),
+            CallRule(rule_path(path, r"vision_backbone(\..*)?"), None),
         ),
         num_layers=text.num_hidden_layers,
         num_heads=text.num_attention_heads,
