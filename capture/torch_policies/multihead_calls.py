@@ -43,6 +43,7 @@ def watch_call(
     bound = _SIGNATURE.bind(*args, **kwargs)
     bound.apply_defaults()
     given = dict(bound.arguments)
+    block.refuse_nested(given["query"], given["key"])
     query, key, heads = given["query"], given["static_k"], given["num_heads"]
     batch = query.shape[1] if query.ndim == 3 else 1
     keys = given["key"].shape[0] if key is None else key.shape[1]

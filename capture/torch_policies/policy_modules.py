@@ -78,7 +78,12 @@ def modules_of(policy: object) -> dict[str, nn.Module]:
     seen: set[int] = set()
     for path, part in _parts(policy, "", 0, seen):
         name = f"{type(part).__module__}.{type(part).__qualname__}"
-        if isinstance(part, torch.jit.ScriptModule) or name.startswith(_COMPILED):
+        if isinstance(part, nn.Module):
+            graphed = getattr(part.__dict__.get("forward"), "__module__", "") == "torch.cuda.graphs"
+            name = "a CUDA graph of make_graphed_callables" if graphed else name
+        else:
+            graphed = False
+        if graphed or isinstance(part, torch.jit.ScriptModule) or name.startswith(_COMPILED):
             raise CannotRunEager(
                 f"{path or 'The policy'} is a compiled program ({name}): its attention cannot be seen, and it cannot "
                 "be made eager. Load the policy as an ordinary torch module; torch.compile is fine."

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall
 from vla_attention.capture.torch_policies.call_changes import check_keys_left, fitted_change
@@ -19,6 +20,11 @@ FUNCTIONS: tuple[Callable[..., Any], ...] = (
     torch.ops.aten.scaled_dot_product_attention,
     torch.ops.aten.scaled_dot_product_attention.default,
 )
+
+#: Where a call is changed: flash attention, which a policy may have asked for, takes no mask.
+_ANY_KERNEL = [
+    SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION, SDPBackend.CUDNN_ATTENTION, SDPBackend.MATH,
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,7 @@ def watch_call(
     """Run one call, changed if the watcher says so, and tell the watcher about it."""
     given = _Arguments(*args, **kwargs)
     query, key = given.query, given.key
+    block.refuse_nested(query, key)
     dtype = query.dtype
     if torch.is_autocast_enabled(query.device.type):
         dtype = torch.get_autocast_dtype(query.device.type)
@@ -63,7 +70,8 @@ def watch_call(
         check_keys_left(before, after, shape)
         # As the kernel wants it: as many axes as the queries have.
         logits = after.expand(-1, heads, -1, -1).expand(batch, -1, -1, -1).reshape(*lead, queries, keys)
-        output = function(
+        with sdpa_kernel(_ANY_KERNEL):
+            output = function(
             query, key, given.value, logits.to(dtype), given.dropout_p, scale=given.scale,
             enable_gqa=given.enable_gqa,
         )  # fmt: skip

@@ -45,6 +45,7 @@ _CHANGES = {
     torch.nn.functional.dropout, torch.dropout, torch.dropout_, torch.nan_to_num, Tensor.nan_to_num, Tensor.nan_to_num_,
     torch.mul, Tensor.mul, Tensor.mul_, Tensor.__mul__, Tensor.__rmul__, Tensor.__imul__, torch.div, Tensor.div,
     Tensor.div_, Tensor.__truediv__, Tensor.__itruediv__, Tensor.masked_fill, Tensor.masked_fill_, torch.masked_fill,
+    torch.add, Tensor.add, Tensor.add_, Tensor.__add__, Tensor.__radd__, Tensor.__iadd__,
     torch.where, Tensor.where, torch.clamp, Tensor.clamp, Tensor.clamp_,
 }  # fmt: skip
 _DROPOUTS = {torch.nn.functional.dropout, torch.dropout, torch.dropout_}
@@ -285,6 +286,8 @@ def _axes_after(
         return axes.permuted(positions if isinstance(positions[0], int) else positions[0])
     if function in _FOLDS:
         return axes.refolded(result.shape)
+    if result is before:  # changed in place
+        return axes
     if function is Tensor.__getitem__ and result.ndim == before.ndim:
         # Keys may be cut off, as those of attention sinks are.
         key = axes.key_position()

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape, Kind, Watcher
 from vla_attention.capture.torch_policies.policy_modules import FoundPolicy
+from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
 from vla_attention.schemas.errors import BadArgument
 
 
@@ -108,6 +109,16 @@ class WatchedBlock:
                 call = AttentionCall(replace(call.shape, number=self._number), call.tensors)
             self._number += 1
             self.watcher.saw(call)
+
+    def refuse_nested(self, *tensors: Tensor) -> None:
+        """Raise `UnseenAttention` for nested tensors, whose sequences have lengths of their own."""
+        if any(tensor.is_nested for tensor in tensors):
+            raise self.failed(
+                UnseenAttention(
+                    f"{self.where().path or 'The policy'} computes attention of nested tensors, whose rows cannot be "
+                    "recorded. Call the policy with padded tensors and a mask."
+                )
+            )
 
     def failed(self, error: BaseException) -> BaseException:
         """Remember an error of watching, and return it."""

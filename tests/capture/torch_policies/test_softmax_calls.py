@@ -99,6 +99,14 @@ def masked_afterwards(query, key, value, mask):
     return torch.nan_to_num(rows) @ repeated(value, query)
 
 
+def altered_in_place(query, key, value, mask):
+    """Renormalised in place: what was multiplied is what counts."""
+    rows = logits_of(query, key, mask).softmax(-1)
+    rows *= 3.0
+    rows.div_(rows.sum(-1, keepdim=True))
+    return rows @ repeated(value, query)
+
+
 def in_place(query, key, value, mask):
     logits = logits_of(query, key, mask)
     torch.softmax(logits, -1, out=logits)
@@ -107,7 +115,8 @@ def in_place(query, key, value, mask):
 
 SPELLINGS = [
     plain, method_and_matmul, llama, smolvla, bmm, folded_afterwards, einsum, einsum_dots, einsum_implicit, grouped,
-    grouped_folded, transposed, queries_before_heads, masked_afterwards, in_place,
+    grouped_folded, transposed, queries_before_heads, masked_afterwards,
+    altered_in_place, in_place,
 ]  # fmt: skip
 
 
@@ -148,7 +157,7 @@ def test_rows_and_results(attend, data):
         torch.testing.assert_close(
             rows.double(), reference_rows(query, key, mask), rtol=1e-4 if wide else 0.1, atol=2e-6 if wide else 2e-2
         )
-        if wide or attend not in (masked_afterwards, in_place):
+        if wide or attend not in (masked_afterwards, altered_in_place, in_place):
             torch.testing.assert_close(rows.sum(-1), torch.ones(rows.shape[:-1]), rtol=0, atol=2e-6)
         assert torch.equal(allowed, keep[:, 0])
         assert (rows[~keep.expand(rows.shape)] == 0).all()
@@ -197,6 +206,22 @@ def test_a_change_takes_keys_away(attend):
     left[:, 1, :, 3] = 0
     torch.testing.assert_close(second.rows[1], left / left.sum(-1, keepdim=True), rtol=1e-5, atol=1e-6)
     assert max(second.errors) < 5e-6
+
+
+def test_probabilities_that_are_changed_before_the_product():
+    """Rows are what is multiplied, whatever function changed it in place."""
+
+    def attend(query, key, value, mask):
+        rows = (query @ key.mT).softmax(-1)
+        rows.pow_(2)
+        return rows @ value
+
+    torch.manual_seed(0)
+    seen, policy = Seen(), Policy(attend).eval().requires_grad_(False)
+    with watch_attention(policy, seen):
+        policy(torch.randn(2, 5, 32), torch.randn(2, 7, 32))
+    assert max(seen.errors) < 5e-6
+    assert (seen.rows[0].sum(-1) < 1).all()
 
 
 def test_sinks_that_are_cut_off_leave_rows_below_one():

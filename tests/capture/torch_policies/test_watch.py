@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import pytest
 import torch
 from torch import nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.nn.functional import scaled_dot_product_attention as sdpa
 
 from tests.kit.attention_modules import Attention, Policy, Seen
@@ -252,6 +253,38 @@ def test_programs_that_cannot_run_eager_are_refused():
             pass
 
 
+def test_graphed_modules_are_refused():
+    policy = small_policy()
+
+    def replayed(*arguments):
+        return arguments
+
+    replayed.__module__ = "torch.cuda.graphs"  # as make_graphed_callables leaves it
+    policy.layers[0].forward = replayed
+    with pytest.raises(CannotRunEager, match=r"layers\.0 is a compiled program \(a CUDA graph"):  # noqa: SIM117
+        with watch_attention(policy, Seen()):
+            pass
+
+
+def test_nested_tensors_are_refused():
+    policy = Policy(lambda q, k, v, mask: sdpa(*[torch.nested.nested_tensor(list(t)) for t in (q, k, v)])).eval()
+    with pytest.raises(UnseenAttention, match=r"layers\.0 computes attention of nested tensors"):  # noqa: SIM117
+        with watch_attention(policy, Seen()):
+            policy(HIDDEN, MEMORY)
+
+
+def test_a_change_of_a_call_that_asks_for_flash_attention():
+    def flash_only(query, key, value, mask):
+        with sdpa_kernel(SDPBackend.FLASH_ATTENTION):
+            return sdpa(query, key, value)
+
+    policy, seen = Policy(flash_only).eval().requires_grad_(False), Seen(changes=lambda shape: torch.zeros(7))
+    expected = policy(HIDDEN, MEMORY)
+    with watch_attention(policy, seen):
+        result = policy(HIDDEN, MEMORY)
+    torch.testing.assert_close(result, expected)
+
+
 def test_operators_that_give_no_rows_are_refused():
     @torch.library.custom_op("flash_attn::_small_forward", mutates_args=())
     def flash(query: torch.Tensor) -> torch.Tensor:
@@ -312,8 +345,16 @@ def test_autocast_policies():
     def by_hand(query, key, value, mask):
         return (query @ key.mT).softmax(-1) @ value
 
-    for function, kind in ((attend, "sdpa"), (by_hand, "softmax")):
-        policy, seen = Policy(function).eval(), Seen()
+    class Multihead(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.layers = nn.ModuleList(nn.MultiheadAttention(32, 4, batch_first=True) for _ in range(2))
+
+        def forward(self, hidden, memory):
+            return [layer(hidden, memory, memory, need_weights=False)[0] for layer in self.layers][-1]
+
+    for policy, kind in ((Policy(attend), "sdpa"), (Policy(by_hand), "softmax"), (Multihead(), "multihead")):
+        policy, seen = policy.eval(), Seen()
         with torch.autocast("cpu", torch.bfloat16):
             expected = policy(HIDDEN, MEMORY)
             with watch_attention(policy, seen):
