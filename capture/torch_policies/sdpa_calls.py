@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall
@@ -50,17 +50,18 @@ def watch_call(
     if torch.is_autocast_enabled(query.device.type):
         dtype = torch.get_autocast_dtype(query.device.type)
     where = block.where()
-    *lead, queries, dim = query.shape
+    *lead, kernel_queries, dim = query.shape
     keys = key.shape[-2]
-    batch, heads = batch_and_heads(lead, where.module)
-    kv_heads = heads
-    if given.enable_gqa and len(lead) >= 2:
-        kv_heads = key.shape[-3]
+    batch, kernel_heads = batch_and_heads(lead, where.module)
+    kv_heads = key.shape[-3] if given.enable_gqa and len(lead) >= 2 else kernel_heads
+    group = _packed_heads(where.module, query, key)
+    heads, queries = kernel_heads * group, kernel_queries // group
     shape = block.new_shape(where, "sdpa", (batch, heads, kv_heads, queries, keys), dtype)
     mask = None
     if given.attn_mask is not None:
-        full = (*lead, *given.attn_mask.shape[-2:]) if given.attn_mask.ndim > 2 else given.attn_mask.shape
-        mask = _folded_mask(given.attn_mask, full, batch, heads)
+        mask = _folded_mask(given.attn_mask.detach(), lead, batch, kernel_heads)
+        if group > 1 and mask.shape[1:3] != (1, 1):
+            mask = mask.expand(-1, kernel_heads, kernel_queries, -1).reshape(-1, heads, queries, mask.shape[-1])
     change = block.change(shape)
     if change is None:
         output = function(*args, **kwargs)
@@ -68,13 +69,11 @@ def watch_call(
         change = fitted_change(change, shape, query.device)
         before, after = changed_mask(mask, given.is_causal, change, queries, keys)
         check_keys_left(before, after, shape)
-        # As the kernel wants it: as many axes as the queries have.
-        logits = after.expand(-1, heads, -1, -1).expand(batch, -1, -1, -1).reshape(*lead, queries, keys)
+        # As the kernel wants it: as many axes as its queries have.
+        logits = after.expand(batch, heads, -1, -1).reshape(*lead, kernel_queries, keys).to(dtype)
+        options = {"scale": given.scale, "enable_gqa": given.enable_gqa}
         with sdpa_kernel(_ANY_KERNEL):
-            output = function(
-            query, key, given.value, logits.to(dtype), given.dropout_p, scale=given.scale,
-            enable_gqa=given.enable_gqa,
-        )  # fmt: skip
+            output = function(query, key, given.value, logits, given.dropout_p, **options)
     tensors = LogitTensors(
         query=query.detach().to(dtype).reshape(batch, heads, queries, dim),
         key=_folded(key.to(dtype), lead, batch, kv_heads),
@@ -96,11 +95,22 @@ def _folded(tensor: Tensor, lead: list[int], batch: int, kv_heads: int) -> Tenso
     return tensor.expand(*shared, *tensor.shape[-2:]).reshape(batch, kv_heads, *tensor.shape[-2:])
 
 
-def _folded_mask(mask: Tensor, full: Any, batch: int, heads: int) -> Tensor:
+def _folded_mask(mask: Tensor, lead: list[int], batch: int, heads: int) -> Tensor:
     """Return a mask that can be broadcast to (..., query, key) as (batch or 1, head or 1, query or 1, key)."""
-    mask = mask.detach()
-    if mask.ndim == 4 and len(full) == 4:
-        return mask
     if mask.ndim <= 2:
-        return mask.reshape(1, 1, *((1,) * (2 - mask.ndim)), *mask.shape)
-    return mask.expand(full).reshape(batch, heads, *mask.shape[-2:])
+        return mask.reshape(*((1,) * (4 - mask.ndim)), *mask.shape)
+    if mask.ndim == 4 and len(lead) == 2:
+        return mask
+    return mask.expand(*lead, *mask.shape[-2:]).reshape(batch, heads, *mask.shape[-2:])
+
+
+def _packed_heads(module: nn.Module | None, query: Tensor, key: Tensor) -> int:
+    """Return how many heads are packed into the query axis, 1 for none.
+
+    transformers (since 5) hands the one query of a decoding step as (batch, kv_head, heads of a group, dim).
+    """
+    group, config = getattr(module, "num_key_value_groups", 1), getattr(module, "config", None)
+    heads = getattr(config, "num_attention_heads", None)
+    if not isinstance(group, int) or group <= 1 or query.ndim != 4 or query.shape[1] != key.shape[1]:
+        return 1
+    return group if query.shape[2] == group and query.shape[1] * group == heads else 1

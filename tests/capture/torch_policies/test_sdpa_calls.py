@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -166,3 +168,32 @@ def test_folded_heads_are_taken_apart():
         plain(hidden, memory)
     assert [(s.batch, s.heads) for s in folded.shapes] == [(3, 4)] * 2
     torch.testing.assert_close(folded.rows, unfolded.rows)
+
+
+@pytest.mark.parametrize("per_head_mask", [False, True])
+def test_heads_that_are_packed_into_the_query_axis(per_head_mask):
+    """What transformers 5 does with the one query of a decoding step; tests/policies runs the real code."""
+
+    def packing(query, key, value, mask):
+        batch, heads, _, dim = query.shape
+        mask = mask.reshape(batch, 2, 2, -1) if per_head_mask else mask
+        return sdpa(query.reshape(batch, 2, heads // 2, dim), key, value, mask).reshape(batch, heads, 1, dim)
+
+    torch.manual_seed(0)
+    packed = Policy(packing, heads=4, kv_heads=2).eval().requires_grad_(False)
+    plain = Policy(lambda q, k, v, mask: sdpa(q, k, v, mask, enable_gqa=True), heads=4, kv_heads=2).eval()
+    plain.load_state_dict(packed.state_dict())
+    for layer in packed.layers:
+        layer.num_key_value_groups, layer.config = 2, SimpleNamespace(num_attention_heads=4)
+    hidden, memory = torch.randn(3, 1, 32), torch.randn(3, 7, 32)
+    mask = torch.randn(3, 4 if per_head_mask else 1, 1, 7)
+    knocked = torch.zeros(4, 1, 7)
+    knocked[1, :, 3] = float("-inf")
+    for changes in (lambda shape: None, lambda shape: knocked):
+        first, second = Seen(changes=changes), Seen(changes=changes)
+        for policy, seen in ((packed, first), (plain, second)):
+            with watch_attention(policy, seen):
+                policy(hidden, memory, mask)
+        assert first.shapes == second.shapes
+        torch.testing.assert_close(first.rows, second.rows)
+        assert max(first.errors) < 2e-6
