@@ -1,0 +1,201 @@
+"""Seconds of a policy call as it is, watched, and recorded: what `va.record` costs.
+
+Usage: python benchmarks/recorder_overhead.py [--rounds 7] [--calls 1] [--blocks 6] [--device cpu] [--dtype float32]
+       [--threads 1] [--clock processor]
+
+The policy is made for this: ten denoise steps of an action expert over a prefix of 968 keys of pictures and words and
+over its own ten tokens, with the sizes of pi0's expert (width 1024, 8 heads of 256, one key head; 18 blocks in pi0) and
+random weights. The pass over the prefix, which a real call makes too without any recording, is left out.
+The kinds of call take turns within one round, so that all of them see the same machine; what is printed are the medians
+of the rounds, and the median of their ratios to the plain call of the same round. `--clock processor` counts the
+processor's time, which work of others on the machine does not change.
+
+plain: without recording, eager, the fast path of nn.MultiheadAttention off. watched: inside of a replan block that
+keeps the least that can be recorded (one head of one block at one denoise step). The others record all layers and
+heads: of the last denoise step of ten, of the first and the last (the default), of all ten; and with contributions.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+
+import vla_attention as va  # noqa: E402 - a script, and not part of the package
+
+WIDTH, HEADS, DIM, STEPS, HORIZON = 1024, 8, 256, 10, 10
+PATCHES, WORDS, CAMERAS = 256, 200, 3
+PREFIX = CAMERAS * PATCHES + WORDS
+
+
+class Attention(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.q_proj = nn.Linear(WIDTH, HEADS * DIM, bias=False)
+        self.kv_proj = nn.Linear(WIDTH, 2 * DIM, bias=False)
+        self.o_proj = nn.Linear(HEADS * DIM, WIDTH, bias=False)
+
+    def forward(self, tokens: Tensor, cache: tuple[Tensor, Tensor], mask: Tensor) -> Tensor:
+        query = self.q_proj(tokens).view(1, -1, HEADS, DIM).transpose(1, 2)
+        key, value = (part[:, None] for part in self.kv_proj(tokens).chunk(2, dim=-1))
+        key, value = torch.cat([cache[0], key], dim=2), torch.cat([cache[1], value], dim=2)
+        mixed = nn.functional.scaled_dot_product_attention(query, key, value, attn_mask=mask, enable_gqa=True)
+        return self.o_proj(mixed.transpose(1, 2).flatten(2))
+
+
+class Block(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.attention = Attention()
+        self.norms = nn.ModuleList(nn.RMSNorm(WIDTH) for _ in range(2))
+        self.up, self.down = nn.Linear(WIDTH, 4 * WIDTH, bias=False), nn.Linear(4 * WIDTH, WIDTH, bias=False)
+
+    def forward(self, tokens: Tensor, cache: tuple[Tensor, Tensor], mask: Tensor) -> Tensor:
+        tokens = tokens + self.attention(self.norms[0](tokens), cache, mask)
+        return tokens + self.down(nn.functional.gelu(self.up(self.norms[1](tokens))))
+
+
+class Policy(nn.Module):
+    """The denoise steps of a flow policy; the prefix's keys and values are random."""
+
+    def __init__(self, blocks: int) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList(Block() for _ in range(blocks))
+        self.action_in, self.action_out = nn.Linear(32, WIDTH), nn.Linear(WIDTH, 32)
+
+    @torch.no_grad()
+    def act(self, noise: Tensor, caches: list[tuple[Tensor, Tensor]], mask: Tensor) -> Tensor:
+        actions = noise
+        for _ in range(STEPS):
+            hidden = self.action_in(actions)
+            for block, cache in zip(self.blocks, caches, strict=True):
+                hidden = block(hidden, cache, mask)
+            actions = actions - self.action_out(hidden) / STEPS
+        return actions
+
+
+def layout(blocks: int) -> va.PolicyLayout:
+    spans = [
+        va.Span(f"image_{i}", "image", i * PATCHES, (i + 1) * PATCHES, f"camera_{i}", va.PatchGrid(16, 16, 224, 224))
+        for i in range(CAMERAS)
+    ]
+    spans.append(va.Span("prompt", "text", PREFIX - WORDS, PREFIX))
+    spans.append(va.Span("actions", "action", PREFIX, PREFIX + HORIZON))
+    roles = {span.name: {"image": "image", "text": "instruction", "action": "action"}[span.kind] for span in spans}
+    keys = va.SiteLayout("joint", tuple(spans))
+    return va.PolicyLayout(
+        name="overhead",
+        family="overhead",
+        sites=(va.RecordedSite(keys, (0, HORIZON), roles, "blocks.{block}.attention.o_proj"),),
+        rules=(va.CallRule(r"blocks\.(?P<block>\d+)\.attention", "joint"),),
+        num_layers=blocks,
+        num_heads=HEADS,
+        num_denoise_steps=STEPS,
+    )
+
+
+KINDS: dict[str, dict[str, Any]] = {
+    "watched": {"denoise_steps": [0], "layers": [0], "heads": [0], "contributions": False},
+    "last step": {"denoise_steps": ["last"], "contributions": False},
+    "first and last step": {"contributions": False},
+    "all ten steps": {"denoise_steps": "all", "contributions": False},
+    "last step, contributions": {"denoise_steps": ["last"], "contributions": True},
+    "first and last step, contributions": {"contributions": True},
+    "last step, knockout": {"denoise_steps": ["last"], "contributions": False, "knockout": "camera:camera_0"},
+}
+
+
+def measure(
+    policy: Policy, given: tuple[Any, ...], folder: Path, rounds: int, calls: int, clock: Callable[[], float]
+) -> dict[str, list[float]]:
+    """Seconds of a call by kind, one number per round: the mean of `calls` calls."""
+    device = given[0].device
+
+    def timed(call: Callable[[int], object]) -> float:
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        began = clock()
+        for number in range(calls):
+            call(number)
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        return (clock() - began) / calls
+
+    seconds: dict[str, list[float]] = {"plain": [], **{kind: [] for kind in KINDS}}
+    with ExitStack() as stack:
+        episodes = {}
+        for kind, settings in KINDS.items():
+            run = va.record(
+                folder / f"{len(episodes)}.zarr", policy, layout=layout(len(policy.blocks)), durable=False, **settings
+            )
+            stack.enter_context(run)
+            episodes[kind] = stack.enter_context(run.episode(task_id=0, episode_index=0, instruction=""))
+        expected = policy.act(*given)
+        step = 0
+        for number in range(rounds + 1):  # the first round is not counted
+            found = {"plain": timed(lambda _: policy.act(*given))}
+            for kind, episode in episodes.items():
+
+                def recorded(_: int, episode: Any = episode, kind: str = kind) -> None:
+                    nonlocal step
+                    step += 1
+                    with episode.replan(env_step=step):
+                        actions = policy.act(*given)
+                    assert "knockout" in kind or torch.equal(actions, expected), kind
+
+                found[kind] = timed(recorded)
+            if number:
+                for kind, value in found.items():
+                    seconds[kind].append(value)
+    return seconds
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--calls", type=int, default=1)
+    parser.add_argument("--blocks", type=int, default=6)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--dtype", default="float32")
+    parser.add_argument("--threads", type=int)
+    parser.add_argument("--clock", choices=("wall", "processor"), default="wall")
+    arguments = parser.parse_args()
+    clock = time.perf_counter if arguments.clock == "wall" else time.process_time
+    if arguments.threads:
+        torch.set_num_threads(arguments.threads)
+    torch.backends.mha.set_fastpath_enabled(False)
+    torch.manual_seed(0)
+    settings: dict[str, Any] = {"device": arguments.device, "dtype": getattr(torch, arguments.dtype)}
+    policy = Policy(arguments.blocks).to(**settings).eval()
+    caches = [tuple(torch.randn(1, 1, PREFIX, DIM, **settings) for _ in range(2)) for _ in range(arguments.blocks)]
+    mask = torch.ones(1, 1, HORIZON, PREFIX + HORIZON, dtype=torch.bool, device=arguments.device)
+    mask[..., PREFIX - 50 : PREFIX] = False
+    given = torch.randn(1, HORIZON, 32, **settings), caches, mask
+    with tempfile.TemporaryDirectory() as folder:
+        seconds = measure(policy, given, Path(folder), arguments.rounds, arguments.calls, clock)
+    plain = seconds["plain"]
+    machine = f"{arguments.device}, {arguments.dtype}, {torch.get_num_threads()} threads"
+    print(f"torch {torch.__version__}, {machine}, {arguments.clock} time")
+    print("| call | ms, median of the rounds | times the plain call, median (lowest, highest) |\n|---|---|---|")
+    for kind, values in seconds.items():
+        ratios = [value / base for value, base in zip(values, plain, strict=True)]
+        print(
+            f"| {kind} | {1000 * statistics.median(values):.1f} | {statistics.median(ratios):.3f} "
+            f"({min(ratios):.3f}, {max(ratios):.3f}) |"
+        )
+
+
+if __name__ == "__main__":
+    main()
