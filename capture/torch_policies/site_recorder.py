@@ -151,7 +151,13 @@ class ReplanRecorder:
         collected, queries = self._collected[site.name], place.queries
         rows = call.rows(queries)
         error = call.product_error(rows, queries)
-        self.largest_error = max(self.largest_error, error) if not math.isnan(error) else math.inf
+        if not math.isfinite(error) and not bool(torch.isfinite(call.output).all()):
+            raise NumbersNotFinite(
+                f"The policy's numbers turned NaN or infinite before or at denoise step {place.step}, block "
+                f"{place.block} of site '{site.name}' (module '{call.shape.module}'). {self._remedy()}. Nothing of this "
+                "episode was kept."
+            )
+        self.largest_error = max(self.largest_error, error)
         self._check_error(error, call.shape, place)
         allowed = call.allowed(queries).any(dim=1)
         keys = None if place.keys is None else torch.from_numpy(place.keys).to(rows.device)
@@ -256,13 +262,16 @@ class ReplanRecorder:
             return
         # Denoise step by denoise step, as the model computes.
         step, layer, head = (int(i) for i in np.argwhere(~finite.swapaxes(0, 1))[0][:3])
-        knocked = "An intervention may leave a query without any key: take a smaller group, or fewer heads or layers"
-        weights = "Look at the policy's input and weights, or use float32"
         raise NumbersNotFinite(
             f"The rows of site '{site}' turned NaN or infinite at {where}, denoise step "
             f"{recording.denoise_steps[step]}, layer {recording.layers[layer]}, head {recording.heads[head]}. "
-            f"{weights if self.bias is None else knocked}. Nothing of this episode was kept."
+            f"{self._remedy()}. Nothing of this episode was kept."
         )
+
+    def _remedy(self) -> str:
+        if self.bias is None:
+            return "Look at the policy's input and weights, or use float32"
+        return "An intervention may leave a query without any key: take a smaller group, or fewer heads or layers"
 
 
 def recordings_of(recording: Recording, layout: PolicyLayout) -> dict[str, Recording | None]:

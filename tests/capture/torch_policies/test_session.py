@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import doctest
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 import vla_attention as va
 from tests.kit.small_torch_policy import BLOCKS, HEADS, HORIZON, PROMPT, STEPS, SmallPolicy, given, small_layout
 from vla_attention.capture.torch_policies import record as record_module
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.capture.torch_policies.policy_layout import CallRule, LayoutForAnotherVersion, PromptText
 from vla_attention.capture.torch_policies.prompts import PromptDoesNotFit
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.session import NothingRecorded, RecordingStopped
-from vla_attention.schemas.errors import BadArgument, UnknownName
+from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
+from vla_attention.schemas.errors import BadArgument, UnknownName, UserError
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import open_store
@@ -407,3 +411,97 @@ def test_the_example_of_the_documentation(tmp_path):
     [test] = doctest.DocTestFinder().find(record_module.record, "record", globs=names)
     assert test.examples
     assert doctest.DocTestRunner().run(test).failed == 0
+
+
+def test_a_compiled_policy_runs_eager_inside_of_the_block(tmp_path, policy):
+    expected = policy.act(**given())
+    for block in policy.blocks:
+        # The backend fails where it is called: nothing is compiled inside of a replan block.
+        block.attention.compile(backend=lambda graph, inputs: pytest.fail("compiled inside of the block"))
+    with (
+        start(tmp_path, policy) as run,
+        run.episode(task_id=0, episode_index=0, instruction="pick the bowl") as episode,
+        episode.replan(env_step=0),
+    ):
+        assert torch.equal(policy.act(**given()), expected)
+    assert stored(tmp_path).episodes[0].attributes.num_replans == 1
+
+
+def test_a_policy_that_predicts_in_another_thread_is_recorded(tmp_path, policy):
+    with start(tmp_path / "here", policy) as run:
+        fill(run, policy)
+    with ThreadPoolExecutor(1) as pool, start(tmp_path / "there", policy) as run:
+        other = type("Server", (), {"act": lambda self, **inputs: pool.submit(policy.act, **inputs).result()})()
+        fill(run, other)
+    here, there = (stored(tmp_path / name).episodes[0] for name in ("here", "there"))
+    for name in here.attributes.arrays:
+        np.testing.assert_array_equal(here.read(name), there.read(name))
+
+
+def test_two_policies_in_one_block_are_an_error(tmp_path, policy):
+    other = SmallPolicy(seed=1)
+    with start(tmp_path, policy) as run, pytest.raises(UserError, match="one block records one policy"):
+        one_call(run, other)
+
+
+def test_a_policy_without_attention_is_an_error(tmp_path):
+    class Convolutions(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.layer = nn.Conv2d(3, 3, 3)
+
+        def act(self, **inputs):
+            return self.layer(inputs["pictures"])
+
+    layout = small_layout(sites=(replace(small_layout().sites[0], projection=None),), text=None)
+    policy = Convolutions()
+    with (
+        record(tmp_path / "a.zarr", policy, layout=layout, durable=False) as run,
+        pytest.raises(NothingRecorded, match=r"computed no attention that can be seen\. Policies without attention"),
+    ):
+        one_call(run, policy)
+
+
+def test_the_difference_to_the_users_own_setting_is_stored(tmp_path, policy):
+    with start(tmp_path, policy, own_setting=lambda: policy.act(**given())) as run:
+        fill(run, policy)
+    store = stored(tmp_path)
+    assert store.attributes.provenance["difference to own setting"] == "none (bit-equal)"
+    assert store.episodes[0].attributes.provenance["difference to own setting"] == "none (bit-equal)"
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])
+def test_other_types_of_numbers(tmp_path, dtype):
+    policy = SmallPolicy().to(dtype)
+    inputs = {name: value.to(dtype) if name != "texts" else value for name, value in given().items()}
+    expected = policy.act(**inputs)
+    with start(tmp_path, policy) as run:
+        one_call(run, policy, inputs)
+    assert torch.equal(policy.act(**inputs), expected)
+    root = stored(tmp_path).attributes
+    assert root.policy.config["dtype"] == str(dtype).removeprefix("torch.")
+
+
+def test_rows_that_do_not_reproduce_the_kernel_are_refused(tmp_path, policy, monkeypatch):
+    exact = AttentionCall.rows
+    monkeypatch.setattr(AttentionCall, "rows", lambda self, *where: exact(self, *where).roll(1, dims=-1))
+    with (
+        start(tmp_path, policy) as run,
+        pytest.raises(RowsDoNotMatch, match=r"block 0, step 0 give a P·V that differs"),
+    ):
+        one_call(run, policy)
+    assert not run.num_dropped
+
+
+def test_numbers_that_are_not_finite_are_refused(tmp_path, policy):
+    with torch.no_grad():
+        policy.state.weight.fill_(torch.inf)
+    with pytest.raises(UserError, match="NaN or infinite"):
+        start(tmp_path, policy)
+    policy = SmallPolicy()
+    inputs = given() | {"states": torch.full((1, 2), torch.nan)}
+    with (
+        start(tmp_path, policy) as run,
+        pytest.raises(UserError, match=r"turned NaN or infinite before or at denoise step 0, block 0"),
+    ):
+        one_call(run, policy, inputs)
