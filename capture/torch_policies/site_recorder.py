@@ -154,8 +154,8 @@ class ReplanRecorder:
         if not math.isfinite(error) and not bool(torch.isfinite(call.output).all()):
             raise NumbersNotFinite(
                 f"The policy's numbers turned NaN or infinite before or at denoise step {place.step}, block "
-                f"{place.block} of site '{site.name}' (module '{call.shape.module}'). {self._remedy()}. Nothing of this "
-                "episode was kept."
+                f"{place.block} of site '{site.name}' (module '{call.shape.module}'). {self._remedy()}. Nothing of "
+                "this episode was kept."
             )
         self.largest_error = max(self.largest_error, error)
         self._check_error(error, call.shape, place)
