@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 pytest.importorskip("transformers", minversion="5.0", reason="run by make test-policies, in .venv-transformers")
 
 import torch
-from transformers import PI0Config, PI0ForConditionalGeneration
 
 import vla_attention as va
+from tests.policies.pi0_model import CAMERAS, CHUNK, LONGEST, PATCHES, inputs, small_pi0
 from tests.policies.policy_checks import (
     PolicyCase,
     changed_spans,
@@ -23,51 +21,8 @@ from tests.policies.policy_checks import (
     roles_of,
     rows_of,
 )
-from tests.policies.word_tokenizer import INSTRUCTION, WordTokenizer
-
-CAMERAS = ("base", "wrist")
-PATCHES, LONGEST, CHUNK, STEPS, LAYERS = 16, 9, 6, 4, 3
-PLACEHOLDER = 299
-
-
-def small_pi0(attention: str = "sdpa") -> Any:
-    sizes = {"num_hidden_layers": LAYERS, "num_attention_heads": 4, "num_key_value_heads": 1, "head_dim": 16}
-    vision = {
-        **{"model_type": "siglip_vision_model", "hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2},
-        **{"num_attention_heads": 2, "image_size": 56, "patch_size": 14, "vision_use_head": False},
-        "projection_dim": 64,
-    }
-    text = {"model_type": "gemma", "hidden_size": 64, "intermediate_size": 96, "vocab_size": 300, **sizes}
-    config = PI0Config(
-        vlm_config={
-            **{"model_type": "paligemma", "text_config": text, "vision_config": vision, "projection_dim": 64},
-            "image_token_id": PLACEHOLDER,
-        },
-        dit_config={"model_type": "gemma", "hidden_size": 32, "intermediate_size": 64, **sizes},
-        chunk_size=CHUNK,
-        max_state_dim=5,
-        max_action_dim=4,
-        num_inference_steps=STEPS,
-        attn_implementation=attention,
-    )
-    torch.manual_seed(0)
-    return PI0ForConditionalGeneration(config).eval()
-
-
-def inputs(padding: int = 2, batch: int = 1, seed: int = 1) -> dict[str, torch.Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    words = [2, *WordTokenizer().encode(INSTRUCTION)]
-    ids = torch.tensor([[PLACEHOLDER] * (PATCHES * len(CAMERAS)) + words + [0] * padding] * batch)
-    seen = torch.ones_like(ids)
-    seen[:, ids.shape[1] - padding :] = 0
-    return {
-        "input_ids": ids,
-        "attention_mask": seen,
-        "pixel_values": torch.rand(batch, len(CAMERAS), 3, 56, 56, generator=generator) * 2 - 1,
-        "pixel_attention_mask": torch.ones(batch, len(CAMERAS), dtype=torch.bool),
-        "state": torch.randn(batch, 5, generator=generator),
-        "noise": torch.randn(batch, CHUNK, 4, generator=generator),
-    }
+from tests.policies.word_tokenizer import INSTRUCTION
+from vla_attention.schemas.stores.reader import open_store
 
 
 @pytest.fixture(scope="module")
@@ -141,8 +96,6 @@ def test_a_batch_is_split_by_row(case, tmp_path):
         case.policy.sample_actions(**given)
     store = va.open(tmp_path / "two.zarr")
     assert store.masses().height > 0
-    from vla_attention.schemas.stores.reader import open_store
-
     for number, episode in enumerate(open_store(tmp_path / "two.zarr").episodes):
         one = {name: value[number : number + 1] for name, value in given.items()}
         alone = record(
