@@ -104,13 +104,14 @@ def _parts(part: object, path: str, depth: int, seen: set[int]) -> Iterator[tupl
         return
     seen.add(id(part))
     if isinstance(part, nn.Module):
-        yield path, part
-        if isinstance(part, torch.jit.ScriptModule):
-            return
-        inner = part._modules.get("_orig_mod")
+        scripted = isinstance(part, torch.jit.ScriptModule)
+        inner = None if scripted else part._modules.get("_orig_mod")
         if inner is not None:
-            # torch.compile's wrapper has the path of what it wraps.
+            # torch.compile's wrapper gives way to what it wraps, which runs in the block.
             yield from _parts(inner, path, depth, seen)
+            return
+        yield path, part
+        if scripted:
             return
         for name, child in part._modules.items():
             if child is not None:

@@ -112,6 +112,21 @@ def test_compiled_parts_run_eager_and_are_seen():
         assert torch.equal(policy(HIDDEN, MEMORY), expected)
 
 
+def test_compiled_policies_in_another_thread_and_their_methods():
+    policy = Direct()
+    compiled = torch.compile(policy, backend="eager")
+    inner = torch.compile(policy.inner, backend="eager")
+    expected = inner(HIDDEN, MEMORY)
+    assert seen_in(compiled, lambda: compiled.attend_here(HIDDEN)) == [""]
+    assert seen_in(compiled, lambda: compiled.sample(HIDDEN, MEMORY)) == ["inner"]
+    seen = Seen()
+    with ThreadPoolExecutor(1) as pool:
+        assert torch.equal(pool.submit(inner, HIDDEN, MEMORY).result(), expected)
+        with watch_attention(inner, seen):
+            assert torch.equal(pool.submit(inner, HIDDEN, MEMORY).result(), expected)
+    assert [shape.module for shape in seen.shapes] == [""]
+
+
 @pytest.mark.parametrize("way", ["call", "forward", "method"])
 def test_other_threads_are_seen(way):
     policy = small_policy()
