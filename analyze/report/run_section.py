@@ -45,6 +45,7 @@ def _store_items(store: Store) -> list[Item]:
         Item("code version at capture", root.provenance.get("code", _NOT_STATED)),
         Item("libraries and machine", ", ".join(libraries) or _NOT_STATED),
         Item("protocol", protocol_text(protocol)),
+        *([] if root.data_set is None else [Item("data set", root.data_set.describe())]),
         Item("recording", _recording(store)),
         Item("cameras", "; ".join(map(_camera, policy.cameras)) or "none"),
     ]

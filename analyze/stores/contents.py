@@ -87,6 +87,8 @@ def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
     yield f"  weights    {policy.digest[:16]}{'  UNTRAINED random weights' if policy.untrained else ''}"
     protocol = root.protocol
     yield f"  run        suite {protocol.suite}, protocol {protocol_text(protocol)}"
+    if root.data_set is not None:
+        yield f"  data set   {root.data_set.describe()}"
     solved = solved_text(episode.attributes.success for episode in episodes)
     yield f"  episodes   {len(episodes)} ({solved}), tasks {listing(store.task_ids, 100)}"
     labels = [

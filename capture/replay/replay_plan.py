@@ -16,6 +16,7 @@ from vla_attention.capture.replay.chosen_episodes import chosen_episodes
 from vla_attention.capture.replay.data_set_files import INDEX_COLUMNS
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, LeRobotDataset, open_dataset
 from vla_attention.capture.replay.replay_episodes import EpisodeReplay, num_calls, task_of
+from vla_attention.capture.replay.video import import_av
 from vla_attention.capture.rerun.progress import RerunProgress
 from vla_attention.capture.rollout.progress import say
 from vla_attention.capture.store.disk_estimate import describe, estimate_disk
@@ -88,6 +89,8 @@ def plan_replay(arguments: argparse.Namespace, termination: Termination) -> Repl
     if arguments.seed < 0:
         raise BadArgument(f"Cannot use --seed {arguments.seed}; expected 0 or more.")
     data = open_dataset(arguments.data_set)
+    if any(data.feature(camera).dtype == "video" for camera in data.cameras):
+        import_av()  # that PyAV is missing is said now, too
     wanted = chosen_episodes(data, arguments.episodes, arguments.num_episodes)
     store = arguments.store or Path("runs") / f"{file_part(suite_of(data))}{STORE_SUFFIX}"
     if store.suffix != STORE_SUFFIX:

@@ -236,6 +236,14 @@ class DataSetSource:
         for text in (self.name, self.version, self.robot_type, *self.columns, *self.columns.values()):
             check_text("data set's text", text)
 
+    def describe(self) -> str:
+        """The data set and the columns that were read, in one line."""
+        columns = "; ".join(f"{what} = {column}" for what, column in self.columns.items())
+        return (
+            f"{self.name}, LeRobotDataset {self.version}, {self.fps:g} frames per second, robot {self.robot_type}; "
+            f"{columns}"
+        )
+
 
 @dataclass(frozen=True)
 class RootAttributes:

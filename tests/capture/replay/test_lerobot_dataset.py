@@ -93,6 +93,12 @@ def test_what_is_no_data_set_is_said(tmp_path):
         open_dataset(tmp_path / "empty")
 
 
+def test_version_2_0_has_the_files_of_2_1(tmp_path):
+    folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3,)))
+    edit_info(folder, codebase_version="v2.0")
+    assert [number_of(frame.images[CAMERAS[0]]) for frame in open_dataset(folder).episode(0).frames()] == [0, 1, 2]
+
+
 @pytest.mark.parametrize("version", ["v1.6", "v4.0", None, 3])
 def test_another_version_is_refused_with_those_that_are_read(tmp_path, version):
     folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3,)))

@@ -142,6 +142,10 @@ def test_the_store_says_what_was_replayed(tmp_path, capsys):
     assert run("replay", data, *TINY, *cameras, "--every", 2, "--store", store, "--resume") == 2
     assert "protocol.replan_steps is 3, this run's is 2" in capsys.readouterr().err
     assert analyze(["verify", str(store)]) == 0
+    capsys.readouterr()
+    assert analyze([str(store), "--list"]) == 0
+    listed = " ".join(capsys.readouterr().out.split())
+    assert "data set so101_pick, LeRobotDataset v3.0, 10 frames per second, robot so101; camera base_0_rgb =" in listed
 
 
 def test_another_instruction_and_known_outcomes(tmp_path):
@@ -276,3 +280,18 @@ def test_a_checkpoint_of_another_robot_is_refused(tmp_path, capsys, tokenizer):
     assert "The policy's states have 8 numbers" in capsys.readouterr().err
     assert run("replay", tmp_path, *TINY) == 2
     assert "is no LeRobotDataset" in capsys.readouterr().err
+
+
+def test_a_video_that_cannot_be_decoded_leaves_nothing(tmp_path, capsys):
+    made = made_up_episodes((3, 3), tuple(LIBERO_COLUMNS.values()), state=8, action=7)
+    data = write_data_set(tmp_path / "data", "v2.1", made, video=H264)
+    for video in data.glob("videos/**/episode_000001.mp4"):
+        content = video.read_bytes()
+        video.write_bytes(content[:40] + content[40:].replace(b"avc1", b"zzzz"))
+    store = tmp_path / "replay.zarr"
+    assert run("replay", data, *TINY, "--store", store) == 2
+    error = capsys.readouterr().err
+    assert "cannot be decoded: the installed PyAV" in error
+    assert "convert the video to H.264 or AV1" in error
+    assert [path.name for path in (store / "episodes").glob("task*")] == ["task000_episode000"]
+    assert not list(tmp_path.glob("*.partial/*"))
