@@ -44,7 +44,9 @@ def add_grouping(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
 def add_site_and_tasks(chosen: argparse._ArgumentGroup) -> None:
     """--site and --tasks."""
     chosen.add_argument(
-        "--site", metavar="NAME", help="softmax family: joint (pi), self or cross (Cosmos); default: the first one"
+        "--site",
+        metavar="NAME",
+        help="softmax family: joint (pi), self or cross (Cosmos), or others that --list shows; default: the first one",
     )
     chosen.add_argument("--tasks", type=int, nargs="+", metavar="N", help="task ids (default: all)")
 

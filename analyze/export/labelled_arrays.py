@@ -208,6 +208,8 @@ def _sample_coordinates(question: Question) -> dict[str, tuple[str, NDArray[Any]
             columns[name] += [value] * attributes.num_replans
         columns["replan"] += range(attributes.num_replans)
         columns["env_step"] += item.episode.read("env_step").tolist()
+    if None in columns["success"]:  # no array of numbers has a place for what is not known
+        columns["success"] = [np.nan if value is None else float(value) for value in columns["success"]]
     return {name: ("sample", np.array(values)) for name, values in columns.items()}
 
 

@@ -258,13 +258,7 @@ def write_tables(analysis: Analysis, folder: Path) -> list[Path]:
 
 def _notes(root: RootAttributes, selection: Selection, site: str) -> list[str]:
     notes = [selection.note] if selection.note else []
-    kinds = {span.kind for span in root.site(site).spans}
-    missing = [name for name, has in (("image", {"image", "latent"}), ("text", {"text"})) if not kinds & has]
-    if missing and root.site(site).layers:
-        notes.append(
-            f"Site '{site}' has no {' and no '.join(missing)} keys: a ratio of visual to linguistic attention is not "
-            "defined inside of it. Compare norms of contributions, which sites of different blocks share."
-        )
+    notes += [one_sided] if (one_sided := site_without_a_side(root, site)) else []
     others = [other.name for other in root.sites if other.name != site]
     if others:
         notes.append(
@@ -272,6 +266,18 @@ def _notes(root: RootAttributes, selection: Selection, site: str) -> list[str]:
             "mass of one must not be divided by a mass of another. Choose with --site."
         )
     return notes
+
+
+def site_without_a_side(root: RootAttributes, site: str) -> str:
+    """That a site of some of the blocks has no image keys or no text keys, as a sentence; empty where it has both."""
+    kinds = {span.kind for span in root.site(site).spans}
+    missing = [name for name, has in (("image", {"image", "latent"}), ("text", {"text"})) if not kinds & has]
+    if not missing or not root.site(site).layers:
+        return ""
+    return (
+        f"Site '{site}' has no {' and no '.join(missing)} keys: a ratio of visual to linguistic attention is not "
+        "defined inside of it. Compare norms of contributions, which sites of different blocks share."
+    )
 
 
 def describe_heads(selection: Selection, num_heads: int) -> str:

@@ -10,7 +10,7 @@ import polars as pl
 
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.sinks import SinkRule
-from vla_attention.analyze.ratios.analysis import Analysis
+from vla_attention.analyze.ratios.analysis import Analysis, site_without_a_side
 from vla_attention.analyze.ratios.summary_text import FEW_EPISODES
 from vla_attention.analyze.report.section_parts import Section
 from vla_attention.analyze.show.headings import untrained_sentence
@@ -96,7 +96,10 @@ def _dependence(question: Question) -> list[Caveat]:
 def _baseline(analysis: Analysis) -> list[Caveat]:
     grouping, uniform = analysis.grouping, analysis.overall.get("uniform_ratio")
     if grouping.ratio is None:
-        return [Caveat("No ratio", f"The grouping '{grouping.name}' defines no ratio here; read fractions and lifts.")]
+        sentence = f"The grouping '{grouping.name}' defines no ratio here; read fractions and lifts."
+        if one_sided := site_without_a_side(analysis.question.stores[0].attributes, analysis.question.site):
+            sentence += f" {one_sided}"
+        return [Caveat("No ratio", sentence)]
     if uniform is None:
         sentence = "A side of the ratio has no keys, so uniform attention has no ratio to compare with."
         return [Caveat("No baseline", sentence, True)]

@@ -60,7 +60,11 @@ def _recording(store: Store) -> str:
             f"denoise steps {listing(recording.denoise_steps, _MOST_LISTED)}",
             plural(len(recording.heads), "head"),
             f"queries: {recording.queries} of {recording.num_action_queries}",
-            *(own_parts(store.attributes, site.name) for site in store.attributes.sites if site.layers or site.heads),
+            *(
+                f"site {site.name}: {own_parts(store.attributes, site.name)}"
+                for site in store.attributes.sites
+                if site.layers or site.heads
+            ),
             "rows exact" if exact else f"rows with {recording.mantissa_bits} bits",
             f"frames {'stored' if recording.frames else 'not stored'}",
             f"contributions {'recorded' if recording.contributions else 'not recorded'}",

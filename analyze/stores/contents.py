@@ -162,6 +162,6 @@ def own_parts(root: RootAttributes, site: str) -> str:
     """What is recorded of a site that has layers, heads or action queries of its own."""
     recording = root.recording_of(site)
     return (
-        f"site {site}: layers {listing(recording.layers, 40)}, {plural(len(recording.heads), 'head')}, "
+        f"layers {listing(recording.layers, 40)}; {plural(len(recording.heads), 'head')}; "
         f"{recording.num_action_queries} action queries"
     )

@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 
 from vla_attention.analyze.measures.frames import float_values, layer_name
-from vla_attention.analyze.show.numbers import interval_name, of_tasks
+from vla_attention.analyze.show.numbers import interval_name, of_tasks, plural
 from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, legend_above, ratio_axis, whole_numbers
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, LINE_OF_HATCH, NOTE_COLOR, group_styles
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
@@ -171,6 +171,9 @@ def _note(courses: TimeCourses, alignment: str, level: float) -> str:
     tasks = courses.autocorrelation.select("suite", "task_id").n_unique()
     text = f"{of_tasks(episodes, tasks)}. "
     text += f"Bands: pointwise {interval_name(level)}s."
+    drawn = courses.course.filter(pl.col("alignment") == alignment)
+    if unknown := courses.unknown_outcomes if (drawn["outcome"] == SUCCESS).any() else 0:
+        text += f" {plural(unknown, 'episode')} without a known outcome {'is' if unknown == 1 else 'are'} in neither."
     if alignment == GRIPPER_CLOSING:
         closers = courses.closing["closing_replan"].is_not_null().sum()
         others = "; the others are not shown" if closers < courses.closing.height else ""

@@ -98,6 +98,7 @@ class TimeCourses:
     outcomes: pl.DataFrame
     autocorrelation: pl.DataFrame
     num_nonfinite: int
+    unknown_outcomes: int = 0
 
 
 @dataclass(frozen=True)
@@ -161,6 +162,7 @@ def time_courses(
         outcomes=_outcomes_table(episodes, quantities, estimand),
         autocorrelation=effective_replans_table(of_layer, grouping),
         num_nonfinite=int(sum((~np.isfinite(values)).sum() for values in ratios)),
+        unknown_outcomes=sum(episode.success is None for episode in episodes),
     )
 
 

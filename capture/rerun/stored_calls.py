@@ -112,6 +112,12 @@ def check_has_inputs(store: Store, policy: Policy) -> None:
     changed = {change.camera for change in store.attributes.interventions.images}
     for episode in store.episodes:
         arrays = episode.attributes.arrays
+        unknown = [name for name in ("state", "noise_seed", "actions") if name not in arrays]
+        if unknown:
+            raise StoreWithoutInputs(
+                f"Cannot rerun {store.path}: episode {episode.name} does not hold {listing(unknown)} of its policy "
+                "calls, which a rerun needs to make them again."
+            )
         missing = [camera.name for camera in policy.cameras if f"frames/{camera.name}" not in arrays]
         if missing:
             raise StoreWithoutInputs(

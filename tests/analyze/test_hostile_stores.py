@@ -6,6 +6,7 @@ import itertools
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,9 @@ from vla_attention.analyze.parse.command import main as parse
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.interventions import Interventions, PromptChange
 from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.layout import SiteLayout, Span
 from vla_attention.schemas.stores.digest import bytes_digest, seal_digest
+from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
 from vla_attention.testing.stores import StoreSpec, rerun_source, reseal, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, contributions=True)
@@ -116,6 +119,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "time": ("STORE", "--output", "OUT", "--no-plots"),
     "compare": ("STORE", "OTHER", "--output", "OUT", "--no-plots"),
     "effects": ("STORE", "OTHER", "--output", "OUT"),
+    "deviation": ("STORE", "--output", "OUT"),
     "overlay": ("STORE", "OTHER", "--output", "OUT"),
     "report": ("STORE", "--output", "OUT", "--episodes", "1", "--tasks", "0", "--layers", "0"),
     "export": ("STORE", "--csv", "--output", "OUT"),
@@ -133,7 +137,11 @@ def test_every_command_is_tried():
 def test_hostile_texts_are_printed_visibly_and_nothing_is_written_elsewhere(
     store, tmp_path, monkeypatch, capsys, command
 ):
-    hostile_texts(store)
+    if command == "deviation":  # of a store with the actions of a data set
+        shutil.rmtree(store)
+        write_site_store(store, HostileSites(dataset_actions=0.5, protocol="dataset"))
+    else:
+        hostile_texts(store)
     other = write_store(tmp_path / "stores" / "b.zarr", spec=SPEC, suite="other")
     if command == "compare":
         shutil.rmtree(other)
@@ -179,6 +187,37 @@ def test_hostile_texts_are_printed_visibly_and_nothing_is_written_elsewhere(
         assert "&lt;img src=x onerror=alert(1)&gt;" in page
 
 
+@dataclass(frozen=True)
+class HostileSites(SiteStoreSpec):
+    """Sites, spans and cameras whose names are markup and a formula."""
+
+    @property
+    def sites(self) -> tuple[SiteLayout, ...]:
+        def named(span: Span) -> Span:
+            return span if span.camera is None else replace(span, name=MARKUP + span.name, camera=MARKUP + span.name)
+
+        made = zip((FORMULA, MARKUP), super().sites, strict=True)
+        return tuple(replace(site, name=name, spans=tuple(map(named, site.spans))) for name, site in made)
+
+
+@pytest.mark.parametrize("command", slow_except(("ratios", "report"), set(WORDS) - {"effects", "objects", "compare"}))
+def test_hostile_names_of_sites_are_printed_visibly_and_nothing_is_written_elsewhere(tmp_path, capsys, command):
+    store = write_site_store(tmp_path / "a.zarr", HostileSites(kind="split", dataset_actions=0.5, outcome="some"))
+    out, before = tmp_path / "out", files_under(tmp_path)
+    words = [word for word in WORDS[command] if word != "OTHER"]
+    assert analyze([command, *(word.replace("STORE", str(store)).replace("OUT", str(out)) for word in words)]) == 0
+    check_output(capsys)
+    assert analyze([str(store), "--list"]) == 0
+    assert FORMULA in check_output(capsys)
+    assert all(out in path.parents for path in files_under(tmp_path) - before)
+    if command == "report":
+        page = (out / "report.html").read_text(encoding="utf-8")
+        tags = Tags()
+        tags.feed(page)
+        assert not [tag for tag in tags.tags if any(name.startswith("on") for name in tag[1])]
+        assert MARKUP not in page
+
+
 def test_the_list_of_a_store_and_its_status_are_visible(store, capsys):
     hostile_texts(store)
     assert analyze([str(store), "--list"]) == 0
@@ -203,6 +242,10 @@ def set_span(root: dict[str, Any], name: str) -> None:
     root["sites"][0]["spans"][0]["name"] = name
 
 
+def set_site(root: dict[str, Any], name: str) -> None:
+    root["sites"][0]["name"] = name
+
+
 def set_policy(root: dict[str, Any], name: str) -> None:
     root["policy"]["name"] = name
 
@@ -224,7 +267,11 @@ CONTROL, PATH = "a\x1b[2J\u202e", "../../../x"
 
 @pytest.mark.parametrize(
     ("make", "name"),
-    [*itertools.product([set_suite, set_camera, set_view, set_span], [PATH, CONTROL]), (set_policy, CONTROL)],
+    [
+        *itertools.product([set_suite, set_camera, set_view, set_span, set_site], [PATH, CONTROL]),
+        (set_policy, CONTROL),
+        (set_site, "seal"),
+    ],
 )
 def test_a_run_whose_names_are_paths_or_control_a_terminal_is_refused(store, tmp_path, capsys, make, name):
     change(store / "zarr.json", lambda attributes: make(attributes, name))

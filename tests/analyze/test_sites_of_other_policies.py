@@ -15,6 +15,7 @@ from vla_attention.analyze.measures.sinks import SinkRule, search_sinks
 from vla_attention.analyze.measures.steps import measure_episodes, step_tables
 from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.interventions import Interventions, KeyKnockout
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing import assert_whole
 from vla_attention.testing.site_stores import SiteStoreSpec, key_exists, site_root, write_site_store
@@ -161,6 +162,24 @@ def test_commands(stores, tmp_path, capsys, name, command, says):
     assert analyze(given) == 0
     printed = capsys.readouterr()
     assert says in " ".join(printed.out.split())
+
+
+def test_effects_of_recorded_rollouts(stores, tmp_path, capsys):
+    knockout = Interventions("without_visual", keys=(KeyKnockout("role:image"),))
+    other = write_site_store(tmp_path / "other.zarr", kind="growing", outcome="some", interventions=knockout)
+    assert analyze(["effects", str(stores["growing"]), str(other), "--out", str(tmp_path), "--no-plots"]) == 0
+    pairs = pl.read_parquet(tmp_path / "rollouts.parquet")
+    assert (pairs["episode"] == pairs["episode_base"]).all()
+    assert pairs["steps"].is_null().all()
+    assert pairs["success"].null_count() == 2
+
+
+def test_masses_as_netcdf_where_outcomes_are_not_known(stores, tmp_path, capsys):
+    xarray = pytest.importorskip("xarray")
+    assert analyze(["export", str(stores["alternating"]), "--netcdf", "--output", str(tmp_path)]) == 0
+    (file,) = tmp_path.glob("*.nc")
+    with xarray.open_dataset(file) as dataset:
+        assert np.isnan(dataset["success"].to_numpy()).sum() == 2 * 4
 
 
 def test_objects_need_coverage(stores, tmp_path, capsys):

@@ -13,6 +13,8 @@
 - `small_tokens`, `libero_tokens`, `random_rows`: tokens of an episode, and attention-like rows for them.
 - `rerun_source`: what a rerun of a store says of it (`StoreSpec.rerun_of`).
 - `reseal`: seal an episode anew after changing its files, as a test of checks behind the seal needs.
+- `SiteStoreSpec`, `write_site_store`: stores of other policies: sites in some of the blocks, absent keys, generated
+  tokens, unknown outcomes, a data set's actions.
 - `assert_whole`: read a store back and fail on everything that `vla-analyze verify` would report.
 - `vla_attention.testing.strategies`: random layouts, tokens and groupings for hypothesis (to be installed beside it).
 """
@@ -23,6 +25,7 @@ from pathlib import Path
 
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
+from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
 from vla_attention.testing.stores import (
     StoreSpec,
     episode_records,
@@ -35,6 +38,7 @@ from vla_attention.testing.stores import (
 from vla_attention.testing.tokens import libero_tokens, random_rows, small_tokens
 
 __all__ = [
+    "SiteStoreSpec",
     "StoreSpec",
     "assert_whole",
     "episode_records",
@@ -45,6 +49,7 @@ __all__ = [
     "reseal",
     "root_attributes",
     "small_tokens",
+    "write_site_store",
     "write_store",
 ]
 

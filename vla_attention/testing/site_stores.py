@@ -12,7 +12,7 @@ Kinds:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from vla_attention.capture.store.episode_writer import EpisodeStart, ReplanRecord
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.store_writer import open_run
+from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.layout import INVALID_ROLES, PatchGrid, Piece, Prompt, Role, SiteLayout, Span
 from vla_attention.schemas.segments import segment_members, segments_of
 from vla_attention.schemas.stores.store_format import (
@@ -66,6 +67,7 @@ class SiteStoreSpec:
     contributions: bool = True
     dataset_actions: float | None = None
     policy: str = "made-up"
+    interventions: Interventions = field(default_factory=Interventions)
 
     @property
     def sites(self) -> tuple[SiteLayout, ...]:
@@ -136,6 +138,7 @@ def site_root(spec: SiteStoreSpec) -> RootAttributes:
         ),
         sites=spec.sites,
         provenance={"numpy": np.__version__},
+        interventions=spec.interventions,
     )
 
 
