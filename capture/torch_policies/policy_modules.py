@@ -37,11 +37,13 @@ class FoundPolicy:
         policy: what was given.
         modules: by path, see `modules_of`.
         attending: those in whose own forward attention can run.
+        simple: the others that have a forward: torch's modules without children, such as `nn.Linear`.
     """
 
     policy: object
     modules: Mapping[str, nn.Module]
     attending: tuple[nn.Module, ...]
+    simple: tuple[nn.Module, ...]
 
 
 def find_policy(policy: object) -> FoundPolicy:
@@ -55,7 +57,9 @@ def find_policy(policy: object) -> FoundPolicy:
         return policy
     modules = modules_of(policy)
     refuse_unseen_settings(modules)
-    return FoundPolicy(policy, modules, tuple(module for module in modules.values() if _may_attend(module)))
+    running = [module for module in modules.values() if type(module).forward is not nn.Module.forward]
+    attending = tuple(module for module in running if _may_attend(module))
+    return FoundPolicy(policy, modules, attending, tuple(module for module in running if not _may_attend(module)))
 
 
 def _may_attend(module: nn.Module) -> bool:

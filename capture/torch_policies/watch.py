@@ -46,6 +46,7 @@ def watch_attention(policy: object, watcher: Watcher) -> Iterator[None]:
         NoModules, CannotRunEager: see `modules_of`.
         OtherPolicy: attention of a module that the policy does not hold ran in the block.
         StillRunning: the policy still runs in another thread at the end.
+        NotFollowed: it ran in another thread in methods that are no forward, and no attention was seen.
         UnseenAttention: the policy is set to attention that gives no rows, such as flash-attn's, or an operator that
             computes attention so ran.
         ChangeRefused: a change that does not fit its call, or that the call does not allow.

@@ -26,6 +26,10 @@ class StillRunning(BadArgument):
     """A block that ends while the policy runs in another thread."""
 
 
+class NotFollowed(BadArgument):
+    """A policy that ran in another thread, in methods in which its attention is not seen."""
+
+
 @dataclass(frozen=True)
 class Where:
     """The innermost module that is running: its path in the policy, and itself (None outside every module)."""
@@ -51,7 +55,9 @@ class WatchedBlock:
         self.watcher = watcher
         #: The first error of watching, which the block raises at its end if the policy's code went on without it.
         self.error: BaseException | None = None
-        self._attending = found.attending
+        self._found = found
+        #: Whether simple modules ran in a thread where nothing is seen.
+        self._unseen_thread = False
         self._number = 0
         self._lock = threading.RLock()
         self._thread = _ThreadState()
@@ -143,6 +149,7 @@ class WatchedBlock:
 
         Raises:
             StillRunning: the policy still runs in another thread.
+            NotFollowed: it ran in another thread so that no attention was seen.
             BaseException: an error of watching that the policy's code caught, or met in another thread.
         """
         with self._lock:
@@ -154,6 +161,12 @@ class WatchedBlock:
                 )
             if self.error is not None:
                 raise self.error
+            if self._unseen_thread and not self._number:
+                raise NotFollowed(
+                    f"The policy ({type(self.policy).__name__}) ran in another thread than the block that records it, "
+                    "in methods that are no forward of a module, and no attention was seen. Call it in the "
+                    "thread of the block."
+                )
 
     @contextmanager
     def following_modules(self, mode: Callable[[], AbstractContextManager[object]]) -> Iterator[None]:
@@ -162,11 +175,14 @@ class WatchedBlock:
         Function modes belong to threads. A module that is called in a thread where none is active enters one for its
         forward. Hooks would not do: `module.forward(...)` skips them, and so do some fast paths.
         """
-        kept = [(module, module.__dict__.get("forward")) for module in self._attending]
+        attending, simple = self._found.attending, self._found.simple
+        kept = [(module, module.__dict__.get("forward")) for module in (*attending, *simple)]
         self._thread.seen = True
         try:
-            for module, _ in kept:
+            for module in attending:
                 module.__dict__["forward"] = self._followed(module, module.forward, mode)
+            for module in simple:
+                module.__dict__["forward"] = self._noticed(module.forward)
             yield
         finally:
             self._thread.seen = False
@@ -175,6 +191,18 @@ class WatchedBlock:
                     module.__dict__.pop("forward", None)
                 else:
                     module.__dict__["forward"] = forward
+
+    def _noticed(self, forward: Callable[..., Any]) -> Callable[..., Any]:
+        """Notice a simple module that runs in another thread, outside every forward that could enter a mode there."""
+        thread = self._thread
+
+        def noticed(*args: Any, **kwargs: Any) -> Any:
+            if not thread.seen:
+                self._unseen_thread = True
+            return forward(*args, **kwargs)
+
+        noticed.__wrapped__ = forward  # type: ignore[attr-defined]
+        return noticed
 
     def _followed(
         self, module: nn.Module, forward: Callable[..., Any], mode: Callable[[], AbstractContextManager[object]]

@@ -20,7 +20,7 @@ from vla_attention.capture.torch_policies.call_changes import ChangeRefused
 from vla_attention.capture.torch_policies.policy_modules import CannotRunEager, NoModules, find_policy, modules_of
 from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
 from vla_attention.capture.torch_policies.watch import AlreadyWatched, watch_attention
-from vla_attention.capture.torch_policies.watched_block import OtherPolicy, StillRunning
+from vla_attention.capture.torch_policies.watched_block import NotFollowed, OtherPolicy, StillRunning
 
 
 def attend(query, key, value, mask):
@@ -145,6 +145,30 @@ def test_other_threads_are_seen(way):
         assert pool.submit(lambda: torch._C._len_torch_function_stack()).result() == 0
         pool.submit(policy, HIDDEN, MEMORY).result()
     assert len(seen.shapes) == 2
+
+
+class InMethods(nn.Module):
+    """Attends in a method that is no forward, and nowhere else."""
+
+    def __init__(self):
+        super().__init__()
+        self.projection = nn.Linear(32, 32)
+
+    def act(self, hidden):
+        projected = self.projection(hidden)[:, None]
+        return sdpa(projected, projected, projected)
+
+
+def test_methods_in_another_thread_are_an_error_and_no_empty_block():
+    policy = InMethods()
+    assert seen_in(policy, lambda: policy.act(HIDDEN)) == [""]
+    with ThreadPoolExecutor(1) as pool:
+        with pytest.raises(NotFollowed, match=r"\(InMethods\) ran in another thread.*in the thread of the block"):  # noqa: SIM117
+            with watch_attention(policy, Seen()):
+                pool.submit(policy.act, HIDDEN).result()
+        assert "forward" not in policy.projection.__dict__
+        with watch_attention(policy, Seen()):
+            pool.submit(int).result()
 
 
 def test_two_threads_at_the_same_time_are_both_seen():
@@ -408,7 +432,7 @@ def test_modules_are_looked_for_once_for_many_blocks():
     assert find_policy(found) is found
     for _ in range(2):
         assert seen_in(found, lambda: policy(HIDDEN, MEMORY)) == PATHS
-    assert [type(module) for module in found.attending] == [Policy, nn.ModuleList, Attention, Attention]
+    assert [type(module) for module in found.attending] == [Policy, Attention, Attention]
 
 
 def test_the_signature_of_forward_stays():
