@@ -111,7 +111,7 @@ setup-analyze: .venv/analyze-installed
 	@echo "Installing LeRobot 0.4.4 into .venv-lerobot ..."
 	$(PYTHON) -m venv .venv-lerobot
 	.venv-lerobot/bin/python -m pip install --quiet --disable-pip-version-check -e . -r tests/policies/requirements-lerobot.txt
-	.venv-lerobot/bin/python -m pip install --quiet --disable-pip-version-check --no-deps lerobot==0.4.4 av==15.0.0
+	.venv-lerobot/bin/python -m pip install --quiet --disable-pip-version-check --no-deps lerobot==0.4.4 av==15.0.0 openpi-client==0.1.2 openpi-server==0.1.0
 	@touch $@
 
 clean:
