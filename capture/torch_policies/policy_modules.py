@@ -14,6 +14,8 @@ from vla_attention.schemas.errors import BadArgument
 
 #: How deep modules are looked for in objects that are no modules.
 _DEPTH = 4
+#: Lists and dictionaries with more entries are not looked into.
+_MANY = 1000
 #: Classes whose instances run a compiled program, by the beginning of their full names.
 _COMPILED = (
     "torch.jit.", "torch._inductor.package.", "torch_tensorrt.", "tensorrt.", "onnxruntime.",
@@ -148,7 +150,9 @@ def _held(part: object, path: str, depth: int, seen: set[int]) -> Iterator[tuple
         return
     if depth >= _DEPTH:
         return
-    if isinstance(part, Mapping):
+    if isinstance(part, dict | list | tuple | set | frozenset) and len(part) > _MANY:
+        return  # vocabularies and data, no modules
+    if isinstance(part, dict):
         items = [(str(name), held) for name, held in part.items()]
     elif isinstance(part, list | tuple | set | frozenset):
         items = [(str(number), held) for number, held in enumerate(part)]

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
@@ -50,7 +51,7 @@ def watch_call(
     if torch.is_autocast_enabled(query.device.type):
         dtype = torch.get_autocast_dtype(query.device.type)
     where = block.where()
-    *lead, kernel_queries, dim = query.shape
+    lead, kernel_queries, dim = _lead(given), query.shape[-2], query.shape[-1]
     keys = key.shape[-2]
     batch, kernel_heads = batch_and_heads(lead, where.module)
     kv_heads = key.shape[-3] if given.enable_gqa and len(lead) >= 2 else kernel_heads
@@ -75,7 +76,7 @@ def watch_call(
         with sdpa_kernel(_ANY_KERNEL):
             output = function(query, key, given.value, logits, given.dropout_p, **options)
     tensors = LogitTensors(
-        query=query.detach().to(dtype).reshape(batch, heads, queries, dim),
+        query=query.detach().to(dtype).expand(*lead, -1, -1).reshape(batch, heads, queries, dim),
         key=_folded(key.to(dtype), lead, batch, kv_heads),
         values=_folded(given.value.to(dtype), lead, batch, kv_heads),
         outputs=output.detach().reshape(batch, heads, queries, given.value.shape[-1]),
@@ -86,6 +87,17 @@ def watch_call(
     )
     block.saw(AttentionCall(shape, tensors))
     return output
+
+
+def _lead(given: _Arguments) -> list[int]:
+    """Return the axes before query and dim of the output: the kernel broadcasts them, as for learned queries."""
+    leads = [tensor.shape[:-2] for tensor in (given.query, given.key, given.value)]
+    if given.attn_mask is not None and given.attn_mask.ndim == given.query.ndim:
+        leads.append(given.attn_mask.shape[:-2])
+    if given.enable_gqa:
+        heads = given.query.shape[-3]
+        leads = [torch.Size((*lead[:-1], heads if lead[-1] > 1 else 1)) for lead in leads]
+    return list(np.broadcast_shapes(*leads))
 
 
 def _folded(tensor: Tensor, lead: list[int], batch: int, kv_heads: int) -> Tensor:

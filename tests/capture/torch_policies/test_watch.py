@@ -305,6 +305,7 @@ def test_graphed_modules_are_refused():
             pass
 
 
+@pytest.mark.filterwarnings("ignore:The PyTorch API of nested tensors")
 def test_nested_tensors_are_refused():
     policy = Policy(lambda q, k, v, mask: sdpa(*[torch.nested.nested_tensor(list(t)) for t in (q, k, v)])).eval()
     with pytest.raises(UnseenAttention, match=r"layers\.0 computes attention of nested tensors"):  # noqa: SIM117
