@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from vla_attention.capture.interventions.arguments import add_intervention_arguments
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.policies.family import PolicyFamily
@@ -46,6 +47,8 @@ def add_replay_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) 
         parser.set_defaults(family=family)
     _add_column_arguments(parser, of_file=of_file)
     _add_frame_arguments(parser, "as the file says, else 1" if of_file else family.replan_default)
+    if of_file:
+        _add_change_arguments(parser)
     add_recording_arguments(parser, f"block indices (default: all){'' if of_file else family.layers_note}")
     _add_output_arguments(parser)
     parser.set_defaults(command=_run)
@@ -130,6 +133,17 @@ def _add_frame_arguments(parser: argparse.ArgumentParser, every: str) -> None:
     )
     group.add_argument("--num-episodes", type=int, metavar="N", help="the first N of these (default: all)")
     group.add_argument("--seed", type=int, default=7, metavar="N", help="seed of all noise (default: %(default)s)")
+
+
+def _add_change_arguments(parser: argparse.ArgumentParser) -> None:
+    add_intervention_arguments(parser)
+    parser.add_argument(
+        "--rerun-of",
+        type=Path,
+        metavar="BASE.zarr",
+        help="the replay of the same frames without interventions, with which `vla-analyze effects` then pairs the "
+        "calls of this one, replan by replan",
+    )
 
 
 def _add_output_arguments(parser: argparse.ArgumentParser) -> None:

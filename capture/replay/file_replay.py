@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 
+from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.policies.noise import noise_seed
 from vla_attention.capture.policies.policy import camera_grid
 from vla_attention.capture.policies.robot import NONE, RobotData
@@ -19,6 +21,9 @@ from vla_attention.capture.run_settings import recording_settings
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.session import RecordedRun
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.interventions import Interventions, RerunSource
+from vla_attention.schemas.stores.root import read_run
+from vla_attention.schemas.stores.store_format import RootAttributes
 
 
 @dataclass(frozen=True)
@@ -29,6 +34,7 @@ class FileReplay:
     run: RecordedRun
     plan: ReplayPlan
     every: int
+    seed: int
     cameras: dict[str, str]
     state: tuple[str, ...]
     actions: tuple[str, ...]
@@ -51,7 +57,7 @@ class FileReplay:
             for number, frame in enumerate(episode.frames(self.every, columns)):
                 before_call(number)
                 frame = frame if own is None else replace(frame, instruction=own)
-                seed = noise_seed(self.plan.seed, task, episode.index, number)
+                seed = noise_seed(self.seed, task, episode.index, number)
                 torch.manual_seed(seed)
                 horizon = self.given.layout.action_horizon or 1
                 with recorded.replan(
@@ -78,6 +84,9 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
     settings = recording_settings(arguments)
     if settings.queries not in ("mean", "all"):
         raise BadArgument(f"Cannot use --queries {settings.queries} with --policy FILE.py; expected mean or all.")
+    interventions = read_interventions(arguments)
+    of_attention = replace(interventions, noise=None)  # the noise is drawn here
+    base = _base_of(arguments, interventions)
     run = record(
         plan.store,
         given.policy,
@@ -92,17 +101,26 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
         bits=settings.mantissa_bits,
         contributions=None if settings.contributions else False,
         frames=settings.frames,
+        knockout=None if of_attention.is_none else of_attention,
+        allow_empty=arguments.allow_empty,
         resume=plan.mode == "resume",
         overwrite=plan.mode == "overwrite",
     )
     run.attributes = replace(
-        run.attributes, protocol=plan.protocol(every), data_set=plan.source(columns_of(cameras, state, actions))
+        run.attributes,
+        protocol=plan.protocol(every),
+        data_set=plan.source(columns_of(cameras, state, actions)),
+        interventions=interventions_for_store(interventions, run.attributes.interventions),
+        rerun_of=None if base is None else RerunSource(run=base[1], name=arguments.rerun_of.name),
     )
+    if base is not None:
+        _check_base(arguments.rerun_of, base[0], run.attributes)
     grids = [camera_grid(run.attributes.sites, camera) for camera in cameras]
     sizes = [grid.image_height * grid.image_width * 3 for grid in grids]
     with run:
         todo = announce(plan, run.attributes, layout.action_horizon, sizes)
-        replay = FileReplay(given, run, plan, every, cameras, state, actions)
+        seed = plan.seed if interventions.noise is None else interventions.noise.seed
+        replay = FileReplay(given, run, plan, every, seed, cameras, state, actions)
         added = record_episodes(plan, todo, every, replay.replay_episode)
     if run.num_dropped:
         say(f"In {run.num_dropped} policy calls no attention ran; they are not in the store.")
@@ -111,6 +129,32 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
             f"Largest difference of P·V from the policy's own attention: {run.largest_error:.2g} of its largest output."
         )
     return added
+
+
+def interventions_for_store(given: Interventions, recorded: Interventions) -> Interventions:
+    """Return what the store says was changed: what the recorder changed, and the noise."""
+    return recorded if given.noise is None else replace(recorded, name=given.name, noise=given.noise)
+
+
+def _base_of(arguments: argparse.Namespace, interventions: Interventions) -> tuple[RootAttributes, str] | None:
+    """Return the attributes and the run of the base of a replay with interventions; None without one."""
+    if arguments.rerun_of is None:
+        return None
+    if interventions.is_none:
+        raise BadArgument("--rerun-of needs an intervention, for instance --knockout camera:NAME.")
+    return read_run(arguments.rerun_of)
+
+
+def _check_base(path: Path, base: RootAttributes, made: RootAttributes) -> None:
+    """Raise `BadArgument` unless the calls of a replay are those of its base, but for the interventions."""
+    for what, first, second in (
+        ("weights", base.policy.digest, made.policy.digest),
+        ("data set, or columns of it", base.data_set, made.data_set),
+        ("--every or --seed", base.protocol, made.protocol),
+        ("interventions of its own", base.interventions.is_none, True),
+    ):
+        if first != second:
+            raise BadArgument(f"Cannot use --rerun-of {path}: its calls are other ones, with other {what}.")
 
 
 def _offered(data: RobotData, given: ReplayPolicy) -> RobotData:

@@ -184,6 +184,8 @@ def announce(
     )
     if source is not None:
         say(f"Columns: {'; '.join(f'{what} = {column}' for what, column in source.columns.items())}.")
+    if not attributes.interventions.is_none:
+        say(f"Interventions: {attributes.interventions.describe()}.")
     calls = [plan.calls(index, every) for index in todo]
     of_actions = f", of {horizon} actions each" if horizon else ""
     say(f"Policy calls: {sum(calls)}, every {every} frames ({every / info.fps:.3g} s){of_actions}.")

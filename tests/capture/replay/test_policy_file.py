@@ -108,6 +108,44 @@ def test_a_file_s_replay_is_continued(tmp_path, data, file, capsys):
     assert "replan_steps is 2, this run's is 1" in capsys.readouterr().err
 
 
+def test_knockouts_are_paired_with_the_unchanged_replay(tmp_path, data, file, capsys):
+    base, changed = tmp_path / "base.zarr", tmp_path / "without_front.zarr"
+    replay = ("replay", data, "--policy", file)
+    assert run(*replay, "--store", base) == 0
+    knockout = ("--knockout", "camera:front", "--rerun-of", base)
+    assert run(*replay, *knockout, "--store", changed) == 0
+    assert "Interventions: " in capsys.readouterr().out
+    for name in ("task000_episode000", "task001_episode001"):
+        one, other = (zarr.open_group(store / "episodes" / name, mode="r") for store in (base, changed))
+        np.testing.assert_array_equal(one["noise_seed"][:], other["noise_seed"][:])
+        assert not np.array_equal(one["actions"][:], other["actions"][:])
+        front = other["joint/key_role"][:] == 1
+        assert not (other["joint/rows"][:] * front[:, None, None, None, None]).any()
+        assert (one["joint/rows"][:] * front[:, None, None, None, None]).any()
+    assert analyze(["effects", str(base), str(changed), "--output", str(tmp_path / "effects"), "--no-plots"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Effects were measured in 3 episodes of 2 tasks." in said
+    assert "without_front" in said
+    # another noise seed is the scale of the effects
+    noise = tmp_path / "noise.zarr"
+    assert run(*replay, "--noise-seed", 8, "--rerun-of", base, "--store", noise) == 0
+    one, other = (zarr.open_group(store / "episodes" / "task000_episode000", mode="r") for store in (base, noise))
+    assert other["noise_seed"][0] == noise_seed(8, 0, 0, 0)
+    assert not np.array_equal(one["actions"][:], other["actions"][:])
+    capsys.readouterr()
+    options = ("--output", str(tmp_path / "with_noise"), "--no-plots")
+    assert analyze(["effects", str(base), str(changed), str(noise), *options]) == 0
+    assert "No rerun changes the noise seed" not in capsys.readouterr().out
+    for options, message in (
+        (("--every", 1), "other --every or --seed"),
+        (("--state", "none"), "other data set, or columns of it"),
+    ):
+        assert run(*replay, *knockout, *options, "--store", tmp_path / "no.zarr") == 2
+        assert message in capsys.readouterr().err
+    assert run(*replay, "--rerun-of", base, "--store", tmp_path / "no.zarr") == 2
+    assert "--rerun-of needs an intervention" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("content", "options", "message"),
     [
@@ -117,6 +155,8 @@ def test_a_file_s_replay_is_continued(tmp_path, data, file, capsys):
         (FILE.replace("every=2", "every=0"), (), "its every is 0"),
         (FILE, ("--camera", "top=front"), "Unknown camera of the policy 'top'"),
         (FILE.replace("small_layout(), act", "small_layout(), act, cameras={'front': 'head'}"), (), "'head'"),
+        (FILE, ("--prompt", "empty"), "prompt, pictures and noise are given to the policy by your own code"),
+        (FILE, ("--knockout", "camera:top"), "top"),
         (FILE, ("--queries", "steps"), "expected mean or all"),
         (FILE, ("--layers", 7), "7"),
         (FILE, ("--checkpoint", "x"), "unrecognized arguments: --checkpoint x"),
