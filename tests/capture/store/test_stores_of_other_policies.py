@@ -1,0 +1,173 @@
+"""What the writer takes of policies and loops that are not ours, and what it refuses; `verify` reports the same."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vla_attention.capture.store.disk_estimate import estimate_disk
+from vla_attention.capture.store.episode_writer import ReplanRecord, ReplanRefused
+from vla_attention.capture.store.store_writer import open_run
+from vla_attention.schemas.layout import Role, SiteLayout, prompt_at
+from vla_attention.schemas.stores import verify
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import CorruptEpisode
+from vla_attention.schemas.stores.verify import verify_store
+from vla_attention.testing.site_stores import SiteStoreSpec, site_records, site_root, write_site_store
+
+Change = Callable[[ReplanRecord], ReplanRecord]
+
+
+def move_mass(site: str, key: int, query: int | None = None) -> Change:
+    """Give a key the mass of the key with the largest one."""
+
+    def change(record: ReplanRecord) -> ReplanRecord:
+        rows = record.rows[site].rows.copy()
+        part = rows if query is None else rows[..., query, :]
+        part[..., key] += part[..., 0]
+        part[..., 0] = 0.0
+        return replace(record, rows=record.rows | {site: replace(record.rows[site], rows=rows, contribution=None)})
+
+    return change
+
+
+def append(path: Path, spec: SiteStoreSpec, changes: dict[int, Change]) -> None:
+    store = open_run(path, site_root(spec), "new", durable=False)
+    start, records = site_records(spec, 0, 0)
+    with store.episode(start, np.array([1.0, 0.5]), len(records)) as writer:
+        for replan, record in enumerate(records):
+            writer.append(changes[replan](record) if replan in changes else record)
+        writer.commit(success=None, num_steps=0)
+
+
+@pytest.mark.parametrize(
+    ("spec", "changes", "says"),
+    [
+        (
+            SiteStoreSpec(kind="growing", contributions=False),
+            {1: move_mass("joint", 33)},
+            "joint/rows gives mass to a key with the role 'absent' at replan 1",
+        ),
+        (
+            SiteStoreSpec(kind="growing", queries="all", replans=1, contributions=False),
+            {0: move_mass("joint", 30, query=2)},
+            "gives query 2 mass of a key of the growing span 'generated' that does not exist for it yet, at replan 0",
+        ),
+        (
+            SiteStoreSpec(),
+            {1: lambda record: replace(record, state=None)},
+            "it has no state, other than the first replan",
+        ),
+        (
+            SiteStoreSpec(state=False),
+            {1: lambda record: replace(record, noise_seed=3)},
+            "it has a noise_seed, other than the first replan",
+        ),
+        (
+            SiteStoreSpec(dataset_actions=0.5),
+            {1: lambda record: replace(record, dataset_actions=np.zeros((3, 4)))},
+            r"dataset_actions has the shape \(3, 4\); that of the first replan is \(5, 3\)",
+        ),
+        (
+            SiteStoreSpec(dataset_actions=0.5),
+            {1: lambda record: replace(record, dataset_actions=np.zeros((0, 3)))},
+            "expected \\(steps, action_dim\\) with at least one step",
+        ),
+        (
+            SiteStoreSpec(),
+            {0: lambda record: replace(record, rows=dict(record.rows, self=record.rows["cross"]))},
+            r"self/rows has the shape \(2, 2, 2, 1, 29\) and type float32; expected \(2, 2, 3, 1, 34\)",
+        ),
+    ],
+)
+def test_replans_that_are_refused(tmp_path, spec, changes, says):
+    with pytest.raises(ReplanRefused, match=says):
+        append(tmp_path / "a.zarr", spec, changes)
+    assert not list((tmp_path / "a.zarr" / "episodes").glob("task*"))
+
+
+@pytest.mark.parametrize(
+    ("spec", "changes", "says"),
+    [
+        (
+            SiteStoreSpec(kind="growing", contributions=False),
+            {1: move_mass("joint", 33)},
+            "the role 'absent' at replan 1",
+        ),
+        (
+            SiteStoreSpec(kind="growing", queries="all", replans=1, contributions=False),
+            {0: move_mass("joint", 30, query=2)},
+            "does not exist for it yet, at replan 0",
+        ),
+    ],
+)
+def test_verify_reports_what_the_writer_let_through(tmp_path, monkeypatch, spec, changes, says):
+    with monkeypatch.context() as patch:
+        patch.setattr("vla_attention.capture.store.site_writer.absent_problems", lambda *_: iter(()))
+        patch.setattr(verify, "absent_problems", lambda *_: iter(()))
+        append(tmp_path / "a.zarr", spec, changes)
+    faults = verify_store(open_store(tmp_path / "a.zarr"))
+    assert [says in fault.problem for fault in faults] == [True]
+
+
+def test_arrays_that_nobody_knows_are_missing_and_no_fault(tmp_path):
+    bare = SiteStoreSpec(actions=False, state=False, frames=False, contributions=False, outcome="unknown")
+    store = open_store(write_site_store(tmp_path / "a.zarr", bare))
+    assert verify_store(store) == []
+    for episode in store.episodes:
+        assert episode.attributes.success is None
+        for name in ("state", "actions", "noise_seed", "dataset_actions", "frames/base"):
+            assert not episode.has(name)
+
+
+def test_a_run_of_our_own_loop_needs_them(tmp_path):
+    spec = SiteStoreSpec(actions=False)
+    root = site_root(spec)
+    root = replace(root, protocol=replace(root.protocol, name="openpi"))
+    store = open_run(tmp_path / "a.zarr", root, "new", durable=False)
+    start, records = site_records(spec, 0, 0)
+    with store.episode(start, np.array([1.0, 0.5]), len(records)) as writer:
+        for record in records:
+            writer.append(record)
+        with pytest.raises(CorruptEpisode, match="the array actions is not in the episode"):
+            writer.commit(success=True, num_steps=5)
+
+
+def test_pieces_of_the_prompt_are_at_the_same_places_of_every_sites_text(tmp_path):
+    store = open_store(write_site_store(tmp_path / "a.zarr", tasks=(0,), episodes=1))
+    (episode,) = store.episodes
+    of_self, of_cross = (episode.tokens(store.attributes, site) for site in ("self", "cross"))
+    assert of_self.prompts == of_cross.prompts
+    text = store.attributes.sites[1].spans[2]
+    moved = SiteLayout("text", (replace(text, start=0, stop=text.num_keys),))
+    sites = (store.attributes.sites[0], moved)
+    (first, *_), (shifted, *_) = of_self.prompts, tuple(prompt_at(sites, moved, prompt) for prompt in of_self.prompts)
+    assert [piece.key for piece in shifted.pieces] == [piece.key - 16 for piece in first.pieces]
+    assert shifted.text == first.text
+
+
+def test_the_estimate_counts_the_layers_and_heads_of_each_site():
+    spec = SiteStoreSpec(contributions=False, frames=False)
+    root = site_root(spec)
+    of_all = estimate_disk(root.recording, [replace(site, layers=(), heads=0) for site in root.sites], [], 10, 1)
+    of_own = estimate_disk(root.recording, root.sites, [], 10, 1)
+    assert of_own.bytes_per_replan < of_all.bytes_per_replan
+
+
+def test_absent_is_a_role_of_every_kind_of_span(tmp_path):
+    spec = SiteStoreSpec(contributions=False)
+
+    def mask_out(record: ReplanRecord) -> ReplanRecord:
+        rows, roles = record.rows["cross"].rows.copy(), record.key_role["cross"].copy()
+        rows[..., 16] += rows[..., 12:16].sum(axis=-1)
+        rows[..., 12:16] = 0.0
+        roles[12:16] = Role.ABSENT
+        cross = replace(record.rows["cross"], rows=rows)
+        return replace(record, rows={**record.rows, "cross": cross}, key_role={**record.key_role, "cross": roles})
+
+    append(tmp_path / "a.zarr", spec, dict.fromkeys(range(spec.replans), mask_out))
+    assert verify_store(open_store(tmp_path / "a.zarr")) == []
