@@ -1,7 +1,7 @@
 """Seconds of a policy call as it is, watched, and recorded: what `va.record` costs.
 
-Usage: python benchmarks/recorder_overhead.py [--rounds 7] [--calls 1] [--blocks 6] [--device cpu] [--dtype float32]
-       [--threads 1] [--clock processor]
+Usage: python benchmarks/recorder_overhead.py [--rounds 7] [--calls 1] [--blocks 6] [--width 1024] [--device cpu]
+       [--dtype float32] [--threads 1] [--clock processor]
 
 The policy is made for this: ten denoise steps of an action expert over a prefix of 968 keys of pictures and words and
 over its own ten tokens, with the sizes of pi0's expert (width 1024, 8 heads of 256, one key head; 18 blocks in pi0) and
@@ -35,20 +35,21 @@ sys.path.insert(0, str(ROOT))
 
 import vla_attention as va  # noqa: E402 - a script, and not part of the package
 
-WIDTH, HEADS, DIM, STEPS, HORIZON = 1024, 8, 256, 10, 10
+HEADS, STEPS, HORIZON = 8, 10, 10
 PATCHES, WORDS, CAMERAS = 256, 200, 3
 PREFIX = CAMERAS * PATCHES + WORDS
 
 
 class Attention(nn.Module):
-    def __init__(self) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
-        self.q_proj = nn.Linear(WIDTH, HEADS * DIM, bias=False)
-        self.kv_proj = nn.Linear(WIDTH, 2 * DIM, bias=False)
-        self.o_proj = nn.Linear(HEADS * DIM, WIDTH, bias=False)
+        self.dim = width // 4
+        self.q_proj = nn.Linear(width, HEADS * self.dim, bias=False)
+        self.kv_proj = nn.Linear(width, 2 * self.dim, bias=False)
+        self.o_proj = nn.Linear(HEADS * self.dim, width, bias=False)
 
     def forward(self, tokens: Tensor, cache: tuple[Tensor, Tensor], mask: Tensor) -> Tensor:
-        query = self.q_proj(tokens).view(1, -1, HEADS, DIM).transpose(1, 2)
+        query = self.q_proj(tokens).view(1, -1, HEADS, self.dim).transpose(1, 2)
         key, value = (part[:, None] for part in self.kv_proj(tokens).chunk(2, dim=-1))
         key, value = torch.cat([cache[0], key], dim=2), torch.cat([cache[1], value], dim=2)
         mixed = nn.functional.scaled_dot_product_attention(query, key, value, attn_mask=mask, enable_gqa=True)
@@ -56,11 +57,11 @@ class Attention(nn.Module):
 
 
 class Block(nn.Module):
-    def __init__(self) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
-        self.attention = Attention()
-        self.norms = nn.ModuleList(nn.RMSNorm(WIDTH) for _ in range(2))
-        self.up, self.down = nn.Linear(WIDTH, 4 * WIDTH, bias=False), nn.Linear(4 * WIDTH, WIDTH, bias=False)
+        self.attention = Attention(width)
+        self.norms = nn.ModuleList(nn.RMSNorm(width) for _ in range(2))
+        self.up, self.down = nn.Linear(width, 4 * width, bias=False), nn.Linear(4 * width, width, bias=False)
 
     def forward(self, tokens: Tensor, cache: tuple[Tensor, Tensor], mask: Tensor) -> Tensor:
         tokens = tokens + self.attention(self.norms[0](tokens), cache, mask)
@@ -70,10 +71,10 @@ class Block(nn.Module):
 class Policy(nn.Module):
     """The denoise steps of a flow policy; the prefix's keys and values are random."""
 
-    def __init__(self, blocks: int) -> None:
+    def __init__(self, blocks: int, width: int) -> None:
         super().__init__()
-        self.blocks = nn.ModuleList(Block() for _ in range(blocks))
-        self.action_in, self.action_out = nn.Linear(32, WIDTH), nn.Linear(WIDTH, 32)
+        self.blocks = nn.ModuleList(Block(width) for _ in range(blocks))
+        self.action_in, self.action_out = nn.Linear(32, width), nn.Linear(width, 32)
 
     @torch.no_grad()
     def act(self, noise: Tensor, caches: list[tuple[Tensor, Tensor]], mask: Tensor) -> Tensor:
@@ -167,6 +168,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--calls", type=int, default=1)
     parser.add_argument("--blocks", type=int, default=6)
+    parser.add_argument("--width", type=int, default=1024)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--dtype", default="float32")
     parser.add_argument("--threads", type=int)
@@ -178,8 +180,11 @@ def main() -> None:
     torch.backends.mha.set_fastpath_enabled(False)
     torch.manual_seed(0)
     settings: dict[str, Any] = {"device": arguments.device, "dtype": getattr(torch, arguments.dtype)}
-    policy = Policy(arguments.blocks).to(**settings).eval()
-    caches = [tuple(torch.randn(1, 1, PREFIX, DIM, **settings) for _ in range(2)) for _ in range(arguments.blocks)]
+    policy = Policy(arguments.blocks, arguments.width).to(**settings).eval()
+    caches = [
+        tuple(torch.randn(1, 1, PREFIX, arguments.width // 4, **settings) for _ in range(2))
+        for _ in range(arguments.blocks)
+    ]
     mask = torch.ones(1, 1, HORIZON, PREFIX + HORIZON, dtype=torch.bool, device=arguments.device)
     mask[..., PREFIX - 50 : PREFIX] = False
     given = torch.randn(1, HORIZON, 32, **settings), caches, mask

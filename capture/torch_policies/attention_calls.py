@@ -127,7 +127,12 @@ class AttentionCall:
 
 
 class Watcher(Protocol):
-    """Is told about every attention call of a watched block, in order."""
+    """Is told about every attention call of a watched block, in order.
+
+    It may have an attribute `changes`, False where it changes nothing: it is not asked then. It may have a method
+    `passes(shape) -> bool` too, asked when the kernel has run: whether the call is not wanted.
+    It is not told of such a call again, and nothing is made of its tensors.
+    """
 
     def change(self, shape: CallShape) -> Tensor | None:
         """Return logits to add before the softmax, broadcastable to (batch, head, query, key), or None for no change.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.torch_policies.attention_calls import CallShape
 from vla_attention.capture.torch_policies.inspect_calls import CallTable
-from vla_attention.capture.torch_policies.policy_layout import CallRule, PolicyLayout, RecordedSite
+from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
 from vla_attention.schemas.errors import BadArgument, UserError, listing
 
 
@@ -26,26 +26,62 @@ class CallsDoNotFit(UserError, ValueError):
 class CallPlace:
     """What one call is.
 
-    step: the denoise step; of an autoregressive policy the number of the generated token. site, block: None for calls
-    that are not recorded. queries: positions of the action queries. keys: (key of the call,) the site's key of each key
-    of the call, None where they are the same.
+    rule: the number of its rule. site, block: None and -1 for calls that have none, or do not fit. step: the denoise
+    step; of an autoregressive policy the number of the generated token. queries: positions of the action queries. keys:
+    (key of the call,) the site's key of each key of the call, None where they are the same. fired: site and block of a
+    call that counts, also if it does not fit.
     """
 
-    rule: CallRule
+    rule: int
     site: str | None = None
     block: int = -1
     step: int = -1
     queries: slice = field(default_factory=lambda: slice(0))
     keys: NDArray[np.int64] | None = None
+    fired: tuple[str, int] | None = None
+
+
+class KnownCalls:
+    """What was found out about calls of a layout: the same for all replans of a run, and looked up at every call."""
+
+    def __init__(self, layout: PolicyLayout) -> None:
+        self.layout = layout
+        self.sites = {site.name: site for site in layout.sites}
+        self.blocks = {site.name: site.keys.layers or tuple(range(layout.num_layers)) for site in layout.sites}
+        #: (site, number of keys, token) -> (the site's keys of such a call, the length of its variable span).
+        self.keys: dict[tuple[str, int, int], tuple[NDArray[np.int64], int]] = {}
+        self._rules: dict[tuple[str, str, int, int], tuple[int, int]] = {}
+        self._queries: dict[tuple[str, int], slice] = {}
+
+    def rule(self, shape: CallShape) -> tuple[int, int]:
+        """Return the number of a call's rule, and of the block in its module's path; -1 where there is none."""
+        call = shape.module, shape.kind, shape.queries, shape.keys
+        found = self._rules.get(call)
+        if found is None:
+            found = -1, -1
+            for number, rule in enumerate(self.layout.rules):
+                match = rule.fits(*call)
+                if match is not None:
+                    found = number, int(match["block"]) if rule.site is not None else -1
+                    break
+            self._rules[call] = found
+        return found
+
+    def queries(self, site: RecordedSite, count: int) -> slice:
+        """Return the action queries of a call with `count` queries; errors as `RecordedSite.queries`."""
+        found = self._queries.get((site.name, count))
+        if found is None:
+            found = self._queries[site.name, count] = slice(*site.queries(count))
+        return found
 
 
 class CallOrder:
     """Gives the calls of one replan their places, one after the other. Every replan needs a new one."""
 
-    def __init__(self, layout: PolicyLayout, policy: str) -> None:
-        self.layout = layout
+    def __init__(self, known: KnownCalls, policy: str) -> None:
+        self.known = known
+        self.layout = known.layout
         self.policy = policy
-        self.sites = {site.name: site for site in layout.sites}
         self.seen: list[CallShape] = []
         self.problems: dict[str, None] = {}
         self.fired: Counter[tuple[str, int]] = Counter()
@@ -53,59 +89,70 @@ class CallOrder:
         self.present: dict[str, NDArray[np.bool_]] = {}
         self._calls_of_rule: Counter[int] = Counter()
         self._variable: dict[str, int] = {}
+        self._noted: set[tuple[str, int, int]] = set()
 
-    def place(self, shape: CallShape, *, ran: bool) -> CallPlace | None:
+    def place(self, shape: CallShape) -> CallPlace | None:
         """Return what the next call is, or None if it does not fit.
 
-        ran: the call has run, and the one after it is the next. Before it has run, nothing is counted: a softmax may
-        turn out not to be attention.
+        Nothing is counted before `ran`: a softmax may turn out not to be attention.
         """
-        if ran:
-            self.seen.append(shape)
-        for number, rule in enumerate(self.layout.rules):
-            match = rule.fits(shape.module, shape.kind, shape.queries, shape.keys)
-            if match is None:
-                continue
-            if not rule.sites:
-                return CallPlace(rule)
-            if rule.sequence:
-                site, block = rule.sequence[self._calls_of_rule[number] % len(rule.sequence)]
-                self._calls_of_rule[number] += ran
-            else:
-                site, block = rule.sites[0], int(match["block"])
-            return self._recorded(rule, self.sites[site], block, shape, ran=ran)
-        if ran:
-            self._problem(f"no rule names the call of module '{shape.module}' ({shape.kind})")
-        return None
-
-    def _recorded(
-        self, rule: CallRule, site: RecordedSite, block: int, shape: CallShape, *, ran: bool
-    ) -> CallPlace | None:
-        if block not in self.blocks(site):
-            self._problem(f"module '{shape.module}' is block {block}, which site '{site.name}' does not have")
+        number, block = self.known.rule(shape)
+        if number < 0:
             return None
-        step = self.fired[site.name, block]
-        self.fired[site.name, block] += ran
+        rule = self.layout.rules[number]
+        if rule.sequence:
+            name, block = rule.sequence[self._calls_of_rule[number] % len(rule.sequence)]
+        elif rule.site is None:
+            return CallPlace(number)
+        else:
+            name = rule.site
+        site = self.known.sites[name]
+        if block not in self.known.blocks[name]:
+            self._problem(f"module '{shape.module}' is block {block}, which site '{name}' does not have")
+            return CallPlace(number)
+        step = self.fired[name, block]
         try:
-            queries = slice(*site.queries(shape.queries))
+            queries = self.known.queries(site, shape.queries)
         except BadArgument as error:
             self._problem(str(error).rstrip("."))
-            return None
-        fitted = self._keys(site, shape.keys, step if self.layout.autoregressive else 0)
+            return CallPlace(number, fired=(name, block))
+        fitted = self._keys_of(site, shape.keys, step if self.layout.autoregressive else 0)
         if fitted is None:
-            return None
+            return CallPlace(number, fired=(name, block))
         keys = fitted if len(fitted) < site.keys.num_keys else None
-        present = self.present.setdefault(site.name, np.zeros(site.keys.num_keys, dtype=bool))
-        present[fitted] = True
-        return CallPlace(rule, site.name, block, step, queries, keys)
+        return CallPlace(number, name, block, step, queries, keys, (name, block))
+
+    def ran(self, shape: CallShape, place: CallPlace | None) -> None:
+        """Count a call that has run; `place`: what `place` returned for it."""
+        self.seen.append(shape)
+        if place is None:
+            self._problem(f"no rule names the call of module '{shape.module}' ({shape.kind})")
+            return
+        self._calls_of_rule[place.rule] += 1
+        if place.fired is not None:
+            self.fired[place.fired] += 1
+
+    def _keys_of(self, site: RecordedSite, count: int, token: int) -> NDArray[np.int64] | None:
+        call = site.name, count, token
+        found = self.known.keys.get(call)
+        if found is None or (site.variable_span is not None and self._variable.get(site.name) != found[1]):
+            fitted = self._keys(site, count, token)
+            if fitted is None:
+                return None
+            found = self.known.keys[call] = fitted, self._variable.get(site.name, 0)
+        if call not in self._noted:
+            self._noted.add(call)
+            present = self.present.setdefault(site.name, np.zeros(site.keys.num_keys, dtype=bool))
+            present[found[0]] = True
+        return found[0]
 
     def _keys(self, site: RecordedSite, count: int, token: int) -> NDArray[np.int64] | None:
         """The site's keys that a call with `count` keys has; `token`: number of tokens generated before it."""
         spans = site.keys.spans
         lengths = {span.name: span.num_keys for span in spans}
         for span in spans:
-            if getattr(span, "growing", False):
-                lengths[span.name] = min(token + getattr(span, "growing_offset", 0), span.num_keys)
+            if span.growing:
+                lengths[span.name] = min(token + span.growing_offset, span.num_keys)
         if site.variable_span is not None:
             others = sum(length for name, length in lengths.items() if name != site.variable_span)
             longest = site.keys.span(site.variable_span).num_keys
@@ -133,10 +180,6 @@ class CallOrder:
             [np.arange(span.start, span.start + lengths[span.name], dtype=np.int64) for span in spans]
         )
 
-    def blocks(self, site: RecordedSite) -> tuple[int, ...]:
-        """The blocks that have the site."""
-        return tuple(getattr(site.keys, "layers", ())) or tuple(range(self.layout.num_layers))
-
     def _problem(self, sentence: str) -> None:
         self.problems[sentence] = None
 
@@ -152,7 +195,7 @@ class CallOrder:
 
     def _missing(self) -> Iterator[str]:
         for site in self.layout.sites:
-            times = {block: self.fired[site.name, block] for block in self.blocks(site)}
+            times = {block: self.fired[site.name, block] for block in self.known.blocks[site.name]}
             if not any(times.values()):
                 yield (
                     f"the site '{site.name}' did not fire (compiled code, flash-attn and other extensions cannot be "

@@ -131,7 +131,8 @@ def watch_call(
         result = function(**{**given, "score_mod": changed_score})
     else:
         result = function(*args, **kwargs)
-    block.saw(AttentionCall(shape, replace(tensors, outputs=result[0].detach())))
+    if not block.passes(shape):
+        block.saw(AttentionCall(shape, replace(tensors, outputs=result[0].detach())))
     return result
 
 

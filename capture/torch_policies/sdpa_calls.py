@@ -75,6 +75,8 @@ def watch_call(
         options = {"scale": given.scale, "enable_gqa": given.enable_gqa}
         with sdpa_kernel(_ANY_KERNEL):
             output = function(query, key, given.value, logits, given.dropout_p, **options)
+    if block.passes(shape):
+        return output
     tensors = LogitTensors(
         query=query.detach().to(dtype).expand(*lead, -1, -1).reshape(batch, heads, queries, dim),
         key=_folded(key.to(dtype), lead, batch, kv_heads),

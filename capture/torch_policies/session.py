@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run
+from vla_attention.capture.torch_policies.call_order import KnownCalls
 from vla_attention.capture.torch_policies.knockouts import SessionKnockouts
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
 from vla_attention.capture.torch_policies.policy_modules import find_policy
@@ -204,6 +205,7 @@ class RecordedRun:
         self._found = find_policy(policy)
         self._embedding = None if layout.text is None else find_module(policy, layout.text.embedding, "token ids")
         self.layout = layout
+        self._known = KnownCalls(layout)
         self.attributes = attributes
         self.num_dropped = 0
         self.largest_error = 0.0
@@ -315,7 +317,7 @@ class RecordedRun:
         text = ReplanText(self.layout, self._tokenizer, batch, dict(zip(rows, given, strict=True)))
         edits = ReplanEdits(self, dict(zip(rows, zip(episodes, given, strict=True), strict=True)), text)
         recorder = ReplanRecorder(
-            self.layout,
+            self._known,
             type(self.policy).__name__,
             self.attributes.recording,
             batch,

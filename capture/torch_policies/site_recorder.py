@@ -15,7 +15,7 @@ from vla_attention.capture.recording.contributions import gram_matrix, keys_of_p
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
-from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace
+from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.segments import Segment, segment_members, segments_of
@@ -69,7 +69,7 @@ class ReplanRecorder:
     """Watches the calls of one replan (`Watcher`). Every replan needs a new one.
 
     Args:
-        layout: what the calls are.
+        known: the layout, and what was found out about its calls.
         policy: the name of the policy's class, for errors.
         recording: what of them is recorded.
         batch: batch size that every call of the sites must have.
@@ -81,7 +81,7 @@ class ReplanRecorder:
 
     def __init__(
         self,
-        layout: PolicyLayout,
+        known: KnownCalls,
         policy: str,
         recording: Recording,
         batch: int,
@@ -90,16 +90,21 @@ class ReplanRecorder:
         early_roles: EarlyRoles,
         bias: LogitBias | None = None,
     ) -> None:
-        self.layout = layout
+        self.layout = layout = known.layout
         self.recordings = {name: found for name, found in recordings_of(recording, layout).items() if found}
         self.batch = batch
         self.rows = tuple(rows)
-        self.order = CallOrder(layout, policy)
+        self.order = CallOrder(known, policy)
         self.projections = projections
         self.early_roles = early_roles
         self.bias = bias
         self.largest_error = 0.0
         self._collected = {site.name: _Collected() for site in layout.sites}
+
+    @property
+    def changes(self) -> bool:
+        """Whether logits are changed at all."""
+        return self.bias is not None
 
     @property
     def saw_attention(self) -> bool:
@@ -108,7 +113,7 @@ class ReplanRecorder:
 
     def change(self, shape: CallShape) -> Tensor | None:
         """Return what is added to the logits of a call, (batch, head or 1, query, key), or None for nothing."""
-        place = None if self.bias is None else self.order.place(shape, ran=False)
+        place = None if self.bias is None else self.order.place(shape)
         if self.bias is None or place is None or place.site is None or shape.batch != self.batch:
             return None
         added = {row: self.bias(row, place, shape) for row in self.rows}
@@ -122,26 +127,37 @@ class ReplanRecorder:
                 total[row] = torch.from_numpy(values)
         return total
 
+    def passes(self, shape: CallShape) -> bool:
+        """Return whether a call that has run is not recorded; it is counted then, and `saw` not called."""
+        place = self.order.place(shape)
+        if place is not None and place.site is not None and self._wanted(place):
+            return False
+        self.order.ran(shape, place)
+        return True
+
+    def _wanted(self, place: CallPlace) -> bool:
+        recording = self.recordings.get(place.site or "")
+        step = 0 if self.layout.autoregressive else place.step
+        return recording is not None and place.block in recording.layers and step in recording.denoise_steps
+
     def saw(self, call: AttentionCall) -> None:
         """Keep the rows of a call, if it is recorded."""
         shape = call.shape
-        place = self.order.place(shape, ran=True)
-        if place is None or place.site is None:
+        place = self.order.place(shape)
+        self.order.ran(shape, place)
+        if place is None or place.site is None or not self._wanted(place):
             return
-        site = self.layout.site(place.site)
+        site, recording = self.order.known.sites[place.site], self.recordings[place.site]
         if shape.batch != self.batch:
             self.order.problems[
                 f"a call of site '{site.name}' has a batch of {shape.batch}, and the replan one of {self.batch} "
                 "(several environments in one call: run.episodes)"
             ] = None
             return
-        recording = self.recordings.get(site.name)
-        step = 0 if self.layout.autoregressive else place.step
-        if recording is None or place.block not in recording.layers or step not in recording.denoise_steps:
-            return
         if max(recording.heads) >= shape.heads:
             self.order.problems[f"a call of site '{site.name}' has {shape.heads} heads"] = None
             return
+        step = 0 if self.layout.autoregressive else place.step
         with torch.no_grad():
             self._take(call, place, site, recording, (place.block, step))
 

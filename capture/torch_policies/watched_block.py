@@ -103,8 +103,21 @@ class WatchedBlock:
 
     def change(self, shape: CallShape) -> Tensor | None:
         """Ask the watcher for a change of the call that comes next."""
+        if not getattr(self.watcher, "changes", True):
+            return None
         with self._lock, torch.no_grad(), self._failing():
             return None if self._closed else self.watcher.change(shape)
+
+    def passes(self, shape: CallShape) -> bool:
+        """Return whether a call that has run is none of the watcher's, and count it then."""
+        ask = getattr(self.watcher, "passes", None)
+        if ask is None:
+            return False
+        with self._lock, self._failing():
+            if self._closed or not ask(shape):
+                return self._closed
+            self._number += 1
+            return True
 
     def saw(self, call: AttentionCall) -> None:
         """Tell the watcher about a call, and count it."""
