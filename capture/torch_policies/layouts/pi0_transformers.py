@@ -48,7 +48,7 @@ def pi0_transformers(
     )
     return PolicyLayout(
         name=_NAME,
-        family="pi",
+        family="pi0_transformers",
         sites=(site,),
         rules=(
             CallRule(rule_path(path, r"model\.dit\.layers\.(?P<block>\d+)\.self_attn"), "joint"),
