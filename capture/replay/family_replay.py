@@ -14,6 +14,7 @@ from vla_attention.capture.replay.lerobot_dataset import LeRobotDataset
 from vla_attention.capture.replay.replay_episodes import Replay, replay_episode
 from vla_attention.capture.replay.replay_plan import ReplayPlan, announce, columns_of, record_episodes
 from vla_attention.capture.replay.robot_policy import RobotPolicy
+from vla_attention.capture.replay.video import decoder_version
 from vla_attention.capture.rollout.progress import say
 from vla_attention.capture.run_settings import recording_settings
 from vla_attention.capture.store.store_writer import open_run
@@ -39,7 +40,7 @@ def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: 
         protocol=plan.protocol(every),
         recording=recording,
         sites=policy.sites,
-        provenance=describe_machine(device),
+        provenance=describe_machine(device) | decoder_version(),
         data_set=plan.source(columns_of(robot.cameras, robot.state, robot.actions)),
     )
     store = open_run(plan.store, attributes, plan.mode)

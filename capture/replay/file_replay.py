@@ -16,6 +16,7 @@ from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode
 from vla_attention.capture.replay.policy_file import ReplayPolicy
 from vla_attention.capture.replay.replay_episodes import BeforeCall, joined, success_of, task_name, task_of
 from vla_attention.capture.replay.replay_plan import ReplayPlan, announce, columns_of, record_episodes
+from vla_attention.capture.replay.video import decoder_version
 from vla_attention.capture.rollout.progress import say
 from vla_attention.capture.run_settings import recording_settings
 from vla_attention.capture.torch_policies.record import record
@@ -103,6 +104,7 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
         frames=settings.frames,
         knockout=None if of_attention.is_none else of_attention,
         allow_empty=arguments.allow_empty,
+        provenance=decoder_version(),
         resume=plan.mode == "resume",
         overwrite=plan.mode == "overwrite",
     )

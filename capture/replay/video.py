@@ -8,6 +8,7 @@ the last key frame before the wanted one until the one with exactly its time sta
 from __future__ import annotations
 
 from collections.abc import Iterator
+from importlib import metadata
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -30,6 +31,14 @@ def import_av() -> Any:
             "`pip install 'vla-attention[datasets]'`."
         ) from error
     return av
+
+
+def decoder_version() -> dict[str, str]:
+    """Return the version of what decodes videos, for provenance: another one may give other pictures."""
+    try:
+        return {"av": metadata.version("av")}
+    except metadata.PackageNotFoundError:
+        return {"av": "absent"}
 
 
 class VideoFile:
