@@ -9,6 +9,10 @@ from torch.nn.attention.flex_attention import create_block_mask, flex_attention
 from tests.kit.attention_modules import Policy, Seen, reference_rows
 from vla_attention.capture.torch_policies.watch import seen_by_python, watch_attention
 
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:flex_attention called without torch.compile", "ignore:`torch.jit.script_method` is deprecated"
+)
+
 
 def window(batch, head, query, key):
     return (query >= key - 3) & (key - query < 4) & (batch + key != 1)
