@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.torch_policies.attention_calls import CallShape
-from vla_attention.capture.torch_policies.inspect_calls import CallTable
+from vla_attention.capture.torch_policies.inspect_calls import CallTable, folded_paths
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
 from vla_attention.schemas.errors import BadArgument, UserError, listing
 
@@ -89,6 +89,8 @@ class CallOrder:
         self.present: dict[str, NDArray[np.bool_]] = {}
         self._calls_of_rule: Counter[int] = Counter()
         self._variable: dict[str, int] = {}
+        #: Kind, queries and keys of calls that no rule names -> their modules.
+        self._unnamed: dict[tuple[str, int, int], dict[str, None]] = {}
         self._noted: set[tuple[str, int, int]] = set()
 
     def place(self, shape: CallShape) -> CallPlace | None:
@@ -126,7 +128,7 @@ class CallOrder:
         """Count a call that has run; `place`: what `place` returned for it."""
         self.seen.append(shape)
         if place is None:
-            self._problem(f"no rule names the call of module '{shape.module}' ({shape.kind})")
+            self._unnamed.setdefault((shape.kind, shape.queries, shape.keys), {})[shape.module] = None
             return
         self._calls_of_rule[place.rule] += 1
         if place.fired is not None:
@@ -185,7 +187,11 @@ class CallOrder:
 
     def check(self, where: str) -> None:
         """Raise `CallsDoNotFit` unless all calls fit and every block of every site computed as often as it should."""
-        problems = [*self.problems, *self._missing()]
+        unnamed = [
+            f"no rule names the calls of module '{folded_paths(list(modules))}' ({kind}, {queries} x {keys})"
+            for (kind, queries, keys), modules in self._unnamed.items()
+        ]
+        problems = [*unnamed, *self.problems, *self._missing()]
         if problems:
             raise CallsDoNotFit(
                 f"The attention calls at {where} do not fit the layout '{self.layout.name}': "

@@ -146,26 +146,27 @@ class SessionKnockouts:
         return {site: editor.edits for site, editor in editors.items()}
 
 
-def logit_bias(edits: Sequence[SiteEdit], place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
-    """Return what edits add to the logits of one call, (head or 1, query, key); None for nothing.
+def edits_at(edits: Sequence[SiteEdit], place: CallPlace) -> list[SiteEdit]:
+    """Return the edits that change one call."""
+    return [
+        edit
+        for edit in edits
+        if (edit.layers is None or place.block in edit.layers)
+        and (edit.denoise_steps is None or place.step in edit.denoise_steps)
+        and not (edit.values == 1).all()
+    ]
+
+
+def logit_bias(edits: Sequence[SiteEdit], place: CallPlace, shape: CallShape) -> NDArray[np.float32]:
+    """Return what edits add to the logits of one call, (head or 1, query, key).
 
     The logarithm of a key's factor, and -infinity where it is 0, at the action queries.
     """
-    total: NDArray[np.float32] | None = None
+    heads = shape.heads if any(edit.heads is not None for edit in edits) else 1
+    total = np.zeros((heads, shape.queries, shape.keys), dtype=np.float32)
     for edit in edits:
-        if edit.layers is not None and place.block not in edit.layers:
-            continue
-        if edit.denoise_steps is not None and place.step not in edit.denoise_steps:
-            continue
         values = edit.values if place.keys is None else edit.values[place.keys]
-        if (values == 1).all():
-            continue
         added = np.where(values == 0, -np.inf, log_factors(values)).astype(np.float32)
-        heads = shape.heads if edit.heads is not None else 1
-        if total is None:
-            total = np.zeros((heads, shape.queries, shape.keys), dtype=np.float32)
-        elif len(total) < heads:
-            total = np.repeat(total, heads, axis=0)
         chosen = slice(None) if edit.heads is None else list(edit.heads)
         total[chosen, place.queries] += added
     return total

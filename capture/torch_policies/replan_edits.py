@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vla_attention.capture.interventions.resolution import ReplanPlace
 from vla_attention.capture.torch_policies.attention_calls import CallShape
 from vla_attention.capture.torch_policies.call_order import CallPlace
-from vla_attention.capture.torch_policies.knockouts import logit_bias
+from vla_attention.capture.torch_policies.knockouts import edits_at, logit_bias
 from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs
 from vla_attention.capture.torch_policies.replan_text import ReplanText
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder
@@ -30,13 +30,25 @@ class ReplanEdits:
     text: ReplanText
     recorder: ReplanRecorder | None = None
     _of_row: dict[int, dict[str, Any]] = field(default_factory=dict)
+    _known: dict[tuple[Any, ...], NDArray[np.float32]] = field(default_factory=dict)
 
     def bias(self, row: int, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
-        """Return what is added to the logits of a call in one row of the batch, (head or 1, query, key)."""
+        """Return what is added to the logits of a call in one row of the batch, (head or 1, query, key).
+
+        Calls to which the same is added get the same array.
+        """
         if row not in self._of_row:
             self._of_row[row] = self._edits(row)
-        edits = self._of_row[row].get(place.site or "")
-        return None if edits is None else logit_bias(edits, place, shape)
+        edits = edits_at(self._of_row[row].get(place.site or "", ()), place)
+        if not edits:
+            return None
+        # Where the keys of calls differ, they differ from token to token.
+        token = -1 if place.keys is None else place.step
+        sizes = shape.heads, shape.queries, shape.keys, place.queries.start, place.queries.stop, token
+        call = row, place.site, tuple(id(edit) for edit in edits), *sizes
+        if call not in self._known:
+            self._known[call] = logit_bias(edits, place, shape)
+        return self._known[call]
 
     def _edits(self, row: int) -> dict[str, Any]:
         episode, inputs = self.episodes[row]

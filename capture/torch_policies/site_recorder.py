@@ -27,7 +27,8 @@ _LARGE_COPY = 2**20
 #: float32 kernel leaves 1e-6, one of bfloat16 a few of its roundings; rows with a wrong mask are off by far more.
 _TOLERANCE = {"float32": 1e-3, "float64": 1e-3, "float16": 2e-2, "bfloat16": 6e-2}
 
-#: Site -> what a replan's row of the batch adds to the logits of a call (head or 1, query, key); None for nothing.
+#: What a row of the batch adds to the logits of a call (head or 1, query, key); None for nothing. The arrays live as
+#: long as the recorder, and are the same for calls to which the same is added.
 LogitBias = Callable[[int, CallPlace, CallShape], NDArray[np.float32] | None]
 #: Row of the batch, site -> the role codes of its keys (key,), before masks are known.
 EarlyRoles = Callable[[int, RecordedSite, NDArray[np.bool_]], NDArray[np.uint8]]
@@ -99,6 +100,7 @@ class ReplanRecorder:
         self.early_roles = early_roles
         self.bias = bias
         self.largest_error = 0.0
+        self._changes: dict[tuple[int, ...], Tensor] = {}
         self._collected = {site.name: _Collected() for site in layout.sites}
 
     @property
@@ -120,12 +122,16 @@ class ReplanRecorder:
         changed = [values for values in added.values() if values is not None]
         if not changed:
             return None
-        heads = max(len(values) for values in changed)
-        total = torch.zeros(self.batch, heads, shape.queries, shape.keys)
-        for row, values in added.items():
-            if values is not None:
-                total[row] = torch.from_numpy(values)
-        return total
+        # The same arrays are given for calls of the same kind, of which there may be hundreds.
+        call = tuple(id(values) for values in added.values())
+        if call not in self._changes:
+            heads = max(len(values) for values in changed)
+            total = torch.zeros(self.batch, heads, shape.queries, shape.keys)
+            for row, values in added.items():
+                if values is not None:
+                    total[row] = torch.from_numpy(values)
+            self._changes[call] = total
+        return self._changes[call]
 
     def passes(self, shape: CallShape) -> bool:
         """Return whether a call that has run is not recorded; it is counted then, and `saw` not called."""

@@ -225,7 +225,10 @@ def without_rule(layout, number):
 @pytest.mark.parametrize(
     ("layout", "sentence"),
     [
-        (without_rule(small_layout(), 1), "no rule names the call of module 'blocks.0.attention' (sdpa)"),
+        (
+            without_rule(small_layout(), 1),
+            "no rule names the calls of module 'blocks.{0..2}.attention' (sdpa, 11 x 11)",
+        ),
         (small_layout(num_denoise_steps=3, denoise_times=()), "must compute 3 times a policy call"),
         (small_layout(num_layers=2), "is block 2, which site 'joint' does not have"),
         (
