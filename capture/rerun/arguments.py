@@ -11,7 +11,7 @@ from vla_attention.capture.interventions.arguments import add_intervention_argum
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import family_of_kind
 from vla_attention.capture.recording_arguments import add_recording_arguments
-from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.threads import use_threads
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ def add_rerun_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -
     )
     root = _root_among(given)
     if root is not None:
+        _refuse_own_loop(root)
         family = family_of_kind(root.policy.family)
         family.add_arguments(parser)
         parser.set_defaults(**family.rebuild(root.policy), family=family)
@@ -45,6 +46,15 @@ def add_rerun_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -
         _take_recording_of(root, parser)
     _add_output_arguments(parser)
     parser.set_defaults(command=_run)
+
+
+def _refuse_own_loop(root: RootAttributes) -> None:
+    """Raise `BadArgument` for a store that was recorded from the caller's own code."""
+    if root.protocol.name == "recorded":
+        raise BadArgument(
+            f"Cannot rerun a store that va.record made: the policy '{root.policy.name}' is called by your own code. "
+            "Run that again with va.record(..., knockout=...) into another store; vla-analyze compare pairs the two."
+        )
 
 
 def _existing_store(text: str) -> Path:

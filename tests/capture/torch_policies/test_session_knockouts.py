@@ -10,6 +10,7 @@ from torch import nn
 from tests.kit.small_torch_policy import HORIZON, SmallPolicy, given, small_layout
 from tests.kit.small_torch_variants import TokenPolicy, token_layout
 from vla_attention.analyze.__main__ import main
+from vla_attention.capture.__main__ import main as vla_capture
 from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
 from vla_attention.capture.torch_policies.knockouts import CannotIntervene
 from vla_attention.capture.torch_policies.record import record
@@ -113,6 +114,8 @@ def test_a_knockout_is_a_part_of_the_runs_configuration(tmp_path, capsys):
     text = " ".join(capsys.readouterr().out.split())
     assert "differ in their interventions (none; the keys of 'word:bowl' knocked out" in text
     assert "P·V" not in text
+    assert vla_capture(["rerun", str(tmp_path / "a.zarr")]) == 2
+    assert "Cannot rerun a store that va.record made" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
