@@ -183,6 +183,7 @@ class PromptText:
         skip_ids: ids that are no text (placeholders for patches): they have no key in `spans`.
         skip_first: number of ids before the first that has a key (placeholders that the policy replaced by another id).
         site: the site whose spans these are; None for every site that has them, at the same keys.
+        state_between: texts around the state, where a policy writes its numbers into the prompt, after the instruction.
     """
 
     spans: tuple[str, ...]
@@ -190,6 +191,7 @@ class PromptText:
     skip_ids: tuple[int, ...] = ()
     skip_first: int = 0
     site: str | None = None
+    state_between: tuple[str, str] | None = None
 
 
 @dataclass(frozen=True)

@@ -199,6 +199,8 @@ def roles_of_keys(
             for piece in prompt.pieces:
                 inside = piece.start < last and piece.stop > first
                 roles[piece.key] = Role.INSTRUCTION if inside else Role.TEMPLATE
+            for piece in _state_pieces(prompt, layout.text.state_between):
+                roles[piece.key] = Role.STATE
             if bos_key is not None:
                 roles[bos_key] = Role.BOS
     for span in site.keys.spans:
@@ -208,6 +210,20 @@ def roles_of_keys(
         if present is not None:
             roles[keys_of_span][~present[keys_of_span]] = absent_role(site, span.name)
     return roles
+
+
+def _state_pieces(prompt: Prompt, around: tuple[str, str] | None) -> list[Piece]:
+    """The pieces of the state that a policy writes into its prompt, after the instruction."""
+    if around is None:
+        return []
+    before, after = around
+    start = prompt.text.find(before, prompt.instruction[1])
+    if start < 0:
+        return []
+    start += len(before)
+    end = prompt.text.find(after, start)
+    end = len(prompt.text) if end < 0 else end
+    return [piece for piece in prompt.pieces if piece.start < end and piece.stop > start and piece.text.strip()]
 
 
 def absent_role(site: RecordedSite, span: str) -> int:

@@ -133,7 +133,10 @@ def small_xvla(**changes: Any) -> Any:
         "florence_config": {"vision_config": vision, "text_config": text, "vocab_size": 100, "projection_dim": 32},
     }
     torch.manual_seed(0)
-    return XVLAPolicy(XVLAConfig(**{**settings, **changes})).eval()
+    policy = XVLAPolicy(XVLAConfig(**{**settings, **changes})).eval()
+    # The class leaves it as the memory was.
+    torch.nn.init.normal_(policy.model.vlm.image_projection, std=0.2)
+    return policy
 
 
 def small_act(**changes: Any) -> Any:
@@ -258,3 +261,46 @@ def small_groot() -> Any:
     }
     with mock.patch.object(GrootPolicy, "_create_groot_model", return_value=model):
         return GrootPolicy(GrootConfig(**settings)).eval()
+
+
+def small_pi0_lerobot(**changes: Any) -> Any:
+    """LeRobot's PI0Policy, whose network is a copy of openpi's PyTorch pi0, of three blocks.
+
+    Its transformers leaves the cache of the prefix alone where none is to be kept; the plain one appends to it: each
+    denoise step gets a copy here.
+    """
+    from copy import deepcopy
+
+    from lerobot.policies.pi0 import modeling_pi0 as module
+    from lerobot.policies.pi0.configuration_pi0 import PI0Config
+    from transformers import GemmaConfig, PaliGemmaConfig
+
+    check = ModuleType("transformers.models.siglip.check")
+    check.check_whether_transformers_replace_is_installed_correctly = lambda: True  # type: ignore[attr-defined]
+
+    def configuration() -> Any:
+        vision = {
+            **{"model_type": "siglip_vision_model", "hidden_size": 32, "intermediate_size": 48},
+            **{"num_hidden_layers": 2, "num_attention_heads": 2, "image_size": 56, "patch_size": 14},
+            "vision_use_head": False,
+        }
+        return PaliGemmaConfig(vision_config=vision, text_config={"model_type": "gemma"}, projection_dim=32)
+
+    sizes = module.GemmaConfig(width=32, depth=3, mlp_dim=48, num_heads=4, num_kv_heads=1, head_dim=8)
+    settings: dict[str, Any] = {
+        **features(56, 56),
+        **{"n_action_steps": 5, "chunk_size": 5, "num_inference_steps": 3, "tokenizer_max_length": 9},
+        **{"image_resolution": (56, 56), "max_state_dim": 8, "max_action_dim": 8},
+    }
+    torch.manual_seed(0)
+    with (
+        mock.patch.dict(sys.modules, {"transformers.models.siglip.check": check}),
+        mock.patch("transformers.models.siglip.check", check, create=True),
+        mock.patch.object(module, "CONFIG_MAPPING", {"paligemma": configuration, "gemma": GemmaConfig}),
+        mock.patch.object(module, "get_gemma_config", return_value=sizes),
+    ):
+        policy = module.PI0Policy(PI0Config(**{**settings, **changes}))
+    policy.model.paligemma_with_expert.paligemma.model.multi_modal_projector.linear = torch.nn.Linear(32, 32)
+    own = policy.model.denoise_step
+    policy.model.denoise_step = lambda past_key_values, **given: own(past_key_values=deepcopy(past_key_values), **given)
+    return policy.eval()

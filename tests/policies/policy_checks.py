@@ -88,8 +88,8 @@ def check_rows(store: Any, site: str, expected: np.ndarray) -> None:
 class _Values:
     """Keeps the values of the recorded calls of one block and denoise step."""
 
-    def __init__(self, layout: PolicyLayout, site: str, block: int) -> None:
-        self.order, self.site, self.block = CallOrder(layout), site, block
+    def __init__(self, case: PolicyCase, site: str, block: int) -> None:
+        self.order, self.site, self.block = CallOrder(case.layout, type(case.policy).__name__), site, block
         self.values: Tensor | None = None
         self.keys: np.ndarray | None = None
 
@@ -106,7 +106,7 @@ class _Values:
 
 def values_of(case: PolicyCase, site: str, block: int, observation: Any) -> np.ndarray:
     """Return the values (key of the site, number) of a block's first call; NaN for keys that the call does not have."""
-    watcher = _Values(case.layout, site, block)
+    watcher = _Values(case, site, block)
     with watch_attention(case.policy, watcher):
         case.call(observation)
     assert watcher.values is not None

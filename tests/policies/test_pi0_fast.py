@@ -25,6 +25,8 @@ from tests.policies.policy_checks import (
     rows_of,
 )
 from tests.policies.word_tokenizer import INSTRUCTION
+from vla_attention.capture.torch_policies.prompts import roles_of_keys
+from vla_attention.schemas.layout import Piece, Prompt, Role
 
 PATCHES, TOKENS, PADDING, LAYERS = 16, 5, 3, 3
 WORDS = len(INSTRUCTION.split())
@@ -104,3 +106,19 @@ def test_the_analysis_answers_of_the_mean_and_of_all_tokens(case, tmp_path):
 def test_another_policy_is_refused_by_name():
     with pytest.raises(ValueError, match="for PI0FastPolicy"):
         va.layouts.pi0_fast(torch.nn.Linear(2, 2))
+
+
+def test_the_state_s_digits_in_the_prompt_are_state(case):
+    words = ["Task:", "put", "bowl,", "State:", "12", "7;", "Action:"]
+    text, pieces = "", []
+    for key, word in enumerate(words, 2 * PATCHES):
+        pieces.append(Piece(key, f" {word}", len(text), len(text) + 1 + len(word)))
+        text += f" {word}"
+    start = text.index("put")
+    prompt = Prompt(text, tuple(pieces), (start, start + len("put bowl")))
+    site = case.layout.site("joint")
+    roles = [Role(int(code)).label for code in roles_of_keys(site, case.layout, prompt)]
+    assert roles[2 * PATCHES :][: len(words)] == [
+        *["template", "instruction", "instruction", "template"],
+        *["state", "state", "template"],
+    ]

@@ -8,8 +8,9 @@ from vla_attention.capture.torch_policies.layouts.act import act
 from vla_attention.capture.torch_policies.layouts.gr00t import gr00t
 from vla_attention.capture.torch_policies.layouts.openvla import openvla, openvla_oft
 from vla_attention.capture.torch_policies.layouts.pi0_fast import pi0_fast
+from vla_attention.capture.torch_policies.layouts.pi0_pytorch import pi0_pytorch
 from vla_attention.capture.torch_policies.layouts.pi0_transformers import pi0_transformers
 from vla_attention.capture.torch_policies.layouts.smolvla import smolvla
 from vla_attention.capture.torch_policies.layouts.xvla import xvla
 
-__all__ = ["act", "gr00t", "openvla", "openvla_oft", "pi0_fast", "pi0_transformers", "smolvla", "xvla"]
+__all__ = ["act", "gr00t", "openvla", "openvla_oft", "pi0_fast", "pi0_pytorch", "pi0_transformers", "smolvla", "xvla"]

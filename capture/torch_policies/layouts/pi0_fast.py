@@ -45,7 +45,7 @@ def pi0_fast(policy: object) -> PolicyLayout:
         num_layers=text.num_hidden_layers,
         num_heads=text.num_attention_heads,
         cameras=tuple(CameraPicture(camera, "pad") for camera in cameras),
-        text=PromptText(("prompt",), f"{decoder}.embed_tokens"),
+        text=PromptText(("prompt",), f"{decoder}.embed_tokens", state_between=("State:", ";")),
         action_horizon=config.n_action_steps,
         action_dim=config.action_feature.shape[0],
         autoregressive=True,
