@@ -15,7 +15,6 @@ from torch import Tensor
 import vla_attention as va
 from tests.policies.word_tokenizer import INSTRUCTION, WordTokenizer
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
-from vla_attention.capture.torch_policies.call_order import CallOrder
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
 from vla_attention.capture.torch_policies.watch import seen_by_python, watch_attention
 from vla_attention.schemas.layout import Role
@@ -86,22 +85,38 @@ def check_rows(store: Any, site: str, expected: np.ndarray) -> None:
 
 
 class _Values:
-    """Keeps the values of the recorded calls of one block and denoise step."""
+    """Keeps the values of the first call of one block that a rule gives to the site."""
 
     def __init__(self, case: PolicyCase, site: str, block: int) -> None:
-        self.order, self.site, self.block = CallOrder(case.layout, type(case.policy).__name__), site, block
+        self.layout, self.site, self.block = case.layout, site, block
         self.values: Tensor | None = None
-        self.keys: np.ndarray | None = None
 
     def change(self, shape: CallShape) -> None:
         """Change nothing."""
 
     def saw(self, call: AttentionCall) -> None:
-        """Keep the values of the first call of the block."""
-        place = self.order.place(call.shape, ran=True)
-        if place is not None and (place.site, place.block) == (self.site, self.block) and self.values is None:
-            self.values = call.value.detach().clone()
-            self.keys = place.keys
+        """Keep the values, if this is the call."""
+        shape = call.shape
+        for rule in self.layout.rules:
+            match = rule.fits(shape.module, shape.kind, shape.queries, shape.keys)
+            if match is not None:
+                # The first call of a sequence is that of its first block.
+                place = rule.sequence[0] if rule.sequence else rule.site and (rule.site, int(match["block"]))
+                if place == (self.site, self.block) and self.values is None:
+                    self.values = call.value.detach().clone()
+                return
+
+    def keys(self) -> list[int]:
+        """The site's keys of this call: generated tokens do not exist yet, and the prompt may be shorter."""
+        assert self.values is not None
+        site = self.layout.site(self.site)
+        missing = site.keys.num_keys - self.values.shape[2]
+        missing -= sum(span.num_keys for span in site.keys.spans if span.growing)
+        keys = []
+        for span in site.keys.spans:
+            left_out = missing if span.name == site.variable_span else span.num_keys if span.growing else 0
+            keys += range(span.start, span.stop - left_out)
+        return keys
 
 
 def values_of(case: PolicyCase, site: str, block: int, observation: Any) -> np.ndarray:
@@ -111,9 +126,8 @@ def values_of(case: PolicyCase, site: str, block: int, observation: Any) -> np.n
         case.call(observation)
     assert watcher.values is not None
     numbers = watcher.values[0].transpose(0, 1).flatten(1).float().numpy()
-    keys = np.arange(len(numbers)) if watcher.keys is None else watcher.keys
     values = np.full((case.layout.site(site).keys.num_keys, numbers.shape[1]), np.nan, dtype=np.float32)
-    values[keys] = numbers
+    values[watcher.keys()] = numbers
     return values
 
 

@@ -54,7 +54,7 @@ def pi0_pytorch(policy: object, *, cameras: Sequence[str] = (), num_steps: int =
     embedding = inside(path, "paligemma_with_expert.paligemma.model.language_model.embed_tokens")
     return PolicyLayout(
         name="pi05_pytorch" if five else _NAME,
-        family="pi",
+        family="pi0_pytorch",
         sites=(site,),
         rules=(
             CallRule(rule_path(path, decoder.replace(".", r"\.") + r"\.(?P<block>\d+)\.self_attn"), "joint"),
