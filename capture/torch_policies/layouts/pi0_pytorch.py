@@ -34,7 +34,7 @@ def pi0_pytorch(policy: object, *, cameras: Sequence[str] = (), num_steps: int =
     chunk = getattr(config, "chunk_size", 0) or config.action_horizon
     prompt = getattr(config, "tokenizer_max_length", 0) or config.max_token_len
     steps = num_steps or getattr(config, "num_inference_steps", 0) or 10
-    five = bool(getattr(config, "pi05", type(found).__name__ == "PI05Pytorch"))
+    five = not hasattr(found, "state_proj")  # pi0.5 has no token of the state
     features = getattr(config, "image_features", None) or {}
     names = list(cameras) or [camera_name(feature) for feature in features] or list(_OPENPI_CAMERAS)
     side = vision.image_size // vision.patch_size
