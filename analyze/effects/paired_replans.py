@@ -159,12 +159,17 @@ def actions_of(base: BaseEpisode, rerun: StoredEpisode, condition: Condition) ->
 def changes_of(base: BaseEpisode, actions: Array, spread: ActionSpread) -> Array:
     """`CHANGES` of every replan of an episode, (replan, change), from the actions of its rerun (`actions_of`)."""
     whole = np.full(len(actions), actions.shape[1])
+    # Which numbers move the hand and the gripper is known of our suites only.
+    angle = flips = np.full(len(actions), np.nan)
+    if not base.item.store.attributes.protocol.of_other_loop:
+        angle = first_angle(base.actions, actions)
+        flips = gripper_flips(base.actions, actions, base.executed)
     return np.stack(
         (
             root_mean_square_change(base.actions, actions, spread, base.executed),
             root_mean_square_change(base.actions, actions, spread, whole),
-            first_angle(base.actions, actions),
-            gripper_flips(base.actions, actions, base.executed),
+            angle,
+            flips,
         ),
         axis=1,
     )

@@ -172,11 +172,19 @@ def _time_of(folder: Path) -> str:
     return datetime.fromtimestamp(folder.stat().st_mtime, UTC).isoformat(timespec="seconds")
 
 
+def _solved(task: TaskStatus) -> str:
+    """Number of solved episodes, and of how many where not every outcome is known."""
+    known = task.committed - task.unknown
+    if not known:
+        return "-"
+    return f"{task.success} of {known}" if task.unknown else str(task.success)
+
+
 def _cells(task: TaskStatus) -> tuple[str, ...]:
     return (
         str(task.task_id),
         f"{task.committed} of {'?' if task.expected is None else task.expected}",
-        str(task.success) if task.committed > task.unknown else "-",
+        _solved(task),
         format_bytes(task.bytes) if task.committed else "-",
         task.last_at.removesuffix("+00:00").replace("T", " ") or "-",
         visible(task.last_by) or ("unknown" if task.committed else "-"),

@@ -17,7 +17,7 @@ from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions, KeyKnockout
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing import assert_whole
+from vla_attention.testing import assert_whole, rerun_source
 from vla_attention.testing.site_stores import SiteStoreSpec, key_exists, site_root, write_site_store
 
 KINDS = ("alternating", "split", "growing")
@@ -172,6 +172,25 @@ def test_effects_of_recorded_rollouts(stores, tmp_path, capsys):
     assert (pairs["episode"] == pairs["episode_base"]).all()
     assert pairs["steps"].is_null().all()
     assert pairs["success"].null_count() == 2
+
+
+@pytest.mark.parametrize("state", [True, False])
+def test_effects_of_replays_name_no_gripper(tmp_path, capsys, state):
+    base = write_site_store(tmp_path / "base.zarr", protocol="dataset", dataset_actions=0.5, state=state)
+    knockout = Interventions("without_visual", keys=(KeyKnockout("role:image"),))
+    rerun = write_site_store(
+        tmp_path / "rerun.zarr",
+        protocol="dataset",
+        dataset_actions=0.5,
+        state=state,
+        interventions=knockout,
+        rerun_of=rerun_source(base),
+    )
+    assert analyze(["effects", str(base), str(rerun), "--out", str(tmp_path), "--no-plots"]) == 0
+    episodes = pl.read_parquet(tmp_path / "effects.parquet")
+    assert (episodes["effect"] == 0).all()
+    assert episodes["angle"].is_null().all()
+    assert episodes["gripper_flips"].is_null().all()
 
 
 def test_masses_as_netcdf_where_outcomes_are_not_known(stores, tmp_path, capsys):

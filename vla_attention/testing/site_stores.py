@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from vla_attention.capture.store.episode_writer import EpisodeStart, ReplanRecord
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.store_writer import open_run
-from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.layout import INVALID_ROLES, PatchGrid, Piece, Prompt, Role, SiteLayout, Span
 from vla_attention.schemas.segments import segment_members, segments_of
 from vla_attention.schemas.stores.store_format import (
@@ -68,6 +68,7 @@ class SiteStoreSpec:
     dataset_actions: float | None = None
     policy: str = "made-up"
     interventions: Interventions = field(default_factory=Interventions)
+    rerun_of: RerunSource | None = None
 
     @property
     def sites(self) -> tuple[SiteLayout, ...]:
@@ -139,6 +140,7 @@ def site_root(spec: SiteStoreSpec) -> RootAttributes:
         sites=spec.sites,
         provenance={"numpy": np.__version__},
         interventions=spec.interventions,
+        rerun_of=spec.rerun_of,
     )
 
 
