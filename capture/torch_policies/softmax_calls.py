@@ -154,12 +154,8 @@ class Softmaxes:
 
     def __init__(self, block: WatchedBlock) -> None:
         self._block = block
-        self._followed: dict[int, _Followed] = {}
-
-    @property
-    def open(self) -> bool:
-        """Whether a tensor is followed."""
-        return bool(self._followed)
+        #: The tensors that are followed, by their ids.
+        self.followed: dict[int, _Followed] = {}
 
     def softmax(self, function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
         """Run a softmax, changed if the watcher says so, and follow its result."""
@@ -210,11 +206,11 @@ class Softmaxes:
         return isinstance(logits, Tensor) and 3 <= logits.ndim <= 5 and axis in (-1, logits.ndim - 1)
 
     def _found(self, given: object) -> _Followed | None:
-        followed = self._followed.get(id(given))
+        followed = self.followed.get(id(given))
         return followed if followed is not None and followed.tensor() is given else None
 
     def _follow(self, tensor: Tensor, followed: _Followed) -> None:
-        number, all_followed = id(tensor), self._followed
+        number, all_followed = id(tensor), self.followed
         reference = weakref.ref(tensor, lambda gone: _forget(all_followed, number, gone))
         all_followed[number] = replace(followed, tensor=reference)
 
@@ -255,8 +251,8 @@ class Softmaxes:
             )
         shape = replace(before, batch=batch, heads=heads, kv_heads=kv_heads, queries=queries, keys=keys)
         # Other tensors that come from this softmax need not be followed any more.
-        for number in [number for number, other in self._followed.items() if other.softmax is softmax]:
-            del self._followed[number]
+        for number in [number for number, other in self.followed.items() if other.softmax is softmax]:
+            del self.followed[number]
         tensors = SoftmaxTensors(softmax, product, probabilities, followed.altered, values, result)
         self._block.saw(AttentionCall(shape, tensors))
 

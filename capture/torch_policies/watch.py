@@ -26,7 +26,7 @@ from vla_attention.capture.torch_policies.unseen_attention import (
 from vla_attention.capture.torch_policies.watched_block import WatchedBlock
 from vla_attention.schemas.errors import BadArgument
 
-_OPERATORS = (torch._ops.OpOverload, torch._ops.OpOverloadPacket)
+_OPERATORS = frozenset((torch._ops.OpOverload, torch._ops.OpOverloadPacket))
 _ACTIVE = threading.Lock()
 
 
@@ -89,6 +89,8 @@ class _Mode(TorchFunctionMode):
         super().__init__()
         self._block = block
         self._softmaxes = softmax_calls.Softmaxes(block)
+        #: Every function of the policy comes by here: one look at a dictionary says whether a softmax is followed.
+        self._followed = self._softmaxes.followed
         self._handlers: dict[Any, Callable[..., Any]] = {
             **{function: self._attend(sdpa_calls.watch_call) for function in sdpa_calls.FUNCTIONS},
             **{function: self._attend(multihead_calls.watch_call) for function in multihead_calls.FUNCTIONS},
@@ -102,9 +104,9 @@ class _Mode(TorchFunctionMode):
         handler = self._handlers.get(func)
         if handler is not None:
             return handler(func, args, kwargs or {})
-        if isinstance(func, _OPERATORS):
+        if type(func) in _OPERATORS:
             self._refuse_unseen(func)
-        if self._softmaxes.open:
+        if self._followed:
             return self._softmaxes.follow(func, args, kwargs or {})
         return func(*args, **kwargs) if kwargs else func(*args)
 
