@@ -80,10 +80,12 @@ class AttentionCall:
     Attributes:
         shape: module, kind and sizes.
         tensors: where the tensors come from.
+        asked: the shape that the watcher was asked about before a softmax by hand, if its product has another one.
     """
 
     shape: CallShape
     tensors: CallTensors
+    asked: CallShape | None = None
 
     @property
     def value(self) -> Tensor:
@@ -105,6 +107,15 @@ class AttentionCall:
         with _exact():
             return self.tensors.allowed(queries)
 
+    @property
+    def precision(self) -> str:
+        """The least precise dtype of what is multiplied and of its result: a softmax may be of higher precision."""
+        dtypes = [self.value.dtype, self.output.dtype, getattr(torch, self.shape.dtype)]
+        probabilities = getattr(self.tensors, "probabilities", None)
+        if probabilities is not None:
+            dtypes.append(probabilities.dtype)
+        return str(max(dtypes, key=lambda dtype: torch.finfo(dtype).eps)).removeprefix("torch.")
+
     def product_error(self, rows: Tensor, queries: Positions = slice(None), batch: Positions = slice(None)) -> float:
         """Return the largest |rows V - output| of these queries, relative to the largest |output| among them.
 
@@ -113,13 +124,17 @@ class AttentionCall:
         """
         # Both as the policy computes them, under its autocast if it has one.
         value, kernel = self.value, self.output
+        projected = getattr(self.tensors, "projected", None)
         with _exact():
             value = at_positions(value, 0, batch).float()
             output = at_positions(at_positions(kernel, 0, batch), 2, queries).float()
             size, heads, count, keys = rows.shape
             # Heads that share a value head become extra queries of that head, without copies of the values.
             stacked = rows.reshape(size, value.shape[1], heads // value.shape[1] * count, keys)
-            difference = (torch.matmul(stacked, value).reshape(output.shape) - output).abs()
+            mixed = torch.matmul(stacked, value).reshape(output.shape)
+            if projected is not None:
+                mixed, output = projected(mixed, queries, batch)
+            difference = (mixed - output).abs()
             if not difference.numel():
                 return 0.0
             largest, scale = float(difference.max()), float(output.abs().max())

@@ -67,7 +67,7 @@ def watch_call(
         run.update(key_padding_mask=None, is_causal=False)
         result = function(**run)
     if not block.passes(shape):
-        block.saw(AttentionCall(shape, MultiheadTensors(given, run, batch)))
+        block.saw(AttentionCall(shape, MultiheadTensors(given, run, batch, result[0].detach())))
     return result
 
 
@@ -79,11 +79,13 @@ class MultiheadTensors:
         given: its arguments by name, without a change.
         run: those that it ran with.
         batch: number of batch rows.
+        result: what the policy's kernel gave, after the output projection: (query, batch, width) or (query, width).
     """
 
     given: Mapping[str, Any]
     run: Mapping[str, Any]
     batch: int
+    result: Tensor
 
     def value(self) -> Tensor:
         """Return the values (batch, head, key, dim), projected as the call does."""
@@ -119,6 +121,18 @@ class MultiheadTensors:
         with torch.no_grad():
             output, _ = _FORWARD(**{**self.run, **_NO_DROPOUT, "out_proj_weight": unchanged, "out_proj_bias": None})
         return self._split(output)
+
+    def projected(self, mixed: Tensor, queries: Positions, batch: Positions) -> tuple[Tensor, Tensor]:
+        """Return rows times values after the output projection, and what the policy's kernel gave, float32.
+
+        mixed: (batch, head, query, dim). What is inside of the kernel is computed a second time; its result is not.
+        """
+        bias = self.given["out_proj_bias"]
+        joined = mixed.transpose(1, 2).flatten(2)
+        bias = None if bias is None else bias.float()
+        projected = torch.nn.functional.linear(joined, self.given["out_proj_weight"].float(), bias)
+        result = self.result if self.result.ndim == 3 else self.result[:, None]
+        return projected, at_positions(at_positions(result, 0, queries), 1, batch).transpose(0, 1).float()
 
     def rows(self, queries: Positions, batch: Positions) -> Tensor:
         """Return float32 probabilities (batch, head, query, key) of these queries."""

@@ -15,6 +15,7 @@ from vla_attention.capture.recording.contributions import gram_matrix, keys_of_p
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
+from vla_attention.capture.torch_policies.call_changes import ChangeRefused
 from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
 from vla_attention.schemas.errors import BadArgument, UserError
@@ -26,6 +27,8 @@ _LARGE_COPY = 2**20
 #: Largest difference of the rows' P·V from the kernel's output, relative to the largest output, by the call's dtype. A
 #: float32 kernel leaves 1e-6, one of bfloat16 a few of its roundings; rows with a wrong mask are off by far more.
 _TOLERANCE = {"float32": 1e-3, "float64": 1e-3, "float16": 2e-2, "bfloat16": 6e-2}
+#: Largest difference of a row's sum from 1, beside rounding.
+_SUM_TOLERANCE = 1e-3
 
 #: What a row of the batch adds to the logits of a call (head or 1, query, key); None for nothing. The arrays live as
 #: long as the recorder, and are the same for calls to which the same is added.
@@ -115,7 +118,10 @@ class ReplanRecorder:
 
     def change(self, shape: CallShape) -> Tensor | None:
         """Return what is added to the logits of a call, (batch, head or 1, query, key), or None for nothing."""
+        # What is asked about may turn out to be no attention: what does not fit here is no problem yet.
+        problems = dict(self.order.problems)
         place = None if self.bias is None else self.order.place(shape)
+        self.order.problems = problems
         if self.bias is None or place is None or place.site is None or shape.batch != self.batch:
             return None
         added = {row: self.bias(row, place, shape) for row in self.rows}
@@ -151,7 +157,11 @@ class ReplanRecorder:
         shape = call.shape
         place = self.order.place(shape)
         self.order.ran(shape, place)
-        if place is None or place.site is None or not self._wanted(place):
+        if place is None or place.site is None:
+            return
+        if self.bias is not None and call.asked is not None:
+            self._check_changed(call.asked, shape, place)
+        if not self._wanted(place):
             return
         site, recording = self.order.known.sites[place.site], self.recordings[place.site]
         if shape.batch != self.batch:
@@ -160,12 +170,23 @@ class ReplanRecorder:
                 "(several environments in one call: run.episodes)"
             ] = None
             return
-        if max(recording.heads) >= shape.heads:
-            self.order.problems[f"a call of site '{site.name}' has {shape.heads} heads"] = None
+        heads = site.keys.heads or self.layout.num_heads
+        if shape.heads != heads:
+            self.order.problems[f"a call of site '{site.name}' has {shape.heads} heads; the layout has {heads}"] = None
             return
         step = 0 if self.layout.autoregressive else place.step
         with torch.no_grad():
             self._take(call, place, site, recording, (place.block, step))
+
+    def _check_changed(self, asked: CallShape, shape: CallShape, place: CallPlace) -> None:
+        """Raise `ChangeRefused` if a knockout of a call could not be made: the softmax showed other axes."""
+        if self.bias is None or all(self.bias(row, place, shape) is None for row in self.rows):
+            return
+        raise ChangeRefused(
+            f"The attention call {shape} of site '{place.site}' cannot be changed: its softmax has {asked.heads} heads "
+            f"and {asked.queries} x {asked.keys} queries and keys, and not those of its product with the values. Leave "
+            "the call out of the knockout (knockout_layers)."
+        )
 
     def _take(
         self, call: AttentionCall, place: CallPlace, site: RecordedSite, recording: Recording, cell: tuple[int, int]
@@ -180,7 +201,7 @@ class ReplanRecorder:
                 "this episode was kept."
             )
         self.largest_error = max(self.largest_error, error)
-        self._check_error(error, call.shape, place)
+        self._check_error(error, call, rows, place)
         allowed = call.allowed(queries).any(dim=1)
         keys = None if place.keys is None else torch.from_numpy(place.keys).to(rows.device)
         if keys is not None:
@@ -197,14 +218,26 @@ class ReplanRecorder:
             chosen = chosen.mean(dim=2, keepdim=True)
         collected.rows.setdefault(cell, []).append(chosen.cpu() if chosen.numel() > _LARGE_COPY else chosen)
 
-    def _check_error(self, error: float, shape: CallShape, place: CallPlace) -> None:
-        allowed = _TOLERANCE.get(shape.dtype.removeprefix("torch."), 1e-3)
+    def _check_error(self, error: float, call: AttentionCall, rows: Tensor, place: CallPlace) -> None:
+        shape, precision = call.shape, call.precision
+        allowed = _TOLERANCE.get(precision, 1e-3)
         if error > allowed:
             raise RowsDoNotMatch(
                 f"The rows of site '{place.site}', block {place.block}, step {place.step} give a P·V that differs from "
-                f"the kernel's output by {error:.2g} of its largest number; allowed is {allowed:g} for {shape.dtype}. "
-                f"The call of module '{shape.module}' ({shape.kind}) does something else than softmax(q kᵀ + mask) v: "
-                "report it with the library's version."
+                f"the kernel's output by {error:.2g} of its largest number; allowed is {allowed:g} for {precision}. "
+                f"The call of module '{shape.module}' ({shape.kind}) does something else than softmax(q kᵀ + mask) v. "
+                "If the policy is in training mode, its dropout does: call policy.eval(). Otherwise report it with the "
+                "library's version."
+            )
+        sums = rows.sum(dim=-1)
+        # A query without any key has a row of zeros.
+        wrong = ((sums - 1).abs() > max(allowed, _SUM_TOLERANCE)) & (sums != 0)
+        if bool(wrong.any()):
+            raise RowsDoNotMatch(
+                f"The rows of site '{place.site}', block {place.block}, step {place.step} sum to "
+                f"{float(sums[wrong][0]):.4g} and not to 1 when they are multiplied with the values: module "
+                f"'{shape.module}' changes them after the softmax, as dropout (call policy.eval()), factors and sinks "
+                "without a key do. Such rows cannot be stored."
             )
 
     def _take_contributions(

@@ -169,6 +169,9 @@ def find_product(
     if not free or (len(value_shape) == 2 and len(axes.parts) > 2):
         return None
     query = free[-1]
+    if 0 in free and any(axis > query for axis in shared):
+        # The same for every batch row and another one for each query: a table of relative positions, not values.
+        return None
     lead = [axis for axis in order if axis != query]
     batch, heads = _batch_and_heads(lead, free)
     first_free = next((number for number, axis in enumerate(heads) if axis in free), len(heads))

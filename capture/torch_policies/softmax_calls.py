@@ -173,11 +173,14 @@ class Softmaxes:
             result = function(*args, **kwargs)
         else:
             change = fitted_change(change, shape, logits.device)
+            if kwargs.get("out") is not None:
+                logits = logits.clone()  # the result may be written over them, and they tell which keys are masked
             changed = logits + change.expand(batch, heads, queries, keys).reshape(logits.shape).to(logits.dtype)
             check_keys_left(
                 logits.reshape(batch, heads, queries, keys), changed.reshape(batch, heads, queries, keys), shape
             )
             result = function(changed, *args[1:], **kwargs) if args else function(**{**kwargs, name: changed})
+            self._block.changed.append(shape)
         sizes = (batch, heads, queries, keys) if len(lead) == 1 else tuple(logits.shape)
         first = ((0, 1), (2,), (3,)) if len(lead) == 1 else tuple((axis,) for axis in range(len(sizes)))
         overwritten = result.data_ptr() == logits.data_ptr()
@@ -187,7 +190,8 @@ class Softmaxes:
 
     def follow(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
         """Run any other function, and follow what comes of a softmax's result."""
-        given = next((found for found in map(self._found, (*args, *kwargs.values())) if found is not None), None)
+        operands = (*args[:1], *args[1]) if function is torch.einsum and isinstance(args[1], list | tuple) else args
+        given = next((found for found in map(self._found, (*operands, *kwargs.values())) if found is not None), None)
         result = function(*args, **kwargs)
         if given is None:
             return result
@@ -245,16 +249,19 @@ class Softmaxes:
         batch, heads, kv_heads, queries, keys = product.sizes
         before = softmax.shape
         if softmax.change is not None and (batch, heads, queries) != (before.batch, before.heads, before.queries):
-            raise ChangeRefused(
+            refused = ChangeRefused(
                 f"The attention call {before} cannot be changed: its product with the values shows other axes "
                 f"(batch {batch}, {heads} heads, {queries} queries) than the softmax. Leave this call out."
             )
+            raise self._block.failed(refused)
         shape = replace(before, batch=batch, heads=heads, kv_heads=kv_heads, queries=queries, keys=keys)
+        if softmax.change is not None:
+            self._block.changed.remove(before)
         # Other tensors that come from this softmax need not be followed any more.
         for number in [number for number, other in self.followed.items() if other.softmax is softmax]:
             del self.followed[number]
         tensors = SoftmaxTensors(softmax, product, probabilities, followed.altered, values, result)
-        self._block.saw(AttentionCall(shape, tensors))
+        self._block.saw(AttentionCall(shape, tensors, None if shape == replace(before, kv_heads=kv_heads) else before))
 
 
 _SAME_NUMBERS = {*_COPIES, *_SWAPS, *_PERMUTES, *_MATRIX_TRANSPOSES, *_FOLDS}
@@ -273,12 +280,12 @@ def _axes_after(
         order[-2:] = reversed(order[-2:])
         return axes.permuted(order)
     if function in _SWAPS:
-        first, second = [*args[1:], *kwargs.values()][:2]
+        first, second = [place for place in (*args[1:], *kwargs.values()) if not isinstance(place, Tensor)][:2]
         order = list(range(before.ndim))
         order[first], order[second] = order[second], order[first]
         return axes.permuted(order)
     if function in _PERMUTES:
-        positions = args[1:] or tuple(kwargs.values())
+        positions = args[1:] or tuple(place for place in kwargs.values() if not isinstance(place, Tensor))
         return axes.permuted(positions if isinstance(positions[0], int) else positions[0])
     if function in _FOLDS:
         return axes.refolded(result.shape)

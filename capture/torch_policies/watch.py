@@ -24,7 +24,7 @@ from vla_attention.capture.torch_policies.unseen_attention import (
     UnseenAttention,
 )
 from vla_attention.capture.torch_policies.watched_block import WatchedBlock
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument, UserError
 
 _OPERATORS = frozenset((torch._ops.OpOverload, torch._ops.OpOverloadPacket))
 _ACTIVE = threading.Lock()
@@ -112,7 +112,10 @@ class _Mode(TorchFunctionMode):
 
     def _attend(self, watch_call: Callable[..., Any]) -> Callable[..., Any]:
         def attend(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-            return watch_call(self._block, func, args, kwargs)
+            try:
+                return watch_call(self._block, func, args, kwargs)
+            except UserError as error:  # the policy's code may catch it
+                raise self._block.failed(error) from None
 
         return attend
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import sys
 import threading
+import types
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
+from functools import update_wrapper
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape, Kind, Watcher
+from vla_attention.capture.torch_policies.call_changes import ChangeRefused
 from vla_attention.capture.torch_policies.policy_modules import FoundPolicy
 from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
 from vla_attention.schemas.errors import BadArgument
@@ -55,6 +58,8 @@ class WatchedBlock:
         self.watcher = watcher
         #: The first error of watching, which the block raises at its end if the policy's code went on without it.
         self.error: BaseException | None = None
+        #: Softmaxes by hand that were changed and met no values yet.
+        self.changed: list[CallShape] = []
         self._found = found
         #: Whether simple modules ran in a thread where nothing is seen.
         self._unseen_thread = False
@@ -125,7 +130,7 @@ class WatchedBlock:
             if self._closed:  # a thread that still runs; the block has ended with an error
                 return
             if call.shape.number != self._number:  # another call came in between, in this thread or in another
-                call = AttentionCall(replace(call.shape, number=self._number), call.tensors)
+                call = replace(call, shape=replace(call.shape, number=self._number))
             self._number += 1
             self.watcher.saw(call)
 
@@ -163,6 +168,7 @@ class WatchedBlock:
         Raises:
             StillRunning: the policy still runs in another thread.
             NotFollowed: it ran in another thread so that no attention was seen.
+            ChangeRefused: a softmax was changed that is no attention.
             BaseException: an error of watching that the policy's code caught, or met in another thread.
         """
         with self._lock:
@@ -174,6 +180,12 @@ class WatchedBlock:
                 )
             if self.error is not None:
                 raise self.error
+            if self.changed:
+                raise ChangeRefused(
+                    f"A softmax that is no attention was changed as if it were the call {self.changed[0]}: it was "
+                    "multiplied with no values, as the gate of a mixture of experts. Give the layout's rule a kind or "
+                    "a number of keys that this softmax does not have, or leave its block out."
+                )
             if self._unseen_thread and not self._number:
                 raise NotFollowed(
                     f"The policy ({type(self.policy).__name__}) ran in another thread than the block that records it, "
@@ -189,21 +201,16 @@ class WatchedBlock:
         forward. Hooks would not do: `module.forward(...)` skips them, and so do some fast paths.
         """
         attending, simple = self._found.attending, self._found.simple
-        kept = [(module, module.__dict__.get("forward")) for module in (*attending, *simple)]
+        replaced: list[_Forward] = []
         self._thread.seen = True
         try:
-            for module in attending:
-                module.__dict__["forward"] = self._followed(module, module.forward, mode)
-            for module in simple:
-                module.__dict__["forward"] = self._noticed(module.forward)
+            replaced.extend(_Forward(module, self._followed(module, module.forward, mode)) for module in attending)
+            replaced.extend(_Forward(module, self._noticed(module.forward)) for module in simple)
             yield
         finally:
             self._thread.seen = False
-            for module, forward in kept:
-                if forward is None:
-                    module.__dict__.pop("forward", None)
-                else:
-                    module.__dict__["forward"] = forward
+            for forward in replaced:
+                forward.give_back()
 
     def _noticed(self, forward: Callable[..., Any]) -> Callable[..., Any]:
         """Notice a simple module that runs in another thread, outside every forward that could enter a mode there."""
@@ -214,7 +221,6 @@ class WatchedBlock:
                 self._unseen_thread = True
             return forward(*args, **kwargs)
 
-        noticed.__wrapped__ = forward  # type: ignore[attr-defined]
         return noticed
 
     def _followed(
@@ -245,8 +251,42 @@ class WatchedBlock:
                 with self._lock:
                     self._elsewhere -= 1
 
-        followed.__wrapped__ = forward  # type: ignore[attr-defined]  # its signature stays what it was
         return followed
+
+
+class _Forward:
+    """What stands in place of a module's forward during a block.
+
+    A copy or a pickle of the module that is made in the block has the module's own forward: with this one, it would
+    compute with the weights of the original.
+    """
+
+    def __init__(self, module: nn.Module, call: Callable[..., Any]) -> None:
+        update_wrapper(self, module.forward)  # its signature stays what it was
+        self.module = module
+        self.own = module.__dict__.get("forward")
+        self.call = call
+        module.__dict__["forward"] = self
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return self.call(*args, **kwargs)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _own_forward, (self.module, self.own)
+
+    def give_back(self) -> None:
+        """Give the module its own forward again, unless the policy's code has set another one meanwhile."""
+        self.call = _own_forward(self.module, self.own)
+        if self.module.__dict__.get("forward") is not self:
+            return
+        if self.own is None:
+            del self.module.__dict__["forward"]
+        else:
+            self.module.__dict__["forward"] = self.own
+
+
+def _own_forward(module: nn.Module, own: Callable[..., Any] | None) -> Callable[..., Any]:
+    return types.MethodType(type(module).forward, module) if own is None else own
 
 
 def _frame_owners() -> Iterator[object]:

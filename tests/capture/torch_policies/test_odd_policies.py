@@ -1,0 +1,349 @@
+"""Policies that do odd things with their softmax: their rows are exact, or an error says what they do."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+from collections.abc import Callable
+from contextlib import nullcontext
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
+from vla_attention.capture.torch_policies.call_changes import ChangeRefused
+from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
+from vla_attention.capture.torch_policies.policy_layout import CallRule, PolicyLayout, RecordedSite
+from vla_attention.capture.torch_policies.record import record
+from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
+from vla_attention.schemas.layout import PatchGrid, SiteLayout, Span
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.verify import verify_store
+
+WIDTH, HEADS, DIM, PREFIX, ACTIONS, BLOCKS = 8, 2, 4, 6, 3, 2
+KEYS = PREFIX + ACTIONS
+Attend = Callable[[nn.Module, Tensor, Tensor, Tensor], Tensor]
+
+
+class Block(nn.Module):
+    def __init__(self, attend: Attend, heads: int) -> None:
+        super().__init__()
+        self.num_heads, self.attend = heads, attend
+        self.query, self.key, self.value = (nn.Linear(WIDTH, heads * DIM) for _ in range(3))
+        self.out = nn.Linear(heads * DIM, WIDTH)
+        self.kept: Tensor | None = None
+
+    def forward(self, tokens: Tensor, prefix: Tensor) -> Tensor:
+        both = torch.cat([prefix, tokens], dim=1)
+        q, k, v = (
+            linear(given).view(len(given), -1, self.num_heads, DIM).transpose(1, 2)
+            for linear, given in ((self.query, tokens), (self.key, both), (self.value, both))
+        )
+        self.kept = logits(q.float(), k.float()).detach()
+        return tokens + self.out(self.attend(self, q, k, v).transpose(1, 2).flatten(2))
+
+
+class OddPolicy(nn.Module):
+    """One call, without denoising: its blocks attend as they are told to."""
+
+    def __init__(self, attend: Attend, heads: int = HEADS) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.blocks = nn.ModuleList(Block(attend, heads) for _ in range(BLOCKS))
+        self.eval()
+
+    def act(self, batch: int = 1) -> Tensor:
+        numbers = torch.Generator().manual_seed(1)
+        dtype = self.blocks[0].out.weight.dtype
+        prefix = torch.randn(batch, PREFIX, WIDTH, generator=numbers).to(dtype)
+        tokens = torch.randn(batch, ACTIONS, WIDTH, generator=numbers).to(dtype)
+        with torch.no_grad():
+            for block in self.blocks:
+                tokens = block(tokens, prefix)
+        return tokens
+
+
+def logits(q: Tensor, k: Tensor) -> Tensor:
+    return q @ k.transpose(-1, -2) / math.sqrt(DIM)
+
+
+def by_hand(block: nn.Module, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+    return torch.softmax(logits(q, k), dim=-1) @ v
+
+
+def sdpa(block: nn.Module, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+    return nn.functional.scaled_dot_product_attention(q, k, v)
+
+
+def layout(**changes: object) -> PolicyLayout:
+    spans = (
+        Span("image_front", "image", 0, 4, "front", PatchGrid(2, 2, 8, 8)),
+        Span("state", "state", 4, PREFIX),
+        Span("actions", "action", PREFIX, KEYS),
+    )
+    roles = {"image_front": "image", "state": "state", "actions": "action"}
+    fields = {
+        "name": "odd",
+        "family": "odd",
+        "sites": (RecordedSite(SiteLayout("joint", spans), (0, ACTIONS), roles),),
+        "rules": (CallRule(r"blocks\.(?P<block>\d+).*", "joint"),),
+        "num_layers": BLOCKS,
+        "num_heads": HEADS,
+    }
+    return PolicyLayout(**{**fields, **changes})  # type: ignore[arg-type]
+
+
+def rows_of(path, policy, act=None, knockout=None, shape=None):
+    """Record one call; return its rows (block, head, query, key) and what it gave."""
+    with (
+        record(
+            path / "a.zarr", policy, layout=shape or layout(), bits=23, queries="all", durable=False, knockout=knockout
+        ) as run,
+        run.episode(task_id=0, episode_index=0, instruction="") as episode,
+        episode.replan(env_step=0),
+    ):
+        result = (act or policy.act)()
+    store = open_store(path / "a.zarr")
+    assert verify_store(store) == []
+    return store.episodes[0].read("joint/rows")[0, :, 0], result
+
+
+def expected(policy, hidden=()):
+    """The rows of the last call, by hand, without the keys `hidden`."""
+    kept = torch.stack([block.kept[0] for block in policy.blocks])
+    kept = kept.float()
+    kept[..., list(hidden)] = -math.inf
+    return kept.softmax(-1).numpy()
+
+
+def float32_softmax(block, q, k, v):
+    """As SmolVLA: the softmax is of float32, the values are not."""
+    return torch.softmax(logits(q.float(), k.float()), dim=-1).to(v.dtype) @ v
+
+
+@pytest.mark.parametrize("knockout", [None, "role:state"])
+def test_a_float32_softmax_over_bfloat16_values(tmp_path, knockout):
+    policy = OddPolicy(float32_softmax).to(torch.bfloat16)
+    own = policy.act()
+    rows, result = rows_of(tmp_path, policy, knockout=knockout)
+    assert torch.equal(result, own) == (knockout is None)
+    np.testing.assert_allclose(rows, expected(policy, (4, 5) if knockout else ()), atol=2e-6)
+
+
+def test_a_float32_softmax_under_autocast(tmp_path):
+    policy = OddPolicy(lambda block, q, k, v: torch.softmax(logits(q, k).float(), dim=-1) @ v)
+
+    def act(recorded: bool = True) -> Tensor:
+        with torch.autocast("cpu", torch.bfloat16):
+            return policy.act()
+
+    own = act()
+    rows, result = rows_of(tmp_path, policy, act)
+    assert torch.equal(result, own)
+    np.testing.assert_allclose(rows, expected(policy), atol=5e-3)
+
+
+class MultiheadBlock(nn.Module):
+    def __init__(self, dropout: float) -> None:
+        super().__init__()
+        self.attention = nn.MultiheadAttention(WIDTH, HEADS, dropout=dropout, batch_first=True)
+        self.out = self.attention.out_proj
+
+    def forward(self, tokens: Tensor, prefix: Tensor) -> Tensor:
+        both = torch.cat([prefix, tokens], dim=1)
+        return tokens + self.attention(tokens, both, both, need_weights=False)[0]
+
+
+def multihead_policy(dropout: float) -> OddPolicy:
+    policy = OddPolicy(by_hand)
+    policy.blocks = nn.ModuleList(MultiheadBlock(dropout) for _ in range(BLOCKS))
+    return policy.eval()
+
+
+def dropped_by_hand(block, q, k, v):
+    return nn.functional.dropout(torch.softmax(logits(q, k), dim=-1), 0.5, block.training) @ v
+
+
+def dropped_by_sdpa(block, q, k, v):
+    return nn.functional.scaled_dot_product_attention(q, k, v, dropout_p=0.5 if block.training else 0.0)
+
+
+@pytest.mark.parametrize(
+    "policy", [OddPolicy(dropped_by_hand), OddPolicy(dropped_by_sdpa), multihead_policy(0.5)], ids=["hand", "sdpa", "m"]
+)
+def test_dropout_in_training_mode_is_refused(tmp_path, policy):
+    rows_of(tmp_path / "eval", policy)
+    policy.train()
+    torch.manual_seed(0)
+    with pytest.raises(RowsDoNotMatch, match=r"call policy\.eval\(\)"):
+        rows_of(tmp_path / "train", policy)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("autocast", [False, True])
+def test_multihead_rows_reproduce_the_projected_output(tmp_path, dtype, autocast):
+    policy = multihead_policy(0.0).to(dtype)
+
+    def act() -> Tensor:
+        with torch.autocast("cpu", torch.bfloat16) if autocast else nullcontext():
+            return policy.act()
+
+    own = act()
+    rows, result = rows_of(tmp_path, policy, act)
+    assert torch.equal(result, own)
+    np.testing.assert_allclose(rows.sum(-1), 1, atol=1e-6)
+
+
+def test_sinks_without_a_key_are_refused(tmp_path):
+    def sinks(block, q, k, v):
+        extra = torch.cat([logits(q, k), torch.ones(len(q), HEADS, ACTIONS, 1)], dim=-1)
+        return torch.softmax(extra, dim=-1)[..., :-1] @ v
+
+    with pytest.raises(RowsDoNotMatch, match=r"sum to 0\.\d+ and not to 1 .* sinks"):
+        rows_of(tmp_path, OddPolicy(sinks))
+
+
+@pytest.mark.parametrize("heads", [1, 4])
+def test_another_number_of_heads_is_refused(tmp_path, heads):
+    with pytest.raises(CallsDoNotFit, match=f"has {heads} heads; the layout has 2"):
+        rows_of(tmp_path, OddPolicy(sdpa, heads=heads))
+
+
+def test_sinks_without_a_key_cannot_be_knocked_out(tmp_path):
+    def sinks(block, q, k, v):
+        extra = torch.cat([logits(q, k), torch.full((len(q), HEADS, ACTIONS, 1), -math.inf)], dim=-1)
+        return torch.softmax(extra, dim=-1)[..., :-1] @ v
+
+    policy = OddPolicy(sinks)
+    np.testing.assert_allclose(rows_of(tmp_path / "rows", policy)[0], expected(policy), atol=2e-6)
+    with pytest.raises(ChangeRefused, match=r"its softmax has 2 heads and 3 x 10 queries and keys"):
+        rows_of(tmp_path, policy, knockout="role:state")
+
+
+class GatedBlock(Block):
+    """An attention block with a gate of experts in the same module."""
+
+    def __init__(self, experts: int) -> None:
+        super().__init__(by_hand, HEADS)
+        self.gate = nn.Linear(WIDTH, experts)
+        self.experts = nn.Parameter(torch.randn(experts, WIDTH, WIDTH))
+
+    def forward(self, tokens: Tensor, prefix: Tensor) -> Tensor:
+        chosen = torch.softmax(self.gate(tokens), dim=-1)
+        each = torch.einsum("btw,ewd->bted", tokens, self.experts)
+        return super().forward(torch.einsum("bte,bted->btd", chosen, each), prefix)
+
+
+@pytest.mark.parametrize("experts", [4, KEYS])
+def test_a_knockout_does_not_change_a_gate_of_experts(tmp_path, experts):
+    policy = OddPolicy(by_hand)
+    policy.blocks = nn.ModuleList(GatedBlock(experts) for _ in range(BLOCKS))
+    policy.eval()
+    own = policy.act()
+    rows, result = rows_of(tmp_path / "rows", policy)
+    assert torch.equal(result, own)
+    np.testing.assert_allclose(rows, expected(policy), atol=2e-6)
+    if experts == KEYS:  # as many experts as keys: nothing tells the two apart before the product
+        with pytest.raises(ChangeRefused, match="A softmax that is no attention was changed"):
+            rows_of(tmp_path / "knockout", policy, knockout="role:state")
+    else:
+        rows, _ = rows_of(tmp_path / "knockout", policy, knockout="role:state")
+        np.testing.assert_allclose(rows, expected(policy, (4, 5)), atol=2e-6)
+
+
+SPELLINGS = {
+    "transpose": lambda p, v: torch.transpose(torch.transpose(input=p, dim0=1, dim1=2), 1, 2) @ v,
+    "permute": lambda p, v: torch.permute(torch.permute(input=p, dims=(0, 2, 1, 3)), dims=(0, 2, 1, 3)) @ v,
+    "einsum of a list": lambda p, v: torch.einsum("bhqk,bhkd->bhqd", [p, v]),
+    "einsum of lists": lambda p, v: torch.einsum(p, [0, 1, 2, 3], v, [0, 1, 3, 4], [0, 1, 2, 4]),
+}
+
+
+@pytest.mark.parametrize("multiply", SPELLINGS.values(), ids=SPELLINGS)
+@pytest.mark.parametrize("knockout", [None, "role:state"])
+def test_spellings_of_the_product(tmp_path, multiply, knockout):
+    policy = OddPolicy(lambda block, q, k, v: multiply(torch.softmax(logits(q, k), dim=-1), v))
+    own = policy.act()
+    rows, result = rows_of(tmp_path, policy, knockout=knockout)
+    assert torch.equal(result, own) == (knockout is None)
+    np.testing.assert_allclose(rows, expected(policy, (4, 5) if knockout else ()), atol=2e-6)
+
+
+@pytest.mark.parametrize("heads", [2, 3])
+@pytest.mark.parametrize("first", [True, False])
+def test_relative_positions_added_to_the_values_are_not_the_values(tmp_path, heads, first):
+    table = torch.randn(ACTIONS, KEYS, DIM)
+
+    def attend(block, q, k, v):
+        rows = torch.softmax(logits(q, k), dim=-1)
+        if first:  # with as many heads as queries their rows would have the same shape
+            return torch.einsum("bhqk,qkd->bhqd", rows, table) + rows @ v
+        return rows @ v + torch.einsum("bhqk,qkd->bhqd", rows, table)
+
+    policy = OddPolicy(attend, heads=heads)
+    rows, _ = rows_of(tmp_path, policy, shape=layout(num_heads=heads))
+    np.testing.assert_allclose(rows, expected(policy), atol=2e-6)
+
+
+def test_a_knockout_where_the_softmax_is_written_over_its_logits(tmp_path):
+    def attend(block, q, k, v):
+        scores = logits(q, k)
+        torch.softmax(scores, dim=-1, out=scores)
+        return scores @ v
+
+    policy = OddPolicy(attend)
+    rows, _ = rows_of(tmp_path, policy, knockout="role:image")
+    np.testing.assert_allclose(rows, expected(policy, range(4)), atol=2e-6)
+    roles = open_store(tmp_path / "a.zarr").episodes[0].read("joint/key_role")[0]
+    assert set(roles[:4]) == {1}  # image, and not masked
+
+
+def test_a_policy_that_catches_the_refusal_of_a_knockout(tmp_path):
+    policy = OddPolicy(sdpa)
+
+    def act() -> Tensor:
+        try:
+            return policy.act()
+        except Exception:
+            return torch.zeros(1)
+
+    with pytest.raises(QueryWithoutKeys):
+        rows_of(tmp_path, policy, act, knockout=["role:image", "role:state", "role:action"])
+
+
+def test_copies_made_in_the_block_have_their_own_weights(tmp_path):
+    policy, made = OddPolicy(sdpa), []
+
+    def act() -> Tensor:
+        made.extend([copy.deepcopy(policy), copy.deepcopy(policy.blocks[0].out)])
+        for weight in made[0].parameters():
+            weight.data.mul_(2)
+        pickle.dumps(policy.blocks[0].out)
+        return policy.act()
+
+    rows, own = rows_of(tmp_path, policy, act)
+    np.testing.assert_allclose(rows, expected(policy), atol=2e-6)
+    other = OddPolicy(sdpa)
+    for weight in other.parameters():
+        weight.data.mul_(2)
+    assert torch.equal(made[0].act(), other.act())
+    assert not torch.equal(made[0].act(), own)
+    assert torch.equal(made[1](torch.ones(WIDTH)), policy.blocks[0].out(torch.ones(WIDTH)))
+    assert "forward" not in policy.blocks[0].__dict__
+
+
+def test_a_forward_that_the_policy_replaces_in_the_block_stays(tmp_path):
+    policy = OddPolicy(sdpa)
+    own = policy.act()
+
+    def act() -> Tensor:
+        before = policy.blocks[0].forward
+        policy.blocks[0].forward = lambda tokens, prefix: before(tokens, prefix) * 2
+        return policy.act()
+
+    _, result = rows_of(tmp_path, policy, act)
+    assert not torch.equal(result, own)
+    assert torch.equal(policy.act(), result)
