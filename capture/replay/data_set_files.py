@@ -7,6 +7,8 @@ come from the templates of `meta/info.json`. Format: `src/lerobot/datasets/` of 
 from __future__ import annotations
 
 import json
+import math
+import re
 import string
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,6 +32,8 @@ FILE_PER_EPISODE, FILE_OF_MANY = ("v2.0", "v2.1"), ("v3.0",)
 VERSIONS = (*FILE_PER_EPISODE, *FILE_OF_MANY)
 #: Columns that every data set has, and that are numbers of its own.
 INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+#: How a template may write a number or a name; any other way is not LeRobot's, and could write a path of any length.
+_PLAIN_FORMAT = re.compile(r"(0?\d{1,2}d?)?")
 #: What is read before the episodes are known.
 META_FILES = ("meta/*.json", "meta/*.jsonl", "meta/*.parquet", "meta/episodes/**")
 
@@ -94,7 +98,10 @@ def read_info(folder: Path) -> DataSetInfo:
     """
     path = folder / INFO
     if not path.is_file():
-        held = listing(sorted(entry.name for entry in folder.iterdir())) if folder.is_dir() else "nothing"
+        if not folder.is_dir():
+            raise DataSetNotFound(f"'{folder}' is no LeRobotDataset, but a file; give the folder that holds {INFO}.")
+        names = sorted(entry.name for entry in folder.iterdir())
+        held = listing(names) if names else "nothing"
         raise DataSetNotFound(f"'{folder}' is no LeRobotDataset: it has no {INFO} and holds {held}.")
     content = _json_object(path)
     version = content.get("codebase_version")
@@ -112,8 +119,8 @@ def read_info(folder: Path) -> DataSetInfo:
         if isinstance(error, DataSetError):
             raise
         raise DamagedDataSet(f"'{path}' lacks what a data set of {version} says ({error!r}).") from error
-    if fps <= 0:
-        raise DamagedDataSet(f"'{path}' has {fps} frames per second.")
+    if not (math.isfinite(fps) and fps > 0):
+        raise DamagedDataSet(f"'{path}' has {fps} frames per second; expected a number above 0.")
     if version in FILE_OF_MANY:
         tasks, episodes = _tasks_of_table(folder), _episodes_of_tables(folder, paths)
     else:
@@ -143,10 +150,12 @@ class _Paths:
 
     def __init__(self, folder: Path, content: Mapping[str, Any], videos: Sequence[str]) -> None:
         self._where = f"'{folder / INFO}'"
-        self._data = str(content["data_path"])
+        self._data = content["data_path"]
         self._video = content.get("video_path")
         self._per_chunk = int(content.get("chunks_size") or 1000)
         self.videos = tuple(videos)
+        if self._per_chunk < 1:
+            raise DamagedDataSet(f"{self._where} has the chunks_size {self._per_chunk}; expected at least 1.")
         if videos and not self._video:
             raise DamagedDataSet(f"{self._where} has the videos {listing(videos)} and no video_path.")
 
@@ -168,15 +177,19 @@ class _Paths:
 
     def _filled(self, template: object, **values: Any) -> str:
         try:
+            if not isinstance(template, str):
+                raise ValueError("it is no text")
             # A plain name in braces only: anything more would reach into the values.
-            fields = [name for _, name, _, _ in string.Formatter().parse(str(template)) if name is not None]
-            if any(name not in values for name in fields):
-                raise KeyError(listing(fields))
-            path = str(template).format(**values)
+            parts = [(name, form) for _, name, form, _ in string.Formatter().parse(template) if name is not None]
+            if any(name not in values for name, _ in parts):
+                raise KeyError(listing(name for name, _ in parts))
+            if any(not _PLAIN_FORMAT.fullmatch(form or "") for _, form in parts):
+                raise ValueError("expected numbers as in {episode_index:06d}")
+            path = template.format(**values)
             check_inner_path(path)
         except (KeyError, ValueError, IndexError) as error:
             raise DamagedDataSet(
-                f"{self._where} has the path template {str(template)!r}, which cannot be filled with {listing(values)} "
+                f"{self._where} has the path template {template!r}, which cannot be filled with {listing(values)} "
                 f"({error})."
             ) from None
         return path
@@ -185,7 +198,7 @@ class _Paths:
 def _json_object(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RecursionError) as error:
         raise DamagedDataSet(f"'{path}' is not valid JSON ({error}).") from error
     if not isinstance(content, dict):
         raise DamagedDataSet(f"'{path}' should hold a JSON object, but holds a {type(content).__name__}.")
@@ -198,7 +211,7 @@ def _lines(folder: Path, name: str) -> list[dict[str, Any]]:
         raise DataSetNotFound(f"The data set '{folder}' has no {name}, which its version needs.")
     try:
         return [dict(json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-    except (ValueError, TypeError, OSError) as error:
+    except (ValueError, TypeError, OSError, RecursionError) as error:
         raise DamagedDataSet(f"'{path}' is not one JSON object per line ({error}).") from error
 
 
@@ -220,6 +233,7 @@ def _episodes_of_lines(folder: Path, paths: _Paths) -> dict[int, EpisodeEntry]:
             tasks = tuple(str(task) for task in line.get("tasks") or ())
         except (KeyError, TypeError, ValueError) as error:
             raise DamagedDataSet(f"'{folder / name}' has a line without episode_index and length.") from error
+        _check_episode(folder / name, index, length)
         data, videos = paths.of_episode(index)
         episodes[index] = EpisodeEntry(index, length, tasks, data, videos)
     return episodes
@@ -230,7 +244,8 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> pl.DataFrame
     if not path.is_file():
         raise DataSetNotFound(f"There is no '{path}', which the data set names.")
     try:
-        return pl.read_parquet(path, columns=None if columns is None else list(columns))
+        # A name with brackets or a star is a name, not a pattern.
+        return pl.read_parquet(path, glob=False, columns=None if columns is None else list(columns))
     except (pl.exceptions.PolarsError, OSError) as error:
         raise DamagedDataSet(f"'{path}' cannot be read ({str(error).splitlines()[0]}).") from error
 
@@ -264,5 +279,11 @@ def _episodes_of_tables(folder: Path, paths: _Paths) -> dict[int, EpisodeEntry]:
                 if isinstance(error, (DataSetError, BadArgument)):
                     raise
                 raise DamagedDataSet(f"'{path}' has an episode without the numbers of its files.") from error
+            _check_episode(path, index, length)
             episodes[index] = EpisodeEntry(index, length, tuple(row["tasks"] or ()), data, videos)
     return episodes
+
+
+def _check_episode(path: Path, index: int, length: int) -> None:
+    if index < 0 or length < 1:
+        raise DamagedDataSet(f"'{path}' has an episode {index} of {length} frames; expected at least one frame.")

@@ -159,7 +159,7 @@ class DataSetEpisode:
         features = dataset.features.values()
         self._pictures = [feature.name for feature in features if feature.dtype == "image"]
         self._table = self._read_table()
-        self.seconds = self._numbers("timestamp")[:, 0]
+        self.seconds = self.column("timestamp")[:, 0]
         self.task_indices = self._numbers("task_index")[:, 0].astype(np.int64)
         unknown = sorted({int(task) for task in self.task_indices} - set(dataset.tasks))
         if unknown:
@@ -170,7 +170,7 @@ class DataSetEpisode:
     def _read_table(self) -> pl.DataFrame:
         path = self.dataset.folder / self.entry.data
         try:
-            stored = pl.read_parquet_schema(path) if path.is_file() else {}
+            stored = pl.scan_parquet(path, glob=False).collect_schema() if path.is_file() else {}
         except (pl.exceptions.PolarsError, OSError) as error:
             raise DamagedDataSet(f"'{path}' cannot be read ({str(error).splitlines()[0]}).") from error
         named = [name for name, feature in self.dataset.features.items() if feature.dtype not in ("image", "video")]
@@ -181,7 +181,7 @@ class DataSetEpisode:
         wanted = list(dict.fromkeys(["episode_index", "frame_index", "timestamp", "task_index", *self._columns]))
         table = read_table(path, wanted).filter(pl.col("episode_index") == self.index).sort("frame_index")
         frames = table["frame_index"].to_list()
-        if frames != list(range(self.length)):
+        if len(frames) != self.length or frames != list(range(self.length)):
             raise DamagedDataSet(
                 f"Episode {self.index} of '{self.dataset.name}' has {len(frames)} rows in '{path}'; the meta files say "
                 f"frames 0 to {self.length - 1}."
@@ -291,16 +291,20 @@ class DataSetEpisode:
         path = self.dataset.folder / self.entry.data
         here = (pl.col("episode_index") == self.index) & pl.col("frame_index").is_in(list(frames))
         try:
-            rows = pl.scan_parquet(path).select("episode_index", "frame_index", *names).filter(here).collect()
+            rows = (
+                pl.scan_parquet(path, glob=False).select("episode_index", "frame_index", *names).filter(here).collect()
+            )
         except (pl.exceptions.PolarsError, OSError) as error:
             raise DamagedDataSet(f"'{path}' cannot be read ({str(error).splitlines()[0]}).") from error
         rows = rows.sort("frame_index")
         return {name: [self._decoded(name, cell) for cell in rows[name]] for name in names}
 
-    def _decoded(self, name: str, cell: Mapping[str, Any] | None) -> NDArray[np.uint8]:
+    def _decoded(self, name: str, cell: Any) -> NDArray[np.uint8]:
         from PIL import Image, UnidentifiedImageError
 
         what = f"A picture of '{name}' in episode {self.index} of '{self.dataset.name}'"
+        if cell is not None and not isinstance(cell, Mapping):
+            raise DamagedDataSet(f"{what} is a {type(cell).__name__} in its table; expected the bytes of a picture.")
         content = None if cell is None else cell.get("bytes")
         try:
             if content is None:
@@ -311,8 +315,12 @@ class DataSetEpisode:
                     raise DataSetNotFound(f"{what} is neither in its table nor in a file of the data set ('{place}').")
                 content = file.read_bytes()
             with Image.open(io.BytesIO(content)) as image:
-                return np.asarray(image.convert("RGB"))
-        except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+                return np.array(image.convert("RGB"))  # a copy: torch warns of arrays that cannot be written
+        except UnidentifiedImageError as error:
+            raise DamagedDataSet(
+                f"{what} cannot be decoded: it is no PNG and no other format that pillow reads."
+            ) from error
+        except (OSError, SyntaxError, ValueError) as error:
             if isinstance(error, DataSetNotFound):
                 raise
             raise DamagedDataSet(f"{what} cannot be decoded ({str(error).splitlines()[0]}).") from error

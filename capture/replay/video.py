@@ -19,6 +19,10 @@ from numpy.typing import NDArray
 from vla_attention.capture.replay.data_set_errors import DamagedDataSet, DataSetNotFound, UndecodableVideo
 from vla_attention.schemas.errors import MissingDependency
 
+#: Formats of files that hold their pictures themselves. Lists and manifests (concat, HLS, DASH) name other files and
+#: addresses, which FFmpeg would open.
+_FORMATS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
+
 
 def import_av() -> Any:
     """Return the module of PyAV; `MissingDependency` without it."""
@@ -58,7 +62,7 @@ class VideoFile:
         if not path.is_file():
             raise DataSetNotFound(f"There is no video '{path}', which the data set names.")
         try:
-            self._container = self._av.open(str(path))
+            self._container = self._av.open(str(path), options={"format_whitelist": _FORMATS})
         except (self._av.error.FFmpegError, ValueError) as error:
             raise UndecodableVideo(f"'{path}' is no video that can be read ({_reason(error)}).") from error
         try:
@@ -170,5 +174,5 @@ class VideoFile:
 
 
 def _reason(error: BaseException) -> str:
-    text = str(error).strip()
+    text = (getattr(error, "strerror", None) or str(error)).strip()
     return text.splitlines()[0].rstrip(".") if text else type(error).__name__

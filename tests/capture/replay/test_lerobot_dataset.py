@@ -108,7 +108,18 @@ def test_another_version_is_refused_with_those_that_are_read(tmp_path, version):
 
 
 @pytest.mark.parametrize(
-    "template", ["../../{episode_index}.parquet", "/etc/{episode_index}", "{elsewhere}", "{episode_index.real}", "{"]
+    "template",
+    [
+        "../../{episode_index}.parquet",
+        "/etc/{episode_index}",
+        "{elsewhere}",
+        "{episode_index.real}",
+        "{",
+        "{episode_index:0999d}.parquet",  # with more digits, gigabytes of text
+        "{episode_index:{episode_chunk}d}.parquet",
+        7,
+        None,
+    ],
 )
 def test_a_path_template_stays_inside_of_the_data_set(tmp_path, template):
     folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3,)))
@@ -159,6 +170,54 @@ def test_numbers_that_are_not_finite_are_refused(tmp_path):
         data.episode(0).column("action")
     with pytest.raises(UnknownName, match=r"Did you mean 'action'\?"):
         data.episode(0).column("actions")
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("fps", [0, -1, float("nan"), float("inf"), "fast", [10]])
+def test_frames_per_second_are_a_number_above_0(tmp_path, version, fps):
+    folder = write_data_set(tmp_path / "robot", version, made_up_episodes((3,)))
+    edit_info(folder, fps=fps)
+    with pytest.raises(DamagedDataSet, match=r"info\.json"):
+        open_dataset(folder)
+
+
+@pytest.mark.parametrize(("index", "length"), [(0, 0), (0, -3), (-1, 3), (0, 10**12)])
+def test_numbers_of_episodes_that_cannot_be_are_refused(tmp_path, index, length):
+    folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3,)))
+    line = {"episode_index": index, "length": length, "tasks": []}
+    (folder / "meta" / "episodes.jsonl").write_text(json.dumps(line))
+    with pytest.raises(DamagedDataSet, match=r"expected at least one frame|has 3 rows"):
+        open_dataset(folder).episode(0)
+
+
+def test_meta_files_that_nest_too_deep_are_refused(tmp_path):
+    folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3,)))
+    (folder / "meta" / "tasks.jsonl").write_text("[" * 100_000)
+    with pytest.raises(DamagedDataSet, match=r"tasks\.jsonl"):
+        open_dataset(folder)
+    (folder / "meta" / "info.json").write_text("[" * 100_000)
+    with pytest.raises(DamagedDataSet, match="not valid JSON"):
+        open_dataset(folder)
+
+
+def test_times_and_pictures_that_are_none_are_refused(tmp_path):
+    folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3,)))
+    table = next(folder.glob("data/**/*.parquet"))
+    rows = pl.read_parquet(table)
+    rows.with_columns(pl.lit(3).alias(CAMERAS[0])).write_parquet(table)
+    with pytest.raises(DamagedDataSet, match="expected the bytes of a picture"):
+        list(open_dataset(folder).episode(0).frames())
+    rows.with_columns(pl.lit(None, dtype=pl.Float32).alias("timestamp")).write_parquet(table)
+    with pytest.raises(DamagedDataSet, match=r"'timestamp' of episode 0 .* NaN"):
+        open_dataset(folder).episode(0)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_folder_s_name_is_no_pattern(tmp_path, version):
+    folder = write_data_set(tmp_path / "robot[1]*", version, made_up_episodes((3,)))
+    frames = list(open_dataset(folder).episode(0).frames())
+    assert [number_of(frame.images[CAMERAS[0]]) for frame in frames] == [0, 1, 2]
+    assert all(frame.images[CAMERAS[0]].flags.writeable for frame in frames)  # torch.from_numpy warns otherwise
 
 
 def test_a_video_that_is_shorter_than_its_table_is_refused(tmp_path):

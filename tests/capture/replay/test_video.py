@@ -53,6 +53,16 @@ def test_what_cannot_be_decoded_is_said(tmp_path):
         VideoFile(path)
 
 
+@pytest.mark.parametrize("text", ["ffconcat version 1.0\nfile 'other.mp4'\n", "#EXTM3U\n#EXTINF:1,\nother.mp4\n"])
+def test_a_list_of_other_files_is_no_video(tmp_path, text):
+    """FFmpeg would open the files and addresses that a playlist names."""
+    write_video(tmp_path / "other.mp4", [numbered_picture(i) for i in range(5)], FPS, H264)
+    path = tmp_path / "video.mp4"
+    path.write_text(text)
+    with pytest.raises(UndecodableVideo, match="no video that can be read"):
+        VideoFile(path)
+
+
 def test_a_codec_without_a_decoder_is_refused_by_name(tmp_path):
     path = tmp_path / "video.mp4"
     write_video(path, [numbered_picture(i) for i in range(5)], FPS, H264)
