@@ -118,7 +118,8 @@ def _every(study: EffectStudy) -> str:
         body.append([*cells, format_number(row["angle"]), format_percent(row["gripper_flips"])])
     note = (
         "chunk: effect over the whole chunk, not only its executed steps. angle: degrees between the first actions' "
-        "translations. gripper: executed steps whose gripper command has the other sign."
+        "translations. gripper: executed steps whose gripper command has the other sign; both of runs in vla-capture's "
+        "own suites only, whose actions are known."
     )
     lines = [heading("EVERY CONDITION"), text_table(header, body, left=(0,)), *wrap(note)]
     lines += [part for one in study.conditions for part in wrap(f"{one.name}: {one.description}", rest="  ")]

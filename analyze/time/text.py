@@ -144,6 +144,8 @@ def outcomes_section(outcomes: pl.DataFrame) -> str:
         counts = outcomes.row(0, named=True)
         numbers = f"{counts[f'num_{SUCCESS}']} solved and {counts[f'num_{FAILURE}']} failed"
         said = f"Not compared: of the episodes, {numbers}; at least 2 of either are needed."
+        if not counts[f"num_{SUCCESS}"] and not counts[f"num_{FAILURE}"]:
+            said = "Not compared: the outcomes of the episodes are not known."
         return "\n".join([above, *wrap(said)])
     header = ["quantity", "n", "difference", "interval", "q", "in tasks", "interval", "q"]
     body = [

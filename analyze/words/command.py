@@ -55,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     study = study_words(stores_of(arguments), settings_of(arguments), arguments.task)
     text = words_text(study)
-    folder = output_folder(arguments, "words" if arguments.task is None else f"words/task{arguments.task:03d}")
+    folder = output_folder(arguments, "words" if arguments.task is None else f"words_task{arguments.task:03d}")
     files = write_parquet(folder, words=study.episodes, words_summary=study.summary)
     files.append(write_whole(folder, text))
     if not arguments.no_plots:

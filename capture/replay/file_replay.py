@@ -60,14 +60,15 @@ class FileReplay:
                 frame = frame if own is None else replace(frame, instruction=own)
                 seed = noise_seed(self.seed, task, episode.index, number)
                 torch.manual_seed(seed)
-                horizon = self.given.layout.action_horizon or 1
+                # With no number in the layout, as many recorded actions are kept as the policy gives.
+                last = frame.index + (self.given.layout.action_horizon or episode.length)
                 with recorded.replan(
                     env_step=frame.index,
                     frames={camera: frame.images[column] for camera, column in self.cameras.items()},
                     state=None if state is None else state[frame.index],
                     instruction=frame.instruction,
                     noise_seed=seed,
-                    dataset_actions=None if actions is None else actions[frame.index : frame.index + horizon],
+                    dataset_actions=None if actions is None else actions[frame.index : last],
                 ) as replan:
                     replan.actions = self.given.act(frame)
             recorded.success = success_of(episode)

@@ -11,10 +11,11 @@ from vla_attention.capture.interventions.arguments import add_intervention_argum
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import family_of_kind
 from vla_attention.capture.recording_arguments import add_recording_arguments
-from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.errors import BadArgument, UnknownName, UserError
 from vla_attention.schemas.threads import use_threads
 
 if TYPE_CHECKING:
+    from vla_attention.capture.policies.family import PolicyFamily
     from vla_attention.schemas.stores.store_format import RootAttributes
 
 RERUN_EXAMPLES = """\
@@ -35,7 +36,7 @@ def add_rerun_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -
     root = _root_among(given)
     if root is not None:
         _refuse_own_loop(root)
-        family = family_of_kind(root.policy.family)
+        family = _family_of(root)
         family.add_arguments(parser)
         parser.set_defaults(**family.rebuild(root.policy), family=family)
     add_intervention_arguments(parser)
@@ -55,6 +56,18 @@ def _refuse_own_loop(root: RootAttributes) -> None:
             f"Cannot rerun a store that va.record made: the policy '{root.policy.name}' is called by your own code. "
             "Run that again with va.record(..., knockout=...) into another store; vla-analyze compare pairs the two."
         )
+
+
+def _family_of(root: RootAttributes) -> PolicyFamily:
+    """Return the family that loads a store's policy; `BadArgument` for policies of the caller's own code."""
+    try:
+        return family_of_kind(root.policy.family)
+    except UnknownName:
+        raise BadArgument(
+            f"Cannot rerun a store of '{root.policy.family}', a policy of the caller's own code, which vla-capture "
+            "cannot load; use vla-capture replay DATASET --policy FILE.py --knockout SELECTOR --rerun-of STORE, or "
+            "va.record(..., knockout=SELECTOR) (docs/your-policy.md)."
+        ) from None
 
 
 def _existing_store(text: str) -> Path:

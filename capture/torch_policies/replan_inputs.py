@@ -53,7 +53,8 @@ class ReplanInputs:
         masks: camera -> (height, width) whole numbers: the number of each pixel's object, counted in the episode's
             `objects`.
         coverage: camera -> (patch, object), the share of each patch that each object covers; instead of masks.
-        dataset_actions: (step, action_dim), the actions that a data set has from this call on.
+        dataset_actions: (step, action_dim), the actions that a data set has from this call on; no more of them are
+            stored than the policy gives actions.
     """
 
     env_step: int

@@ -381,6 +381,9 @@ class RecordedRun:
             rows, gram = of_site.rows, final_contribution(site, of_site, roles)
             stored[site.name] = RecordedRows(rows.rows, rows.row_sum, gram)
             key_role[site.name] = roles
+        recorded = inputs.dataset_actions
+        if recorded is not None and actions is not None:
+            recorded = recorded[: len(actions)]  # beyond the policy's chunk there is nothing to compare
         return ReplanRecord(
             env_step=inputs.env_step,
             noise_seed=inputs.noise_seed,
@@ -391,5 +394,5 @@ class RecordedRun:
             actions=actions,
             frames=inputs.frames if self.attributes.recording.frames else {},
             coverage=inputs.coverage,
-            dataset_actions=inputs.dataset_actions,
+            dataset_actions=recorded,
         )

@@ -23,8 +23,9 @@ NO_WORDS = (
     "without its tokenizer needs a capture with --t5-tokenizer"
 )
 NO_COVERAGE = (
-    "no selected episode has object coverage at this site, which is recorded from the simulator's segmentation; choose "
-    "a site with pictures by --site (Cosmos: self), or use a store as vla-capture wrote it, not a copy without objects"
+    "no selected episode has object coverage at this site: captures take it from the simulator's segmentation, "
+    "va.record from the masks or coverage that replan() is given, and replays of data sets have none; choose a site "
+    "with pictures by --site (Cosmos: self), or a store that is no copy without objects"
 )
 
 

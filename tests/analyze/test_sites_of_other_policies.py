@@ -203,7 +203,15 @@ def test_masses_as_netcdf_where_outcomes_are_not_known(stores, tmp_path, capsys)
 
 def test_objects_need_coverage(stores, tmp_path, capsys):
     assert analyze(["objects", str(stores["alternating"]), "--out", str(tmp_path)]) == 2
-    assert "no selected episode has object coverage" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "no selected episode has object coverage" in said
+    assert "va.record from the masks or coverage that replan() is given, and replays of data sets have none" in said
+
+
+def test_success_is_not_compared_where_it_is_not_known(stores, tmp_path, capsys):
+    assert analyze(["time", str(stores["bare"]), "--out", str(tmp_path), "--no-plots"]) == 0
+    text = " ".join((tmp_path / "summary.txt").read_text().split())
+    assert "Not compared: the outcomes of the episodes are not known." in text
 
 
 def test_no_results_file_without_outcomes(stores, tmp_path, capsys):

@@ -23,9 +23,10 @@ from tests.kit.reruns import (
     write_series,
 )
 from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.effects.action_changes import action_spread
 from vla_attention.analyze.effects.effect_study import study_effects
 from vla_attention.analyze.effects.group_rows import group_rows
-from vla_attention.analyze.effects.paired_replans import BaseEpisode
+from vla_attention.analyze.effects.paired_replans import BaseEpisode, changes_of
 from vla_attention.analyze.effects.text import effects_text
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.schemas.errors import BadArgument
@@ -440,6 +441,22 @@ def test_only_executed_steps_count_where_the_base_stores_how_many(folder):
     # The frames between the calls of a replayed data set are no executed steps; nor is a number known that is 0.
     assert executed(name="dataset", replan_steps=2) == [5] * REPLANS
     assert executed(name="recorded", replan_steps=0) == [5] * REPLANS
+
+
+@pytest.mark.parametrize("name", ["dataset", "recorded"])
+def test_which_numbers_are_the_gripper_s_is_known_of_own_runs_only(folder, name):
+    [item, *_] = study_effects(
+        folder / "base.zarr", [folder / "series" / "noise.zarr"], AnalysisSettings()
+    ).question.selected
+    attributes = replace(item.store.attributes, protocol=replace(item.store.attributes.protocol, name=name))
+    other = BaseEpisode.of(replace(item, store=replace(item.store, attributes=attributes)))
+    own = BaseEpisode.of(item)
+    spread = action_spread([own.actions])
+    known = changes_of(own, own.actions + 1, spread)
+    unknown = changes_of(other, own.actions + 1, spread)
+    np.testing.assert_array_equal(unknown[:, :2], known[:, :2])
+    assert np.isfinite(known).all()
+    assert np.isnan(unknown[:, 2:]).all()
 
 
 def test_it_is_said_where_the_number_of_executed_steps_is_not_known(study):

@@ -90,6 +90,25 @@ def test_any_torch_policy_on_a_data_set(tmp_path, data, file, capsys):
     assert analyze([str(store), "--output", str(tmp_path / "results"), "--no-plots"]) == 0
 
 
+def test_recorded_actions_are_as_many_as_the_policy_s_where_the_layout_says_no_number(tmp_path, data, file):
+    store = tmp_path / "replay.zarr"
+    file.write_text(FILE.replace("small_layout()", "dataclasses.replace(small_layout(), action_horizon=0)"))
+    file.write_text("import dataclasses\n" + file.read_text())
+    assert run("replay", data, "--policy", file, "--store", store, "--episodes", 1) == 0
+    episode = zarr.open_group(store / "episodes" / "task001_episode001", mode="r")
+    assert episode["dataset_actions"].shape[1] == HORIZON
+    assert episode["dataset_action_count"][:].tolist() == [3, 2]
+
+
+def test_a_store_of_other_code_is_not_rerun_and_the_way_is_said(tmp_path, data, file, capsys):
+    store = tmp_path / "replay.zarr"
+    assert run("replay", data, "--policy", file, "--store", store, "--episodes", 1) == 0
+    assert run("rerun", store, "--knockout", "camera:front") == 2
+    said = capsys.readouterr().err
+    assert "a policy of the caller's own code" in said
+    assert "--rerun-of STORE" in said
+
+
 def _noise(seed: int) -> torch.Tensor:
     torch.manual_seed(seed)
     return torch.randn(1, HORIZON, 2)
