@@ -84,11 +84,15 @@ def _weights(question: Question) -> list[Caveat]:
 def _dependence(question: Question) -> list[Caveat]:
     if question.untrained:
         return []
+    recorded = any(store.attributes.protocol.name == "recorded" for store in question.stores)
+    how = "vla-capture rerun with --prompt, or with --knockout and --knockout-queries all"
+    if recorded:
+        how = "va.record with another instruction, or with knockout=... (docs/your-policy.md)"
     sentence = (
         "Attention says which keys the action queries read, not on what the action depends: in policies that were "
         "trained to need one word of the sentence, this word got less attention than a key's uniform share, because "
         "the keys of the pictures had read it (docs/validation.md). A dependence is shown by an intervention: "
-        "vla-capture rerun with --prompt, or with --knockout and --knockout-queries all."
+        f"{how}."
     )
     return [Caveat("Attention and dependence", sentence)]
 

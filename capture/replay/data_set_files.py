@@ -142,6 +142,8 @@ def _feature(name: str, stated: Mapping[str, Any]) -> Feature:
     info = stated.get("info") or stated.get("video_info") or {}
     depth = bool(info.get("is_depth_map") or info.get("video.is_depth_map"))
     shape = tuple(int(size) for size in stated["shape"])
+    if any(size < 0 for size in shape):
+        raise ValueError(f"the column '{name}' has the shape {shape}")
     return Feature(name, str(stated["dtype"]), shape, tuple(str(part) for part in names or ()), depth)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -159,7 +160,7 @@ class DataSetEpisode:
         features = dataset.features.values()
         self._pictures = [feature.name for feature in features if feature.dtype == "image"]
         self._table = self._read_table()
-        self.seconds = self.column("timestamp")[:, 0]
+        self.seconds = self._finite("timestamp")[:, 0]
         self.task_indices = self._numbers("task_index")[:, 0].astype(np.int64)
         unknown = sorted({int(task) for task in self.task_indices} - set(dataset.tasks))
         if unknown:
@@ -199,11 +200,21 @@ class DataSetEpisode:
         Raises:
             UnknownName: the data set has no such column.
             BadArgument: it does not hold numbers.
-            DamagedDataSet: a number is missing or not finite.
+            DamagedDataSet: a number is missing or not finite, or there are not as many as the meta files say.
         """
         feature = self.dataset.feature(name)
         if name not in self._columns:
             raise BadArgument(f"The column '{name}' of '{self.dataset.name}' holds {feature.dtype}, not numbers.")
+        values = self._finite(name)
+        stated = math.prod(feature.shape)
+        if values.shape[1] != stated:
+            raise DamagedDataSet(
+                f"The column '{name}' of episode {self.index} of '{self.dataset.name}' has {values.shape[1]} numbers "
+                f"in each frame, and {INFO} says {stated}."
+            )
+        return values
+
+    def _finite(self, name: str) -> NDArray[np.float64]:
         values = self._numbers(name)
         if not np.isfinite(values).all():
             raise DamagedDataSet(

@@ -268,6 +268,9 @@ class PolicyLayout:
                     f"the number of action queries of site '{site.name}' depends on the call ({site.action_queries}); "
                     "count both ends from the same side, as (0, 50) or (-50, None)"
                 )
+        for library, versions in self.versions.items():
+            if isinstance(versions, str):
+                yield f"its versions of {library} are one text; expected several, as ('{versions}',)"
         if self.autoregressive and (self.num_denoise_steps != 1 or self.num_action_tokens < 1):
             yield "an autoregressive policy has one denoise step and at least one action token"
         pictured = {camera for site in self.sites for camera in site.keys.cameras}

@@ -182,6 +182,14 @@ def test_untrained_weights_and_compute_types_are_caveats(analysis: Analysis) -> 
         assert topic in topics
         assert "Untrained weights" not in topics
         assert "Attention and dependence" in topics
+        protocol = replace(store.attributes.protocol, name="recorded")
+        other = replace(store, attributes=replace(store.attributes, policy=policy, protocol=protocol))
+        own_code = caveats(replace(analysis, question=replace(analysis.question, stores=(other,))), {})
+        for given, how in (
+            (notes, "vla-capture rerun with --prompt"),
+            (own_code, "va.record with another instruction"),
+        ):
+            assert how in next(note.sentence for note in given if note.topic == "Attention and dependence")
 
 
 def no_words(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:

@@ -212,6 +212,19 @@ def test_times_and_pictures_that_are_none_are_refused(tmp_path):
         open_dataset(folder).episode(0)
 
 
+def test_numbers_of_another_size_than_stated_are_refused(tmp_path):
+    folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3,)))
+    features = json.loads((folder / "meta" / "info.json").read_text())["features"]
+    features["action"]["shape"] = [7]
+    edit_info(folder, features=features)
+    with pytest.raises(DamagedDataSet, match=r"'action' of episode 0 .* has 6 numbers in each frame, .* says 7"):
+        open_dataset(folder).episode(0).column("action")
+    features["action"]["shape"] = [-6]
+    edit_info(folder, features=features)
+    with pytest.raises(DamagedDataSet, match=r"'action' has the shape \(-6,\)"):
+        open_dataset(folder)
+
+
 @pytest.mark.parametrize("version", VERSIONS)
 def test_a_folder_s_name_is_no_pattern(tmp_path, version):
     folder = write_data_set(tmp_path / "robot[1]*", version, made_up_episodes((3,)))

@@ -86,6 +86,7 @@ def test_roles_of_masked_keys_follow_the_spans():
         ({"text": PromptText(("prompt", "more"), "embed")}, "the prompt's span 'more' is not in site 'joint'"),
         ({"autoregressive": True}, "one denoise step"),
         ({"num_layers": 0}, "its number of layers is 0"),
+        ({"versions": {"lerobot": "0.4.4"}}, "its versions of lerobot are one text; expected several, as ('0.4.4',)"),
     ],
 )
 def test_what_does_not_fit_is_said(changes, sentence):
