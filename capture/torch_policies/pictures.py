@@ -43,6 +43,8 @@ def _levels(picture: Any, camera: str) -> NDArray[np.uint8]:
         picture = (picture.float() if picture.is_floating_point() else picture).numpy()
     values = np.asarray(picture)
     values = values[0] if values.ndim == 4 and len(values) == 1 else values
+    if not values.size:
+        raise BadArgument(f"The picture of camera '{camera}' is empty: its shape is {values.shape}.")
     if values.ndim == 3 and values.shape[-1] == 3 and values.dtype == np.uint8:
         return np.ascontiguousarray(values)
     if values.ndim == 3 and values.shape[0] == 3 and values.dtype == np.uint8:

@@ -20,7 +20,9 @@ from vla_attention.schemas.safe_text import check_name, check_text
 PictureFit = Literal["stretch", "pad", "pad_left_top"]
 
 #: What a key is called that no query of the call can see, by the kind of its span.
-_MASKED_ROLE = {"image": Role.MASKED_IMAGE}
+_MASKED_ROLE = {
+    "image": Role.MASKED_IMAGE, "text": Role.PADDING, "latent": Role.MASKED_IMAGE,
+}  # fmt: skip
 
 
 class LayoutForAnotherVersion(UserError, RuntimeError):
@@ -91,7 +93,7 @@ class RecordedSite:
             is the end: (-50, None) are the last 50 queries.
         role_of_span: span -> role of its keys ("image", "instruction", "state", "action" ...). Keys of the prompt get
             finer roles where token ids are known; keys that no action query may see become `masked_image` in image
-            spans and `padding` in others.
+            spans, `padding` in text, and `absent` in others.
         projection: path of the output projection with ``{block}`` for the block's number, for contributions; None where
             there is none.
         variable_span: the span that may have fewer keys in a call than in `keys` (a prompt without padding). Its keys
@@ -154,7 +156,7 @@ class RecordedSite:
 
     def masked_role(self, span: Span) -> Role:
         """Return the role of a span's keys that no action query may see."""
-        return _MASKED_ROLE.get(span.kind, Role.PADDING)
+        return _MASKED_ROLE.get(span.kind, Role.ABSENT)
 
 
 @dataclass(frozen=True)

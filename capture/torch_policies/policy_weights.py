@@ -44,6 +44,18 @@ def policy_digest(policy: object) -> str:
     return digest.hexdigest()
 
 
+def weights_state(policy: object) -> tuple[tuple[int, int], ...]:
+    """Return what tells quickly that weights may have changed: where they are, and how often torch wrote to them.
+
+    What is written through `.data` is not counted.
+    """
+    return tuple(
+        (weight.data_ptr(), 0 if weight.is_inference() else weight._version)
+        for module in _roots(policy).values()
+        for weight in module.parameters()
+    )
+
+
 def device_and_dtype(policy: object) -> tuple[str, str]:
     """Return the device and the type of most weights, such as `cuda:0` and `bfloat16`."""
     counts: dict[tuple[str, str], int] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -32,8 +33,12 @@ class EpisodeFacts:
     def __post_init__(self) -> None:
         """Check the numbers."""
         for name in ("task_id", "episode_index"):
-            if getattr(self, name) < 0:
-                raise BadArgument(f"The {name} of an episode is {getattr(self, name)}; expected 0 or more.")
+            number = whole_number(f"{name} of an episode", getattr(self, name))
+            if number < 0:
+                raise BadArgument(f"The {name} of an episode is {number}; expected 0 or more.")
+            object.__setattr__(self, name, number)
+        if not isinstance(self.instruction, str):
+            raise BadArgument(f"The instruction of an episode is {self.instruction!r}; expected a text.")
 
 
 @dataclass(frozen=True)
@@ -69,6 +74,30 @@ class ReplanInputs:
     dataset_actions: NDArray[np.float64] | None = None
 
 
+def whole_number(what: str, given: Any) -> int:
+    """Return an int of what a caller's loop counts with (numpy's and torch's numbers too), or raise `BadArgument`."""
+    try:
+        return operator.index(given)
+    except TypeError:
+        raise BadArgument(f"The {what} is {given!r}; expected a whole number.") from None
+
+
+def _seed(given: Any) -> int:
+    seed = whole_number("seed of a replan's noise", given)
+    if not -(2**63) <= seed < 2**63:
+        raise BadArgument(f"The seed of a replan's noise is {seed}; expected a number of 64 bits.")
+    return seed
+
+
+def _numbers(what: str, given: Any) -> NDArray[np.float64]:
+    """Return numbers as float64, or raise `BadArgument`."""
+    values = given.detach().float().cpu().numpy() if hasattr(given, "detach") else given
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise BadArgument(f"The {what} of a replan is no array of numbers (given: {type(given).__name__}).") from None
+
+
 _NAMES = tuple(part.name for part in fields(ReplanInputs) if part.name != "env_step")
 
 
@@ -87,6 +116,16 @@ def read_inputs(layout: PolicyLayout, facts: EpisodeFacts, env_step: int, given:
     sites = [site.keys for site in layout.sites]
     fits = {camera.name: camera.fit for camera in layout.cameras}
     cameras = layout.camera_names
+    for what in ("frames", "masks", "coverage", "roles"):
+        if not isinstance(values.get(what, {}), Mapping):
+            raise BadArgument(
+                f"{what} of a replan is of type {type(values[what]).__name__}; expected a dictionary by "
+                f"{'site' if what == 'roles' else 'camera'}."
+            )
+    for site in values.get("roles", ()):
+        layout.site(site)
+    if not isinstance(values.get("instruction", ""), str):
+        raise BadArgument(f"The instruction of a replan is {values['instruction']!r}; expected a text.")
     for what in ("frames", "masks", "coverage"):
         for camera in values.get(what, ()):
             if camera not in cameras:
@@ -104,13 +143,13 @@ def read_inputs(layout: PolicyLayout, facts: EpisodeFacts, env_step: int, given:
         )
     seed = values.get("noise_seed", facts.seed)
     return ReplanInputs(
-        env_step=env_step,
+        env_step=whole_number("env_step of a replan", env_step),
         frames=frames,
         state=_state(values.get("state")),
         instruction=values.get("instruction", facts.instruction),
         prompt=values.get("prompt"),
         roles=values.get("roles", {}),
-        noise_seed=None if seed is None else int(seed),
+        noise_seed=None if seed is None else _seed(seed),
         coverage={camera: coverage[camera] for camera in cameras if camera in coverage},
         dataset_actions=_dataset_actions(values.get("dataset_actions")),
     )
@@ -130,8 +169,7 @@ def _dataset_actions(given: Any) -> NDArray[np.float64] | None:
 def _state(given: Any) -> NDArray[np.float64] | None:
     if given is None:
         return None
-    values = given.detach().float().cpu().numpy() if hasattr(given, "detach") else given
-    state = np.asarray(values, dtype=np.float64)
+    state = _numbers("state", given)
     state = state[0] if state.ndim == 2 and len(state) == 1 else state
     if state.ndim != 1:
         raise BadArgument(f"The state of a replan has the shape {state.shape}; expected (state_dim,).")
@@ -142,11 +180,10 @@ def read_actions(given: Any) -> NDArray[np.float64] | None:
     """Return actions as (horizon, action_dim) float64; None where the caller gave none."""
     if given is None:
         return None
-    values = given.detach().float().cpu().numpy() if hasattr(given, "detach") else given
-    actions = np.asarray(values, dtype=np.float64)
+    actions = _numbers("actions", given)
     actions = actions[0] if actions.ndim == 3 and len(actions) == 1 else actions
     actions = actions[None] if actions.ndim == 1 else actions
-    if actions.ndim != 2:
+    if actions.ndim != 2 or not actions.size:
         raise BadArgument(
             f"The actions of a replan have the shape {actions.shape}; expected (horizon, action_dim) or (action_dim,)."
         )

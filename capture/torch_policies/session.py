@@ -19,10 +19,16 @@ from vla_attention.capture.torch_policies.call_order import KnownCalls
 from vla_attention.capture.torch_policies.knockouts import SessionKnockouts
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
 from vla_attention.capture.torch_policies.policy_modules import find_policy
-from vla_attention.capture.torch_policies.policy_weights import find_module
+from vla_attention.capture.torch_policies.policy_weights import find_module, policy_digest, weights_state
 from vla_attention.capture.torch_policies.prompts import TokenText
 from vla_attention.capture.torch_policies.replan_edits import ReplanEdits
-from vla_attention.capture.torch_policies.replan_inputs import EpisodeFacts, ReplanInputs, read_actions, read_inputs
+from vla_attention.capture.torch_policies.replan_inputs import (
+    EpisodeFacts,
+    ReplanInputs,
+    read_actions,
+    read_inputs,
+    whole_number,
+)
 from vla_attention.capture.torch_policies.replan_text import ReplanText, watched_ids
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder, SiteRows, final_contribution
 from vla_attention.capture.torch_policies.unseen_attention import no_attention
@@ -36,6 +42,10 @@ _MANY_REPLANS = 1_000_000
 
 class RecordingStopped(UserError, RuntimeError):
     """A part of a session was used outside of its block, twice, or inside of another."""
+
+
+class WeightsChanged(UserError, RuntimeError):
+    """A policy whose weights are others than when the run began."""
 
 
 class NothingRecorded(UserError, RuntimeError):
@@ -114,7 +124,11 @@ class Episode:
             "replan blocks without attention": str(self.num_dropped),
         }
         self.writer.start = replace(self.writer.start, provenance=facts)
-        self.folder = self.writer.commit(self.success, last if self.num_steps is None else self.num_steps)
+        self.run._check_weights()
+        # Environments give numpy's bools and numbers.
+        success = None if self.success is None else bool(self.success)
+        num_steps = last if self.num_steps is None else whole_number("num_steps of an episode", self.num_steps)
+        self.folder = self.writer.commit(success, num_steps)
         self.run.largest_error = max(self.run.largest_error, self.largest_error)
 
 
@@ -145,7 +159,7 @@ class EpisodeBatch(Sequence[Episode]):
         """
         count = len(self)
         chosen = [row for row in range(count) if active is None or active[row]]
-        steps = [env_step] * count if isinstance(env_step, int) else list(env_step)
+        steps: list[Any] = list(np.asarray(env_step)) if np.ndim(env_step) else [env_step] * count
         for name, values in (("env_step", steps), *(inputs.items())):
             if values is not None and len(values) != count:
                 raise BadArgument(f"{name} has {len(values)} entries; expected one for each of {count} episodes.")
@@ -153,7 +167,7 @@ class EpisodeBatch(Sequence[Episode]):
             read_inputs(
                 self._run.layout,
                 self[row].facts,
-                int(steps[row]),
+                steps[row],
                 {name: None if values is None else values[row] for name, values in inputs.items()},
             )
             for row in chosen
@@ -203,6 +217,7 @@ class RecordedRun:
         self.path = path
         self.policy = policy
         self._found = find_policy(policy)
+        self._weights = weights_state(policy)
         self._embedding = None if layout.text is None else find_module(policy, layout.text.embedding, "token ids")
         self.layout = layout
         self._known = KnownCalls(layout)
@@ -255,6 +270,7 @@ class RecordedRun:
         Raises:
             StoreExists: the episode is in the store already.
             NothingRecorded: no attention was seen in the block.
+            WeightsChanged: the policy has other weights than when the run began.
         """
         facts = EpisodeFacts(task_id, episode_index, instruction, seed, task_name, tuple(objects))
         with ExitStack() as stack:
@@ -276,6 +292,18 @@ class RecordedRun:
             yield batch
             for episode in batch:
                 episode._commit()
+
+    def _check_weights(self) -> None:
+        """Raise `WeightsChanged` if the policy has other weights than when the run began."""
+        state = weights_state(self.policy)
+        if state == self._weights:
+            return
+        if policy_digest(self.policy) != self.attributes.policy.digest:
+            raise WeightsChanged(
+                f"The weights of the policy ({type(self.policy).__name__}) changed since va.record was called, and a "
+                "store is of one policy. Record each of its states into a store of its own."
+            )
+        self._weights = state
 
     def _opened(self) -> RunStore:
         if self._store is None:

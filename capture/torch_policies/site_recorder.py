@@ -194,7 +194,7 @@ class ReplanRecorder:
         collected, queries = self._collected[site.name], place.queries
         rows = call.rows(queries)
         error = call.product_error(rows, queries)
-        if not math.isfinite(error) and not bool(torch.isfinite(call.output).all()):
+        if not math.isfinite(error) and not bool(torch.isfinite(call.output).all() & torch.isfinite(rows).all()):
             raise NumbersNotFinite(
                 f"The policy's numbers turned NaN or infinite before or at denoise step {place.step}, block "
                 f"{place.block} of site '{site.name}' (module '{call.shape.module}'). {self._remedy()}. Nothing of "

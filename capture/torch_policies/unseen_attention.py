@@ -54,6 +54,7 @@ def no_attention(policy: object) -> str:
         f"{listing(loaded)} is loaded, whose kernels nothing sees. {LOAD_WITH_SDPA}"
         if loaded
         else "Policies without attention, such as a U-Net of diffusion policy, cannot be recorded; a policy that "
-        "answers from a queue computes attention only when the queue is empty, so reset it before the call."
+        "answers from a queue computes attention only when the queue is empty, so reset it before the call. A softmax "
+        "that is written with exp and sum, and functions of TorchScript, are not seen either."
     )
     return f"The policy ({type(policy).__name__}) computed no attention that can be seen. {reason}"

@@ -14,12 +14,15 @@ import torch
 from torch import Tensor, nn
 
 from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
+from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.torch_policies.call_changes import ChangeRefused
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.capture.torch_policies.policy_layout import CallRule, PolicyLayout, RecordedSite
 from vla_attention.capture.torch_policies.record import record
+from vla_attention.capture.torch_policies.session import WeightsChanged
 from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
-from vla_attention.schemas.layout import PatchGrid, SiteLayout, Span
+from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 
@@ -347,3 +350,87 @@ def test_a_forward_that_the_policy_replaces_in_the_block_stays(tmp_path):
     _, result = rows_of(tmp_path, policy, act)
     assert not torch.equal(result, own)
     assert torch.equal(policy.act(), result)
+
+
+def test_keys_of_the_state_that_no_query_may_see_are_absent(tmp_path):
+    mask = torch.ones(ACTIONS, KEYS).bool()
+    mask[:, 4] = False
+    policy = OddPolicy(lambda block, q, k, v: nn.functional.scaled_dot_product_attention(q, k, v, attn_mask=mask))
+    rows, _ = rows_of(tmp_path, policy)
+    np.testing.assert_allclose(rows, expected(policy, [4]), atol=2e-6)
+    roles = open_store(tmp_path / "a.zarr").episodes[0].read("joint/key_role")[0]
+    assert [Role(code).label for code in roles[4:6]] == ["absent", "state"]
+
+
+def test_weights_that_change_during_a_run_are_refused(tmp_path):
+    policy = OddPolicy(sdpa)
+    with record(tmp_path / "a.zarr", policy, layout=layout(), durable=False) as run:
+        with run.episode(task_id=0, episode_index=0, instruction="") as episode, episode.replan(env_step=0):
+            policy.act()
+        with torch.no_grad():
+            policy.blocks[0].out.weight.copy_(policy.blocks[0].out.weight.clone())  # written, and the same
+        with run.episode(task_id=0, episode_index=1, instruction="") as episode, episode.replan(env_step=0):
+            policy.act()
+        with torch.no_grad():
+            policy.blocks[0].out.weight.mul_(1.5)
+        with (
+            pytest.raises(WeightsChanged, match="changed since"),
+            run.episode(task_id=0, episode_index=2, instruction="") as episode,
+            episode.replan(env_step=0),
+        ):
+            policy.act()
+    assert len(open_store(tmp_path / "a.zarr").episodes) == 2
+
+
+def one_replan(path, facts=None, actions=None, success=None, **given):
+    policy = OddPolicy(sdpa)
+    with record(path / "a.zarr", policy, layout=layout(), durable=False) as run:
+        facts = {"task_id": 0, "episode_index": 0, "instruction": ""} | (facts or {})
+        with run.episode(**facts) as episode:
+            with episode.replan(**({"env_step": 0} | given)) as replan:
+                policy.act()
+                replan.actions = actions
+            episode.success = success
+    store = open_store(path / "a.zarr")
+    assert verify_store(store) == []
+    return store.episodes[0]
+
+
+def test_numbers_of_numpy_and_torch(tmp_path):
+    facts = {"task_id": np.int64(3), "episode_index": torch.tensor(2), "seed": np.uint32(7)}
+    episode = one_replan(tmp_path, facts, success=np.bool_(True), env_step=np.int32(5))
+    assert (episode.attributes.task_id, episode.attributes.episode_index) == (3, 2)
+    assert (episode.attributes.success, episode.attributes.num_steps) == (True, 6)
+    assert episode.read("env_step").tolist() == [5]
+
+
+WRONG = {
+    "env_step is no number": ({"env_step": "1"}, "env_step of a replan is '1'; expected a whole number"),
+    "env_step is half": ({"env_step": 1.5}, "env_step of a replan is 1.5; expected a whole number"),
+    "task": ({"facts": {"task_id": "a"}}, "task_id of an episode is 'a'; expected a whole number"),
+    "instruction": ({"facts": {"instruction": None}}, "instruction of an episode is None; expected a text"),
+    "instruction of a replan": ({"instruction": 3}, "instruction of a replan is 3; expected a text"),
+    "seed": ({"noise_seed": 2**70}, "expected a number of 64 bits"),
+    "state": ({"state": "abc"}, r"state of a replan is no array of numbers \(given: str\)"),
+    "state of two lengths": ({"state": [[1], [2, 3]]}, r"no array of numbers \(given: list\)"),
+    "actions": ({"actions": {"a": 1}}, r"actions of a replan is no array of numbers \(given: dict\)"),
+    "no actions": ({"actions": []}, r"actions of a replan have the shape \(1, 0\)"),
+    "frames": (
+        {"frames": np.zeros((8, 8, 3), np.uint8)},
+        "frames of a replan is of type ndarray; expected a dictionary",
+    ),
+    "empty frame": ({"frames": {"front": np.zeros((0, 8, 3), np.uint8)}}, "camera 'front' is empty"),
+    "roles": ({"roles": {"joynt": [1] * KEYS}}, "Unknown site 'joynt'. Did you mean 'joint'"),
+}
+
+
+@pytest.mark.parametrize(("given", "sentence"), WRONG.values(), ids=WRONG)
+def test_what_is_no_number_has_a_sentence(tmp_path, given, sentence):
+    with pytest.raises(UserError, match=sentence):
+        one_replan(tmp_path, **given)
+
+
+def test_not_a_number_in_the_queries_has_its_own_sentence(tmp_path):
+    policy = OddPolicy(lambda block, q, k, v: nn.functional.scaled_dot_product_attention(q * math.nan, k, v))
+    with pytest.raises(NumbersNotFinite, match="turned NaN or infinite"):
+        rows_of(tmp_path, policy)

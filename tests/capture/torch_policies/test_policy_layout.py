@@ -71,7 +71,7 @@ def test_rules_fit_whole_paths_and_their_conditions():
 
 
 def test_roles_of_masked_keys_follow_the_spans():
-    assert [SITE.masked_role(span) for span in KEYS.spans] == [Role.MASKED_IMAGE, Role.PADDING, Role.PADDING]
+    assert [SITE.masked_role(span) for span in KEYS.spans] == [Role.MASKED_IMAGE, Role.PADDING, Role.ABSENT]
     assert SITE.role_of(KEYS.spans[1]) is Role.INSTRUCTION
 
 
