@@ -11,6 +11,7 @@ from vla_attention.analyze.ratios.answer import ratio_sentence
 from vla_attention.analyze.show.findings import findings
 from vla_attention.analyze.show.numbers import format_number, row_interval
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
+from vla_attention.schemas.stores.store_format import CALLERS_MODULES
 
 #: Sentences that name conditions after looking at all: beyond noise, and beyond random keys.
 _SENTENCES = 2
@@ -41,10 +42,14 @@ def noise_sentence(study: EffectStudy) -> str:
     """What another noise seed does on the same inputs; every effect must exceed it."""
     rows = [study.of(condition) for condition in study.of_kind(Kind.NOISE)]
     if not rows:
-        return (
-            "No rerun changes the noise seed alone, so nobody knows how much of an effect another noise would give: "
-            f"make one with vla-capture rerun {study.given.base.path} --noise-seed 1."
-        )
+        base = study.given.base
+        said = "No rerun changes the noise seed alone, so nobody knows how much of an effect another noise would give"
+        if base.attributes.protocol.name == "recorded":
+            return f"{said}."
+        command = f"rerun {base.path} --noise-seed 1"
+        if base.attributes.policy.checkpoint_format == CALLERS_MODULES:
+            command = f"replay ... --noise-seed 1 --rerun-of {base.path}"
+        return f"{said}: make one with vla-capture {command}."
     texts = [f"{format_number(row['effect'])}{_interval(row, 'effect')}" for row in rows]
     return (
         f"Another noise seed on the same inputs changes the action by {', '.join(texts)} of its spread: the floor of "

@@ -27,6 +27,7 @@ from vla_attention.schemas.layers import select_layers
 from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
 from vla_attention.schemas.stores.store_format import (
+    CALLERS_MODULES,
     FORMAT_NAME,
     FORMAT_VERSION,
     PolicyCameraView,
@@ -246,7 +247,7 @@ def _identity(policy: object, layout: PolicyLayout, checkpoint: str, dtype: str,
         name=layout.name,
         family=layout.family,
         checkpoint=checkpoint or "not given",
-        checkpoint_format="torch modules of the caller",
+        checkpoint_format=CALLERS_MODULES,
         digest=policy_digest(policy),
         untrained=untrained,
         num_layers=layout.num_layers,

@@ -141,6 +141,8 @@ class Recording:
 
 #: Names of protocols of runs whose loop is not ours: the caller's own, and a replayed data set.
 OTHER_LOOPS = ("recorded", "dataset")
+#: What the checkpoint format says of policies that the caller's own code loaded, and vla-capture cannot load.
+CALLERS_MODULES = "torch modules of the caller"
 
 
 @dataclass(frozen=True)

@@ -133,7 +133,9 @@ def test_knockouts_are_paired_with_the_unchanged_replay(tmp_path, data, file, ca
     assert run(*replay, "--store", base) == 0
     knockout = ("--knockout", "camera:front", "--rerun-of", base)
     assert run(*replay, *knockout, "--store", changed) == 0
-    assert "Interventions: " in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "Interventions: " in said
+    assert f"Next: vla-analyze effects {base} {changed}" in said
     for name in ("task000_episode000", "task001_episode001"):
         one, other = (zarr.open_group(store / "episodes" / name, mode="r") for store in (base, changed))
         np.testing.assert_array_equal(one["noise_seed"][:], other["noise_seed"][:])
@@ -144,6 +146,7 @@ def test_knockouts_are_paired_with_the_unchanged_replay(tmp_path, data, file, ca
     assert analyze(["effects", str(base), str(changed), "--output", str(tmp_path / "effects"), "--no-plots"]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "Effects were measured in 3 episodes of 2 tasks." in said
+    assert f"make one with vla-capture replay ... --noise-seed 1 --rerun-of {base}." in said
     assert "without_front" in said
     # another noise seed is the scale of the effects
     noise = tmp_path / "noise.zarr"
