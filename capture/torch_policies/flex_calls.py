@@ -101,6 +101,7 @@ def watch_call(
     )
     given.update(kwargs)
     query, key, value = (given[name] for name in names[:3])
+    block.refuse_nested(query, key)
     batch, heads, queries, _ = query.shape
     shape = block.new_shape(
         block.where(), "flex", (batch, heads, key.shape[1], queries, key.shape[2]), query.dtype

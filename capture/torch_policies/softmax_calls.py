@@ -70,6 +70,8 @@ class _Softmax:
         logits: what it took, before any change; None if the result was written over them.
         result: what it returned. Weak, so that what meets no values is not kept.
         change: logits that the watcher added, (batch or 1, head or 1, query or 1, key or 1).
+        written: how often torch had written to logits and result when the softmax returned.
+        altered: whether something wrote to the result, or to a tensor that comes from it, afterwards.
     """
 
     where: Where
@@ -77,6 +79,8 @@ class _Softmax:
     logits: Tensor | None
     result: weakref.ref[Tensor]
     change: Tensor | None
+    written: tuple[int, int]
+    altered: bool = False
 
 
 @dataclass(frozen=True)
@@ -119,10 +123,14 @@ class SoftmaxTensors:
     def rows(self, queries: Positions, batch: Positions) -> Tensor:
         """Return float32 probabilities (batch, head, query, key) of these queries."""
         softmax, result = self.softmax, self.softmax.result()
-        if self.altered or softmax.logits is None:
-            return self._part(self.product.rows_of(self.probabilities.detach()), queries, batch).float()
-        if result is not None and torch.finfo(result.dtype).bits >= 32:
+        if not self.altered and result is not None and torch.finfo(result.dtype).bits >= 32:
             return self._part(self._in_order(result.detach()), queries, batch).float()
+        if self.altered or softmax.logits is None:
+            rows = self._part(self.product.rows_of(self.probabilities.detach()), queries, batch).float()
+            if torch.finfo(self.probabilities.dtype).bits >= 32:
+                return rows
+            sums = rows.sum(dim=-1, keepdim=True)
+            return rows / torch.where((sums - 1).abs() < _ROUNDING, sums, 1.0)
         # Rounded to the compute precision, probabilities would not sum to 1.
         logits = self._part(self._in_order(softmax.logits.detach()), queries, batch)
         logits = logits.to(torch.promote_types(logits.dtype, torch.float32))
@@ -173,8 +181,8 @@ class Softmaxes:
             result = function(*args, **kwargs)
         else:
             change = fitted_change(change, shape, logits.device)
-            if kwargs.get("out") is not None:
-                logits = logits.clone()  # the result may be written over them, and they tell which keys are masked
+            # The policy may write over them, and they tell which keys are masked.
+            logits = logits.clone()
             changed = logits + change.expand(batch, heads, queries, keys).reshape(logits.shape).to(logits.dtype)
             check_keys_left(
                 logits.reshape(batch, heads, queries, keys), changed.reshape(batch, heads, queries, keys), shape
@@ -184,7 +192,14 @@ class Softmaxes:
         sizes = (batch, heads, queries, keys) if len(lead) == 1 else tuple(logits.shape)
         first = ((0, 1), (2,), (3,)) if len(lead) == 1 else tuple((axis,) for axis in range(len(sizes)))
         overwritten = result.data_ptr() == logits.data_ptr()
-        softmax = _Softmax(where, shape, None if overwritten else logits, weakref.ref(result), change)
+        softmax = _Softmax(
+            where,
+            shape,
+            None if overwritten else logits,
+            weakref.ref(result),
+            change,
+            (_times_written(logits), _times_written(result)),
+        )
         self._follow(result, _Followed(weakref.ref(result), softmax, Axes(sizes, first), altered=False))
         return result
 
@@ -195,6 +210,10 @@ class Softmaxes:
         result = function(*args, **kwargs)
         if given is None:
             return result
+        if args and args[0] is not None and getattr(function, "__name__", "") in _WRITES:
+            written = self._found(args[0])
+            if written is not None:
+                written.softmax.altered = True
         if function in _MATMULS or function is torch.einsum:
             self._product(function, args, kwargs, result)
         elif isinstance(result, Tensor) and result.ndim:
@@ -207,7 +226,9 @@ class Softmaxes:
     def _may_attend(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> bool:
         logits = args[0] if args else kwargs.get("input", kwargs.get("self"))
         axis = args[1] if len(args) > 1 else kwargs.get("dim", kwargs.get("axis"))
-        return isinstance(logits, Tensor) and 3 <= logits.ndim <= 5 and axis in (-1, logits.ndim - 1)
+        if not isinstance(logits, Tensor) or torch._C._functorch.is_functorch_wrapped_tensor(logits):
+            return False
+        return 3 <= logits.ndim <= 5 and axis in (-1, logits.ndim - 1)
 
     def _found(self, given: object) -> _Followed | None:
         followed = self.followed.get(id(given))
@@ -260,10 +281,19 @@ class Softmaxes:
         # Other tensors that come from this softmax need not be followed any more.
         for number in [number for number, other in self.followed.items() if other.softmax is softmax]:
             del self.followed[number]
-        tensors = SoftmaxTensors(softmax, product, probabilities, followed.altered, values, result)
+        before_logits, before_result = softmax.written
+        own = softmax.result()
+        altered = followed.altered or softmax.altered or (own is not None and _times_written(own) != before_result)
+        if softmax.logits is not None and _times_written(softmax.logits) != before_logits:
+            softmax.logits = None
+        tensors = SoftmaxTensors(softmax, product, probabilities, altered, values, result)
         self._block.saw(AttentionCall(shape, tensors, None if shape == replace(before, kv_heads=kv_heads) else before))
 
 
+#: Methods that write to their tensor otherwise than those of `_CHANGES`.
+_WRITES = {"__setitem__", "copy_", "index_fill_", "index_copy_", "scatter_", "masked_scatter_", "zero_", "fill_"}
+#: Largest difference of a sum of probabilities from 1 that rounding to bfloat16 leaves, with room.
+_ROUNDING = 1e-2
 _SAME_NUMBERS = {*_COPIES, *_SWAPS, *_PERMUTES, *_MATRIX_TRANSPOSES, *_FOLDS}
 
 
@@ -297,6 +327,11 @@ def _axes_after(
         same = all(result.shape[axis] == before.shape[axis] for axis in range(before.ndim) if axis != key)
         return axes.with_keys(result.shape[key]) if key is not None and same else None
     return None
+
+
+def _times_written(tensor: Tensor) -> int:
+    """Return how often torch wrote to a tensor; tensors of inference mode do not count it."""
+    return 0 if tensor.is_inference() else tensor._version
 
 
 def _no_dropout(function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> bool:

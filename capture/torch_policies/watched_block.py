@@ -135,7 +135,14 @@ class WatchedBlock:
             self.watcher.saw(call)
 
     def refuse_nested(self, *tensors: Tensor) -> None:
-        """Raise `UnseenAttention` for nested tensors, whose sequences have lengths of their own."""
+        """Raise `UnseenAttention` for nested tensors, whose sequences have lengths of their own, and inside of vmap."""
+        if any(torch._C._functorch.is_functorch_wrapped_tensor(tensor) for tensor in tensors):
+            raise self.failed(
+                UnseenAttention(
+                    f"{self.where().path or 'The policy'} computes attention inside of torch.vmap or another transform "
+                    "of torch.func, whose tensors have no numbers that can be recorded. Call it with a batch instead."
+                )
+            )
         if any(tensor.is_nested for tensor in tensors):
             raise self.failed(
                 UnseenAttention(

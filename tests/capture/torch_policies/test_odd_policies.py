@@ -21,6 +21,7 @@ from vla_attention.capture.torch_policies.policy_layout import CallRule, PolicyL
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.session import WeightsChanged
 from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
+from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span
 from vla_attention.schemas.stores.reader import open_store
@@ -433,4 +434,63 @@ def test_what_is_no_number_has_a_sentence(tmp_path, given, sentence):
 def test_not_a_number_in_the_queries_has_its_own_sentence(tmp_path):
     policy = OddPolicy(lambda block, q, k, v: nn.functional.scaled_dot_product_attention(q * math.nan, k, v))
     with pytest.raises(NumbersNotFinite, match="turned NaN or infinite"):
+        rows_of(tmp_path, policy)
+
+
+def reuse_logits(block, q, k, v):
+    scores = logits(q, k)
+    rows = torch.softmax(scores, dim=-1)
+    scores.zero_()
+    return rows @ v
+
+
+def swap_keys(block, q, k, v):
+    rows = torch.softmax(logits(q, k), dim=-1)
+    first = rows[..., 0].clone()
+    rows[..., 0] = rows[..., 1]
+    rows[..., 1] = first
+    return rows @ v
+
+
+def swap_keys_in_a_view(block, q, k, v):
+    rows = torch.softmax(logits(q, k), dim=-1)
+    flat = rows.view(-1, KEYS)
+    first = flat[:, 0].clone()
+    flat[:, 0] = flat[:, 1]
+    flat[:, 1] = first
+    return rows @ v
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("attend", [reuse_logits, swap_keys, swap_keys_in_a_view])
+@pytest.mark.parametrize("knockout", [None, "role:image"])
+@pytest.mark.parametrize("inference", [False, True])
+def test_what_is_written_after_the_softmax_is_seen(tmp_path, dtype, attend, knockout, inference):
+    if (attend, dtype, inference, knockout) == (reuse_logits, torch.bfloat16, True, None):
+        pytest.skip("tensors of inference mode do not count what is written: the check of P·V refuses the rows")
+    policy = OddPolicy(attend).to(dtype)
+
+    def act() -> Tensor:
+        with torch.inference_mode(inference):
+            return policy.act()
+
+    own = act()
+    rows, result = rows_of(tmp_path, policy, act, knockout=knockout)
+    assert torch.equal(result, own) == (knockout is None)
+    wanted = expected(policy, range(4) if knockout else ())
+    if attend is not reuse_logits:
+        wanted = wanted[..., [1, 0, *range(2, KEYS)]]
+    np.testing.assert_allclose(rows, wanted, atol=2e-6 if dtype is torch.float32 else 4e-3)
+    assert set(open_store(tmp_path / "a.zarr").episodes[0].read("joint/key_role")[0][:4]) == {1}
+
+
+def test_logits_that_are_reused_in_inference_mode_are_refused(tmp_path):
+    policy = OddPolicy(reuse_logits).to(torch.bfloat16)
+    with torch.inference_mode(), pytest.raises(RowsDoNotMatch):
+        rows_of(tmp_path, policy)
+
+
+def test_attention_inside_of_vmap_is_refused(tmp_path):
+    policy = OddPolicy(lambda block, q, k, v: torch.vmap(nn.functional.scaled_dot_product_attention)(q, k, v))
+    with pytest.raises(UnseenAttention, match=r"inside of torch\.vmap"):
         rows_of(tmp_path, policy)
