@@ -18,6 +18,7 @@ from vla_attention.analyze.show.numbers import format_number, format_percent, pl
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, mass_error_bound
+from vla_attention.schemas.stores.store_format import CALLERS_MODULES
 
 #: A smaller share of attention is not mentioned.
 _WORTH_MENTIONING = 0.005
@@ -86,6 +87,8 @@ def _dependence(question: Question) -> list[Caveat]:
         return []
     recorded = any(store.attributes.protocol.name == "recorded" for store in question.stores)
     how = "vla-capture rerun with --prompt, or with --knockout and --knockout-queries all"
+    if any(store.attributes.policy.checkpoint_format == CALLERS_MODULES for store in question.stores):
+        how = "vla-capture replay with another --instruction, or with --knockout and --rerun-of (docs/data-sets.md)"
     if recorded:
         how = "va.record with another instruction, or with knockout=... (docs/your-policy.md)"
     sentence = (

@@ -27,6 +27,7 @@ from vla_attention.analyze.report.section_parts import Cell, Table, interval_cel
 from vla_attention.analyze.show.numbers import format_number
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
+from vla_attention.schemas.stores.store_format import CALLERS_MODULES
 
 _VOID = {"meta", "link", "img", "input", "br", "hr"}
 _HOSTILE = "<script>alert('task')</script> & \"bowl\""
@@ -185,9 +186,13 @@ def test_untrained_weights_and_compute_types_are_caveats(analysis: Analysis) -> 
         protocol = replace(store.attributes.protocol, name="recorded")
         other = replace(store, attributes=replace(store.attributes, policy=policy, protocol=protocol))
         own_code = caveats(replace(analysis, question=replace(analysis.question, stores=(other,))), {})
+        of_file = replace(store.attributes, policy=replace(policy, checkpoint_format=CALLERS_MODULES))
+        other = replace(store, attributes=of_file)
+        file = caveats(replace(analysis, question=replace(analysis.question, stores=(other,))), {})
         for given, how in (
             (notes, "vla-capture rerun with --prompt"),
             (own_code, "va.record with another instruction"),
+            (file, "vla-capture replay with another --instruction"),
         ):
             assert how in next(note.sentence for note in given if note.topic == "Attention and dependence")
 
