@@ -158,11 +158,11 @@ class EpisodeBatch(Sequence[Episode]):
             inputs: as in `ReplanInputs`, each a sequence with one entry per row.
         """
         count = len(self)
+        _check_length("active", active, count)
         chosen = [row for row in range(count) if active is None or active[row]]
         steps: list[Any] = list(np.asarray(env_step)) if np.ndim(env_step) else [env_step] * count
         for name, values in (("env_step", steps), *(inputs.items())):
-            if values is not None and len(values) != count:
-                raise BadArgument(f"{name} has {len(values)} entries; expected one for each of {count} episodes.")
+            _check_length(name, values, count)
         given = [
             read_inputs(
                 self._run.layout,
@@ -187,6 +187,19 @@ class EpisodeBatch(Sequence[Episode]):
         episode = self._run._begin(self._stack, EpisodeFacts(**facts))
         episode._batch = self
         return episode
+
+
+def _check_length(name: str, values: Any, count: int) -> None:
+    """Raise `BadArgument` unless values are None or a sequence with one entry for each episode."""
+    if values is None:
+        return
+    try:
+        length = len(values)
+    except TypeError:
+        raise BadArgument(f"{name} is {values!r}; expected one for each of {count} episodes.") from None
+    if length != count or isinstance(values, (str, Mapping)):
+        what = f"{length} entries" if length != count else f"the type {type(values).__name__}"
+        raise BadArgument(f"{name} has {what}; expected one for each of {count} episodes.")
 
 
 class RecordedRun:
@@ -384,6 +397,8 @@ class RecordedRun:
             for episode, inputs in list(zip(episodes, given, strict=True))[:2]
         )
         found = recorder.finish(where)
+        if recorder.batch > 1:
+            _check_length("actions", replan.actions, recorder.batch)
         replan.recorded = True
         for position, (row, episode, inputs) in enumerate(zip(rows, episodes, given, strict=True)):
             episode.largest_error = max(episode.largest_error, recorder.largest_error)
