@@ -83,6 +83,7 @@ class Episode:
     largest_error: float = 0.0
     folder: Path | None = None
     _batch: EpisodeBatch | None = field(default=None, repr=False)
+    _ended: bool = field(default=False, repr=False)
 
     @property
     def name(self) -> str:
@@ -288,7 +289,10 @@ class RecordedRun:
         facts = EpisodeFacts(task_id, episode_index, instruction, seed, task_name, tuple(objects))
         with ExitStack() as stack:
             episode = self._begin(stack, facts)
-            yield episode
+            try:
+                yield episode
+            finally:
+                episode._ended = True
             episode._commit()
 
     @contextmanager
@@ -302,7 +306,11 @@ class RecordedRun:
             batch = EpisodeBatch(self, stack)
             for facts in episodes:
                 batch._episodes.append(batch._begin(facts))
-            yield batch
+            try:
+                yield batch
+            finally:
+                for episode in batch:
+                    episode._ended = True
             for episode in batch:
                 episode._commit()
 
@@ -353,6 +361,11 @@ class RecordedRun:
     ) -> Iterator[Replan]:
         """Record one policy call of some rows of a batch."""
         self._opened()
+        for episode in episodes:
+            if episode._ended:
+                raise RecordingStopped(
+                    f"The block of {episode.name} has ended, and nothing can be added to it; begin another episode."
+                )
         if self._in_block:
             raise RecordingStopped("A replan block stands inside of another; record one policy call after the other.")
         text = ReplanText(self.layout, self._tokenizer, batch, dict(zip(rows, given, strict=True)))

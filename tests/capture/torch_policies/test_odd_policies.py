@@ -19,7 +19,7 @@ from vla_attention.capture.torch_policies.call_changes import ChangeRefused
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.capture.torch_policies.policy_layout import CallRule, PolicyLayout, RecordedSite
 from vla_attention.capture.torch_policies.record import record
-from vla_attention.capture.torch_policies.session import WeightsChanged
+from vla_attention.capture.torch_policies.session import RecordingStopped, WeightsChanged
 from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
 from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
 from vla_attention.schemas.errors import BadArgument, UserError
@@ -519,3 +519,13 @@ def test_what_a_batch_is_given_has_an_entry_for_each_episode(tmp_path, given, se
         ):
             replan.actions = (policy.act(batch=2), actions)[1]
         assert not run.has(0, 0)
+
+
+def test_an_episode_that_has_ended_takes_no_more(tmp_path):
+    policy = OddPolicy(sdpa)
+    with record(tmp_path / "a.zarr", policy, layout=layout(), durable=False) as run:
+        with run.episode(task_id=0, episode_index=0, instruction="") as episode, episode.replan(env_step=0):
+            policy.act()
+        with pytest.raises(RecordingStopped, match="has ended"), episode.replan(env_step=1):
+            policy.act()
+    assert episode.num_replans == 1
