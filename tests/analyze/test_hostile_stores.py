@@ -200,7 +200,9 @@ class HostileSites(SiteStoreSpec):
         return tuple(replace(site, name=name, spans=tuple(map(named, site.spans))) for name, site in made)
 
 
-@pytest.mark.parametrize("command", slow_except(("ratios", "report"), set(WORDS) - {"effects", "objects", "compare"}))
+@pytest.mark.parametrize(
+    "command", slow_except(("ratios", "report"), sorted(set(WORDS) - {"effects", "objects", "compare"}))
+)
 def test_hostile_names_of_sites_are_printed_visibly_and_nothing_is_written_elsewhere(tmp_path, capsys, command):
     store = write_site_store(tmp_path / "a.zarr", HostileSites(kind="split", dataset_actions=0.5, outcome="some"))
     out, before = tmp_path / "out", files_under(tmp_path)
