@@ -335,6 +335,7 @@ def test_the_error_without_coverage_names_the_cause_and_the_remedy(tmp_path, cap
         assert main([*command, "--output", str(tmp_path / "out")]) == 2
         error = capsys.readouterr().err
         assert "no selected episode has object coverage" in error
-        assert "vla-capture" in error
+        assert "captures take it from the simulator's segmentation" in error
+        assert "masks" in error
     with pytest.raises(BadArgument, match="no selected episode has object coverage"):
         measured(path)
