@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -110,7 +110,10 @@ class AttentionCall:
     @property
     def precision(self) -> str:
         """The least precise dtype of what is multiplied and of its result: a softmax may be of higher precision."""
-        dtypes = [self.value.dtype, self.output.dtype, getattr(torch, self.shape.dtype)]
+        # Where there is a result after the output projection, the output before it would be a second computation.
+        result = getattr(self.tensors, "result", None)
+        kernel = self.output if result is None else result
+        dtypes = [self.value.dtype, kernel.dtype, getattr(torch, self.shape.dtype)]
         probabilities = getattr(self.tensors, "probabilities", None)
         if probabilities is not None:
             dtypes.append(probabilities.dtype)
@@ -123,17 +126,19 @@ class AttentionCall:
         rounding errors: some 1e-7 where it computes in float32, some 1e-3 to 1e-2 where in bfloat16.
         """
         # Both as the policy computes them, under its autocast if it has one.
-        value, kernel = self.value, self.output
-        projected = getattr(self.tensors, "projected", None)
+        value = self.value
+        projected: Any = getattr(self.tensors, "projected", None)
+        kernel = self.output if projected is None else None
         with _exact():
             value = at_positions(value, 0, batch).float()
-            output = at_positions(at_positions(kernel, 0, batch), 2, queries).float()
             size, heads, count, keys = rows.shape
             # Heads that share a value head become extra queries of that head, without copies of the values.
             stacked = rows.reshape(size, value.shape[1], heads // value.shape[1] * count, keys)
-            mixed = torch.matmul(stacked, value).reshape(output.shape)
-            if projected is not None:
+            mixed = torch.matmul(stacked, value).reshape(size, heads, count, value.shape[3])
+            if kernel is None:
                 mixed, output = projected(mixed, queries, batch)
+            else:
+                output = at_positions(at_positions(kernel, 0, batch), 2, queries).float()
             difference = (mixed - output).abs()
             if not difference.numel():
                 return 0.0

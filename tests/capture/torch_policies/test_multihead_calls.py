@@ -10,6 +10,7 @@ from torch import nn
 
 from tests.kit.attention_modules import Seen
 from tests.kit.examples import examples
+from vla_attention.capture.torch_policies import multihead_calls
 from vla_attention.capture.torch_policies.call_changes import ChangeRefused
 from vla_attention.capture.torch_policies.watch import seen_by_python, watch_attention
 
@@ -59,6 +60,8 @@ def test_rows_and_results(data):
         result = policy(hidden, memory, **masks)
     assert torch.equal(result, expected)
     shape, call, rows = seen.shapes[0], seen.calls[0], seen.rows[0]
+    # Before the weights change their dtype below.
+    output = call.output.transpose(1, 2).flatten(2)
     extra = int("add_zero_attn" in options)
     assert (shape.module, shape.kind) == ("attention", "multihead")
     assert (shape.batch, shape.heads, shape.queries, shape.keys) == (batch, 4, queries, keys + extra)
@@ -76,7 +79,6 @@ def test_rows_and_results(data):
     assert torch.equal(seen.allowed[0][..., :keys], ~gone.expand(batch, 4, queries, keys).all(1))
     assert (rows[..., :keys][gone.expand(batch, 4, queries, keys)] == 0).all()
     # The output per head, projected, is what the module returned.
-    output = call.output.transpose(1, 2).flatten(2)
     projected = policy.attention.out_proj(output.float())
     returned = (result if batch_first else result.transpose(0, 1)).float()
     torch.testing.assert_close(
@@ -145,3 +147,15 @@ def test_the_fast_path_is_off_inside_and_as_before_afterwards():
             assert torch.backends.mha.get_fastpath_enabled() is before
         finally:
             torch.backends.mha.set_fastpath_enabled(True)
+
+
+def test_checking_the_rows_runs_the_function_no_further_time(monkeypatch):
+    own, ran = multihead_calls._FORWARD, []
+    monkeypatch.setattr(multihead_calls, "_FORWARD", lambda **given: ran.append(given) or own(**given))
+    policy, seen = Block().eval(), Seen()
+    with watch_attention(policy, seen):
+        policy(torch.randn(3, 1, 16), torch.randn(5, 1, 16))
+    assert len(ran) == len(seen.rows) == 1
+    assert seen.calls[0].precision == "float32"
+    assert seen.errors[0] < 3e-6
+    assert len(ran) == 1
