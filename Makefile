@@ -28,7 +28,7 @@ CAPTURE_ARGS := --num-episodes $(or $(EPISODES),$(if $(BUILT_IN),2,5)) $(if $(fi
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
-SOURCES := vla_attention schemas capture analyze tests benchmarks scripts docs
+SOURCES := vla_attention schemas capture analyze tests benchmarks scripts docs examples
 
 # Processes that share the tests; WORKERS=0 runs them in one, which a debugger needs.
 WORKERS ?= 2

@@ -22,7 +22,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -119,48 +119,66 @@ KINDS: dict[str, dict[str, Any]] = {
 
 
 def measure(
-    policy: Policy, given: tuple[Any, ...], folder: Path, rounds: int, calls: int, clock: Callable[[], float]
+    policy: nn.Module,
+    layout: va.PolicyLayout,
+    act: Callable[[], Tensor],
+    kinds: Mapping[str, Mapping[str, Any]],
+    folder: Path,
+    rounds: int,
+    calls: int,
+    clock: Callable[[], float],
 ) -> dict[str, list[float]]:
-    """Seconds of a call by kind, one number per round: the mean of `calls` calls."""
-    device = given[0].device
+    """Seconds of a call by kind, one number per round: the mean of `calls` calls.
 
-    def timed(call: Callable[[int], object]) -> float:
-        if device.type == "cuda":
+    act: makes one call of the policy. kinds: what `va.record` is given, by kind; `plain` is the call without it.
+    """
+
+    def timed(call: Callable[[], object]) -> float:
+        if torch.cuda.is_available():
             torch.cuda.synchronize()
         began = clock()
-        for number in range(calls):
-            call(number)
-        if device.type == "cuda":
+        for _ in range(calls):
+            call()
+        if torch.cuda.is_available():
             torch.cuda.synchronize()
         return (clock() - began) / calls
 
-    seconds: dict[str, list[float]] = {"plain": [], **{kind: [] for kind in KINDS}}
+    seconds: dict[str, list[float]] = {"plain": [], **{kind: [] for kind in kinds}}
     with ExitStack() as stack:
         episodes = {}
-        for kind, settings in KINDS.items():
-            run = va.record(
-                folder / f"{len(episodes)}.zarr", policy, layout=layout(len(policy.blocks)), durable=False, **settings
-            )
+        for kind, settings in kinds.items():
+            run = va.record(folder / f"{len(episodes)}.zarr", policy, layout=layout, durable=False, **settings)
             stack.enter_context(run)
             episodes[kind] = stack.enter_context(run.episode(task_id=0, episode_index=0, instruction=""))
-        expected = policy.act(*given)
+        expected = act()
         step = 0
         for number in range(rounds + 1):  # the first round is not counted
-            found = {"plain": timed(lambda _: policy.act(*given))}
+            found = {"plain": timed(act)}
             for kind, episode in episodes.items():
 
-                def recorded(_: int, episode: Any = episode, kind: str = kind) -> None:
+                def recorded(episode: Any = episode, kind: str = kind) -> None:
                     nonlocal step
                     step += 1
                     with episode.replan(env_step=step):
-                        actions = policy.act(*given)
-                    assert "knockout" in kind or torch.equal(actions, expected), kind
+                        actions = act()
+                    assert "knockout" in kinds[kind] or torch.equal(actions, expected), kind
 
                 found[kind] = timed(recorded)
             if number:
                 for kind, value in found.items():
                     seconds[kind].append(value)
     return seconds
+
+
+def milliseconds(seconds: list[float]) -> str:
+    """The median of the rounds."""
+    return f"{1000 * statistics.median(seconds):.1f}"
+
+
+def times(seconds: list[float], plain: list[float]) -> str:
+    """The median, lowest and highest of the ratios within the rounds."""
+    ratios = [value / base for value, base in zip(seconds, plain, strict=True)]
+    return f"{statistics.median(ratios):.3f} ({min(ratios):.3f}, {max(ratios):.3f})"
 
 
 def main() -> None:
@@ -189,17 +207,21 @@ def main() -> None:
     mask[..., PREFIX - 50 : PREFIX] = False
     given = torch.randn(1, HORIZON, 32, **settings), caches, mask
     with tempfile.TemporaryDirectory() as folder:
-        seconds = measure(policy, given, Path(folder), arguments.rounds, arguments.calls, clock)
-    plain = seconds["plain"]
+        seconds = measure(
+            policy,
+            layout(arguments.blocks),
+            lambda: policy.act(*given),
+            KINDS,
+            Path(folder),
+            arguments.rounds,
+            arguments.calls,
+            clock,
+        )
     machine = f"{arguments.device}, {arguments.dtype}, {torch.get_num_threads()} threads"
     print(f"torch {torch.__version__}, {machine}, {arguments.clock} time")
     print("| call | ms, median of the rounds | times the plain call, median (lowest, highest) |\n|---|---|---|")
     for kind, values in seconds.items():
-        ratios = [value / base for value, base in zip(values, plain, strict=True)]
-        print(
-            f"| {kind} | {1000 * statistics.median(values):.1f} | {statistics.median(ratios):.3f} "
-            f"({min(ratios):.3f}, {max(ratios):.3f}) |"
-        )
+        print(f"| {kind} | {milliseconds(values)} | {times(values, seconds['plain'])} |")
 
 
 if __name__ == "__main__":

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import MappingProxyType, ModuleType, SimpleNamespace
 from typing import Any
 from unittest import mock
 
@@ -21,6 +22,8 @@ from tests.policies.word_tokenizer import INSTRUCTION, WordTokenizer
 
 CAMERAS = ("top", "wrist")
 STATE_DIM, ACTION_DIM = 6, 4
+#: Sizes that a builder is not given are those of the tests.
+NONE: Mapping[str, int] = MappingProxyType({})
 
 
 def features(height: int, width: int, cameras: tuple[str, ...] = CAMERAS) -> dict[str, Any]:
@@ -76,8 +79,13 @@ def chunk_of(policy: Any, seed: int = 0) -> Any:
     return call
 
 
-def small_smolvla(folder: Path, **changes: Any) -> Any:
-    """A SmolVLAPolicy of four blocks; `folder` is where the configuration of its vision-language model is written."""
+def small_smolvla(
+    folder: Path, text_sizes: Mapping[str, int] = NONE, vision_sizes: Mapping[str, int] = NONE, **changes: Any
+) -> Any:
+    """A SmolVLAPolicy of four blocks; `folder` is where the configuration of its vision-language model is written.
+
+    `text_sizes` and `vision_sizes` are of that model's configuration, `changes` of the policy's.
+    """
     from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
     from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
     from transformers import SmolVLMConfig
@@ -87,10 +95,12 @@ def small_smolvla(folder: Path, **changes: Any) -> Any:
             "model_type": "llama",
             **{"hidden_size": 48, "intermediate_size": 64, "num_hidden_layers": 4, "num_attention_heads": 3},
             **{"num_key_value_heads": 1, "head_dim": 16, "vocab_size": 100, "pad_token_id": 0},
+            **text_sizes,
         },
         vision_config={
             **{"hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 2},
             **{"image_size": 64, "patch_size": 8},
+            **vision_sizes,
         },
         scale_factor=2,
         image_token_id=98,
@@ -153,10 +163,11 @@ def small_act(**changes: Any) -> Any:
     return ACTPolicy(ACTConfig(**{**settings, **changes})).eval()
 
 
-def small_pi0_fast(**changes: Any) -> Any:
+def small_pi0_fast(sizes: Mapping[str, int] = NONE, picture: int = 56, **changes: Any) -> Any:
     """A PI0FastPolicy of three blocks. The check for LeRobot's own transformers is answered, its tokenizers are none.
 
     The class fixes sizes that a small model cannot have: its configuration and its projector are made smaller here.
+    `sizes` are of its language model, `changes` of the policy's configuration; `picture` is a side in pixels.
     """
     from lerobot.policies.pi0_fast import modeling_pi0_fast as module
     from lerobot.policies.pi0_fast.configuration_pi0_fast import PI0FastConfig
@@ -168,16 +179,20 @@ def small_pi0_fast(**changes: Any) -> Any:
     def configuration() -> Any:
         vision = {
             **{"model_type": "siglip_vision_model", "hidden_size": 32, "intermediate_size": 48},
-            **{"num_hidden_layers": 2, "num_attention_heads": 2, "image_size": 56, "patch_size": 14},
+            **{"num_hidden_layers": 2, "num_attention_heads": 2, "image_size": picture, "patch_size": 14},
             "vision_use_head": False,
         }
-        return PaliGemmaConfig(vision_config=vision, text_config={"model_type": "gemma"}, projection_dim=32)
+        return PaliGemmaConfig(vision_config=vision, text_config={"model_type": "gemma"}, projection_dim=width)
 
-    sizes = module.GemmaConfig(width=32, depth=3, mlp_dim=48, num_heads=4, num_kv_heads=1, head_dim=8)
+    language = {
+        **{"width": 32, "depth": 3, "mlp_dim": 48, "num_heads": 4, "num_kv_heads": 1, "head_dim": 8},
+        **sizes,
+    }
+    width = language["width"]
     settings: dict[str, Any] = {
-        **features(56, 56),
+        **features(picture, picture),
         **{"n_action_steps": 3, "chunk_size": 3, "max_decoding_steps": 5, "tokenizer_max_length": 9},
-        **{"image_resolution": (56, 56)},
+        **{"image_resolution": (picture, picture)},
     }
     tokenizer = SimpleNamespace(bos_token_id=2)
     torch.manual_seed(0)
@@ -185,12 +200,12 @@ def small_pi0_fast(**changes: Any) -> Any:
         mock.patch.dict(sys.modules, {"transformers.models.siglip.check": check}),
         mock.patch("transformers.models.siglip.check", check, create=True),
         mock.patch.object(module, "CONFIG_MAPPING", {"paligemma": configuration}),
-        mock.patch.object(module, "get_gemma_config", return_value=sizes),
+        mock.patch.object(module, "get_gemma_config", return_value=module.GemmaConfig(**language)),
         mock.patch("transformers.AutoProcessor.from_pretrained", return_value=tokenizer),
         mock.patch("transformers.AutoTokenizer.from_pretrained", return_value=tokenizer),
     ):
         policy = module.PI0FastPolicy(PI0FastConfig(**{**settings, **changes}))
-    policy.model.paligemma_with_expert.paligemma.model.multi_modal_projector.linear = torch.nn.Linear(32, 32)
+    policy.model.paligemma_with_expert.paligemma.model.multi_modal_projector.linear = torch.nn.Linear(32, width)
     # The tokens themselves, as actions: what turns them into actions is another network's tokenizer.
     policy.detokenize_actions = lambda tokens, action_horizon, action_dim: tokens[:, :action_horizon, None].float()
     return policy.eval()
@@ -229,8 +244,15 @@ class StandInBackbone(torch.nn.Module):
         )
 
 
-def small_groot() -> Any:
-    """LeRobot's GrootPolicy with the real action head of GR00T N1.5, on a stand-in for its vision-language model."""
+def small_groot(
+    block_sizes: Mapping[str, int] = NONE,
+    head_sizes: Mapping[str, int] = NONE,
+    backbone: int = 24,
+) -> Any:
+    """LeRobot's GrootPolicy with the real action head of GR00T N1.5, on a stand-in for its vision-language model.
+
+    `block_sizes` are of the head's transformer, `head_sizes` of the head around it; `backbone` is the stand-in's width.
+    """
     from lerobot.policies.groot import groot_n1
     from lerobot.policies.groot.configuration_groot import GrootConfig
     from lerobot.policies.groot.modeling_groot import GrootPolicy
@@ -239,28 +261,50 @@ def small_groot() -> Any:
     head = {
         "diffusion_model_cfg": {
             **{**blocks, "num_layers": 4, "output_dim": 16, "norm_type": "ada_norm", "positional_embeddings": None},
-            **{"interleave_self_attention": True, "cross_attention_dim": 24},
+            **{"interleave_self_attention": True, "cross_attention_dim": backbone, **block_sizes},
         },
-        "vl_self_attention_cfg": {**blocks, "attention_head_dim": 6, "num_layers": 1, "positional_embeddings": None},
-        **{"input_embedding_dim": 32, "backbone_embedding_dim": 24, "hidden_size": 16, "max_seq_len": 32},
+        "vl_self_attention_cfg": {
+            **{**blocks, "attention_head_dim": backbone // 4, "num_layers": 1, "positional_embeddings": None}
+        },
+        **{"input_embedding_dim": 32, "backbone_embedding_dim": backbone, "hidden_size": 16, "max_seq_len": 32},
         **{"action_dim": ACTION_DIM, "action_horizon": 5, "num_inference_timesteps": 3, "max_num_embodiments": 2},
-        **{"num_target_vision_tokens": 2, "max_state_dim": STATE_DIM},
+        **{"num_target_vision_tokens": 2, "max_state_dim": STATE_DIM, **head_sizes},
     }
+    horizon = head["action_horizon"]
     torch.manual_seed(0)
-    with mock.patch.object(groot_n1, "EagleBackbone", return_value=StandInBackbone()):
+    with mock.patch.object(groot_n1, "EagleBackbone", return_value=StandInBackbone(backbone)):
         model = groot_n1.GR00TN15(
             groot_n1.GR00TN15Config(
-                backbone_cfg={}, action_head_cfg=head, action_horizon=5, action_dim=ACTION_DIM, compute_dtype="float32"
+                backbone_cfg={},
+                action_head_cfg=head,
+                action_horizon=horizon,
+                action_dim=ACTION_DIM,
+                compute_dtype="float32",
             ),
             local_model_path="",
         )
     settings: dict[str, Any] = {
         **features(8, 8),
-        **{"use_bf16": False, "chunk_size": 5, "n_action_steps": 5, "max_state_dim": STATE_DIM},
+        **{"use_bf16": False, "chunk_size": horizon, "n_action_steps": horizon, "max_state_dim": STATE_DIM},
         "max_action_dim": ACTION_DIM,
     }
     with mock.patch.object(GrootPolicy, "_create_groot_model", return_value=model):
         return GrootPolicy(GrootConfig(**settings)).eval()
+
+
+def groot_observation(patches: int = 4) -> dict[str, torch.Tensor]:
+    """Return a preprocessed observation of two pictures, each a row of squares of two pixels, and the instruction."""
+    picture = [98] * patches
+    ids = torch.tensor([[15, *picture, 16, *picture, *WordTokenizer().encode(INSTRUCTION)]])
+    generator = torch.Generator().manual_seed(1)
+    return {
+        "eagle_input_ids": ids,
+        "eagle_attention_mask": torch.ones_like(ids),
+        # The two pictures beneath each other.
+        "eagle_pixel_values": torch.rand(1, 3, 2 * patches, 4, generator=generator),
+        "state": torch.randn(1, 1, STATE_DIM, generator=generator),
+        "embodiment_id": torch.zeros(1, dtype=torch.long),
+    }
 
 
 def small_pi0_lerobot(**changes: Any) -> Any:

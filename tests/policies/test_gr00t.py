@@ -19,29 +19,15 @@ from tests.policies.policy_checks import (
     rows_of,
     softmax_rows,
 )
-from tests.policies.word_tokenizer import INSTRUCTION, WordTokenizer
+from tests.policies.word_tokenizer import INSTRUCTION
 
-PLACEHOLDER, PATCHES, CHUNK, HEADS, DIM = 98, 4, 5, 4, 8
+PATCHES, CHUNK, HEADS, DIM = 4, 5, 4, 8
 WORDS = len(INSTRUCTION.split())
-
-
-def observation() -> dict[str, torch.Tensor]:
-    picture = [PLACEHOLDER] * PATCHES
-    ids = torch.tensor([[15, *picture, 16, *picture, *WordTokenizer().encode(INSTRUCTION)]])
-    generator = torch.Generator().manual_seed(1)
-    return {
-        "eagle_input_ids": ids,
-        "eagle_attention_mask": torch.ones_like(ids),
-        # The two pictures of 4 x 4 beneath each other.
-        "eagle_pixel_values": torch.rand(1, 3, 8, 4, generator=generator),
-        "state": torch.randn(1, 1, models.STATE_DIM, generator=generator),
-        "embodiment_id": torch.zeros(1, dtype=torch.long),
-    }
 
 
 @pytest.fixture(scope="module")
 def case():
-    policy, given = models.small_groot(), observation()
+    policy, given = models.small_groot(), models.groot_observation()
     layout = va.layouts.gr00t(
         policy, given["eagle_input_ids"][0], cameras=models.CAMERAS, picture_size=4, prompt_tokens=WORDS + 2
     )
