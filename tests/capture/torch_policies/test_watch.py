@@ -133,8 +133,8 @@ def test_other_threads_are_seen(way):
     wrapper = Wrapper(policy, {})
     call = {"call": policy, "forward": policy.forward, "method": wrapper.select_action}[way]
     with ThreadPoolExecutor(1) as pool:  # its thread is older than the block
-        # Threads may have other numbers of OpenMP threads, and then other last bits.
-        expected = pool.submit(policy, HIDDEN, MEMORY).result()
+        # The first call of a thread may use another number of OpenMP threads than all later ones: other last bits.
+        expected = [pool.submit(policy, HIDDEN, MEMORY).result() for _ in range(2)][-1]
         seen = Seen()
         with watch_attention(wrapper, seen):
             # What is bound before the block skips it, as a reference to a bound method does.
