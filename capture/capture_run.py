@@ -23,6 +23,7 @@ from vla_attention.capture.jobs.worker_records import (
     planned_tasks,
     read_records,
 )
+from vla_attention.capture.policies.identity import announcement
 from vla_attention.capture.policies.policy import Policy, stored_picture_sizes
 from vla_attention.capture.provenance import describe_machine
 from vla_attention.capture.rollout.episode import EpisodeResult, EpisodeRun, check_protocol, max_replans
@@ -217,16 +218,9 @@ def _checkpoint_line(identity: PolicyIdentity) -> str:
 
 def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int, num_damaged: int) -> None:
     identity, recording, protocol = store.attributes.policy, store.attributes.recording, store.attributes.protocol
-    say(
-        f"Policy: {identity.name} ({identity.checkpoint_format}: {identity.checkpoint}), weights "
-        f"{identity.digest[:12]}."
-    )
-    if identity.untrained:
-        say(
-            "These weights are random and UNTRAINED: the numbers show that the tool works, and say nothing about any "
-            "policy."
-        )
-    else:
+    for line in announcement(identity):
+        say(line)
+    if not identity.untrained:
         say(_checkpoint_line(identity))
     say(
         f"Protocol: {protocol.name} (docs/protocol.md), seed {protocol.seed}, pictures of {protocol.image_size} "

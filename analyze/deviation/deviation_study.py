@@ -16,7 +16,7 @@ from vla_attention.analyze.measures.frames import EPISODE_ID, Tables, episode_id
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
+from vla_attention.analyze.statistics.episode_intervals import means_of_all_and_of_tasks, means_with_intervals
 from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE
 from vla_attention.analyze.statistics.many_looks import adjusted_p_values
 from vla_attention.analyze.time.alignment import episode_timing, on_episode_time
@@ -195,16 +195,7 @@ def _phase_table(episodes: list[_Episode], question: Question) -> pl.DataFrame:
         ]
     table = pl.DataFrame(rows).with_columns(pl.col(MEASURES).fill_nan(None))
     limits, estimand = dict.fromkeys(MEASURES, POSITIVE), question.settings.intervals
-    of_task = ["suite", "task_id", "instruction"]
-    whole = means_with_intervals(table, ["phase"], limits, estimand).select(
-        pl.lit("all").alias("scope"),
-        *(pl.lit(None, dtype=table.schema[name]).alias(name) for name in of_task),
-        pl.all(),
-    )
-    tasks = means_with_intervals(table, [*of_task, "phase"], limits, estimand).select(
-        pl.lit("task").alias("scope"), pl.all()
-    )
-    return pl.concat([whole, tasks.select(whole.columns)])
+    return means_of_all_and_of_tasks(table, ["phase"], limits, estimand)
 
 
 def _dimension_table(episodes: list[_Episode], question: Question, spread: ActionSpread) -> pl.DataFrame:

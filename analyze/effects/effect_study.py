@@ -42,7 +42,7 @@ from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens
 from vla_attention.analyze.ratios.analysis import Analysis, analyse
-from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
+from vla_attention.analyze.statistics.episode_intervals import means_of_all_and_of_tasks
 from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE, SHARE, Estimand
 from vla_attention.analyze.statistics.many_looks import adjusted_p_values
 from vla_attention.analyze.stores.parallel import map_episodes
@@ -368,18 +368,9 @@ def summary_of(episodes: pl.DataFrame, estimand: Estimand = Estimand.TASKS_LIKE_
     }
     quotients = {"over_noise": ("effect", "noise"), "over_random": ("effect", "random")}
     nulls = {"minus_noise": 0.0, "minus_random": 0.0}
-    whole = means_with_intervals(
-        episodes, [*_NAMES, "phase"], values, estimand, quotients=quotients, nulls=nulls
-    ).select(
-        pl.lit("all").alias("scope"),
-        *(pl.lit(None, dtype=_ID[name]).alias(name) for name in ("suite", "task_id", "instruction")),
-        pl.all(),
+    return _with_adjusted(
+        means_of_all_and_of_tasks(episodes, [*_NAMES, "phase"], values, estimand, quotients=quotients, nulls=nulls)
     )
-    of_task = ["suite", "task_id", "instruction"]
-    tasks = means_with_intervals(
-        episodes, [*of_task, *_NAMES, "phase"], values, estimand, quotients=quotients, nulls=nulls
-    ).select(pl.lit("task").alias("scope"), pl.all())
-    return _with_adjusted(pl.concat([whole, tasks.select(whole.columns)]))
 
 
 def _with_adjusted(summary: pl.DataFrame) -> pl.DataFrame:

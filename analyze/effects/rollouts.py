@@ -9,7 +9,7 @@ import polars as pl
 
 from vla_attention.analyze.effects.conditions import Condition
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
+from vla_attention.analyze.statistics.episode_intervals import means_of_all_and_of_tasks
 from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE, SHARE, Estimand
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.safe_text import visible
@@ -91,16 +91,7 @@ def rollout_summary(pairs: pl.DataFrame, estimand: Estimand) -> pl.DataFrame:
         (pairs), num_tasks; success_base, success, success_difference, steps_base, steps, steps_difference, each with
         `_low`, `_high` and `_episodes`. The number of steps of a failure is that at which it was stopped.
     """
-    of_task = ["suite", "task_id", "instruction"]
-    whole = means_with_intervals(pairs, ["condition"], _VALUES, estimand).select(
-        pl.lit("all").alias("scope"),
-        *(pl.lit(None, dtype=ROLLOUT_COLUMNS[name]).alias(name) for name in of_task),
-        pl.all(),
-    )
-    tasks = means_with_intervals(pairs, [*of_task, "condition"], _VALUES, estimand).select(
-        pl.lit("task").alias("scope"), pl.all()
-    )
-    return pl.concat([whole, tasks.select(whole.columns)])
+    return means_of_all_and_of_tasks(pairs, ["condition"], _VALUES, estimand)
 
 
 def _by_start(episodes: Sequence[StoredEpisode]) -> dict[tuple[int, str, int], StoredEpisode]:

@@ -80,3 +80,32 @@ def means_with_intervals(
         schema |= dict.fromkeys((name, f"{name}_low", f"{name}_high"), pl.Float64) | {f"{name}_episodes": pl.Int64}
     schema |= dict.fromkeys((f"{name}_p" for name in nulls), pl.Float64)
     return pl.DataFrame(rows, schema=schema)
+
+
+def means_of_all_and_of_tasks(
+    table: pl.DataFrame,
+    by: Sequence[str],
+    values: Mapping[str, tuple[float, float]],
+    estimand: Estimand = Estimand.TASKS_LIKE_THESE,
+    *,
+    quotients: Mapping[str, tuple[str, str]] | None = None,
+    nulls: Mapping[str, float] | None = None,
+) -> pl.DataFrame:
+    """`means_with_intervals` of all episodes, then of each task; the arguments are those of it.
+
+    table: has `suite`, `task_id` and `instruction` besides `by` and the values.
+
+    Returns:
+        scope ("all" or "task"), suite, task_id and instruction (null for "all"), then the columns of
+        `means_with_intervals`.
+    """
+    of_task = ["suite", "task_id", "instruction"]
+    whole = means_with_intervals(table, by, values, estimand, quotients=quotients, nulls=nulls).select(
+        pl.lit("all").alias("scope"),
+        *(pl.lit(None, dtype=table.schema[name]).alias(name) for name in of_task),
+        pl.all(),
+    )
+    tasks = means_with_intervals(table, [*of_task, *by], values, estimand, quotients=quotients, nulls=nulls).select(
+        pl.lit("task").alias("scope"), pl.all()
+    )
+    return pl.concat([whole, tasks.select(whole.columns)])

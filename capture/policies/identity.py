@@ -46,3 +46,17 @@ def describe_policy(policy: Policy, source: PolicySource, digest: str, config: d
         cameras=policy.cameras,
         config={"configuration": source.configuration, **config},
     )
+
+
+def announcement(identity: PolicyIdentity) -> list[str]:
+    """Return the lines with which a run says what it runs: the policy, and that its weights are random if they are."""
+    lines = [
+        f"Policy: {identity.name} ({identity.checkpoint_format}: {identity.checkpoint}), weights "
+        f"{identity.digest[:12]}."
+    ]
+    if identity.untrained:
+        lines.append(
+            "These weights are random and UNTRAINED: the numbers show that the tool works, and say nothing about any "
+            "policy."
+        )
+    return lines

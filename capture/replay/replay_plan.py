@@ -11,6 +11,7 @@ from pathlib import Path
 from vla_attention.capture.command_line import check_writable
 from vla_attention.capture.jobs.damaged_episodes import find_damaged
 from vla_attention.capture.jobs.termination import Termination
+from vla_attention.capture.policies.identity import announcement
 from vla_attention.capture.policies.robot import RobotData
 from vla_attention.capture.replay.chosen_episodes import chosen_episodes
 from vla_attention.capture.replay.data_set_files import INDEX_COLUMNS
@@ -169,15 +170,8 @@ def announce(
     stored = sorted(path.name for path in episode_folders(plan.store)) if plan.store.exists() else []
     done = {parse_episode_name(name)[1] for name in stored}
     todo = tuple(index for index in plan.wanted if index not in done)
-    say(
-        f"Policy: {identity.name} ({identity.checkpoint_format}: {identity.checkpoint}), weights "
-        f"{identity.digest[:12]}."
-    )
-    if identity.untrained:
-        say(
-            "These weights are random and UNTRAINED: the numbers show that the tool works, and say nothing about any "
-            "policy."
-        )
+    for line in announcement(identity):
+        say(line)
     say(
         f"Data set: {plan.data.name}, LeRobotDataset {info.version}, {len(info.episodes)} episodes of "
         f"{len(info.tasks)} tasks at {info.fps:g} frames per second, robot {info.robot_type}."
