@@ -6,9 +6,9 @@ that of another noise seed and with that of equally many random keys.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,7 @@ from vla_attention.analyze.statistics.many_looks import adjusted_p_values
 from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.safe_text import visible
-from vla_attention.schemas.stores.reader import Store, open_store
+from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 
 _LIMITS = {"effect": POSITIVE, "effect_chunk": POSITIVE, "angle": POSITIVE, "gripper_flips": SHARE}
@@ -266,29 +266,38 @@ def _episodes_of(pairing: Pairing, spread: ActionSpread, attention: dict[Any, Gr
         "selector": None if group is None else group.text,
     }
 
-    def measure(pair: tuple[BaseEpisode, Any]) -> list[dict[str, object]]:
-        base, rerun = pair
-        changes = changes_of(base, actions_of(base, rerun, condition), spread)
-        there = _has_keys(known.get(base.name), len(changes), condition.kind)
-        if not there.any():
-            return []
-        changes[~there] = np.nan
-        values = {name: changes[:, i] for i, name in enumerate(CHANGES)}
-        if base.name in known:
-            values |= {name: known[base.name][:, i] for i, name in enumerate(MEASURES)}
-        attributes = base.item.episode.attributes
-        named = {
-            "suite": base.item.store.suite,
-            "task_id": attributes.task_id,
-            "instruction": visible(attributes.instruction),
-            "episode_index": attributes.episode_index,
-            **fixed,
-            "num_replans": int(there.sum()),
-        }
-        return [{**named, **row} for row in mean_over_phases(base, values)]
-
-    rows = [row for part in map_episodes(measure, pairing.pairs) for row in part]
+    measure = partial(_rows_of_pair, condition=condition, spread=spread, fixed=fixed)
+    given = [(base, rerun, known.get(base.name)) for base, rerun in pairing.pairs]
+    rows = [row for part in map_episodes(measure, given) for row in part]
     return pl.DataFrame(rows, schema=_EPISODE_SCHEMA)
+
+
+def _rows_of_pair(
+    given: tuple[BaseEpisode, StoredEpisode, NDArray[np.float64] | None],
+    condition: Condition,
+    spread: ActionSpread,
+    fixed: Mapping[str, str | None],
+) -> list[dict[str, object]]:
+    """The rows of one episode: of the base, its rerun, and the base's attention (replan, measure) to the group."""
+    base, rerun, attention = given
+    changes = changes_of(base, actions_of(base, rerun, condition), spread)
+    there = _has_keys(attention, len(changes), condition.kind)
+    if not there.any():
+        return []
+    changes[~there] = np.nan
+    values = {name: changes[:, i] for i, name in enumerate(CHANGES)}
+    if attention is not None:
+        values |= {name: attention[:, i] for i, name in enumerate(MEASURES)}
+    attributes = base.item.episode.attributes
+    named = {
+        "suite": base.item.store.suite,
+        "task_id": attributes.task_id,
+        "instruction": visible(attributes.instruction),
+        "episode_index": attributes.episode_index,
+        **fixed,
+        "num_replans": int(there.sum()),
+    }
+    return [{**named, **row} for row in mean_over_phases(base, values)]
 
 
 def _has_keys(attention: NDArray[np.float64] | None, replans: int = 1, kind: Kind = Kind.WITHOUT) -> NDArray[np.bool_]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from vla_attention.analyze.heads.denoise import denoise_tables
 from vla_attention.analyze.heads.depth import contribution_norms, depth_table
@@ -14,7 +16,7 @@ from vla_attention.analyze.heads.row_metrics import RowOptions, groups_with_vali
 from vla_attention.analyze.measures.aggregate import episode_tables, replan_tables, task_tables
 from vla_attention.analyze.measures.frames import Tables, concat_tables, named_tables
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.selected import resolve_all
+from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
 from vla_attention.analyze.measures.sinks import SinkSearch, search_of
 from vla_attention.analyze.measures.steps import (
     MeasuredEpisode,
@@ -26,6 +28,8 @@ from vla_attention.analyze.measures.steps import (
 )
 from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.parallel import map_episodes
+from vla_attention.analyze.stores.selection import Selection
+from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 
 
 @dataclass(frozen=True)
@@ -66,6 +70,16 @@ class HeadStudy:
         return tables
 
 
+def _measure(
+    given: tuple[SelectedEpisode, ResolvedGrouping, NDArray[np.float32] | None], apart: Selection, site: str
+) -> MeasuredEpisode:
+    """Masses of one episode; where they were measured with its rows, those."""
+    item, groups, mass = given
+    if mass is None:
+        return measure_episode(item, groups, apart, site)
+    return measured_from(item, groups, apart, mass.astype(np.float64), row_sums(item, apart, site))
+
+
 def study_heads(question: Question, options: RowOptions | None = None) -> HeadStudy:
     """Measure heads, layers, denoise steps and, with `options`, rows. Rows are read at most once.
 
@@ -83,16 +97,14 @@ def study_heads(question: Question, options: RowOptions | None = None) -> HeadSt
         ]
         measures = measure_all_rows(question, resolved, options, shown, with_masses=any(cut))
 
-    def measure(i: int) -> MeasuredEpisode:
-        item, groups, apart = question.selected[i], resolved[i], replace(selection, per_head=True)
-        if measures is None or not cut[i]:
-            return measure_episode(item, groups, apart, question.site)
-        mass = measures[i].mass
-        assert mass is not None
-        return measured_from(item, groups, apart, mass.astype(np.float64), row_sums(item, apart, question.site))
-
+    known = (
+        [None] * len(resolved)
+        if measures is None
+        else [of_episode.mass if is_cut else None for of_episode, is_cut in zip(measures, cut, strict=True)]
+    )
+    measure = partial(_measure, apart=replace(selection, per_head=True), site=question.site)
     with progress_bar(len(resolved), "episodes") as advance:
-        measured = map_episodes(measure, range(len(resolved)), advance)
+        measured = map_episodes(measure, list(zip(question.selected, resolved, known, strict=True)), advance)
     heads = concat_tables([episode_heads(episode, grouping) for episode in measured])
     over_heads = [episode.over_heads() for episode in measured]
     replans = replan_tables(over_heads, grouping)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import polars as pl
@@ -17,7 +18,7 @@ from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
 from vla_attention.analyze.measures.sinks import KeyShares, SinkRule
 from vla_attention.analyze.measures.steps import with_valid
 from vla_attention.analyze.show.progress import progress_bar
-from vla_attention.analyze.stores.parallel import map_episodes
+from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import BadArgument, listing
@@ -61,6 +62,15 @@ class RowMeasures:
     mass: NDArray[np.float32] | None
     shares: KeyShares
 
+    def take(self, measured: RowMeasures) -> None:
+        """Copy the values of the same measures of the same episode."""
+        self.entropy[:] = measured.entropy
+        self.top[:] = measured.top
+        if self.mass is not None:
+            self.mass[:] = measured.mass
+        self.shares.above[:] = measured.shares.above
+        self.shares.held[:] = measured.shares.held
+
 
 def empty_measures(
     items: Sequence[SelectedEpisode],
@@ -71,8 +81,8 @@ def empty_measures(
 ) -> list[RowMeasures]:
     """Arrays for every episode's measures, which `measure_rows` fills: parts of a few large arrays.
 
-    They are allocated before anything is read. Small results between the large temporary arrays of reading would
-    fragment the heap, and the process would take twice the memory.
+    They are allocated before anything is read. Small results that stay between the large temporary arrays of reading
+    would fragment the heap, and the process would take twice the memory.
     """
     cells = (len(selection.layers), len(selection.denoise), len(selection.heads))
     ends = np.cumsum([item.tokens.num_replans for item in items])
@@ -90,7 +100,8 @@ def empty_measures(
 def measure_rows(
     item: SelectedEpisode,
     resolved: ResolvedGrouping,
-    question: Question,
+    selection: Selection,
+    site: str,
     options: RowOptions,
     shown: Sequence[str],
     out: RowMeasures,
@@ -100,12 +111,13 @@ def measure_rows(
     Args:
         item: the episode.
         resolved: the groups on its keys.
-        question: the site and the selection; heads are always kept apart.
+        selection: layers, denoise steps and heads; heads are always kept apart.
+        site: the softmax family.
         options: what is measured.
         shown: the groups inside which an entropy is wanted, over their valid keys.
         out: is filled; with masses where it has an array for them.
     """
-    valid, selection = item.valid, question.selection
+    valid = item.valid
     weights = with_valid(resolved.weights, valid)
     # Half of the keys of a usual site are never valid: without them the measures take half the time.
     used = np.flatnonzero(valid.any(axis=0))
@@ -113,7 +125,7 @@ def measure_rows(
     of_used = None if counts is None else counts[:, used]
     columns = [*(resolved.names.index(name) for name in shown), weights.shape[2] - 1]
     within = np.ascontiguousarray(weights[:, used][:, :, columns] * inside[:, :, None])
-    for part in layer_rows(item.episode, selection, question.site):
+    for part in layer_rows(item.episode, selection, site):
         rows = part.rows if len(used) == part.rows.shape[2] else part.rows[:, :, used]
         out.entropy[:, part.layer, part.denoise] = entropies(rows, within)
         out.top[:, part.layer, part.denoise] = top_mass(rows, inside, options.top)
@@ -211,13 +223,33 @@ def measure_all_rows(
     """`measure_rows` of every episode, a few at a time; shows progress."""
     num_masses = len(question.grouping.names) + 1 if with_masses else None
     room = empty_measures(question.selected, question.selection, options, len(shown) + 1, num_masses)
-
-    def measure(i: int) -> None:
-        measure_rows(question.selected[i], resolved[i], question, options, shown, room[i])
-
+    measure = partial(
+        _episode_measures,
+        selection=question.selection,
+        site=question.site,
+        options=options,
+        shown=shown,
+        num_masses=num_masses,
+    )
+    pairs = list(zip(question.selected, resolved, strict=True))
     with progress_bar(len(room), "episodes' rows") as advance:
-        map_episodes(measure, range(len(room)), advance)
+        for kept, measured in zip(room, each_episode(measure, pairs, advance), strict=True):
+            kept.take(measured)
     return room
+
+
+def _episode_measures(
+    pair: tuple[SelectedEpisode, ResolvedGrouping],
+    selection: Selection,
+    site: str,
+    options: RowOptions,
+    shown: Sequence[str],
+    num_masses: int | None,
+) -> RowMeasures:
+    """`measure_rows` of one episode into arrays of its own."""
+    (out,) = empty_measures([pair[0]], selection, options, len(shown) + 1, num_masses)
+    measure_rows(*pair, selection, site, options, shown, out)
+    return out
 
 
 def row_metrics(question: Question, options: RowOptions | None = None) -> Tables:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import polars as pl
@@ -51,27 +52,29 @@ def contribution_table(
     if not all(item.store.attributes.recording.contributions for item in selected):
         return None
 
-    def measure(item: SelectedEpisode) -> pl.DataFrame | None:
-        root, episode = item.store.attributes, item.episode
-        sides = [_parts_of_side(root, episode, roles) for roles in (VISUAL_ROLES, LINGUISTIC_ROLES)]
-        if len({root.recording_of(side[0]).layers for side in sides if side}) > 1:
-            return _of_different_blocks(item, selection, layers, [side for side in sides if side])
-        sites = {side[0] for side in sides if side}
-        grams = {site: selected_gram(item, site, selection) for site in sites}
-        uniform = {site: uniform_weights(item, site, selection) for site in sites}
-        norms = [
-            (joint_norm(grams[side[0]], side[1]), joint_norm(grams[side[0]], side[1], uniform[side[0]]))
-            for side in sides
-            if side is not None
-        ]
-        if len(norms) < len(sides):
-            return None
-        visual, linguistic = norms
-        values = {"visual_norm": visual[0], "linguistic_norm": linguistic[0], **ratio_columns(visual, linguistic)}
-        return long_table(item, [replan_axis(item), layer_axis(selection), denoise_axis(selection)], values)
-
+    measure = partial(_episode_norms, selection=selection, layers=layers)
     frames = [frame for frame in map_episodes(measure, selected) if frame is not None]
     return pl.concat(frames) if len(frames) == len(selected) else None
+
+
+def _episode_norms(item: SelectedEpisode, selection: Selection, layers: Sequence[int] | None) -> pl.DataFrame | None:
+    root, episode = item.store.attributes, item.episode
+    sides = [_parts_of_side(root, episode, roles) for roles in (VISUAL_ROLES, LINGUISTIC_ROLES)]
+    if len({root.recording_of(side[0]).layers for side in sides if side}) > 1:
+        return _of_different_blocks(item, selection, layers, [side for side in sides if side])
+    sites = {side[0] for side in sides if side}
+    grams = {site: selected_gram(item, site, selection) for site in sites}
+    uniform = {site: uniform_weights(item, site, selection) for site in sites}
+    norms = [
+        (joint_norm(grams[side[0]], side[1]), joint_norm(grams[side[0]], side[1], uniform[side[0]]))
+        for side in sides
+        if side is not None
+    ]
+    if len(norms) < len(sides):
+        return None
+    visual, linguistic = norms
+    values = {"visual_norm": visual[0], "linguistic_norm": linguistic[0], **ratio_columns(visual, linguistic)}
+    return long_table(item, [replan_axis(item), layer_axis(selection), denoise_axis(selection)], values)
 
 
 def _of_different_blocks(

@@ -8,6 +8,7 @@ has no norm.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,8 @@ from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.statistics.intervals import Estimand
 from vla_attention.analyze.stores.parallel import map_episodes
+from vla_attention.analyze.stores.selection import Selection
+from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 from vla_attention.schemas.segments import segment_members, weights_on_segments
 
@@ -78,21 +81,20 @@ def group_contribution_tables(question: Question, resolved: Sequence[ResolvedGro
     names = [name for name in question.grouping.names if all(name in parts for parts in chosen)]
     if not names:
         return None
-    return concat_tables(
-        map_episodes(
-            lambda pair: _episode_norms(pair[0], {name: pair[1][name] for name in names}, question),
-            list(zip(question.selected, chosen, strict=True)),
-        )
-    )
+    measure = partial(_episode_norms, selection=question.selection, site=question.site, grouping=question.grouping)
+    measurable = [{name: parts[name] for name in names} for parts in chosen]
+    return concat_tables(map_episodes(measure, list(zip(question.selected, measurable, strict=True))))
 
 
-def _episode_norms(item: SelectedEpisode, parts: Mapping[str, NDArray[np.bool_]], question: Question) -> Tables:
-    selection, grouping = question.selection, question.grouping
-    gram = selected_gram(item, question.site, selection)
+def _episode_norms(
+    pair: tuple[SelectedEpisode, Mapping[str, NDArray[np.bool_]]], selection: Selection, site: str, grouping: Grouping
+) -> Tables:
+    item, parts = pair
+    gram = selected_gram(item, site, selection)
     norms = np.stack([joint_norm(gram, taken) for taken in parts.values()], axis=-1)
     sides: dict[str, NDArray[np.float64]] = {}
     if grouping.ratio is not None and {*grouping.ratio.numerator, *grouping.ratio.denominator} <= parts.keys():
-        uniform = uniform_weights(item, question.site, selection)
+        uniform = uniform_weights(item, site, selection)
         above, below = (
             (joint_norm(gram, taken), joint_norm(gram, taken, uniform))
             for side in (grouping.ratio.numerator, grouping.ratio.denominator)

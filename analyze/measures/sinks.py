@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import polars as pl
@@ -259,10 +260,7 @@ def search_of(question: Question, shares: Sequence[KeyShares], rule: SinkRule) -
 def search_sinks(question: Question, rule: SinkRule | None = None) -> SinkSearch:
     """Look for sinks in every task; reads all selected rows once."""
     rule = rule or SinkRule()
-
-    def measure(item: SelectedEpisode) -> KeyShares:
-        return episode_key_shares(item, question.selection, question.site, rule)
-
+    measure = partial(episode_key_shares, selection=question.selection, site=question.site, rule=rule)
     with progress_bar(len(question.selected), "episodes searched for sinks") as advance:
         shares = map_episodes(measure, question.selected, advance)
     return search_of(question, shares, rule)

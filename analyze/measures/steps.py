@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,14 +134,16 @@ def measure_episodes(
     known = resolved or resolve_all(question.grouping, question.selected, question.vocabulary)
     selection = question.selection if per_head is None else replace(question.selection, per_head=per_head)
 
-    def measure(pair: tuple[SelectedEpisode, ResolvedGrouping]) -> MeasuredEpisode:
-        return measure_episode(*pair, selection, question.site)
-
+    measure = partial(_measure_pair, selection=selection, site=question.site)
     pairs = list(zip(question.selected, known, strict=True))
     if progress is not None:
         return map_episodes(measure, pairs, progress)
     with progress_bar(len(pairs), "episodes") as advance:
         return map_episodes(measure, pairs, advance)
+
+
+def _measure_pair(pair: tuple[SelectedEpisode, ResolvedGrouping], selection: Selection, site: str) -> MeasuredEpisode:
+    return measure_episode(*pair, selection, site)
 
 
 def step_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Tables:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 
 import numpy as np
 import polars as pl
@@ -110,12 +111,15 @@ def object_tables(question: Question, settings: ObjectSettings | None = None, ke
         raise BadArgument(f"Site '{question.site}': {NO_COVERAGE}.")
     showing = [item for item in question.selected if cameras_of(item)]
     episodes_of = Counter(task_of(item) for item in showing)
+    measure = partial(
+        _measure_episode,
+        selection=question.selection,
+        site=question.site,
+        settings=settings,
+        keep_steps=keep_steps,
+        episodes_of=episodes_of,
+    )
     with progress_bar(len(showing), "episodes") as advance:
-
-        def measure(item: SelectedEpisode) -> tuple[ObjectTables, ControlParts]:
-            others = episodes_of[task_of(item)] - 1
-            return _measure_episode(item, question.selection, question.site, settings, keep_steps, others)
-
         measured = map_episodes(measure, showing, advance)
     columns = control_columns([of_control for _, of_control in measured])
     parts = [
@@ -160,7 +164,12 @@ class _Episode:
 
 
 def _measure_episode(
-    item: SelectedEpisode, selection: Selection, site: str, settings: ObjectSettings, keep_steps: bool, num_others: int
+    item: SelectedEpisode,
+    selection: Selection,
+    site: str,
+    settings: ObjectSettings,
+    keep_steps: bool,
+    episodes_of: Mapping[tuple[str, int], int],
 ) -> tuple[ObjectTables, ControlParts]:
     names, members = items_of(item)
     views = views_of(item, members, settings)
@@ -200,7 +209,7 @@ def _measure_episode(
         name: control_source(
             np.concatenate([averaged[view.camera] for view in seen], axis=-1),
             np.concatenate([view.area for view in seen], axis=1),
-            num_others,
+            episodes_of[task_of(item)] - 1,
         )
         for name, seen in pictures.items()
     }

@@ -1,10 +1,19 @@
-"""The same work on many episodes in a few threads: one waits for its chunks while another is computed."""
+"""The same work on many episodes, several at once: the episode is the one unit of work everywhere.
+
+Threads of this process unless `episodes_with` says otherwise: one waits for its chunks while another is computed. The
+functions that are handed over here are picklable: defined at the top of their module, or a `functools.partial` of such
+a function with plain arguments. Any of them can then be computed in another process.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import partial
+from typing import Any, Protocol, TypeVar
 
 from vla_attention.analyze.stores.blas import one_blas_thread
 from vla_attention.schemas.threads import threads_of_this_process
@@ -14,23 +23,87 @@ Result = TypeVar("Result")
 
 #: More threads are not faster (decoding has its own), and each holds the rows of one layer in memory.
 _MOST_AT_ONCE = 4
+#: Episodes that are begun beyond the one whose result is waited for, for each thread or worker: results of later
+#: episodes are kept until those of earlier ones are there.
+_BEGUN_AHEAD = 2
+
+
+class Engine(Protocol):
+    """Computes a function of each item somewhere."""
+
+    def results(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """Results in the order of the items; the first item's error that fails is raised."""
+
+
+class Threads:
+    """The engine of this process."""
+
+    def results(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """See `Engine`."""
+        number = min(_MOST_AT_ONCE, threads_of_this_process().number)
+        executor = ThreadPoolExecutor(number)
+        with one_blas_thread():
+            try:
+                yield from in_order(lambda item: executor.submit(function, item), items, number * _BEGUN_AHEAD)
+            finally:
+                executor.shutdown(wait=True, cancel_futures=True)
+
+
+_engine: ContextVar[Engine | None] = ContextVar("engine of episodes", default=None)
+
+
+@contextmanager
+def episodes_with(engine: Engine) -> Iterator[None]:
+    """Within the block, `each_episode` and `map_episodes` hand episodes to this engine."""
+    token = _engine.set(engine)
+    try:
+        yield
+    finally:
+        _engine.reset(token)
+
+
+def each_episode(
+    function: Callable[[Item], Result], items: Iterable[Item], progress: Callable[[int], object] | None = None
+) -> Iterator[Result]:
+    """Results in the order of the items, one after the other: only a few are kept at once.
+
+    The first error is raised, and no further item is started.
+
+    Args:
+        function: a function at the top of its module, or a `functools.partial` of one; raises `TypeError` otherwise.
+        items: what it is called with, one at a time.
+        progress: called with 1 after each item, in the caller's thread.
+    """
+    _refuse_local(function)
+    for result in (_engine.get() or Threads()).results(function, items):
+        yield result
+        if progress is not None:
+            progress(1)
 
 
 def map_episodes(
     function: Callable[[Item], Result], items: Iterable[Item], progress: Callable[[int], object] | None = None
 ) -> list[Result]:
-    """Results in the order of the items. The first error is raised, and no further item is started.
+    """All results of `each_episode`."""
+    return list(each_episode(function, items, progress))
 
-    `progress` is called with 1 after each, in the caller's thread.
-    """
-    results: list[Result] = []
-    executor = ThreadPoolExecutor(min(_MOST_AT_ONCE, threads_of_this_process().number))
-    with one_blas_thread():
-        try:
-            for result in executor.map(function, items):
-                results.append(result)
-                if progress is not None:
-                    progress(1)
-        finally:
-            executor.shutdown(wait=True, cancel_futures=True)
-    return results
+
+def in_order(submit: Callable[[Item], Future[Result]], items: Iterable[Item], begun_at_once: int) -> Iterator[Result]:
+    """Results of futures in the order of the items; at most so many are begun and not yet handed out."""
+    begun: deque[Future[Result]] = deque()
+    for item in items:
+        if len(begun) >= begun_at_once:
+            yield begun.popleft().result()
+        begun.append(submit(item))
+    while begun:
+        yield begun.popleft().result()
+
+
+def _refuse_local(function: Callable[..., Any]) -> None:
+    """Raise `TypeError` for a function that another process could not find by its name."""
+    inner = function
+    while isinstance(inner, partial):
+        inner = inner.func
+    name = getattr(inner, "__qualname__", type(inner).__qualname__)
+    if "<" in name:
+        raise TypeError(f"{name} is defined inside of a function: episodes are handed to functions of a module only")

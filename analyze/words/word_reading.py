@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import polars as pl
@@ -61,11 +62,8 @@ def words_table(question: Question) -> pl.DataFrame:
     """
     if not question.vocabulary.words:
         raise BadArgument(f"Site '{question.site}': {NO_WORDS}.")
+    measure = partial(_episode_words, selection=question.selection, site=question.site)
     with progress_bar(len(question.selected), "episodes") as advance:
-
-        def measure(item: SelectedEpisode) -> pl.DataFrame:
-            return _episode_words(item, question.selection, question.site)
-
         return pl.concat(map_episodes(measure, question.selected, advance))
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -25,6 +27,14 @@ def count():
     limit(before)
 
 
+def _called(count: Callable[[], int], _: int) -> int:
+    return count()
+
+
+def _fail(_: int) -> None:
+    raise ValueError("damaged")
+
+
 def test_the_blas_of_numpys_wheels_can_be_limited():
     built = np.show_config(mode="dicts")["Build Dependencies"]["blas"]["name"]
     if "openblas" not in built:
@@ -33,16 +43,13 @@ def test_the_blas_of_numpys_wheels_can_be_limited():
 
 
 def test_a_scan_has_one_thread_inside_and_the_users_number_after_it(count):
-    assert map_episodes(lambda _: count(), range(5)) == [1] * 5
+    assert map_episodes(partial(_called, count), range(5)) == [1] * 5
     assert count() == 3
 
 
 def test_an_error_in_a_scan_gives_the_number_back(count):
-    def fail(_: int) -> None:
-        raise ValueError("damaged")
-
     with pytest.raises(ValueError, match="damaged"):
-        map_episodes(fail, range(3))
+        map_episodes(_fail, range(3))
     assert count() == 3
 
 

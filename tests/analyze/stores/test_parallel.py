@@ -1,30 +1,57 @@
 """Working on several episodes at once changes nothing but the time."""
 
 import threading
+from functools import partial
 
 import pytest
 
-from vla_attention.analyze.stores.parallel import map_episodes
+from vla_attention.analyze.stores.parallel import each_episode, map_episodes
 
 
 def test_results_come_in_order_and_progress_counts_each():
     counted = []
-    assert map_episodes(lambda i: i * i, range(20), counted.append) == [i * i for i in range(20)]
+    assert map_episodes(_square, range(20), counted.append) == [i * i for i in range(20)]
     assert counted == [1] * 20
 
 
 def test_the_first_error_ends_it():
     begun = []
     gate = threading.Event()
+    with pytest.raises(ValueError, match="episode 0"):
+        map_episodes(partial(_fail_first, begun=begun, gate=gate), range(1000))
+    assert len(begun) < 1000
 
-    def work(i: int) -> int:
-        begun.append(i)
-        if i == 0:
-            gate.set()
-            raise ValueError("episode 0")
-        gate.wait(10)
+
+def test_results_are_handed_out_one_by_one_and_few_episodes_are_begun_ahead():
+    begun = []
+    results = each_episode(partial(_begin, begun=begun), range(1000))
+    assert [next(results) for _ in range(3)] == [0, 1, 2]
+    results.close()
+    assert len(begun) < 50
+
+
+def test_a_function_that_no_other_process_could_find_is_refused():
+    def inside(i: int) -> int:
         return i
 
-    with pytest.raises(ValueError, match="episode 0"):
-        map_episodes(work, range(1000))
-    assert len(begun) < 1000
+    for function in (inside, partial(inside, 3), lambda i: i):
+        with pytest.raises(TypeError, match="defined inside of a function"):
+            map_episodes(function, range(3))
+
+
+def _square(i: int) -> int:
+    return i * i
+
+
+def _fail_first(i: int, begun: list[int], gate: threading.Event) -> int:
+    begun.append(i)
+    if i == 0:
+        gate.set()
+        raise ValueError("episode 0")
+    gate.wait(10)
+    return i
+
+
+def _begin(i: int, begun: list[int]) -> int:
+    begun.append(i)
+    return i
