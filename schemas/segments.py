@@ -68,12 +68,27 @@ def weights_on_segments(weights: NDArray[np.float32], members: NDArray[np.bool_]
     Returns:
         (replan or 1, segment, group) float32, 0 for a segment without keys at a replan.
     """
+    # The first replan alone tells most groups that cut a segment.
+    for part in (slice(0, 1), slice(None)):
+        result = _alike(weights[part], members[part])
+        if result is None:
+            return None
+    return result
+
+
+def _alike(weights: NDArray[np.float32], members: NDArray[np.bool_]) -> NDArray[np.float32] | None:
+    """`weights_on_segments` of some replans."""
     replans = max(weights.shape[0], members.shape[0])
     result = np.zeros((replans, members.shape[2], weights.shape[2]), dtype=np.float32)
     for segment in range(members.shape[2]):
-        inside = members[:, :, segment, None]
-        highest = np.where(inside, weights, -np.inf).max(axis=1)
-        lowest = np.where(inside, weights, np.inf).min(axis=1)
+        keys = np.flatnonzero(members[:, :, segment].any(axis=0))
+        if not keys.size:
+            continue
+        # A segment is a part of a span: looking at all keys for each of them would take ten times as long.
+        own = slice(keys[0], keys[-1] + 1)
+        inside, values = members[:, own, segment, None], weights[:, own]
+        highest = np.where(inside, values, -np.inf).max(axis=1)
+        lowest = np.where(inside, values, np.inf).min(axis=1)
         present = inside.any(axis=1)
         if (present & (highest != lowest)).any():
             return None

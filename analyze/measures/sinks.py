@@ -181,7 +181,7 @@ def episode_key_shares(item: SelectedEpisode, selection: Selection, site: str, r
     """Read an episode's rows once."""
     valid, counts = item.valid, item.key_counts
     shares = KeyShares.empty(selection, valid.shape[1])
-    for part in layer_rows(item.episode, selection, site):
+    for part in layer_rows(item.episode, selection, site, per_head=True):
         shares.add(part.layer, part.rows, valid, rule.factor, selection, counts=counts)
     return shares
 

@@ -100,7 +100,7 @@ def measure_episode(
     else:
         mass = np.empty((*row_sum.shape, weights.shape[2]))
         for part in layer_rows(item.episode, selection, site):
-            mass[:, part.layer, part.denoise] = masses(part.of_heads(selection), weights)
+            mass[:, part.layer, part.denoise] = masses(part.rows, weights)
     return measured_from(item, resolved, selection, mass, row_sum)
 
 

@@ -178,7 +178,7 @@ def _measure_episode(
     cells = (item.tokens.num_replans, len(selection.layers), len(selection.denoise), heads)
     maps = {view.camera: np.zeros((*cells[:2], heads, view.grid.num_patches)) for view in views}
     for part in layer_rows(item.episode, selection, site):
-        rows = part.of_heads(selection)
+        rows = part.rows
         if item.without:
             rows = rows.copy()
             rows[:, :, list(item.without)] = 0.0

@@ -19,24 +19,48 @@ class LayerRows:
     Attributes:
         layer: position in the selection's layers.
         denoise: position in the selection's denoise steps.
-        rows: probabilities (replan, head, key) float32, mean over the stored queries, of the selected heads.
+        rows: probabilities (replan, head, key) float32, mean over the stored queries, of the selected heads; or their
+            mean over these heads, (replan, 1, key).
     """
 
     layer: int
     denoise: int
     rows: NDArray[np.float32]
 
-    def of_heads(self, selection: Selection) -> NDArray[np.float32]:
-        """The rows (replan, head or 1, key): their mean over heads unless the selection keeps heads apart."""
-        return self.rows if selection.per_head else self.rows.mean(axis=1, keepdims=True)
 
+def layer_rows(
+    episode: StoredEpisode, selection: Selection, site: str, per_head: bool | None = None
+) -> Iterator[LayerRows]:
+    """Read the selected layers and denoise steps of an episode one after the other.
 
-def layer_rows(episode: StoredEpisode, selection: Selection, site: str) -> Iterator[LayerRows]:
-    """Read the selected layers and denoise steps of an episode one after the other."""
-    stored = episode.array(f"{site}/rows").shape[3]
+    All are read into the same memory: each is gone when the next one is asked for.
+
+    Args:
+        episode: where the rows are.
+        selection: which layers, denoise steps and heads.
+        site: the softmax family.
+        per_head: keep heads apart; as in the selection unless it is given.
+    """
+    name = f"{site}/rows"
     # A slice where it can be one: picking heads by their numbers copies every row.
+    replans, *_, stored, queries, keys = episode.shape_of(name)
     heads = slice(None) if selection.heads == tuple(range(stored)) else list(selection.heads)
-    for i, layer in enumerate(selection.layers):
-        for j, step in enumerate(selection.denoise):
-            rows = episode.read_layer(f"{site}/rows", layer, step)[:, heads]
-            yield LayerRows(i, j, rows.mean(axis=2) if rows.shape[2] > 1 else rows[:, :, 0])
+    apart = selection.per_head if per_head is None else per_head
+    # Means too are written into memory that stays: new memory for each would be asked of the system again and again.
+    of_queries = np.empty((replans, len(selection.heads), keys), np.float32) if queries > 1 else None
+    of_heads = None if apart else np.empty((replans, keys), np.float32)
+    cells = [(i, j) for i in range(len(selection.layers)) for j in range(len(selection.denoise))]
+    places = [(selection.layers[i], selection.denoise[j]) for i, j in cells]
+    for (i, j), whole in zip(cells, episode.read_layers(name, places), strict=True):
+        rows = whole[:, heads]
+        rows = rows[:, :, 0] if of_queries is None else _mean_into(of_queries, rows, 2)
+        if of_heads is not None:
+            rows = _mean_into(of_heads, rows, 1)[:, None]
+        episode.refuse_missing(name, rows)
+        yield LayerRows(i, j, rows)
+
+
+def _mean_into(memory: NDArray[np.float32], values: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
+    """The mean over one axis: to the last bit that of `values.mean`, which divides in float64 and is slower."""
+    np.add.reduce(values, axis=axis, out=memory)
+    return np.divide(memory, np.float32(values.shape[axis]), out=memory)

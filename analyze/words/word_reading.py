@@ -105,7 +105,7 @@ def _episode_words(item: SelectedEpisode, selection: Selection, site: str) -> pl
     heads = len(selection.heads) if selection.per_head else 1
     mass = np.zeros((item.tokens.num_replans, len(selection.layers), heads, items.weights.shape[2]))
     for part in layer_rows(item.episode, selection, site):
-        mass[:, part.layer] += masses(part.of_heads(selection), items.weights) / len(selection.denoise)
+        mass[:, part.layer] += masses(part.rows, items.weights) / len(selection.denoise)
     layers = LayerAxis.of(selection, average_one=False)
     mass = layers.with_average(mass)
     keys = counted_keys(items.weights, item.key_counts)

@@ -7,9 +7,9 @@ is opened.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -138,11 +138,9 @@ class StoredEpisode:
 
     def _metadata(self, name: str) -> dict[str, Any]:
         """An array's `zarr.json`, which must have the shape that the attributes list."""
-        recorded = self.attributes.arrays.get(name)
-        if recorded is None:
-            raise CorruptEpisode(f"Episode {self.name} lacks the array {name}: its attributes do not list it.")
+        shape = self.shape_of(name)
         document = json.loads(self.sealed(f"{name}/zarr.json"))
-        if not isinstance(document, dict) or document.get("shape") != list(recorded.shape):
+        if not isinstance(document, dict) or document.get("shape") != list(shape):
             raise CorruptEpisode(f"Array {name} of episode {self.name} has another shape than its attributes say.")
         return document
 
@@ -158,7 +156,8 @@ class StoredEpisode:
             raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {problem}.") from error
         if name.endswith("/key_role") and not values.all():
             raise _lost_chunk(self, name)
-        return self._without_missing(name, values)
+        self.refuse_missing(name, values)
+        return values
 
     def _single_chunk(self, name: str) -> SingleChunk | None:
         if name not in self._single_chunks:
@@ -167,26 +166,51 @@ class StoredEpisode:
             self._single_chunks[name] = SingleChunk.of(self._metadata(name), self.files, name)
         return self._single_chunks[name]
 
+    def shape_of(self, name: str) -> tuple[int, ...]:
+        """Shape of one array, as the attributes list it; `CorruptEpisode` when they do not."""
+        recorded = self.attributes.arrays.get(name)
+        if recorded is None:
+            raise CorruptEpisode(f"Episode {self.name} lacks the array {name}: its attributes do not list it.")
+        return tuple(recorded.shape)
+
     def read_layer(self, name: str, layer: int, denoise: int) -> NDArray[np.float32]:
         """One layer and denoise step (positions) of an array (replan, layer, denoise, ...), without those two axes."""
+        values = next(self.read_layers(name, [(layer, denoise)]))
+        self.refuse_missing(name, values)
+        return values
+
+    def read_layers(self, name: str, places: Iterable[tuple[int, int]]) -> Iterator[NDArray[np.float32]]:
+        """Layers and denoise steps of an array as `read_layer` gives them, one after the other in the same memory.
+
+        Each is gone when the next one is asked for. They are not searched for missing values: give `refuse_missing`
+        what is made of them, which has far fewer numbers.
+        """
+        layers = self._sharded(name)
+        buffer = None if layers is None else self._readable(name, layers.buffer)
+        for layer, denoise in places:
+            if layers is None:
+                yield self.read(name, (slice(None), layer, denoise))
+            else:
+                yield self._readable(name, partial(layers.read, layer, denoise, buffer))
+
+    def _sharded(self, name: str) -> ShardedLayers | None:
         if name not in self._layers:
             from vla_attention.schemas.stores.shards import ShardedLayers
 
-            metadata, files = dict(self.array(name).metadata.to_dict()), self.files
-            self._layers[name] = ShardedLayers.of(metadata, lambda file: files.shard(f"{name}/{file}"))
-        layers = self._layers[name]
-        if layers is None:
-            return self.read(name, (slice(None), layer, denoise))
+            files = self.files
+            self._layers[name] = ShardedLayers.of(self._metadata(name), lambda file: files.shard(f"{name}/{file}"))
+        return self._layers[name]
+
+    def _readable(self, name: str, read: Callable[[], NDArray[np.float32]]) -> NDArray[np.float32]:
         try:
-            values = layers.read(layer, denoise)
+            return read()
         except CorruptEpisode as error:
             raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {error}.") from None
-        return self._without_missing(name, values)
 
-    def _without_missing(self, name: str, values: NDArray[Any]) -> NDArray[Any]:
+    def refuse_missing(self, name: str, values: NDArray[Any]) -> None:
+        """Raise `CorruptEpisode` when values of an array, or sums of them, have the mark of a lost chunk."""
         if _holds_missing(values):
             raise _lost_chunk(self, name)
-        return values
 
     def tokens(self, root: RootAttributes, site: str) -> EpisodeTokens:
         """What every key of a site is in this episode."""
@@ -270,6 +294,9 @@ def _holds_missing(values: NDArray[Any]) -> bool:
     """Whether floats or signed integers contain the fill value that zarr gives for a missing chunk."""
     if values.dtype.kind == "i":
         return bool((values == -1).any())
-    if values.dtype.kind != "f" or not np.isnan(values.sum()):
-        return False  # one pass without a temporary array: rows are large
-    return bool(np.isnan(values).any())
+    if values.dtype.kind != "f":
+        return False
+    # One pass without a temporary array: rows are large. Squares do not cancel each other, so that their sum is NaN for
+    # NaN alone.
+    flat = values.reshape(-1)
+    return bool(np.isnan(np.dot(flat, flat)))

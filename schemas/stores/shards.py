@@ -180,21 +180,23 @@ class ShardedLayers:
     @classmethod
     def of(cls, metadata: dict[str, Any], shard_in: Callable[[str], SealedShard | None]) -> ShardedLayers | None:
         """The array's reader, or None when its metadata (its `zarr.json`) describe another layout."""
-        shape = tuple(metadata["shape"])
-        shard = tuple(metadata["chunk_grid"].get("configuration", {}).get("chunk_shape", ()))
-        codecs = metadata["codecs"]
-        if len(shape) < 4 or chunks_of_a_shard(metadata) is None:
-            return None
-        inner = codecs[0]["configuration"]
-        known = (
-            metadata["data_type"] == "float32"
-            and metadata["chunk_key_encoding"] == {"name": "default", "configuration": {"separator": "/"}}
-            and not metadata.get("storage_transformers")
-            and shard[1:] == shape[1:]
-            and tuple(inner["chunk_shape"]) == (shard[0], 1, 1, *shape[3:])
-            and [codec["name"] for codec in inner["codecs"]] == ["bytes", "blosc", "crc32c"]
-            and inner["codecs"][0]["configuration"]["endian"] == "little"
-        )
+        try:
+            shape = tuple(metadata["shape"])
+            shard = tuple(metadata["chunk_grid"]["configuration"]["chunk_shape"])
+            if len(shape) < 4 or chunks_of_a_shard(metadata) is None:
+                return None
+            inner = metadata["codecs"][0]["configuration"]
+            known = (
+                metadata["data_type"] == "float32"
+                and metadata["chunk_key_encoding"] == {"name": "default", "configuration": {"separator": "/"}}
+                and not metadata.get("storage_transformers")
+                and shard[1:] == shape[1:]
+                and tuple(inner["chunk_shape"]) == (shard[0], 1, 1, *shape[3:])
+                and [codec["name"] for codec in inner["codecs"]] == ["bytes", "blosc", "crc32c"]
+                and inner["codecs"][0]["configuration"]["endian"] == "little"
+            )
+        except (AttributeError, KeyError, TypeError):
+            return None  # zarr says what is wrong with them
         return cls(shape, shard[0], shard_in) if known else None
 
     @cached_property
@@ -209,8 +211,15 @@ class ShardedLayers:
             raise CorruptEpisode(f"the seal does not list the chunks of its {file}")
         return shard
 
-    def read(self, layer: int, denoise: int) -> NDArray[np.float32]:
+    def buffer(self) -> NDArray[np.float32]:
+        """Memory for `read`: whole chunks of one layer and denoise step, (replans of all shards, ...)."""
+        return np.empty((len(self._shards) * self.replans_per_shard, *self.shape[3:]), dtype="<f4")
+
+    def read(self, layer: int, denoise: int, into: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
         """Values (replan, ...) of one layer and denoise step, both positions along their axes.
+
+        into: a `buffer`, of which the result is then a part; a new one without. Decoding every layer into the same
+        memory keeps it in the processor's cache, and no chunk is copied.
 
         Raises:
             CorruptEpisode: a chunk is missing, is not the one that was sealed, or decodes to another size.
@@ -220,15 +229,13 @@ class ShardedLayers:
         if not (0 <= layer < self.shape[1] and 0 <= denoise < self.shape[2]):
             raise IndexError(f"layer {layer} and denoise {denoise} of an array of shape {self.shape}")
         number = layer * self.shape[2] + denoise
-        values = np.empty((self.shape[0], *self.shape[3:]), dtype=np.float32)
-        chunk = np.empty((self.replans_per_shard, *self.shape[3:]), dtype="<f4")
+        values = self.buffer() if into is None else into
         for i, shard in enumerate(self._shards):
             frame = shard.chunk(number)
+            chunk = values[i * self.replans_per_shard : (i + 1) * self.replans_per_shard]
             try:
                 check_blosc_frame(frame, chunk.nbytes, chunk.itemsize)
                 blosc.decompress(frame, chunk)
             except (CorruptEpisode, RuntimeError, ValueError) as error:
                 raise CorruptEpisode(f"chunk {number} of its {shard.file} cannot be decoded: {error}") from None
-            first = i * self.replans_per_shard
-            values[first : first + self.replans_per_shard] = chunk[: self.shape[0] - first]
-        return values
+        return values[: self.shape[0]]

@@ -114,7 +114,7 @@ def test_rows_are_only_read_when_the_grouping_cuts_through_a_segment(tmp_path, m
         )
 
     spy_on("read")
-    spy_on("read_layer")
+    spy_on("read_layers")
     table_of(path, Grouping("spans", {"a": ("span:prompt & role:instruction",), "rest": ("*",)}))
     assert "joint/atoms" in read
     assert "joint/rows" not in read
