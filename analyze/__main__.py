@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
 import gc
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from importlib import import_module
 from pathlib import Path
 
@@ -43,15 +45,31 @@ def _run(name: str, arguments: Sequence[str]) -> int:
         metavar="N",
         help="threads that measure episodes, at most 4 (default: OMP_NUM_THREADS, else the cores of this process)",
     )
+    if name != "cache":
+        parser.add_argument(
+            "--no-cache",
+            action="store_true",
+            help="measure again what was measured before (see vla-analyze cache; VLA_CACHE=off does the same)",
+        )
     parsed = parser.parse_args(arguments)
     # The libraries read the numbers when they are imported, which the command does.
     use_threads(parsed.threads)
     os.environ.update(dict.fromkeys(_ONE_THREAD_EACH, "1"))
     try:
-        code: int = command.run(parsed)
+        with _cache_of(parsed):
+            code: int = command.run(parsed)
         return code
     except UserError as error:
         raise _with_way_out(error, can_skip=hasattr(parsed, "skip_corrupt")) from error.__cause__
+
+
+def _cache_of(parsed: argparse.Namespace) -> AbstractContextManager[None]:
+    """The cache that the arguments leave to the command."""
+    if not getattr(parsed, "no_cache", False):
+        return nullcontext()
+    from vla_attention.analyze.cache.places import switched_off
+
+    return switched_off()
 
 
 def _with_way_out(error: UserError, can_skip: bool) -> UserError:

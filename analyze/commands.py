@@ -21,6 +21,7 @@ COMMANDS: dict[str, str] = {
     "export": "tables as CSV or Parquet, masses or rows as NetCDF",
     "copy": "a smaller copy of a store, for instance without frames",
     "verify": "read everything back and check it",
+    "cache": "what is kept of earlier analyses: where, how much; --clear removes it",
 }
 #: The command of `vla-analyze STORE`.
 DEFAULT_COMMAND = "ratios"

@@ -75,7 +75,8 @@ def make_store(path: Path, episodes: int, replans: int) -> None:
 def measured(command: list[str]) -> tuple[float, float]:
     """Wall seconds and peak resident megabytes of a process."""
     began = time.perf_counter()
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, cwd=ROOT)
+    # What is measured is an analysis without the cache of an earlier one.
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, cwd=ROOT, env={**os.environ, "VLA_CACHE": "off"})
     _, status, usage = os.wait4(process.pid, 0)
     if status:
         raise SystemExit(f"failed: {' '.join(command)}")

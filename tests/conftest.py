@@ -17,6 +17,8 @@ from vla_attention.schemas.threads import use_threads
 # Before a test module imports torch or numpy: several threads make small models slower. OMP_NUM_THREADS overrides.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 use_threads()
+# What is tested is measured; tests of the cache switch it on in a folder of their own. Subprocesses inherit it.
+os.environ["VLA_CACHE"] = "off"
 
 for _name, _count in PROFILES.items():
     settings.register_profile(_name, max_examples=_count, deadline=None)

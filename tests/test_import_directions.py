@@ -24,6 +24,8 @@ LEVELS = {
     "analyze.measures": 2,
     "analyze.arguments": 3,
     **{f"analyze.{command}": 4 for command in COMMANDS},
+    "analyze.cache": 1,
+    "analyze.cache.command": 4,
     "analyze.published": 3,
     "analyze.parse": 5,
     "analyze.report": 5,

@@ -99,16 +99,27 @@ def resolve_all(
     """
     check_names(grouping, vocabulary or vocabulary_of(selected), selected[0].tokens.layout)
     resolved = [resolve(grouping, item.tokens) for item in selected]
-    for i, name in enumerate(grouping.names):
-        if name not in grouping.allow_empty and not any(item.num_keys[:, i].any() for item in resolved):
-            selectors = " | ".join(grouping.groups[name])
-            raise EmptyGroup(
-                f"Group '{name}' ({selectors}) has no key in any of the {len(selected)} selected episodes; change its "
-                f'selector, or add allow_empty = ["{name}"] to the grouping.'
-            )
+    check_not_empty(grouping, [item.num_keys for item in resolved])
     return [
         _without(weights, item) if item.without else weights for item, weights in zip(selected, resolved, strict=True)
     ]
+
+
+def resolve_episode(grouping: Grouping, item: SelectedEpisode) -> ResolvedGrouping:
+    """The grouping on one episode, without the checks that need all of them."""
+    resolved = resolve(grouping, item.tokens)
+    return _without(resolved, item) if item.without else resolved
+
+
+def check_not_empty(grouping: Grouping, num_keys: Sequence[NDArray[np.float64]]) -> None:
+    """Raise `EmptyGroup` for a group without a key in any episode; numbers of keys (replan or 1, group) of each."""
+    for i, name in enumerate(grouping.names):
+        if name not in grouping.allow_empty and not any(item[:, i].any() for item in num_keys):
+            selectors = " | ".join(grouping.groups[name])
+            raise EmptyGroup(
+                f"Group '{name}' ({selectors}) has no key in any of the {len(num_keys)} selected episodes; change its "
+                f'selector, or add allow_empty = ["{name}"] to the grouping.'
+            )
 
 
 def _without(resolved: ResolvedGrouping, item: SelectedEpisode) -> ResolvedGrouping:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.analyze.cache.remembered import CachedQuestion, remembered
 from vla_attention.analyze.measures.frames import (
     EPISODE_KEYS,
     Axis,
@@ -29,14 +32,23 @@ from vla_attention.analyze.measures.masses import (
     uniform_ratio,
 )
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
+from vla_attention.analyze.measures.selected import (
+    SelectedEpisode,
+    check_not_empty,
+    resolve_all,
+    resolve_episode,
+)
+from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.show.progress import progress_bar
-from vla_attention.analyze.stores.parallel import map_episodes
+from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.groupings.grouping import Grouping
-from vla_attention.schemas.groupings.resolve import ResolvedGrouping
+from vla_attention.schemas.groupings.resolve import ResolvedGrouping, check_names
 from vla_attention.schemas.segments import segment_members, weights_on_segments
+
+#: The arrays of a `MeasuredEpisode`.
+MEASURED_ARRAYS = ("mass", "valid_mass", "row_sum", "num_keys", "num_valid")
 
 
 @dataclass(frozen=True)
@@ -131,19 +143,88 @@ def measure_episodes(
         progress: called with 1 after each episode.
         per_head: keep heads apart; as in the question unless it is given.
     """
-    known = resolved or resolve_all(question.grouping, question.selected, question.vocabulary)
     selection = question.selection if per_head is None else replace(question.selection, per_head=per_head)
-
-    measure = partial(_measure_pair, selection=selection, site=question.site)
-    pairs = list(zip(question.selected, known, strict=True))
+    selected = question.selected
     if progress is not None:
-        return map_episodes(measure, pairs, progress)
-    with progress_bar(len(pairs), "episodes") as advance:
-        return map_episodes(measure, pairs, advance)
+        return _measured_or_kept(question, selection, resolved, progress)
+    with progress_bar(len(selected), "episodes") as advance:
+        return _measured_or_kept(question, selection, resolved, advance)
 
 
-def _measure_pair(pair: tuple[SelectedEpisode, ResolvedGrouping], selection: Selection, site: str) -> MeasuredEpisode:
-    return measure_episode(*pair, selection, site)
+def _measured_or_kept(
+    question: Question,
+    selection: Selection,
+    resolved: Sequence[ResolvedGrouping] | None,
+    progress: Callable[[int], object],
+) -> list[MeasuredEpisode]:
+    """`measure_episodes`: from the cache what it holds. The grouping is resolved on the other episodes only."""
+    grouping, selected = question.grouping, question.selected
+    # Whether a group is empty is decided with its sinks.
+    if resolved is None and any(item.without for item in selected):
+        resolved = resolve_all(grouping, selected, question.vocabulary)
+    if resolved is None:
+        check_names(grouping, question.vocabulary, selected[0].tokens.layout)
+
+    def measure(positions: Sequence[int]) -> Iterator[dict[str, NDArray[Any]]]:
+        items = [selected[i] for i in positions]
+        if resolved is not None:
+            known = [resolved[i] for i in positions]
+        elif len(items) == len(selected):
+            known = resolve_all(grouping, items, question.vocabulary)
+        else:
+            known = [resolve_episode(grouping, item) for item in items]
+        each = partial(_measured_arrays, selection=selection, site=question.site)
+        return each_episode(each, list(zip(items, known, strict=True)), progress)
+
+    arrays = remembered(
+        masses_question(grouping, selection, question.site),
+        [item.episode for item in selected],
+        measure,
+        arguments=[
+            [item.without, None if resolved is None else digest_of_weights(resolved[i])]
+            for i, item in enumerate(selected)
+        ],
+        progress=progress,
+    )
+    if resolved is None:
+        check_not_empty(grouping, [one["num_keys"] for one in arrays])
+    return [MeasuredEpisode(item, selection, **one) for item, one in zip(selected, arrays, strict=True)]
+
+
+def masses_question(grouping: Grouping, selection: Selection, site: str) -> CachedQuestion:
+    """What the masses of an episode depend on besides the episode."""
+    heads = f"{plural(len(selection.heads), 'head')}{' apart' if selection.per_head else ''}"
+    return CachedQuestion(
+        "masses",
+        {
+            "groups": [[name, list(selectors)] for name, selectors in grouping.groups.items()],
+            "overlap": grouping.overlap,
+            "site": site,
+            "layers": selection.layers,
+            "denoise": selection.denoise,
+            "heads": selection.heads,
+            "per_head": selection.per_head,
+        },
+        f"masses of grouping {grouping.name}, site {site}, {plural(len(selection.layers), 'layer')}, "
+        f"{plural(len(selection.denoise), 'denoise step')}, {heads}",
+    )
+
+
+def digest_of_weights(resolved: ResolvedGrouping) -> str:
+    """A digest of what masses depend on of a grouping that was resolved by the caller."""
+    digest = hashlib.sha256()
+    for array in (resolved.weights, resolved.num_keys, resolved.num_valid):
+        digest.update(f"{array.dtype.str}{array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+def _measured_arrays(
+    pair: tuple[SelectedEpisode, ResolvedGrouping], selection: Selection, site: str
+) -> dict[str, NDArray[Any]]:
+    measured = measure_episode(*pair, selection, site)
+    # In C order, as they come from the cache and from other processes: numpy's sums depend on the order in memory.
+    return {name: np.ascontiguousarray(getattr(measured, name)) for name in MEASURED_ARRAYS}
 
 
 def step_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Tables:

@@ -62,7 +62,6 @@ class Analysis:
     """
 
     question: Question
-    resolved: Sequence[ResolvedGrouping]
     measured: Sequence[MeasuredEpisode]
     replans: Tables
     episodes: Tables
@@ -73,6 +72,11 @@ class Analysis:
     def grouping(self) -> Grouping:
         """The groups of keys and the ratio that the tables are about."""
         return self.question.grouping
+
+    @cached_property
+    def resolved(self) -> Sequence[ResolvedGrouping]:
+        """The grouping on every episode."""
+        return resolve_all(self.grouping, self.question.selected, self.question.vocabulary)
 
     @cached_property
     def overall(self) -> dict[str, Any]:
@@ -200,12 +204,11 @@ def analyse(question: Question, without_sinks: SinkRule | None = None) -> Analys
         sinks = search_sinks(question, without_sinks).sinks
         question = question_without_sinks(question, sinks, without_sinks)
     grouping = question.grouping
-    resolved = resolve_all(grouping, question.selected, question.vocabulary)
-    measured = measure_episodes(question, resolved)
+    measured = measure_episodes(question)
     replans = replan_tables(measured, grouping)
     episodes = episode_tables(replans, grouping)
     tasks = task_tables(episodes, grouping, estimand=question.settings.intervals)
-    return Analysis(question, resolved, measured, replans, episodes, tasks, sinks)
+    return Analysis(question, measured, replans, episodes, tasks, sinks)
 
 
 def _described(analysis: Analysis) -> AnalysedRun:

@@ -125,6 +125,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "export": ("STORE", "--csv", "--output", "OUT"),
     "copy": ("STORE", "OUT/copy.zarr", "--without", "frames"),
     "verify": ("STORE",),
+    "cache": (),
 }
 
 

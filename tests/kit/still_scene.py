@@ -39,4 +39,3 @@ def capture_without_simulator(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "vla_attention.capture.rollout.episode_loop.make_environment", lambda suite, task_id, settings: StillScene()
     )
-    monkeypatch.setattr("vla_attention.capture.capture_run.default_num_envs", lambda: 1)

@@ -1,0 +1,75 @@
+"""Where the cache is and how large it may become: the variables VLA_CACHE and VLA_CACHE_SIZE. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from vla_attention.schemas.errors import BadArgument
+
+#: The folder of the cache, relative to the working directory: beside the results, which are in results/STORE/GROUPING.
+DEFAULT_FOLDER = Path("results", ".cache")
+#: A grouping of 500 LIBERO episodes takes 70 MB.
+DEFAULT_BYTES = 2_000_000_000
+FOLDER_VARIABLE = "VLA_CACHE"
+SIZE_VARIABLE = "VLA_CACHE_SIZE"
+#: Values of VLA_CACHE with which there is no cache.
+_OFF = ("off", "0", "no", "false")
+_UNITS = {"": 1, "B": 1, "KB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}
+
+
+@dataclass(frozen=True)
+class CachePlace:
+    """A folder for the cache, which need not exist, and the most bytes that its files may take."""
+
+    folder: Path
+    most_bytes: int = DEFAULT_BYTES
+
+
+def cache_place() -> CachePlace | None:
+    """The cache of this process; None when it is switched off.
+
+    Raises:
+        BadArgument: VLA_CACHE_SIZE is no size.
+    """
+    given = os.environ.get(FOLDER_VARIABLE, "").strip()
+    if given.casefold() in _OFF:
+        return None
+    size = os.environ.get(SIZE_VARIABLE, "").strip()
+    # Absolute: the working directory may change while a store is open.
+    return CachePlace(Path(given or DEFAULT_FOLDER).absolute(), parse_size(size) if size else DEFAULT_BYTES)
+
+
+@contextmanager
+def switched_off() -> Iterator[None]:
+    """No cache within the block, for this process and those that it starts: `--no-cache`."""
+    before = os.environ.get(FOLDER_VARIABLE)
+    os.environ[FOLDER_VARIABLE] = _OFF[0]
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[FOLDER_VARIABLE]
+        else:
+            os.environ[FOLDER_VARIABLE] = before
+
+
+def parse_size(text: str) -> int:
+    """A size such as "500MB" or "2 GB" in bytes (powers of ten).
+
+    Raises:
+        BadArgument: it is no size.
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([kmgt]?b?)", text.strip(), re.IGNORECASE)
+    unit = match[2].upper() if match else ""
+    unit = f"{unit}B" if unit and not unit.endswith("B") else unit
+    if match is None:
+        raise BadArgument(
+            f"{SIZE_VARIABLE}={text} is no size; expected a number of bytes, or one with a unit, as in 500MB or 2GB. "
+            f"To switch the cache off, set {FOLDER_VARIABLE}=off."
+        )
+    return int(float(match[1]) * _UNITS[unit])

@@ -1,0 +1,110 @@
+"""The size of the cache: bounded, shown, removed when asked; and the commands that use it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.cache.housekeeping import clear, kept_segments, make_room
+from vla_attention.analyze.cache.places import CachePlace, cache_place, parse_size
+from vla_attention.analyze.cache.remembered import question_folder
+from vla_attention.analyze.cache.segments import SegmentWriter, question_digest
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.testing.stores import StoreSpec, write_store
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory) -> Path:
+    return write_store(tmp_path_factory.mktemp("store") / "a.zarr", spec=StoreSpec(tasks=(0, 1), episodes=2))
+
+
+def segment(place: CachePlace, question: str, size: int, used: float) -> Path:
+    digest = question_digest(question)
+    writer = SegmentWriter(question_folder(place, digest), digest, f"about {question}")
+    writer.add(bytes(32), bytes(32), bytes(size))
+    writer.close()
+    assert writer.path is not None
+    os.utime(writer.path, (used, used))
+    return writer.path
+
+
+def test_what_was_not_used_for_longest_goes_first(tmp_path):
+    place = CachePlace(tmp_path / "cache", 3_000)
+    paths = [segment(place, name, 1_000, used) for name, used in (("b", 20), ("a", 10), ("c", 30))]
+    stranger = place.folder / "notes.txt"
+    stranger.write_text("mine")
+    assert make_room(place) > 1_000
+    assert [path.exists() for path in paths] == [True, False, True]
+    assert sum(one.size for one in kept_segments(place.folder)) <= 3_000
+    assert not paths[1].parent.exists()
+    assert make_room(place) == 0
+    assert clear(place.folder) > 2_000
+    assert list(place.folder.iterdir()) == [stranger]
+
+
+def test_a_question_larger_than_the_cache_stays_within_it(cache, store, tmp_path, monkeypatch):
+    assert main([str(store), "--no-plots", "--output", str(tmp_path / "out")]) == 0
+    all_of_it = sum(one.size for one in kept_segments(cache))
+    clear(cache)
+    monkeypatch.setenv("VLA_CACHE_SIZE", str(all_of_it // 2))
+    assert main([str(store), "--no-plots", "--output", str(tmp_path / "out")]) == 0
+    assert 0 < sum(one.size for one in kept_segments(cache)) <= all_of_it // 2
+
+
+def test_the_command_shows_and_removes(cache, store, tmp_path, capsys):
+    assert main(["cache"]) == 0
+    assert "nothing is kept yet" in capsys.readouterr().out
+    assert main([str(store), "--no-plots", "--output", str(tmp_path / "out")]) == 0
+    assert main(["time", str(store), "--no-plots", "--output", str(tmp_path / "time"), "--layers", "2"]) == 0
+    capsys.readouterr()
+    assert main(["cache"]) == 0
+    printed = capsys.readouterr().out
+    assert f"{cache}: " in printed
+    assert "of at most 2 GB; 2 questions" in printed
+    assert "masses of grouping default, site joint, 2 layers" in printed
+    assert "masses of grouping default, site joint, 1 layer," in printed
+    assert main(["cache", "--clear"]) == 0
+    assert "Removed" in capsys.readouterr().out
+    assert kept_segments(cache) == []
+
+
+def test_nothing_is_written_without_a_cache(cache, store, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    before = os.environ["VLA_CACHE"]
+    assert main([str(store), "--no-plots", "--no-cache", "--output", str(tmp_path / "out")]) == 0
+    assert os.environ["VLA_CACHE"] == before
+    assert not cache.exists()
+    monkeypatch.setenv("VLA_CACHE", "off")
+    assert main([str(store), "--no-plots", "--output", str(tmp_path / "out")]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
+    capsys.readouterr()
+    assert main(["cache"]) == 0
+    assert "The cache is off" in capsys.readouterr().out
+
+
+def test_the_cache_is_beside_the_results(tmp_path, monkeypatch):
+    monkeypatch.delenv("VLA_CACHE")
+    monkeypatch.chdir(tmp_path)
+    assert cache_place() == CachePlace(tmp_path / "results/.cache")
+    monkeypatch.setenv("VLA_CACHE", "elsewhere")
+    monkeypatch.setenv("VLA_CACHE_SIZE", "1.5 GB")
+    assert cache_place() == CachePlace(tmp_path / "elsewhere", 1_500_000_000)
+
+
+@pytest.mark.parametrize(
+    ("text", "size"), [("10", 10), ("10B", 10), ("2k", 2_000), ("1.5mb", 1_500_000), ("3TB", 3e12)]
+)
+def test_sizes(text, size):
+    assert parse_size(text) == size
+
+
+@pytest.mark.parametrize("text", ["much", "-1", "1 PB", "GB", "1,5GB"])
+def test_what_is_no_size_is_one_sentence(text, cache, store, tmp_path, monkeypatch, capsys):
+    with pytest.raises(BadArgument, match="is no size; expected"):
+        parse_size(text)
+    monkeypatch.setenv("VLA_CACHE_SIZE", text)
+    assert main([str(store), "--no-plots", "--output", str(tmp_path / "out")]) == 2
+    assert "VLA_CACHE_SIZE" in capsys.readouterr().err

@@ -1,0 +1,321 @@
+"""What comes from the cache is what is measured, only what is new is measured, and nothing damaged comes from it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+import vla_attention as va
+from tests.kit.attacks import attacks, files_of, first, two
+from tests.kit.slow import slow_except
+from vla_attention.analyze.cache import fingerprints, remembered
+from vla_attention.analyze.cache.housekeeping import kept_segments
+from vla_attention.analyze.measures import steps
+from vla_attention.analyze.measures.question import ask
+from vla_attention.analyze.measures.question_settings import settings_from_keywords
+from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.measures.steps import measure_episodes
+from vla_attention.capture.store import codecs as store_codecs
+from vla_attention.schemas.groupings.resolve import EmptyGroup
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import CorruptEpisode
+from vla_attention.testing.stores import StoreSpec, write_store
+
+SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=9, contributions=True, prompts="same")
+ARRAYS = (
+    *(f"joint/{name}" for name in ("atoms", "contribution", "denoise", "head", "key_role", "layer", "row_sum", "rows")),
+    *(f"{kind}/{camera}" for kind in ("frames", "objects") for camera in ("base_0_rgb", "left_wrist_0_rgb")),
+    *("actions", "denoise_time", "env_step", "noise_seed", "prompt_index", "state"),
+)
+#: A grouping of spans, which is answered from atoms, and one of words, which needs the rows.
+SPANS: dict[str, object] = {"grouping": "cameras"}
+WORDS: dict[str, object] = {"groups": {"image": "role:image", "bowl": "word:bowl"}, "ratio": "image/bowl"}
+
+
+@pytest.fixture(scope="module")
+def originals(tmp_path_factory) -> tuple[Path, Path]:
+    """Two stores of other seeds, with equal shapes; rows are in two shards."""
+    folder = tmp_path_factory.mktemp("originals")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store_codecs, "TARGET_CHUNK_BYTES", 1)
+        return write_store(folder / "a.zarr", spec=SPEC), write_store(folder / "b.zarr", spec=SPEC, seed=3)
+
+
+@pytest.fixture
+def stores(originals, tmp_path) -> tuple[Path, Path]:
+    for store in originals:
+        shutil.copytree(store, tmp_path / store.name)
+    return tmp_path / "a.zarr", tmp_path / "b.zarr"
+
+
+@pytest.fixture
+def measured(monkeypatch) -> list[str]:
+    """The names of the episodes that are measured from now on."""
+    names: list[str] = []
+    measure = steps.measure_episode
+
+    def watched(item: SelectedEpisode, *rest: object) -> steps.MeasuredEpisode:
+        names.append(item.episode.name)
+        return measure(item, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(steps, "measure_episode", watched)
+    return names
+
+
+def tables(path: Path, **settings: object) -> list[pl.DataFrame]:
+    run = va.open(path)
+    found = [run.ratios(level, **settings) for level in ("tasks", "episodes", "replans", "steps")]  # type: ignore
+    return [*found, run.masses("steps", **settings), run.masses("tasks", **settings)]  # type: ignore[arg-type]
+
+
+def same(found: list[pl.DataFrame], expected: list[pl.DataFrame]) -> bool:
+    """Bit for bit, as `equals` compares floats."""
+    return all(a.equals(b) for a, b in zip(found, expected, strict=True))
+
+
+@pytest.fixture
+def uncached(monkeypatch) -> Callable[..., list[pl.DataFrame]]:
+    def answer(path: Path, **settings: object) -> list[pl.DataFrame]:
+        with monkeypatch.context() as patch:
+            patch.setenv("VLA_CACHE", "off")
+            return tables(path, **settings)
+
+    return answer
+
+
+QUESTIONS: tuple[dict[str, object], ...] = (
+    SPANS,
+    WORDS,
+    {"grouping": "instruction"},
+    {"grouping": "cameras", "layers": 2},
+    {"grouping": "cameras", "layers": [2, 0]},
+    {"grouping": "cameras", "denoise": "last"},
+    {"grouping": "cameras", "heads": 1},
+    {"grouping": "cameras", "per_head": True},
+    {"grouping": "cameras", "tasks": 1},
+    {"grouping": "objects"},
+    {"groups": {"bowl": "word:bowl", "rest": "*"}},
+    {"groups": {"rest": "*", "bowl": "word:bowl"}},
+    {"groups": {"plate": "word:plate", "rest": "*"}},
+)
+
+
+def test_a_second_analysis_measures_nothing_and_gives_the_same_bits(cache, originals, measured, uncached):
+    path = originals[0]
+    expected = [uncached(path, **question) for question in QUESTIONS]
+    measured.clear()
+    for question, answer in zip(QUESTIONS, expected, strict=True):
+        assert same(tables(path, **question), answer), question  # each one while others are in the cache
+    assert len(measured) > 4 * (len(QUESTIONS) - 2)
+    measured.clear()
+    for question, answer in zip(QUESTIONS, expected, strict=True):
+        assert same(tables(path, **question), answer), question
+    assert measured == []
+    shutil.rmtree(cache)
+    assert same(tables(path, **SPANS), expected[0])
+    assert len(measured) == 4
+
+
+def test_what_does_not_change_masses_needs_no_new_ones(cache, originals, measured):
+    tables(originals[0], groups={"a": "role:image", "b": "word:bowl"}, ratio="a/b")
+    measured.clear()
+    tables(originals[0], groups={"a": "role:image", "b": "word:bowl"}, ratio="b/a")
+    tables(originals[0], groups={"a": "role:image", "b": "word:bowl"}, ratio="b/a", intervals="these-tasks")
+    tables(originals[0], groups={"a": "role:image", "b": "word:bowl"}, tasks=0)
+    assert measured == []
+
+
+def test_one_more_episode_costs_one_episode(cache, stores, measured, uncached, tmp_path):
+    aside = two(stores[0])[1].rename(tmp_path / "aside")
+    tables(stores[0], **WORDS)
+    assert len(measured) == 3
+    aside.rename(two(stores[0])[1])
+    measured.clear()
+    found = tables(stores[0], **WORDS)
+    assert measured == ["task000_episode001"]
+    assert same(found, uncached(stores[0], **WORDS))
+
+
+def test_another_arithmetic_measures_anew(cache, originals, measured, monkeypatch):
+    tables(originals[0], **SPANS)
+    measured.clear()
+    monkeypatch.setattr(remembered, "arithmetic_version", lambda: "another")
+    tables(originals[0], **SPANS)
+    assert len(measured) == 4
+
+
+def test_masses_without_some_keys_are_kept_apart(cache, originals, measured):
+    question = ask([open_store(originals[0])], settings_from_keywords(**WORDS))
+    found = {}
+    for without in ((), (0, 1), (0, 2), (0, 1)):
+        selected = tuple(replace(item, without=without) for item in question.selected)
+        masses = [one.valid_mass for one in measure_episodes(replace(question, selected=selected))]
+        if without in found:
+            assert all(np.array_equal(*pair) for pair in zip(masses, found[without], strict=True))
+        found[without] = masses
+    assert len(measured) == 12
+    assert not any(np.array_equal(found[()][0], found[other][0]) for other in ((0, 1), (0, 2)))
+    assert not np.array_equal(found[0, 1][0], found[0, 2][0])
+
+
+FAST = (
+    "files of joint/atoms exchanged",
+    "joint/atoms exchanged",
+    "joint/rows exchanged",
+    "joint/row_sum encoded again",
+    "joint/key_role of another store",
+    "chunks of rows: layers exchanged",
+    "seals and attributes exchanged",
+    "episodes exchanged",
+    "an episode copied under another name",
+    "an episode of another run",
+    "the root of another run",
+)
+
+
+@pytest.mark.parametrize("name", slow_except(FAST, attacks(list(ARRAYS))))
+def test_no_attack_is_answered_from_the_cache(cache, stores, uncached, name):
+    """A question about a damaged store ends as without the cache: refused, or with the right numbers."""
+    for path in stores:
+        for question in (SPANS, WORDS):
+            tables(path, **question)
+    kept = sum(one.size for one in kept_segments(cache))
+    assert kept > 0
+    attacks(list(ARRAYS))[name](*stores)
+    for question in (SPANS, WORDS):
+        expected, found = (outcome(answer, stores[0], question) for answer in (uncached, tables))
+        assert type(found) is type(expected)
+        assert same(found, expected) if isinstance(expected, list) else str(found) == str(expected)
+
+
+def outcome(
+    answer: Callable[..., list[pl.DataFrame]], path: Path, question: dict[str, object]
+) -> list[pl.DataFrame] | CorruptEpisode:
+    """The tables, or the error that the question ends with."""
+    try:
+        return answer(path, **question)
+    except CorruptEpisode as error:
+        return error
+
+
+@pytest.mark.parametrize("array", ["joint/atoms", "joint/row_sum", "joint/rows"])
+def test_a_byte_that_changes_in_place_is_noticed_whatever_the_dates_say(cache, stores, array):
+    question = WORDS if array == "joint/rows" else SPANS
+    tables(stores[0], **question)
+    file = files_of(first(stores[0]), array)[0]
+    before = file.stat()
+    content = bytearray(file.read_bytes())
+    content[len(content) // 3] ^= 1
+    file.write_bytes(content)
+    os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
+    with pytest.raises(CorruptEpisode, match="task000_episode000"):
+        tables(stores[0], **question)
+
+
+def test_a_store_that_stays_open_is_not_answered_from_the_cache_when_files_change(cache, stores):
+    run = va.open(stores[0])
+    expected = run.ratios("steps", **SPANS)
+    again = va.open(stores[0])
+    file = files_of(first(stores[0]), "joint/atoms")[0]
+    file.write_bytes(file.read_bytes()[:-1] + b"x")
+    with pytest.raises(CorruptEpisode):
+        again.ratios("steps", **SPANS)
+    assert run.ratios("steps", **SPANS).equals(expected)  # its own answer, made before
+
+
+def test_an_episode_that_was_captured_again_has_its_new_numbers(cache, stores, measured, uncached, tmp_path):
+    tables(stores[0], **SPANS)
+    episode = first(stores[0])
+    write_store(tmp_path / "again.zarr", spec=SPEC, seed=SPEC.seed, plant_success=lambda *_: True)
+    shutil.rmtree(episode)
+    shutil.copytree(tmp_path / "again.zarr/episodes" / episode.name, episode)
+    measured.clear()
+    found = tables(stores[0], **SPANS)
+    assert measured == [episode.name]
+    assert same(found, uncached(stores[0], **SPANS))
+    assert found[1].filter(task_id=0, episode_index=0)["success"].to_list()[0] is True
+
+
+def test_files_that_changed_a_moment_ago_are_not_kept(cache, stores, measured, monkeypatch):
+    """Within a tick of the file system's clock, a second change would not be seen."""
+    monkeypatch.setattr(fingerprints, "SETTLED_SECONDS", 1e9)
+    tables(stores[0], **SPANS)
+    tables(stores[0], **SPANS)
+    assert len(measured) == 8
+    assert kept_segments(cache) == []
+
+
+def test_a_moved_store_is_known_and_a_copied_one_is_measured(cache, stores, measured, tmp_path):
+    tables(stores[0], **SPANS)
+    measured.clear()
+    moved = stores[0].rename(tmp_path / "moved.zarr")
+    tables(moved, **SPANS)
+    assert measured == []
+    shutil.copytree(moved, tmp_path / "copied.zarr")
+    tables(tmp_path / "copied.zarr", **SPANS)  # copying may damage files
+    assert len(measured) == 4
+
+
+def test_an_empty_group_is_refused_from_the_cache_too(cache, stores):
+    groups = {"rest": "*", "proprio": "role:proprio & role:image"}
+    for _ in range(2):
+        with pytest.raises(EmptyGroup, match="proprio"):
+            tables(stores[0], groups=groups)
+
+
+def test_a_cache_that_cannot_be_written_changes_nothing(stores, tmp_path, monkeypatch, uncached):
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setenv("VLA_CACHE", str(tmp_path / "file" / "cache"))
+    monkeypatch.setattr(fingerprints, "SETTLED_SECONDS", 0.0)
+    assert same(tables(stores[0], **SPANS), uncached(stores[0], **SPANS))
+
+
+def test_damaged_segments_are_measured_again(cache, stores, measured, uncached):
+    expected = uncached(stores[0], **SPANS)
+    tables(stores[0], **SPANS)
+    (segment,) = kept_segments(cache)
+    whole = segment.path.read_bytes()
+    records = whole.index(b"\n") + 1
+    for position in (0, records, records + 40, len(whole) // 2, len(whole) - 40, len(whole) - 1):
+        segment.path.write_bytes(whole[:position] + bytes([whole[position] ^ 0x10]) + whole[position + 1 :])
+        assert same(tables(stores[0], **SPANS), expected), position
+        assert measured, position
+        measured.clear()
+        for other in kept_segments(cache):
+            if other.path != segment.path:
+                other.path.unlink()
+
+
+CODE = """
+import sys
+from vla_attention.analyze.cache import fingerprints
+fingerprints.SETTLED_SECONDS = 0.0
+import vla_attention as va
+sys.stdin.readline()
+run = va.open(sys.argv[1])
+run.ratios("steps", grouping="cameras").write_parquet(sys.argv[2])
+"""
+
+
+def test_processes_that_fill_one_cache_at_the_same_time_agree(cache, stores, measured, tmp_path):
+    outputs = [tmp_path / f"{i}.parquet" for i in range(3)]
+    running = [
+        subprocess.Popen([sys.executable, "-c", CODE, str(stores[0]), str(output)], stdin=subprocess.PIPE)
+        for output in outputs
+    ]
+    for process in running:
+        process.communicate(b"\n", timeout=120)
+        assert process.returncode == 0
+    found = [pl.read_parquet(output) for output in outputs]
+    assert all(one.equals(found[0]) for one in found)
+    assert va.open(stores[0]).ratios("steps", grouping="cameras").equals(found[0])
+    assert measured == []
