@@ -190,6 +190,13 @@ def _add_evaluation_arguments(
         help="steps after waiting (default: the published number of suite and protocol)",
     )
     group.add_argument(
+        "--num-envs",
+        type=int,
+        metavar="N",
+        help="simulators that run at a time, each in a process of its own; 1 simulates in the policy's process "
+        "(default: the cores that this process may use, at most 8)",
+    )
+    group.add_argument(
         "--libero-assets", type=Path, metavar="PATH", help="LIBERO asset folder (or set VLA_LIBERO_ASSETS)"
     )
 

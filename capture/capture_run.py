@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import torch
 
@@ -28,6 +28,7 @@ from vla_attention.capture.policies.policy import Policy, stored_picture_sizes
 from vla_attention.capture.provenance import describe_machine
 from vla_attention.capture.rollout.episode import EpisodeResult, EpisodeRun, check_protocol, max_replans
 from vla_attention.capture.rollout.episode_loop import EpisodeLoop
+from vla_attention.capture.rollout.pipeline import PipelinedLoop, default_num_envs
 from vla_attention.capture.rollout.progress import say
 from vla_attention.capture.run_settings import RecordingSettings, RunSettings
 from vla_attention.capture.store.disk_estimate import describe, estimate_disk
@@ -180,14 +181,18 @@ def _record_missing(
         return [], damaged_names
     worker = this_worker()
     record = RecordWriter(store.path, worker, plan, torch.get_num_threads())
-    loop = EpisodeLoop(
-        suite=settings.suite,
-        environment_settings=EnvironmentSettings(evaluation, settings.libero_assets),
-        run=EpisodeRun(policy, store, machine, changes, termination.check),
-        worker=worker,
-        record=record,
-        termination=termination,
-    )
+    num_envs = min(settings.num_envs or default_num_envs(), len(todo))
+    parts: dict[str, Any] = {
+        "suite": settings.suite,
+        "environment_settings": EnvironmentSettings(evaluation, settings.libero_assets),
+        "run": EpisodeRun(policy, store, machine, changes, termination.check),
+        "worker": worker,
+        "record": record,
+        "termination": termination,
+    }
+    if num_envs > 1:
+        say(f"Simulators: {num_envs} processes; --num-envs N changes it.")
+    loop = PipelinedLoop(**parts, num_envs=num_envs) if num_envs > 1 else EpisodeLoop(**parts)
     results = loop.record_all(todo)
     if (empty := changes.describe_empty()) is not None:
         say(empty)

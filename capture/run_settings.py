@@ -45,7 +45,8 @@ class RunSettings:
     the policy. seed, replan_steps, max_steps: None takes the protocol's number. array_task_ids: tasks that
     other processes of the same array job run; the store is expected to hold these too. verify: read every byte of the
     episodes that an existing store has, before they count as done. interventions: what is changed, with layer
-    numbers as typed. allow_empty: leave a replan unchanged where a group of an intervention has no key.
+    numbers as typed. allow_empty: leave a replan unchanged where a group of an intervention has no key. num_envs:
+    simulators that run at a time; None takes as many as there are cores.
     """
 
     suite: Suite
@@ -63,6 +64,7 @@ class RunSettings:
     verify: bool = False
     interventions: Interventions = field(default_factory=Interventions)
     allow_empty: bool = False
+    num_envs: int | None = None
 
 
 def run_settings(arguments: argparse.Namespace) -> RunSettings:
@@ -72,6 +74,8 @@ def run_settings(arguments: argparse.Namespace) -> RunSettings:
         check_task_id(suite, task_id)
     if arguments.num_episodes < 1:
         raise BadArgument(f"Cannot use --num-episodes {arguments.num_episodes}; expected at least 1.")
+    if arguments.num_envs is not None and arguments.num_envs < 1:
+        raise BadArgument(f"Cannot use --num-envs {arguments.num_envs}; expected at least 1.")
     if arguments.seed is not None and arguments.seed < 0:
         raise BadArgument(f"Cannot use --seed {arguments.seed}; expected 0 or more.")
     if arguments.verify and not arguments.resume:
@@ -91,6 +95,7 @@ def run_settings(arguments: argparse.Namespace) -> RunSettings:
         recording=recording_settings(arguments),
         interventions=read_interventions(arguments),
         allow_empty=arguments.allow_empty,
+        num_envs=arguments.num_envs,
     )
 
 

@@ -22,7 +22,7 @@ from vla_attention.schemas.errors import BadArgument
 _OPENMP = "OMP_NUM_THREADS"
 _SLURM = ("SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE")
 #: Set to the same number, unless the user has set them. LP_: Mesa's renderer, which draws on nodes without a GPU.
-_OTHER_LIBRARIES = ("MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "POLARS_MAX_THREADS", "LP_NUM_THREADS")
+OTHER_LIBRARIES = ("MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "POLARS_MAX_THREADS", "LP_NUM_THREADS")
 #: Let threads that wait sleep: the standard's variable, and those of the GNU (torch's own) and the Intel runtime.
 _SLEEP = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "KMP_BLOCKTIME": "0"}
 
@@ -91,7 +91,7 @@ def use_threads(given: int | None = None) -> Threads:
     threads = threads_of_this_process(given)
     number = str(threads.number)
     os.environ[_OPENMP] = number
-    for name in _OTHER_LIBRARIES:
+    for name in OTHER_LIBRARIES:
         if given is not None or name not in os.environ:
             os.environ[name] = number
     if not any(name in os.environ for name in _SLEEP):
@@ -102,6 +102,12 @@ def use_threads(given: int | None = None) -> Threads:
 def threads_of_this_process(given: int | None = None) -> Threads:
     """Return the number that `use_threads` would set; after it, the number that it has set."""
     return choose_threads(given, os.environ, _cores(), cpu_quota())
+
+
+def available_cores() -> int:
+    """Return the number of cores that this process may use, whatever OMP_NUM_THREADS says."""
+    environment = {name: value for name, value in os.environ.items() if name != _OPENMP}
+    return choose_threads(None, environment, _cores(), cpu_quota()).number
 
 
 def _cores() -> int:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol
 
 from vla_attention.capture.environments.episode_protocol import OPENPI, EvaluationProtocol
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument, unknown_name
 
 # Command lines read suites and settings from here, and print their help without waiting for a library.
 if TYPE_CHECKING:
@@ -152,3 +152,10 @@ def check_initial_state_index(task: Task, index: int) -> None:
             f"Initial state {index} does not exist for task {task.task_id} of {task.suite}; "
             f"its initial states are 0 to {task.num_initial_states - 1}."
         )
+
+
+def camera_frame(observation: Observation, camera: str) -> NDArray[np.uint8]:
+    """Return a camera's picture (height, width, 3); `UnknownName` lists the environment's cameras."""
+    if camera not in observation.images:
+        raise unknown_name("environment camera", camera, observation.images)
+    return observation.images[camera]

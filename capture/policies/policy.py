@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from vla_attention.capture.environments.base import Observation
+from vla_attention.capture.environments.base import (
+    camera_frame as camera_frame,
+)  # policies and their users import it here
 from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
 from vla_attention.capture.recording.attention import AttentionEditor, RowCollector
 from vla_attention.schemas.errors import unknown_name
@@ -150,13 +153,6 @@ class Policy(Protocol):
 
         recorders: the row collector of each recorded site. editors: the editor of each site whose attention changes.
         """
-
-
-def camera_frame(observation: Observation, camera: str) -> NDArray[np.uint8]:
-    """Return a camera's picture (height, width, 3); `UnknownName` lists the environment's cameras."""
-    if camera not in observation.images:
-        raise unknown_name("environment camera", camera, observation.images)
-    return observation.images[camera]
 
 
 def stored_picture_sizes(policy: Policy, image_size: int) -> list[int]:

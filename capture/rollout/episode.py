@@ -1,32 +1,34 @@
-"""One episode: the policy acts in the environment, and every replan is stored."""
+"""One episode: the policy acts in the environment, and every replan is stored.
+
+The simulator may be in this process (`record_episode`) or in another one (`pipeline.py`): both use `EpisodeRecording`.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol as Interface
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.environments.base import Environment, Observation, Task
-from vla_attention.capture.environments.coverage import patch_coverage
-from vla_attention.capture.environments.episode_protocol import WAIT_ACTION
+from vla_attention.capture.environments.base import Environment, Task
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
 from vla_attention.capture.interventions.run_changes import RunChanges
-from vla_attention.capture.policies.policy import Policy, camera_frame, camera_grid
-from vla_attention.capture.rollout.policy_call import record_call
-from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
+from vla_attention.capture.policies.policy import Policy, PolicyInput, camera_grid
+from vla_attention.capture.recording.attention import AttentionEditor
+from vla_attention.capture.rollout.policy_call import RecordedCall, record_call
+from vla_attention.capture.rollout.simulation import Advanced, Begun, CameraPatches, Seen, Simulation, StopCheck
+from vla_attention.capture.store.episode_writer import EpisodeStart, ReplanRecord
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions
-from vla_attention.schemas.stores.store_format import Protocol
+from vla_attention.schemas.stores.store_format import Protocol, episode_name
 
 #: Called after the actions of each replan with (environment steps done, replans done).
 StepReport = Callable[[int, int], None]
-#: Raises an exception when the process shall stop.
-StopCheck = Callable[[], None]
 
 
 @dataclass(frozen=True)
@@ -72,132 +74,168 @@ class EpisodeRun:
     check: StopCheck = lambda: None
 
 
-def record_episode(
-    run: EpisodeRun, environment: Environment, task: Task, episode_index: int, report: StepReport | None = None
-) -> EpisodeResult:
-    """Run one episode from the stored initial state of the same index, and commit it to the store.
+class ReplanWriter(Interface):
+    """Stores the replans of one episode, as `EpisodeWriter` does."""
 
-    The protocol of the published evaluations: waiting steps, then one policy call for every `replan_steps` executed
-    actions, until the task is solved or `max_steps` actions have been executed. An exception, also one from
-    `run.check`, drops the episode: nothing of it remains in or beside the store.
+    def append(self, record: ReplanRecord) -> None:
+        """Add the next replan."""
+
+
+@dataclass(frozen=True)
+class PreparedCall:
+    """A policy call before it is made.
+
+    where: replan, environment step and episode, for messages. editors: the editor of each site whose attention changes.
     """
-    policy, store, check = run.policy, run.store, run.check
-    protocol = store.attributes.protocol
-    environment.reset(episode_index, protocol.seed)
-    start = EpisodeStart(
+
+    env_step: int
+    where: str
+    policy_input: PolicyInput
+    noise_seed: int
+    coverage: Mapping[str, NDArray[np.float32]]
+    editors: Mapping[str, AttentionEditor] | None
+
+
+def episode_title(store: RunStore, task: Task, episode_index: int) -> str:
+    """Return an episode's name in messages."""
+    return f"episode {episode_name(task.task_id, episode_index)} of {store.path}"
+
+
+def episode_start(run: EpisodeRun, task: Task, episode_index: int, begun: Begun) -> EpisodeStart:
+    """Return what is known of an episode before its first replan."""
+    return EpisodeStart(
         task_id=task.task_id,
         task_name=task.name,
         instruction=task.instruction,
         episode_index=episode_index,
         initial_state_index=episode_index,
-        initial_state_digest=environment.initial_state_digest,
-        objects=tuple(environment.objects),
+        initial_state_digest=begun.initial_state_digest,
+        objects=begun.objects,
         provenance=run.machine,
     )
-    denoise_times = policy.denoise_times()[list(store.attributes.recording.denoise_steps)]
-    with store.episode(start, denoise_times, max_replans(protocol)) as writer:
-        observation = _wait(environment, protocol.wait_steps, check)
-        success, step, replans = False, 0, 0
-        while step < protocol.max_steps and not success:
-            check()
-            actions = _replan(run, environment, writer, start, observation, step)
-            replans += 1
-            chunk = min(protocol.replan_steps, protocol.max_steps - step)
-            for i in range(chunk):
-                # Only the picture before the next replan is drawn, because the policy sees no other.
-                check()
-                observe = i == chunk - 1 and step + 1 < protocol.max_steps
-                result = environment.step(actions[i], observe=observe)
-                step += 1
-                success = result.success
-                if success:
-                    break
-                if result.observation is not None:
-                    observation = result.observation
-            if report is not None:
-                report(step, replans)
-        folder = writer.commit(success, step)
-    return EpisodeResult(task.task_id, episode_index, success, step, replans, folder)
 
 
-def _wait(environment: Environment, steps: int, check: StopCheck) -> Observation:
-    action, observation = np.array(WAIT_ACTION), None
-    for i in range(steps):
-        check()
-        observation = environment.step(action, observe=i == steps - 1).observation
-    if observation is None:
-        raise ValueError(
-            "an episode needs at least one waiting step: the first picture is the one after the last of them"
-        )
-    return observation
+def recorded_times(run: EpisodeRun) -> NDArray[np.float64]:
+    """Return the noise levels of the denoise steps that the run records, (denoise,)."""
+    return run.policy.denoise_times()[list(run.store.attributes.recording.denoise_steps)]
 
 
-def _replan(
-    run: EpisodeRun,
-    environment: Environment,
-    writer: EpisodeWriter,
-    start: EpisodeStart,
-    observation: Observation,
-    step: int,
-) -> NDArray[np.float64]:
-    """Call the policy after `step` policy steps, store the call, and return its actions (horizon, action dim)."""
-    policy, changes = run.policy, run.changes
-    protocol, recording = run.store.attributes.protocol, run.store.attributes.recording
-    task_id, episode_index = start.task_id, start.episode_index
-    interventions, replan = changes.interventions, len(writer.records)
-    where = f"replan {replan} (environment step {protocol.wait_steps + step}) of {writer.what}"
-    policy_input = policy.prepare(observation, start.instruction)
-    coverage = _coverage(environment, policy, observation, where)
-    context = CallContext(task_id, episode_index, replan, changes.instructions, start.objects, coverage)
-    if interventions.changes_input:
-        given = changed_inputs(
-            policy_input.given, interventions, policy.sites, context, allow_empty=changes.allow_empty
-        )
-        policy_input = policy.prepare_again(given)
-    noise = protocol.seed if interventions.noise is None else interventions.noise.seed
-    seed = policy.replan_noise_seed(noise, task_id, episode_index, replan)
-    editors = changes.editors(policy.sites, policy_input, context)
-    call = record_call(policy, policy_input, seed, recording, where, editors)
-    writer.append(
-        ReplanRecord(
-            env_step=protocol.wait_steps + step,
-            noise_seed=seed,
-            rows=call.rows,
-            key_role=policy_input.key_role,
-            prompt=policy_input.prompt,
-            state=policy_input.state,
-            actions=call.actions,
-            frames=policy_input.frames if recording.frames else {},
-            camera_frames=policy_input.camera_frames if recording.frames else {},
-            coverage=coverage,
-        )
+def policy_cameras(policy: Policy) -> tuple[CameraPatches, ...]:
+    """Return the policy's cameras with their patches."""
+    grids = [camera_grid(policy.sites, camera.name) for camera in policy.cameras]
+    return tuple(
+        CameraPatches(camera, grid.rows, grid.columns) for camera, grid in zip(policy.cameras, grids, strict=True)
     )
-    return call.actions
 
 
-def _coverage(
-    environment: Environment, policy: Policy, observation: Observation, where: str
-) -> dict[str, NDArray[np.float32]]:
-    """Return how much of each patch each object covers, (patch, object) by policy camera."""
-    coverage = {}
-    for camera in policy.cameras:
-        segmentation, grid = environment.segmentation(camera.source), camera_grid(policy.sites, camera.name)
-        expected = camera_frame(observation, camera.source).shape[:2]
-        try:
-            if segmentation.shape != expected or segmentation.dtype.kind not in "iu":
-                raise BadArgument(
-                    f"The segmentation has the shape {segmentation.shape} and type {segmentation.dtype}; expected "
-                    f"whole numbers for the picture's {expected} pixels."
-                )
-            coverage[camera.name] = patch_coverage(
-                segmentation,
-                len(environment.objects),
-                grid.rows,
-                grid.columns,
-                flip_rows=camera.upright,
-                flip_columns=camera.mirrored,
-                visible=camera.visible,
+@dataclass
+class EpisodeRecording:
+    """The policy's part of one episode, after the protocol of the published evaluations.
+
+    After the waiting steps, `prepare` and `keep` make one policy call for every `replan_steps` executed actions, and
+    `advanced` takes what the simulator gave for these; until the task is solved or `max_steps` actions have been
+    executed.
+    """
+
+    run: EpisodeRun
+    task: Task
+    start: EpisodeStart
+    step: int = field(default=0, init=False)
+    num_replans: int = field(default=0, init=False)
+    success: bool = field(default=False, init=False)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the episode is over."""
+        return self.success or self.step >= self.run.store.attributes.protocol.max_steps
+
+    def prepare(self, seen: Seen) -> PreparedCall:
+        """Return the next policy call: its input, with the run's interventions, and the seed of its noise."""
+        policy, changes, start = self.run.policy, self.run.changes, self.start
+        protocol, interventions, replan = self.run.store.attributes.protocol, changes.interventions, self.num_replans
+        title = episode_title(self.run.store, self.task, start.episode_index)
+        env_step = protocol.wait_steps + self.step
+        policy_input = policy.prepare(seen.observation, start.instruction)
+        context = CallContext(
+            start.task_id, start.episode_index, replan, changes.instructions, start.objects, seen.coverage
+        )
+        if interventions.changes_input:
+            given = changed_inputs(
+                policy_input.given, interventions, policy.sites, context, allow_empty=changes.allow_empty
             )
-        except BadArgument as error:
-            raise BadArgument(f"Cannot store {where}, camera '{camera.source}': {error}") from None
-    return coverage
+            policy_input = policy.prepare_again(given)
+        noise = protocol.seed if interventions.noise is None else interventions.noise.seed
+        return PreparedCall(
+            env_step=env_step,
+            where=f"replan {replan} (environment step {env_step}) of {title}",
+            policy_input=policy_input,
+            noise_seed=policy.replan_noise_seed(noise, start.task_id, start.episode_index, replan),
+            coverage=seen.coverage,
+            editors=changes.editors(policy.sites, policy_input, context),
+        )
+
+    def keep(self, prepared: PreparedCall, call: RecordedCall, writer: ReplanWriter) -> None:
+        """Store a policy call that has been made."""
+        frames, given = self.run.store.attributes.recording.frames, prepared.policy_input
+        self.num_replans += 1
+        writer.append(
+            ReplanRecord(
+                env_step=prepared.env_step,
+                noise_seed=prepared.noise_seed,
+                rows=call.rows,
+                key_role=given.key_role,
+                prompt=given.prompt,
+                state=given.state,
+                actions=call.actions,
+                frames=given.frames if frames else {},
+                camera_frames=given.camera_frames if frames else {},
+                coverage=prepared.coverage,
+            )
+        )
+
+    def next_actions(self, call: RecordedCall) -> tuple[NDArray[np.float64], bool]:
+        """Return the actions (step, action dim) to execute after a call, and whether another call may follow."""
+        protocol = self.run.store.attributes.protocol
+        count = min(protocol.replan_steps, protocol.max_steps - self.step)
+        return call.actions[:count], self.step + count < protocol.max_steps
+
+    def advanced(self, result: Advanced) -> None:
+        """Note what the simulator gave for the last actions."""
+        self.step += result.steps
+        self.success = result.success
+
+
+def record_episode(
+    run: EpisodeRun, environment: Environment, task: Task, episode_index: int, report: StepReport | None = None
+) -> EpisodeResult:
+    """Run one episode from the stored initial state of the same index, and commit it to the store.
+
+    The simulator is in this process. An exception, also one from `run.check`, drops the episode: nothing of it remains
+    in or beside the store.
+    """
+    store, protocol = run.store, run.store.attributes.protocol
+    simulation = Simulation(environment, protocol, policy_cameras(run.policy), run.check)
+    begun = simulation.begin(episode_index, episode_title(store, task, episode_index))
+    start = episode_start(run, task, episode_index, begun)
+    with store.episode(start, recorded_times(run), max_replans(protocol)) as writer:
+        recording, result = EpisodeRecording(run, task, start), simulation.wait()
+        while not recording.ended:
+            run.check()
+            if result.seen is None:
+                raise ValueError("the environment gave no observation before a policy call")
+            prepared = recording.prepare(result.seen)
+            call = record_call(
+                run.policy,
+                prepared.policy_input,
+                prepared.noise_seed,
+                store.attributes.recording,
+                prepared.where,
+                prepared.editors,
+            )
+            recording.keep(prepared, call, writer)
+            result = simulation.advance(*recording.next_actions(call))
+            recording.advanced(result)
+            if report is not None:
+                report(recording.step, recording.num_replans)
+        folder = writer.commit(recording.success, recording.step)
+    return EpisodeResult(task.task_id, episode_index, recording.success, recording.step, recording.num_replans, folder)

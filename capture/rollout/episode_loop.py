@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Suite, Task
@@ -14,7 +14,7 @@ from vla_attention.capture.jobs.termination import Terminated, Termination
 from vla_attention.capture.jobs.worker import Worker
 from vla_attention.capture.jobs.worker_records import RecordWriter
 from vla_attention.capture.rollout.episode import EpisodeResult, EpisodeRun, record_episode
-from vla_attention.capture.rollout.progress import Progress
+from vla_attention.capture.rollout.progress import EpisodeProgress, Progress
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.stores.store_format import StoreExists, episode_name
@@ -28,7 +28,11 @@ _LOOK_EVERY_S = 5.0
 
 @dataclass
 class EpisodeLoop:
-    """Records the missing episodes of a store. Other processes may fill the same store at the same time."""
+    """Records the missing episodes of a store. Other processes may fill the same store at the same time.
+
+    Here the simulator is in this process and one episode follows the other; `pipeline.py` has the loop with simulators
+    in processes of their own.
+    """
 
     suite: Suite
     environment_settings: EnvironmentSettings
@@ -37,10 +41,12 @@ class EpisodeLoop:
     record: RecordWriter
     termination: Termination
     results: list[EpisodeResult] = field(default_factory=list, init=False)
+    claims: Claims = field(init=False)
+    progress: Progress = field(init=False)
+    #: The episodes in progress and their steps, for the message after SIGTERM.
+    positions: dict[str, int] = field(default_factory=dict, init=False)
     _environment: Environment | None = field(default=None, init=False)
     _task_id: int | None = field(default=None, init=False)
-    #: The current episode and its step, for the message after SIGTERM; None between episodes.
-    _position: str | None = field(default=None, init=False)
 
     def record_all(self, missing: Sequence[TaskEpisode]) -> list[EpisodeResult]:
         """Record the missing episodes, and return those that this process committed.
@@ -49,84 +55,117 @@ class EpisodeLoop:
         is writing, and takes it over if that process dies.
 
         Raises:
-            Terminated: after SIGTERM; the current episode was dropped.
+            Terminated: after SIGTERM; the episodes in progress were dropped.
         """
         with ExitStack() as stack:
-            self._claims = stack.enter_context(Claims(self.run.store.path, self.worker))
-            self._progress = Progress(len(missing), self.run.store.attributes.protocol.max_steps)
-            stack.callback(self._progress.close)
-            stack.callback(self._close_environment)
+            self.claims = stack.enter_context(Claims(self.run.store.path, self.worker))
+            self.progress = Progress(len(missing), self.run.store.attributes.protocol.max_steps)
+            stack.callback(self.progress.close)
             try:
-                self._record_until_complete(missing)
+                with self.simulators():
+                    self._record_until_complete(missing)
             except BaseException as error:
                 self.record.end("stopped" if isinstance(error, (Terminated, KeyboardInterrupt)) else "failed")
                 if isinstance(error, Terminated):
-                    self._progress.say(self._describe_stop(missing))
+                    self.progress.say(self._describe_stop(missing))
                 raise
         self.record.end("finished")
         return self.results
 
+    @contextmanager
+    def simulators(self) -> Iterator[None]:
+        """Free what simulates at the end of the block."""
+        try:
+            yield
+        finally:
+            self._close_environment()
+
     def _record_until_complete(self, missing: Sequence[TaskEpisode]) -> None:
-        left = [(episode, holder) for episode in missing if (holder := self._attempt(*episode)) is not None]
+        left = self.attempt_all(missing)
         announced: set[str] = set()
         while left:
             new = [holder for _, holder in left if holder.episode not in announced]
             if new:
                 described = listing([holder.describe() for holder in new], 4)
-                self._progress.say(f"Waiting for episodes that other processes are writing: {described}.")
+                self.progress.say(f"Waiting for episodes that other processes are writing: {described}.")
                 announced.update(holder.episode for holder in new)
             time.sleep(_LOOK_EVERY_S)
-            left = [(episode, holder) for episode, _ in left if (holder := self._attempt(*episode)) is not None]
+            left = self.attempt_all([episode for episode, _ in left])
+
+    def attempt_all(self, missing: Sequence[TaskEpisode]) -> list[tuple[TaskEpisode, Holder]]:
+        """Record every episode that nobody has; return those that other processes have claimed."""
+        return [(episode, holder) for episode in missing if (holder := self._attempt(*episode)) is not None]
+
+    def claim(self, task: Task, episode: int) -> bool | Holder:
+        """Claim an episode: True if it is to be recorded, False if the store has it, else the holder of the claim."""
+        name = episode_name(task.task_id, episode)
+        # Check before and after claiming: another process may commit the episode at any time before our claim.
+        if self.run.store.has(task.task_id, episode):
+            self.progress.skip(name)
+            return False
+        holder = self.claims.acquire(name)
+        if holder is not None:
+            return holder
+        if self.run.store.has(task.task_id, episode):
+            self.progress.skip(name)
+            self.claims.release(name)
+            return False
+        return True
 
     def _attempt(self, task: Task, episode: int) -> Holder | None:
         """Record an episode unless the store has it. If another process has claimed it, return that claim's holder."""
-        name = episode_name(task.task_id, episode)
         self.termination.check()
-        # Check before and after claiming: another process may commit the episode at any time before our claim.
-        if self.run.store.has(task.task_id, episode):
-            self._progress.skip(name)
-            return None
-        holder = self._claims.acquire(name)
-        if holder is not None:
-            return holder
-        try:
-            if self.run.store.has(task.task_id, episode):
-                self._progress.skip(name)
-            else:
+        claimed = self.claim(task, episode)
+        if isinstance(claimed, Holder):
+            return claimed
+        if claimed:
+            try:
                 self._record(task, episode)
-        except StoreExists as error:
-            self._progress.say(f"{error} This process's copy was dropped.")
-        finally:
-            self._claims.release(name)
+            finally:
+                self.claims.release(episode_name(task.task_id, episode))
         self.termination.check()
         return None
 
     def _record(self, task: Task, episode: int) -> None:
         environment = self._environment_of(task)
         name = episode_name(task.task_id, episode)
-        self._progress.begin(task.task_id, episode)
+        progress = self.progress.begin(task.task_id, episode)
 
         def report(step: int, replans: int) -> None:
-            self._position = f"{name} at step {step}"
-            self._progress.update(step, replans)
+            self.positions[name] = step
+            progress.update(step, replans)
 
         missing = environment.missing_resets(episode, self.run.store.attributes.protocol.seed)
         if missing:
-            self._progress.say(
-                f"{name}: the published furniture depends on the resets of earlier episodes; making {missing} first."
-            )
-        self._position = f"{name} at step 0"
+            self.say_resets(name, missing)
+        self.positions[name] = 0
         with self.termination.only_at_checks():
-            result = record_episode(self.run, environment, task, episode, report)
-            self._position = None
-            self.results.append(result)
-            self.record.add_commit(result.folder.name)
+            try:
+                result = record_episode(self.run, environment, task, episode, report)
+            except StoreExists as error:
+                self.note_refused(name, progress, error)
+                return
+            self.note_commit(result)
         size = sum(file.stat().st_size for file in result.folder.rglob("*") if file.is_file())
-        outcome = "success" if result.success else "no success"
-        self._progress.end(
-            f"{outcome} after {result.num_steps} steps, {result.num_replans} replans, {format_bytes(size)}",
-            task.instruction,
+        progress.end(describe_result(result, size), task.instruction)
+
+    def say_resets(self, name: str, missing: int) -> None:
+        """Say that an episode needs resets of other episodes first."""
+        self.progress.say(
+            f"{name}: the published furniture depends on the resets of earlier episodes; making {missing} first."
         )
+
+    def note_commit(self, result: EpisodeResult) -> None:
+        """Note that this process has committed an episode."""
+        self.positions.pop(result.folder.name, None)
+        self.results.append(result)
+        self.record.add_commit(result.folder.name)
+
+    def note_refused(self, name: str, progress: EpisodeProgress, error: StoreExists) -> None:
+        """Note that another process has committed an episode while this one recorded it."""
+        self.positions.pop(name, None)
+        progress.drop()
+        self.progress.say(f"{error} This process's copy was dropped.")
 
     def _environment_of(self, task: Task) -> Environment:
         if self._environment is None or self._task_id != task.task_id:
@@ -143,8 +182,15 @@ class EpisodeLoop:
     def _describe_stop(self, missing: Sequence[TaskEpisode]) -> str:
         committed = listing([result.folder.name for result in self.results], 40)
         left = sum(not self.run.store.has(task.task_id, episode) for task, episode in missing)
-        dropped = f"dropped {self._position}" if self._position else "no episode was in progress"
+        running = [f"{name} at step {step}" for name, step in sorted(self.positions.items())]
+        dropped = f"dropped {listing(running, 40)}" if running else "no episode was in progress"
         return (
             f"Stopped by SIGTERM: {dropped}; committed {len(self.results)} episodes ({committed}); "
             f"{left} of this process's {len(missing)} are missing."
         )
+
+
+def describe_result(result: EpisodeResult, num_bytes: int) -> str:
+    """Return how an episode ended as text."""
+    outcome = "success" if result.success else "no success"
+    return f"{outcome} after {result.num_steps} steps, {result.num_replans} replans, {format_bytes(num_bytes)}"

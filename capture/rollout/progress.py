@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import sys
 import time
+from dataclasses import dataclass
 
 from tqdm import tqdm
 
 from vla_attention.schemas.safe_text import plain_stderr
 
-#: Seconds between two lines about one episode in a log file. A GPU completes several replans a second.
+#: Seconds between two lines about episodes in progress in a log file. A GPU completes several replans a second.
 _LOG_EVERY_S = 30.0
+#: Episodes in progress that one line names.
+_MOST_SHOWN = 4
 
 
 def say(line: str) -> None:
@@ -18,8 +21,40 @@ def say(line: str) -> None:
     print(line, flush=True)
 
 
+@dataclass(eq=False)
+class EpisodeProgress:
+    """The progress of one episode."""
+
+    progress: Progress
+    position: str
+    name: str
+    begun_at: float
+    step: int = 0
+    replans: int = 0
+
+    def update(self, step: int, replans: int) -> None:
+        """Show how many environment steps and replans of the episode are done."""
+        self.step, self.replans = step, replans
+        self.progress.show()
+
+    def end(self, result: str, instruction: str) -> None:
+        """Show how the episode ended."""
+        self.progress.end(self, f"{result}, {time.monotonic() - self.begun_at:.0f} s ({instruction})")
+
+    def drop(self) -> None:
+        """Show the episode no more: another process was faster, or this one stops."""
+        self.progress.drop(self)
+
+    def describe(self, max_steps: int, now: float) -> str:
+        """Return what is done as text for a log file."""
+        return (
+            f"{self.position} {self.name}: step {self.step} of at most {max_steps}, {self.replans} replans, "
+            f"{now - self.begun_at:.0f} s"
+        )
+
+
 class Progress:
-    """The progress of one process through its episodes. `close` it at the end.
+    """The progress of one process through its episodes, of which several may run at a time. `close` it at the end.
 
     num_episodes: number of episodes that the process was started for.
     max_steps: largest number of policy steps of one episode.
@@ -29,36 +64,44 @@ class Progress:
         self._num_episodes = num_episodes
         self._max_steps = max_steps
         self._num_begun = 0
-        self._episode = ""
-        self._begun_at = self._last_line_at = time.monotonic()
-        self._steps_before = 0
+        self._num_done = 0
+        self._running: list[EpisodeProgress] = []
+        self._last_line_at = time.monotonic()
         hidden = not sys.stderr.isatty()
         self._bar = tqdm(total=num_episodes * max_steps, unit="step", file=plain_stderr(), disable=hidden)
 
-    def begin(self, task_id: int, episode: int) -> None:
+    def begin(self, task_id: int, episode: int) -> EpisodeProgress:
         """Begin an episode."""
         self._num_begun += 1
-        self._episode = f"task {task_id} episode {episode}"
-        self._bar.set_description(self._episode)
-        self._begun_at = self._last_line_at = time.monotonic()
-        self._steps_before = self._bar.n
+        now = time.monotonic()
+        if not self._running:
+            self._last_line_at = now
+        begun = EpisodeProgress(self, self._position(), f"task {task_id} episode {episode}", now)
+        self._running.append(begun)
+        self._describe_bar()
+        return begun
 
-    def update(self, step: int, replans: int) -> None:
-        """Show how many environment steps and replans of the current episode are done."""
-        self._bar.update(self._steps_before + step - self._bar.n)
+    def show(self) -> None:
+        """Show the steps that are done by now."""
+        self._update_bar()
         now = time.monotonic()
         if self._bar.disable and now - self._last_line_at >= _LOG_EVERY_S:
             self._last_line_at = now
-            say(
-                f"{self._position()} {self._episode}: step {step} of at most {self._max_steps}, {replans} replans, "
-                f"{now - self._begun_at:.0f} s"
-            )
+            shown = [episode.describe(self._max_steps, now) for episode in self._running[:_MOST_SHOWN]]
+            more = len(self._running) - len(shown)
+            say("; ".join(shown) + (f"; {more} more episodes" if more else ""))
 
-    def end(self, result: str, instruction: str) -> None:
-        """Show how the current episode ended."""
-        self._bar.update(self._steps_before + self._max_steps - self._bar.n)
-        seconds = time.monotonic() - self._begun_at
-        self.say(f"{self._position()} {self._episode}: {result}, {seconds:.0f} s ({instruction})")
+    def end(self, episode: EpisodeProgress, result: str) -> None:
+        """Show how an episode ended."""
+        self.drop(episode)
+        self.say(f"{episode.position} {episode.name}: {result}")
+
+    def drop(self, episode: EpisodeProgress) -> None:
+        """Count an episode as done, and show it no more."""
+        self._running.remove(episode)
+        self._num_done += 1
+        self._update_bar()
+        self._describe_bar()
 
     def skip(self, name: str) -> None:
         """Show that another process has committed an episode."""
@@ -75,3 +118,12 @@ class Progress:
 
     def _position(self) -> str:
         return f"[{self._num_begun}/{self._num_episodes}]"
+
+    def _update_bar(self) -> None:
+        steps = self._num_done * self._max_steps + sum(episode.step for episode in self._running)
+        self._bar.update(steps - self._bar.n)  # an episode that begins again takes its steps back
+
+    def _describe_bar(self) -> None:
+        names = [episode.name for episode in self._running]
+        more = f" and {len(names) - _MOST_SHOWN} more" if len(names) > _MOST_SHOWN else ""
+        self._bar.set_description(", ".join(names[:_MOST_SHOWN]) + more)

@@ -305,6 +305,8 @@ def test_capture_is_interrupted_cleanly(monkeypatch, tmp_path, capsys):
             "4",
             "--task-id",
             "0",
+            "--num-envs",
+            "1",
             "--store",
             str(tmp_path / "a.zarr"),
         ]

@@ -25,6 +25,7 @@ from vla_attention.capture.published.evaluate import evaluate_attention_ratio
 pytestmark = pytest.mark.simulator
 
 DUMMY = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--replan-steps", "4", "--task-id", "0"]
+DUMMY += ["--num-envs", "1"]  # several simulators: tests/capture/rollout/test_pipeline.py
 NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2")
 
 

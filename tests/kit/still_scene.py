@@ -39,3 +39,4 @@ def capture_without_simulator(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "vla_attention.capture.rollout.episode_loop.make_environment", lambda suite, task_id, settings: StillScene()
     )
+    monkeypatch.setattr("vla_attention.capture.capture_run.default_num_envs", lambda: 1)

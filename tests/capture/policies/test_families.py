@@ -56,6 +56,7 @@ class StubEnvironment:
 def toy_is_registered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(families, "FAMILY_MODULES", (*families.FAMILY_MODULES, "tests.kit.toy_family"))
     monkeypatch.setattr(episode_loop, "make_environment", lambda suite, task_id, settings: StubEnvironment())
+    monkeypatch.setattr("vla_attention.capture.capture_run.default_num_envs", lambda: 1)
 
 
 @pytest.mark.usefixtures("toy_is_registered")

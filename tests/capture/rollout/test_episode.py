@@ -114,7 +114,7 @@ class FakeStore:
             recording=Recording((0,), (0,), (1,), (0, 1), "mean", 1, 10, frames=False),
         )
         self.records: list[ReplanRecord] = []
-        self.what = "episode task003_episode002"
+        self.path = Path("runs/made_up.zarr")
         self.ending: tuple[bool, int] | None = None
         self.dropped = False
 
@@ -194,7 +194,8 @@ def test_a_segmentation_that_does_not_fit_its_picture_is_refused(segmentation, m
     with pytest.raises(BadArgument, match=message) as caught:
         record_episode(EpisodeRun(FakePolicy(), store, {}), environment, TASK, 2)
     assert str(caught.value).startswith(
-        "Cannot store replan 0 (environment step 10) of episode task003_episode002, camera 'agentview': "
+        "Cannot store replan 0 (environment step 10) of episode task003_episode002 of runs/made_up.zarr, "
+        "camera 'agentview': "
     )
     assert store.dropped
 

@@ -27,18 +27,18 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 def test_lines_of_a_log_file(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
     progress = Progress(num_episodes=3, max_steps=200)
-    progress.begin(4, 0)
+    episode = progress.begin(4, 0)
     clock.now += 10
-    progress.update(5, 1)  # too early for a line
+    episode.update(5, 1)  # too early for a line
     clock.now += 25
-    progress.update(40, 8)
+    episode.update(40, 8)
     clock.now += 25
-    progress.update(80, 16)  # 25 s after the last line
-    progress.end("success after 80 steps", "lift the red cube")
+    episode.update(80, 16)  # 25 s after the last line
+    episode.end("success after 80 steps", "lift the red cube")
     progress.skip("task004_episode001")
-    progress.begin(4, 2)
+    episode = progress.begin(4, 2)
     clock.now += 7
-    progress.end("no success after 200 steps", "lift the red cube")
+    episode.end("no success after 200 steps", "lift the red cube")
     progress.close()
     printed = capsys.readouterr()
     assert printed.out.splitlines() == [
@@ -48,3 +48,28 @@ def test_lines_of_a_log_file(clock: Clock, capsys: pytest.CaptureFixture[str]) -
         "[3/3] task 4 episode 2: no success after 200 steps, 7 s (lift the red cube)",
     ]
     assert printed.err == ""
+
+
+def test_one_line_is_about_all_episodes_in_progress(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    progress = Progress(num_episodes=9, max_steps=200)
+    episodes = [progress.begin(0, number) for number in range(2)]
+    clock.now += 31
+    episodes[1].update(5, 1)
+    clock.now += 29
+    episodes[0].update(10, 2)  # 29 s after the last line
+    episodes[0].end("success after 10 steps", "lift the red cube")
+    more = [progress.begin(1, number) for number in range(5)]
+    clock.now += 1
+    more[0].update(1, 1)
+    for episode in (episodes[1], *more):
+        episode.end("no success after 200 steps", "lift the red cube")
+    progress.close()
+    assert capsys.readouterr().out.splitlines()[:3] == [
+        "[1/9] task 0 episode 0: step 0 of at most 200, 0 replans, 31 s; "
+        "[2/9] task 0 episode 1: step 5 of at most 200, 1 replans, 31 s",
+        "[1/9] task 0 episode 0: success after 10 steps, 60 s (lift the red cube)",
+        "[2/9] task 0 episode 1: step 5 of at most 200, 1 replans, 61 s; "
+        "[3/9] task 1 episode 0: step 1 of at most 200, 1 replans, 1 s; "
+        "[4/9] task 1 episode 1: step 0 of at most 200, 0 replans, 1 s; "
+        "[5/9] task 1 episode 2: step 0 of at most 200, 0 replans, 1 s; 2 more episodes",
+    ]

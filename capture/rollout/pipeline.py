@@ -1,0 +1,310 @@
+"""The loop over episodes with simulators in processes of their own: they, the policy and the writing overlap.
+
+This process has the policy, and calls it for one simulator after the other. So every call has the input that it has in
+the loop with one simulator, and every episode is the same to the bit. A thread writes (`background_writing.py`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection, wait
+
+from vla_attention.capture.environments.base import Task
+from vla_attention.capture.jobs.claims import Holder
+from vla_attention.capture.rollout.background_writing import BackgroundWriting, Committed, EpisodeInBackground
+from vla_attention.capture.rollout.episode import (
+    EpisodeRecording,
+    EpisodeResult,
+    episode_start,
+    episode_title,
+    max_replans,
+    policy_cameras,
+    recorded_times,
+)
+from vla_attention.capture.rollout.episode_loop import EpisodeLoop, TaskEpisode, describe_result
+from vla_attention.capture.rollout.policy_call import record_call
+from vla_attention.capture.rollout.progress import EpisodeProgress
+from vla_attention.capture.rollout.simulation import Advanced, Begun, Seen
+from vla_attention.capture.rollout.simulator_process import (
+    BeginEpisode,
+    Execute,
+    Failed,
+    ResetsFirst,
+    SimulatorProcess,
+    SimulatorSetup,
+)
+from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.stores.store_format import StoreExists, episode_name
+from vla_attention.schemas.threads import available_cores
+
+#: How often an episode is begun again after the end of its simulator.
+MOST_RESTARTS = 2
+#: Seconds between two looks whether SIGTERM came, while no simulator answers.
+_LOOK_EVERY_S = 0.5
+
+
+#: The largest number of simulators that is taken without being asked for: one policy keeps few more busy.
+MOST_BY_DEFAULT = 8
+
+
+def default_num_envs() -> int:
+    """Return the number of simulators without `--num-envs`: as many as there are cores."""
+    return min(available_cores(), MOST_BY_DEFAULT)
+
+
+class SimulationFailed(UserError):
+    """A simulator refused its work or failed, in one sentence."""
+
+
+class SimulatorDied(UserError, RuntimeError):
+    """The process of a simulator ended again and again in the same episode."""
+
+
+@dataclass(eq=False)
+class Simulator:
+    """A process, and the episode that runs in it; `recording` and `writer` from its reset on."""
+
+    process: SimulatorProcess
+    task: Task
+    episode_index: int
+    progress: EpisodeProgress
+    begun_times: int = 1
+    recording: EpisodeRecording | None = None
+    writer: EpisodeInBackground | None = None
+
+    @property
+    def name(self) -> str:
+        """The name of the episode."""
+        return episode_name(self.task.task_id, self.episode_index)
+
+
+@dataclass
+class PipelinedLoop(EpisodeLoop):
+    """Records episodes in several simulators at a time; see `EpisodeLoop`.
+
+    num_envs: number of simulators. Each stays with its task as long as possible, because another task needs another
+    scene, and because LIBERO's published furniture depends on the resets of earlier episodes.
+    """
+
+    num_envs: int = 2
+    _idle: list[tuple[SimulatorProcess, int | None]] = field(default_factory=list, init=False)
+    _running: list[Simulator] = field(default_factory=list, init=False)
+    #: Episodes whose commit waits for the thread, with the progress of each.
+    _writing: dict[EpisodeInBackground, tuple[EpisodeRecording, EpisodeProgress]] = field(
+        default_factory=dict, init=False
+    )
+    _ready: deque[tuple[Simulator, Seen]] = field(default_factory=deque, init=False)
+
+    @contextmanager
+    def simulators(self) -> Iterator[None]:
+        """Start the thread that writes; end it and all simulators at the end of the block."""
+        attributes = self.run.store.attributes
+        cameras = policy_cameras(self.run.policy)
+        self._setup = SimulatorSetup(self.suite, self.environment_settings, attributes.protocol, cameras)
+        self._woken, wake = Pipe(duplex=False)
+        with ExitStack() as stack:
+            stack.enter_context(self._woken)
+            stack.enter_context(wake)
+            stack.callback(self._note_last_commits)
+            self._thread = stack.enter_context(
+                BackgroundWriting(notify=partial(_wake, wake), check=self.termination.check)
+            )
+            stack.callback(self._end_simulators)
+            yield
+
+    def attempt_all(self, missing: Sequence[TaskEpisode]) -> list[tuple[TaskEpisode, Holder]]:
+        """Record every episode that nobody has; return those that other processes have claimed."""
+        self.termination.check()
+        left = list(missing)
+        elsewhere: list[tuple[TaskEpisode, Holder]] = []
+        with self.termination.only_at_checks():
+            while left or self._running or self._writing:
+                self.termination.check()
+                self._note_commits(self._thread.take_commits())
+                self._begin_episodes(left, elsewhere)
+                if self._running or self._writing:
+                    self._receive()
+                    self._call_policy()
+        self.termination.check()
+        return elsewhere
+
+    def _begin_episodes(self, left: list[TaskEpisode], elsewhere: list[tuple[TaskEpisode, Holder]]) -> None:
+        """Give an episode to every simulator without one; takes from `left`, adds to `elsewhere`."""
+        while left and len(self._running) < self.num_envs:
+            process, task_id = self._idle.pop() if self._idle else (None, None)
+            task, episode = left.pop(self._choose(left, task_id))
+            claimed = self.claim(task, episode)
+            if claimed is True:
+                process = process or self._start_simulator()
+                simulator = Simulator(process, task, episode, self.progress.begin(task.task_id, episode))
+                self._running.append(simulator)
+                self._begin(simulator)
+                continue
+            if process is not None:
+                self._idle.append((process, task_id))
+            if isinstance(claimed, Holder):
+                elsewhere.append(((task, episode), claimed))
+
+    def _start_simulator(self) -> SimulatorProcess:
+        try:
+            return SimulatorProcess(self._setup)
+        except OSError as error:
+            raise SimulationFailed(
+                f"Cannot start a process for a simulator ({error.strerror or error}); use a smaller --num-envs, and "
+                "--resume for what is missing."
+            ) from None
+
+    def _choose(self, left: Sequence[TaskEpisode], task_id: int | None) -> int:
+        """Return the place of the next episode: of the same task, else of one that no simulator has, else the first."""
+        taken = {simulator.task.task_id for simulator in self._running}
+        taken.update(number for _, number in self._idle if number is not None)
+
+        def preference(place: int) -> tuple[bool, bool, int]:
+            other = left[place][0].task_id
+            return (other != task_id, other in taken, place)
+
+        return min(range(len(left)), key=preference)
+
+    def _begin(self, simulator: Simulator) -> None:
+        self.positions[simulator.name] = 0
+        title = episode_title(self.run.store, simulator.task, simulator.episode_index)
+        simulator.process.begin(BeginEpisode(simulator.task.task_id, simulator.episode_index, title))
+
+    def _receive(self) -> None:
+        """Take what the simulators have answered; waits for an answer unless the policy has something to do."""
+        by_connection = {simulator.process.connection: simulator for simulator in self._running}
+        timeout = 0.0 if self._ready else _LOOK_EVERY_S
+        for connection in wait([*by_connection, self._woken], timeout):
+            if connection is self._woken:
+                self._woken.recv_bytes()
+                continue
+            simulator = by_connection[connection]  # type: ignore[index]
+            try:
+                answer = simulator.process.connection.recv()
+            except (EOFError, ConnectionError):
+                self._begin_again(simulator)
+            else:
+                self._take(simulator, answer)
+
+    def _take(self, simulator: Simulator, answer: object) -> None:
+        match answer:
+            case ResetsFirst(number):
+                self.say_resets(simulator.name, number)
+            case Begun():
+                start = episode_start(self.run, simulator.task, simulator.episode_index, answer)
+                simulator.recording = EpisodeRecording(self.run, simulator.task, start)
+                protocol = self.run.store.attributes.protocol
+                simulator.writer = self._thread.episode(
+                    self.run.store, start, recorded_times(self.run), max_replans(protocol)
+                )
+            case Advanced():
+                self._advanced(simulator, answer)
+            case Failed(sentence, expected):
+                if expected:
+                    raise SimulationFailed(sentence)
+                title = episode_title(self.run.store, simulator.task, simulator.episode_index)
+                raise SimulationFailed(
+                    f"The simulator of {title} failed: {sentence}. Nothing of this episode was kept, and the episodes "
+                    "before it are unharmed; --num-envs 1 --resume shows the whole traceback."
+                )
+
+    def _advanced(self, simulator: Simulator, result: Advanced) -> None:
+        recording, writer = simulator.recording, simulator.writer
+        assert recording is not None
+        assert writer is not None
+        recording.advanced(result)
+        if recording.num_replans:
+            self.positions[simulator.name] = recording.step
+            simulator.progress.update(recording.step, recording.num_replans)
+        if not recording.ended:
+            if result.seen is None:
+                raise ValueError("a simulator gave no observation before a policy call")
+            self._ready.append((simulator, result.seen))
+            return
+        self._running.remove(simulator)
+        self._idle.append((simulator.process, simulator.task.task_id))
+        self._writing[writer] = (recording, simulator.progress)
+        writer.commit(recording.success, recording.step)
+
+    def _call_policy(self) -> None:
+        """Make the next policy call, and let its simulator go on before the call is stored."""
+        if not self._ready:
+            return
+        simulator, seen = self._ready.popleft()
+        recording, writer = simulator.recording, simulator.writer
+        assert recording is not None
+        assert writer is not None
+        prepared = recording.prepare(seen)
+        call = record_call(
+            self.run.policy,
+            prepared.policy_input,
+            prepared.noise_seed,
+            self.run.store.attributes.recording,
+            prepared.where,
+            prepared.editors,
+        )
+        simulator.process.execute(Execute(*recording.next_actions(call)))
+        recording.keep(prepared, call, writer)
+
+    def _begin_again(self, simulator: Simulator) -> None:
+        """Begin the episode of a simulator that has died in a new one."""
+        how = simulator.process.how_it_ended()
+        simulator.process.close()
+        self._ready = deque(entry for entry in self._ready if entry[0] is not simulator)
+        if simulator.writer is not None:
+            simulator.writer.drop()
+            simulator.recording = simulator.writer = None
+        title = episode_title(self.run.store, simulator.task, simulator.episode_index)
+        if simulator.begun_times > MOST_RESTARTS:
+            raise SimulatorDied(
+                f"The simulator of {title} ended {simulator.begun_times} times, the last time {how}. Nothing of this "
+                "episode was kept, and the episodes before it are unharmed. Signal 9 mostly means that the memory was "
+                "full: go on with --resume and a smaller --num-envs; 1 keeps the simulator in this process."
+            )
+        self.progress.say(f"{simulator.name}: its simulator ended ({how}); the episode begins again.")
+        simulator.begun_times += 1
+        simulator.progress.update(0, 0)
+        simulator.process = self._start_simulator()
+        self._begin(simulator)
+
+    def _note_commits(self, commits: Sequence[Committed]) -> None:
+        for commit in commits:
+            recording, progress = self._writing.pop(commit.episode)
+            start = recording.start
+            name = episode_name(start.task_id, start.episode_index)
+            if isinstance(commit.folder, StoreExists):
+                self.note_refused(name, progress, commit.folder)
+            else:
+                result = EpisodeResult(
+                    start.task_id,
+                    start.episode_index,
+                    recording.success,
+                    recording.step,
+                    recording.num_replans,
+                    commit.folder,
+                )
+                self.note_commit(result)
+                progress.end(describe_result(result, commit.num_bytes), start.instruction)
+            self.claims.release(name)
+
+    def _note_last_commits(self) -> None:
+        """Note the commits that were completed while the thread ended."""
+        self._note_commits(self._thread.commits_before_end())
+
+    def _end_simulators(self) -> None:
+        for process in [*(simulator.process for simulator in self._running), *(process for process, _ in self._idle)]:
+            process.close()
+        self._running.clear()
+        self._idle.clear()
+        self._ready.clear()
+
+
+def _wake(connection: Connection) -> None:
+    with contextlib.suppress(OSError):  # nobody waits any more
+        connection.send_bytes(b".")

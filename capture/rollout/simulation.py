@@ -1,0 +1,133 @@
+"""The simulator's part of an episode: reset, waiting steps, and the steps between two policy calls.
+
+It needs no torch, so that processes that only simulate start fast and stay small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.capture.environments.base import Environment, Observation, camera_frame
+from vla_attention.capture.environments.coverage import patch_coverage
+from vla_attention.capture.environments.episode_protocol import WAIT_ACTION
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.stores.store_format import PolicyCameraView, Protocol
+
+#: Raises an exception when the process shall stop.
+StopCheck = Callable[[], None]
+
+
+@dataclass(frozen=True)
+class CameraPatches:
+    """A camera of the policy, and the rows and columns of the patches that tile its model image."""
+
+    view: PolicyCameraView
+    rows: int
+    columns: int
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a policy call gets from the simulator.
+
+    coverage: policy camera -> (patch, object) float32, how much of each patch each object covers.
+    """
+
+    observation: Observation
+    coverage: dict[str, NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class Begun:
+    """The beginning of an episode; `initial_state_digest` and `objects` as in `Environment`."""
+
+    initial_state_digest: str
+    objects: tuple[SceneObject, ...]
+
+
+@dataclass(frozen=True)
+class Advanced:
+    """What some steps gave: their number, whether the task is solved, and what the next policy call gets, if any."""
+
+    steps: int
+    success: bool
+    seen: Seen | None
+
+
+@dataclass
+class Simulation:
+    """One environment and the episode that runs in it.
+
+    cameras: those of the policy. check: called before every environment step; an exception that it raises ends the
+    episode.
+    """
+
+    environment: Environment
+    protocol: Protocol
+    cameras: Sequence[CameraPatches]
+    check: StopCheck = lambda: None
+
+    def begin(self, episode_index: int, what: str) -> Begun:
+        """Reset to the stored initial state of that index; what: the episode's name in messages."""
+        self._what, self._step, self._replan = what, 0, 0
+        self.environment.reset(episode_index, self.protocol.seed)
+        return Begun(self.environment.initial_state_digest, tuple(self.environment.objects))
+
+    def wait(self) -> Advanced:
+        """Make the waiting steps, in which objects come to rest; only the last one is observed."""
+        action, observation = np.array(WAIT_ACTION), None
+        for i in range(self.protocol.wait_steps):
+            self.check()
+            observation = self.environment.step(action, observe=i == self.protocol.wait_steps - 1).observation
+        if observation is None:
+            raise ValueError(
+                "an episode needs at least one waiting step: the first picture is the one after the last of them"
+            )
+        return Advanced(0, False, self._seen(observation))
+
+    def advance(self, actions: NDArray[np.float64], observe: bool) -> Advanced:
+        """Execute actions (step, 7) until the task is solved; with `observe` the last one is observed.
+
+        Only the picture before the next replan is drawn, because the policy sees no other.
+        """
+        observation = None
+        for i, action in enumerate(actions):
+            self.check()
+            result = self.environment.step(action, observe=observe and i == len(actions) - 1)
+            self._step += 1
+            observation = result.observation
+            if result.success:
+                return Advanced(i + 1, True, None)
+        self._replan += 1
+        return Advanced(len(actions), False, None if observation is None else self._seen(observation))
+
+    def _seen(self, observation: Observation) -> Seen:
+        return Seen(observation, {camera.view.name: self._coverage(camera, observation) for camera in self.cameras})
+
+    def _coverage(self, camera: CameraPatches, observation: Observation) -> NDArray[np.float32]:
+        view = camera.view
+        expected = camera_frame(observation, view.source).shape[:2]
+        segmentation = self.environment.segmentation(view.source)
+        try:
+            if segmentation.shape != expected or segmentation.dtype.kind not in "iu":
+                raise BadArgument(
+                    f"The segmentation has the shape {segmentation.shape} and type {segmentation.dtype}; expected "
+                    f"whole numbers for the picture's {expected} pixels."
+                )
+            return patch_coverage(
+                segmentation,
+                len(self.environment.objects),
+                camera.rows,
+                camera.columns,
+                flip_rows=view.upright,
+                flip_columns=view.mirrored,
+                visible=view.visible,
+            )
+        except BadArgument as error:
+            where = f"replan {self._replan} (environment step {self.protocol.wait_steps + self._step}) of {self._what}"
+            raise BadArgument(f"Cannot store {where}, camera '{view.source}': {error}") from None

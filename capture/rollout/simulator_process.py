@@ -1,0 +1,194 @@
+"""A process that simulates: it gets an episode and then actions, and answers with what the simulator gave.
+
+`SimulatorProcess` is its other end, in the process of the policy. The process begins anew instead of being forked: an
+OpenGL context does not survive a fork. Every process draws with a context and one thread of its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import traceback
+from dataclasses import dataclass
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Suite
+from vla_attention.capture.environments.suites import make_environment
+from vla_attention.capture.rollout.simulation import CameraPatches, Simulation
+from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.stores.store_format import Protocol
+from vla_attention.schemas.threads import OTHER_LIBRARIES
+
+#: Seconds that a process gets to end by itself.
+_END_WITHIN_S = 2.0
+#: The paths of modules are those of the first process, which may have got some while it ran.
+_BOOT = (
+    "import sys; sys.path[:] = sys.argv[2:]; "
+    "from vla_attention.capture.rollout.simulator_process import main; main(int(sys.argv[1]))"
+)
+
+
+@dataclass(frozen=True)
+class SimulatorSetup:
+    """What a process needs to know once."""
+
+    suite: Suite
+    settings: EnvironmentSettings
+    protocol: Protocol
+    cameras: tuple[CameraPatches, ...]
+
+
+@dataclass(frozen=True)
+class BeginEpisode:
+    """Asks for the beginning of an episode, with its waiting steps. title: its name in messages."""
+
+    task_id: int
+    episode_index: int
+    title: str
+
+
+@dataclass(frozen=True)
+class Execute:
+    """Asks for the execution of actions (step, 7); with `observe` the last one is observed."""
+
+    actions: NDArray[np.float64]
+    observe: bool
+
+
+@dataclass(frozen=True)
+class ResetsFirst:
+    """Tells that so many resets of earlier episodes are made before the episode begins."""
+
+    number: int
+
+
+@dataclass(frozen=True)
+class Failed:
+    """Tells that the simulator failed, in one sentence, which is whole if it is `expected`: a mistake of the user."""
+
+    sentence: str
+    expected: bool
+
+
+class SimulatorProcess:
+    """A running process. `connection` gives its answers: `ResetsFirst`, `Begun`, `Advanced` and `Failed`."""
+
+    def __init__(self, setup: SimulatorSetup) -> None:
+        self.connection, theirs = Pipe()
+        one_thread = dict.fromkeys(("OMP_NUM_THREADS", *OTHER_LIBRARIES), "1")
+        with theirs:
+            # A session of its own: Ctrl-C reaches the policy's process alone, which ends this one. It also ends when
+            # the other end of the connection closes, however the policy's process ended.
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", _BOOT, str(theirs.fileno()), *sys.path],
+                stdin=subprocess.DEVNULL,
+                stdout=sys.stderr.fileno() if _has_descriptor(sys.stderr) else None,
+                pass_fds=[theirs.fileno()],
+                env=os.environ | one_thread,
+                start_new_session=True,
+            )
+        self._send(setup)
+
+    @property
+    def number(self) -> int:
+        """The number of the process."""
+        return self._process.pid
+
+    def begin(self, request: BeginEpisode) -> None:
+        """Let it begin an episode: it answers `Begun` and, after the waiting steps, `Advanced`."""
+        self._send(request)
+
+    def execute(self, request: Execute) -> None:
+        """Let it execute actions: it answers `Advanced`."""
+        self._send(request)
+
+    def _send(self, message: Any) -> None:
+        with contextlib.suppress(OSError):  # it has died, and reading says so
+            self.connection.send(message)
+
+    def how_it_ended(self) -> str:
+        """Wait for the end of a process whose connection has closed, and describe it."""
+        try:
+            code = self._process.wait(_END_WITHIN_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            code = self._process.wait()
+        return f"killed by signal {-code}" if code < 0 else f"exit code {code}"
+
+    def close(self) -> None:
+        """End the process."""
+        self.connection.close()
+        self._process.kill()
+        self._process.wait()
+
+
+def _has_descriptor(stream: Any) -> bool:
+    try:
+        stream.fileno()
+    except (AttributeError, OSError, ValueError):
+        return False
+    return True
+
+
+class _Server:
+    """The process's own side."""
+
+    def __init__(self, connection: Connection, setup: SimulatorSetup) -> None:
+        self.connection = connection
+        self.setup = setup
+        self.environment: Environment | None = None
+        self.task_id: int | None = None
+
+    def serve(self) -> None:
+        """Answer until the other end closes."""
+        while True:
+            message = self.connection.recv()
+            if isinstance(message, BeginEpisode):
+                self._begin(message)
+            else:
+                self.connection.send(self.simulation.advance(message.actions, message.observe))
+
+    def _begin(self, request: BeginEpisode) -> None:
+        environment = self._environment_of(request.task_id)
+        missing = environment.missing_resets(request.episode_index, self.setup.protocol.seed)
+        if missing:
+            self.connection.send(ResetsFirst(missing))
+        self.simulation = Simulation(environment, self.setup.protocol, self.setup.cameras)
+        self.connection.send(self.simulation.begin(request.episode_index, request.title))
+        self.connection.send(self.simulation.wait())
+
+    def _environment_of(self, task_id: int) -> Environment:
+        if self.environment is None or self.task_id != task_id:
+            if self.environment is not None:
+                self.environment.close()
+                self.environment = None
+            self.environment = make_environment(self.setup.suite, task_id, self.setup.settings)
+            self.task_id = task_id
+        return self.environment
+
+
+def main(descriptor: int) -> None:
+    """Simulate for the process at the other end of a connection, until that end closes."""
+    connection = Connection(descriptor)
+    try:
+        server = _Server(connection, connection.recv())
+        try:
+            server.serve()
+        except (EOFError, ConnectionError):
+            raise
+        except UserError as error:
+            connection.send(Failed(str(error), expected=True))
+        except Exception as error:
+            at = traceback.extract_tb(error.__traceback__)[-1]
+            text = " ".join(str(error).split())
+            connection.send(Failed(f"{type(error).__name__}: {text} ({Path(at.filename).name}:{at.lineno})", False))
+    except (EOFError, ConnectionError):
+        return  # the policy's process has ended, or needs this one no more

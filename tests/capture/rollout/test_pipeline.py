@@ -1,0 +1,386 @@
+"""Several simulators at a time: the same stores as with one, and what happens when processes end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from multiprocessing import Pipe
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+
+from tests.kit.still_scene import StillScene
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.capture.__main__ import main as capture
+from vla_attention.capture.jobs.claims import Claims, holders
+from vla_attention.capture.jobs.status import store_status
+from vla_attention.capture.jobs.termination import EXIT_TERMINATED
+from vla_attention.capture.jobs.worker import Worker
+from vla_attention.capture.rollout import pipeline, simulator_process
+from vla_attention.schemas.errors import MissingDependency
+
+NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2")
+TINY = ["pi", "--checkpoint", "untrained-tiny", "--replan-steps", "4", "--max-steps", "8"]
+
+
+def assert_same_episodes(one: Path, other: Path) -> None:
+    """Compare two stores array by array, with types, shapes and attributes."""
+    first, second = (zarr.open_group(store, mode="r")["episodes"] for store in (one, other))
+    assert sorted(first.keys()) == sorted(second.keys())
+    for name in first:
+        assert dict(first[name].attrs) == dict(second[name].attrs)
+        arrays, others = (
+            {path: array for path, array in group[name].members(max_depth=None) if isinstance(array, zarr.Array)}
+            for group in (first, second)
+        )
+        assert arrays.keys() == others.keys()
+        assert "joint/rows" in arrays
+        for path, array in arrays.items():
+            mine, its = array[:], others[path][:]
+            assert (mine.dtype, mine.shape) == (its.dtype, its.shape)
+            assert mine.tobytes() == its.tobytes(), f"{name}/{path}"
+
+
+# ---------------------------------------------------------------- simulators in threads, for what needs no simulator
+
+
+class ThreadOfTests:
+    """Stands for a `SimulatorProcess`: its own side runs in a thread of this process, in a `StillScene`."""
+
+    started: list[ThreadOfTests]
+
+    def __init__(self, setup: simulator_process.SimulatorSetup) -> None:
+        self.connection, theirs = Pipe()
+        self.code = -signal.SIGKILL
+        self._theirs = theirs
+        self._thread = threading.Thread(target=simulator_process.main, args=(os.dup(theirs.fileno()),), daemon=True)
+        theirs.close()
+        self._thread.start()
+        self.connection.send(setup)
+        self.started.append(self)
+
+    def begin(self, request: simulator_process.BeginEpisode) -> None:
+        self.connection.send(request)
+
+    def execute(self, request: simulator_process.Execute) -> None:
+        self.connection.send(request)
+
+    def how_it_ended(self) -> str:
+        return "killed by signal 9"
+
+    def close(self) -> None:
+        self.connection.close()
+        self._thread.join()
+
+
+class Deadly(StillScene):
+    """Ends its process at the second step after the waiting steps of an episode, as often as `lives` says."""
+
+    lives: list[int]
+
+    def reset(self, initial_state_index: int, seed: int) -> None:
+        super().reset(initial_state_index, seed)
+        self.index, self.steps = initial_state_index, 0
+
+    def step(self, action: np.ndarray, observe: bool) -> Any:
+        self.steps += 1
+        if self.index == 1 and self.steps == 12 and self.lives[0] > 0:
+            self.lives[0] -= 1
+            raise EOFError  # as if the process ended: its end of the connection closes without an answer
+        return super().step(action, observe)
+
+
+@pytest.fixture
+def scene(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """Simulators are threads; `scene.make` makes the environment of each."""
+    made = SimpleNamespace(make=StillScene)
+    monkeypatch.setattr(ThreadOfTests, "started", [], raising=False)
+    monkeypatch.setattr(simulator_process, "make_environment", lambda suite, task_id, settings: made.make())
+    monkeypatch.setattr(
+        "vla_attention.capture.rollout.episode_loop.make_environment", lambda suite, task_id, settings: made.make()
+    )
+    monkeypatch.setattr(pipeline, "SimulatorProcess", ThreadOfTests)
+    return made
+
+
+def record(store: Path, num_envs: int, *words: str) -> int:
+    return capture([*TINY, "--task-suite", "robosuite", "--store", str(store), "--num-envs", str(num_envs), *words])
+
+
+def test_more_simulators_give_the_same_episodes(scene, tmp_path, capsys):
+    words = ["--task-id", "0", "2", "--num-episodes", "3"]
+    assert record(tmp_path / "one.zarr", 1, *words) == 0
+    assert not ThreadOfTests.started
+    capsys.readouterr()
+    assert record(tmp_path / "three.zarr", 3, *words) == 0
+    assert len(ThreadOfTests.started) == 3
+    assert_same_episodes(tmp_path / "one.zarr", tmp_path / "three.zarr")
+    printed = capsys.readouterr().out
+    assert "Simulators: 3 processes; --num-envs N changes it." in printed
+    assert printed.count("no success after 8 steps, 2 replans") == 6
+    assert "6 episodes added, 0 solved." in printed
+    assert not (tmp_path / "three.zarr.partial").exists()
+    assert holders(tmp_path / "three.zarr") == []
+    assert store_status(tmp_path / "three.zarr").complete
+    assert analyze(["verify", str(tmp_path / "three.zarr")]) == 0
+
+
+def test_no_more_simulators_than_episodes(scene, tmp_path):
+    assert record(tmp_path / "a.zarr", 8, "--task-id", "0", "--num-episodes", "2") == 0
+    assert len(ThreadOfTests.started) == 2
+
+
+def test_what_is_complete_is_not_recorded_again(scene, tmp_path, capsys):
+    assert record(tmp_path / "a.zarr", 2, "--task-id", "0", "--num-episodes", "2") == 0
+    assert record(tmp_path / "a.zarr", 2, "--task-id", "0", "--num-episodes", "4", "--resume") == 0
+    assert "2 of 4 episodes are complete already; 2 to run." in capsys.readouterr().out
+    assert store_status(tmp_path / "a.zarr").complete
+
+
+def test_an_episode_whose_simulator_died_begins_again(scene, tmp_path, capsys):
+    words = ["--task-id", "0", "--num-episodes", "3"]
+    assert record(tmp_path / "one.zarr", 1, *words) == 0
+    Deadly.lives = [2]
+    scene.make = Deadly
+    assert record(tmp_path / "a.zarr", 2, *words) == 0
+    assert Deadly.lives == [0]
+    assert len(ThreadOfTests.started) == 4
+    again = "task000_episode001: its simulator ended (killed by signal 9); the episode begins again."
+    assert capsys.readouterr().out.count(again) == 2
+    assert_same_episodes(tmp_path / "one.zarr", tmp_path / "a.zarr")
+    assert not (tmp_path / "a.zarr.partial").exists()
+
+
+def test_an_episode_begins_again_at_most_twice(scene, tmp_path, capsys):
+    Deadly.lives = [3]
+    scene.make = Deadly
+    assert record(tmp_path / "a.zarr", 2, "--task-id", "0", "--num-episodes", "3") == 2
+    said = capsys.readouterr().err
+    assert (
+        f"The simulator of episode task000_episode001 of {tmp_path}/a.zarr ended 3 times, the last time killed" in said
+    )
+    assert "a smaller --num-envs" in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "a.zarr.partial").exists()
+    assert holders(tmp_path / "a.zarr") == []
+    assert analyze(["verify", str(tmp_path / "a.zarr")]) == 0
+
+
+class Broken(StillScene):
+    """Fails in its first episode."""
+
+    error: Exception
+
+    def reset(self, initial_state_index: int, seed: int) -> None:
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (MissingDependency("robosuite is not installed; run 'make setup'."), "robosuite is not installed; run 'make"),
+        (
+            RuntimeError("the context\nis lost"),
+            "of .*a.zarr failed: RuntimeError: the context is lost (test_pipeline.py:",
+        ),
+    ],
+)
+def test_an_error_of_a_simulator_is_one_sentence(scene, tmp_path, capsys, error, said):
+    Broken.error = error
+    scene.make = Broken
+    assert record(tmp_path / "a.zarr", 2, "--task-id", "0", "--num-episodes", "2") == 2
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    for part in said.split(".*"):
+        assert part in printed
+    assert "Traceback" not in printed
+
+
+def test_an_error_of_the_policy_ends_everything(scene, tmp_path, monkeypatch, capsys):
+    from vla_attention.capture.policies.pi.policy import PiPolicy
+
+    act, calls = PiPolicy.act, []
+
+    def sometimes(self: Any, *given: Any) -> Any:
+        calls.append(given)
+        return act(self, *given) * (np.nan if len(calls) == 3 else 1)
+
+    monkeypatch.setattr(PiPolicy, "act", sometimes)
+    assert record(tmp_path / "a.zarr", 2, "--task-id", "0", "--num-episodes", "4") == 2
+    assert "The policy's numbers turned NaN or infinite at replan" in capsys.readouterr().err
+    assert not (tmp_path / "a.zarr.partial").exists()
+    assert holders(tmp_path / "a.zarr") == []
+
+
+def test_an_error_of_the_writing_ends_everything(scene, tmp_path, monkeypatch, capsys):
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("vla_attention.capture.store.episode_writer.publish", full)
+    assert record(tmp_path / "a.zarr", 2, "--task-id", "0", "--num-episodes", "2") == 2
+    said = capsys.readouterr().err
+    assert "No space left on device. Nothing of this episode was kept" in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "a.zarr.partial").exists()
+    assert holders(tmp_path / "a.zarr") == []
+
+
+def test_it_waits_for_an_episode_that_another_process_has_claimed(scene, tmp_path, monkeypatch, capsys):
+    store = tmp_path / "a.zarr"
+    assert record(store, 1, "--task-id", "0", "--num-episodes", "1") == 0
+    other = Claims(store, NODE)
+    assert other.acquire("task000_episode001") is None
+    monkeypatch.setattr(
+        "vla_attention.capture.rollout.episode_loop.time",
+        SimpleNamespace(sleep=lambda seconds: other.release("task000_episode001")),
+    )
+    assert record(store, 2, "--task-id", "0", "--num-episodes", "4", "--resume") == 0
+    printed = capsys.readouterr().out
+    assert printed.count("Waiting for episodes that other processes are writing: task000_episode001 by node7") == 1
+    assert printed.index("episode 3: no success") < printed.index("Waiting") < printed.index("episode 1: no success")
+    assert store_status(store).complete
+
+
+def test_an_episode_that_another_process_commits_meanwhile_is_dropped(scene, tmp_path, monkeypatch, capsys):
+    from vla_attention.capture.store import episode_writer
+
+    publish = episode_writer.publish
+
+    def slow(folder: Path, target: Path, durable: bool) -> None:
+        if target.name == "task000_episode000":
+            target.mkdir()
+            (target / "zarr.json").touch()
+        publish(folder, target, durable)
+
+    monkeypatch.setattr(episode_writer, "publish", slow)
+    assert record(tmp_path / "a.zarr", 2, "--task-id", "0", "--num-episodes", "3") == 0
+    printed = capsys.readouterr().out
+    assert "was committed by another process. This process's copy was dropped." in printed
+    assert "2 episodes added" in printed
+    assert not (tmp_path / "a.zarr.partial").exists()
+
+
+def test_simulators_stay_with_their_task(scene, tmp_path, monkeypatch):
+    made: list[int] = []
+
+    def make(suite: Any, task_id: int, settings: Any) -> StillScene:
+        made.append(task_id)
+        return StillScene()
+
+    monkeypatch.setattr(simulator_process, "make_environment", make)
+    assert record(tmp_path / "a.zarr", 2, "--task-id", "0", "1", "2", "3", "--num-episodes", "4") == 0
+    # Four scenes for four tasks, and at most one more for the episodes that are left at the end.
+    assert set(made) == {0, 1, 2, 3}
+    assert len(made) <= 5
+
+
+def test_a_process_that_simulates_needs_no_torch():
+    code = (
+        "import sys, vla_attention.capture.rollout.simulator_process as s\n"
+        "from vla_attention.capture.environments.suites import find_suite, make_environment\n"
+        "print([name for name in ('torch', 'zarr', 'polars', 'matplotlib') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+# --------------------------------------------------------------------------------------------- real simulators
+
+
+@pytest.mark.simulator
+@pytest.mark.parametrize("suite", ["cubes", "robosuite"])
+def test_two_simulators_give_the_episodes_of_one_to_the_bit(suite, tmp_path, monkeypatch):
+    # One renders with the threads of this process, the other two with one each.
+    words = ["--task-suite", suite, "--task-id", "0", "3", "--num-episodes", "2"]
+    for name, num_envs in (("one", "1"), ("two", "2")):
+        arguments = [*TINY, *words, "--num-envs", num_envs, "--store", str(tmp_path / f"{name}.zarr")]
+        command = [sys.executable, "-m", "vla_attention.capture", *arguments, "--threads", "2"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+    assert_same_episodes(tmp_path / "one.zarr", tmp_path / "two.zarr")
+
+
+class Run:
+    """A capture with two simulators in a process of its own, and what the operating system knows of it."""
+
+    def __init__(self, folder: Path, max_steps: int) -> None:
+        self.store, self.log = folder / "a.zarr", folder / "log"
+        words = ["--task-suite", "robosuite", "--task-id", "0", "--num-episodes", "3", "--num-envs", "2"]
+        words = [*TINY[:-1], str(max_steps), *words, "--store", str(self.store)]
+        with self.log.open("w") as out:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "vla_attention.capture", *words],
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                env=os.environ | {"MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl"), "SLURM_JOB_ID": ""},
+            )
+
+    def wait_until(self, what: Any) -> Any:
+        until = time.monotonic() + 240
+        while not (found := what()):
+            assert self.process.poll() is None, self.log.read_text()
+            assert time.monotonic() < until, self.log.read_text()
+            time.sleep(0.1)
+        return found
+
+    def simulators(self) -> list[int]:
+        """The numbers of the simulators' processes that live."""
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
+        return [int(child) for child in children if _is_simulator(child)]
+
+    def both_are_in_an_episode(self) -> bool:
+        return len(list(self.store.with_name("a.zarr.partial").glob("task*"))) == 2
+
+
+def _is_simulator(number: str | int) -> bool:
+    try:
+        return b"simulator_process" in Path(f"/proc/{number}/cmdline").read_bytes()
+    except OSError:
+        return False
+
+
+@pytest.mark.simulator
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGTERM, EXIT_TERMINATED), (signal.SIGINT, 130), (signal.SIGKILL, -9)]
+)
+def test_a_stopped_capture_leaves_no_half_episode_and_no_process(number, code, tmp_path):
+    run = Run(tmp_path, max_steps=400)
+    run.wait_until(run.both_are_in_an_episode)
+    children = run.simulators()
+    assert len(children) == 2
+    run.process.send_signal(number)
+    assert run.process.wait(60) == code, run.log.read_text()
+    until = time.monotonic() + 60
+    while any(_is_simulator(child) for child in children):  # after SIGKILL they see that nobody listens
+        assert time.monotonic() < until
+        time.sleep(0.1)
+    said = run.log.read_text()
+    assert "Traceback" not in said
+    if number != signal.SIGKILL:
+        assert not run.store.with_name("a.zarr.partial").exists()
+        assert holders(run.store) == []
+    if number == signal.SIGTERM:
+        assert "Stopped by SIGTERM: dropped task000_episode000 at step" in said
+        assert ", task000_episode001 at step" in said
+        assert "3 of this process's 3 are missing" in said
+    assert not any((run.store / "episodes").glob("task*"))
+
+
+@pytest.mark.simulator
+def test_a_killed_simulator_is_replaced(tmp_path):
+    run = Run(tmp_path, max_steps=40)
+    run.wait_until(run.both_are_in_an_episode)
+    victim = run.simulators()[0]
+    os.kill(victim, signal.SIGKILL)
+    assert run.process.wait(600) == 0, run.log.read_text()
+    assert run.log.read_text().count("its simulator ended (killed by signal 9); the episode begins again.") == 1
+    assert store_status(run.store).complete
+    assert analyze(["verify", str(run.store)]) == 0
