@@ -48,10 +48,10 @@ from vla_attention.analyze.statistics.intervals import (
     SHARE,
     EpisodeStatistic,
     Estimand,
-    Estimate,
     estimates,
     geometric_mean_over_episodes,
     mean_over_episodes,
+    means_over_tasks,
     named_interval,
     ratio_of_means_over_episodes,
 )
@@ -197,18 +197,19 @@ def task_tables(
         groups: scope, suite, task_id, instruction, layer, layer_number, block, group; mass, keys, density, lift
             (means); fraction, fraction_low, fraction_high.
     """
-    # NaN instead of null, once: there can be thousands of (task, layer) pairs, and numpy has no null.
-    cells = _sorted(episodes.cells).with_columns(pl.col(pl.Float64).fill_null(float("nan")))
-    cells = cells.with_columns(task_number().alias(_TASK))
+    cells = _sorted(episodes.cells)
     ordered = Tables(cells, _sorted(episodes.groups))
+    # As arrays, once: there can be thousands of (task, layer) pairs. numpy has no null: NaN.
+    columns = {name: float_values(cells[name]) for name in _columns_over_episodes(grouping)}
+    columns[_TASK] = cells.select(task_number()).to_series().to_numpy()
     values = {name: ordered.values(name) for name in ("mass", "keys", "density", "lift", "fraction")}
     rows, group_rows = [], []
-    for members, scope in _scopes(cells):
-        part = cells[members]
+    for scope, names, members in _scopes(cells):
+        of_scope = {name: array[members] for name, array in columns.items()}
         of_groups = {name: array[members] for name, array in values.items()}
-        row, bounds = _task_row(part, of_groups, grouping, estimand, level)
-        rows.append({**scope, **row})
-        group_rows += [{**scope, **bound} for bound in bounds]
+        for row, bounds, layer in zip(*_task_rows(of_scope, of_groups, grouping, estimand, level), names, strict=True):
+            rows.append({**scope, **layer, **row})
+            group_rows += [{**scope, **layer, **bound} for bound in bounds]
     return Tables(_task_frame(rows, _cell_schema(grouping)), _task_frame(group_rows, _GROUP_SCHEMA))
 
 
@@ -234,82 +235,117 @@ def overall_rows(tasks: Tables) -> Tables:
     return tasks.filter(pl.col("scope") == scope)
 
 
-def _scopes(cells: pl.DataFrame) -> Iterator[tuple[NDArray[np.int64], dict[str, object]]]:
-    """Positions of the cells that belong together, and what they share."""
+def _columns_over_episodes(grouping: Grouping) -> tuple[str, ...]:
+    """The columns of `episode_tables(...).cells` that tasks are computed from."""
+    columns: tuple[str, ...] = ("num_replans", "success")
+    if grouping.ratio:
+        columns += ("numerator_mass", "denominator_mass", "ratio_mean", "log_ratio_mean", "num_nonfinite")
+        columns += ("geometric_left_out", "nonfinite_layers", "uniform_ratio", "ratio_lift")
+    return columns
+
+
+def _scopes(cells: pl.DataFrame) -> Iterator[tuple[dict[str, object], list[dict[str, object]], NDArray[np.int64]]]:
+    """The cells that belong together: what they share, what names each layer, and positions (layer, episode).
+
+    Layers of the same episodes come together.
+    """
     several = cells["suite"].n_unique() > 1
-    indexed = cells.with_columns(pl.int_range(pl.len()).alias("_position"))
-    for of_layer in indexed.partition_by("layer", maintain_order=True):
-        first = of_layer.row(0, named=True)
-        names = {name: first[name] for name in _LAYER_KEYS}
-        for of_suite in of_layer.partition_by("suite", maintain_order=True):
-            suite = of_suite["suite"][0]
-            for part in of_suite.partition_by("task_id", maintain_order=True):
-                known = {
-                    "scope": "task",
-                    "suite": suite,
-                    "task_id": part["task_id"][0],
-                    "instruction": part["instruction"][0],
-                }
-                yield part["_position"].to_numpy(), {**known, **names}
-            whole = {"scope": "all", "suite": suite, "task_id": None, "instruction": None}
-            yield of_suite["_position"].to_numpy(), {**whole, **names}
-        if several:
-            whole = {"scope": "combined", "suite": None, "task_id": None, "instruction": None}
-            yield of_layer["_position"].to_numpy(), {**whole, **names}
+    indexed = cells.select(
+        *("suite", "task_id", "instruction", *_LAYER_KEYS),
+        pl.int_range(pl.len()).alias("_position"),
+        pl.struct(EPISODE_ID).rank("dense").alias("_episode"),
+    )
+
+    def by_layer(
+        part: pl.DataFrame, scope: dict[str, object]
+    ) -> Iterator[tuple[dict[str, object], list[dict[str, object]], NDArray[np.int64]]]:
+        found: dict[bytes, tuple[list[dict[str, object]], list[NDArray[np.int64]]]] = {}
+        for of_layer in part.partition_by("layer", maintain_order=True):
+            names, positions = found.setdefault(of_layer["_episode"].to_numpy().tobytes(), ([], []))
+            names.append(of_layer.select(_LAYER_KEYS).row(0, named=True))
+            positions.append(of_layer["_position"].to_numpy())
+        for names, positions in found.values():
+            yield scope, names, np.stack(positions)
+
+    for of_suite in indexed.partition_by("suite", maintain_order=True):
+        suite = of_suite["suite"][0]
+        for part in of_suite.partition_by("task_id", maintain_order=True):
+            task, instruction = part["task_id"][0], part["instruction"][0]
+            yield from by_layer(part, {"scope": "task", "suite": suite, "task_id": task, "instruction": instruction})
+        yield from by_layer(of_suite, {"scope": "all", "suite": suite, "task_id": None, "instruction": None})
+    if several:
+        yield from by_layer(indexed, {"scope": "combined", "suite": None, "task_id": None, "instruction": None})
 
 
-def _task_row(
-    part: pl.DataFrame,
-    groups: dict[str, NDArray[np.float64]],
+def _task_rows(
+    columns: Mapping[str, NDArray[Any]],
+    groups: Mapping[str, NDArray[np.float64]],
     grouping: Grouping,
     estimand: Estimand,
     level: float,
-) -> tuple[dict[str, float | int | None], list[dict[str, Any]]]:
-    """The cell's row, and a row per group."""
+) -> tuple[list[dict[str, float | int | None]], list[list[dict[str, Any]]]]:
+    """For each layer of a scope the cell's row, and a row per group.
 
-    def values(column: str) -> NDArray[np.float64]:
-        return part[column].to_numpy()
-
-    row: dict[str, float | int | None] = {
-        "num_tasks": len(np.unique(values(_TASK))),
-        "num_episodes": part.height,
-        "num_replans": int(part["num_replans"].sum()),
-    }
-    tasks = values(_TASK)
-    # Outcomes that are not known are NaN, and in no mean.
-    plain = {"success_rate": mean_over_episodes(float_values(part["success"]))}
-    bounded: dict[str, EpisodeStatistic] = {}
-    if grouping.ratio:
-        spread = summarize(values("ratio_mean"))
-        row |= {f"ratio_{name}": getattr(spread, name) for name in ("std", "median", "min", "max")}
-        row["episodes_without_ratio"] = spread.num_nonfinite
-        row |= {name: int(part[name].sum()) for name in ("num_nonfinite", "geometric_left_out", "nonfinite_layers")}
-        plain |= {name: mean_over_episodes(values(name)) for name in ("numerator_mass", "denominator_mass")}
-        uniform = values("uniform_ratio")
-        # With the mean and the episodes of the headline, so that ratio / uniform ratio is the lift.
-        plain["uniform_ratio"] = geometric_mean_over_episodes(baseline_logs(uniform, values("log_ratio_mean")))
-        bounded["ratio_mean"] = mean_over_episodes(values("ratio_mean"), POSITIVE)
-        bounded["ratio_of_means"] = ratio_of_means_over_episodes(values("numerator_mass"), values("denominator_mass"))
-        bounded["geometric_mean"] = geometric_mean_over_episodes(values("log_ratio_mean"))
-        bounded["ratio_lift"] = geometric_mean_over_episodes(_logs(values("ratio_lift")))
-    shares = {name: mean_over_episodes(groups["fraction"][:, i], SHARE) for i, name in enumerate(grouping.names)}
-    row |= {name: one.value for name, one in _named(plain, tasks, estimand)}
-    for name, one in _named(bounded, tasks, estimand):
-        row |= named_interval(name, one.value, one.interval(level))
-    measures = {
-        name: estimates([mean_over_episodes(column) for column in groups[name].T], tasks, estimand)
-        for name in ("mass", "keys", "density", "lift")
-    }
-    fractions = dict(_named(shares, tasks, estimand))
-    of_groups = [
-        {
-            "group": name,
-            **{measure: of[i].value for measure, of in measures.items()},
-            **named_interval("fraction", fractions[name].value, fractions[name].interval(level)),
+    columns: (layer, episode) each; groups: (layer, episode, group) each.
+    """
+    tasks = columns[_TASK][0]
+    layers = range(len(columns[_TASK]))
+    plain: list[dict[str, EpisodeStatistic]] = []
+    bounded: list[dict[str, EpisodeStatistic]] = []
+    for i in layers:
+        of_layer = {name: array[i] for name, array in columns.items()}
+        # Outcomes that are not known are NaN, and in no mean.
+        plain.append({"success_rate": mean_over_episodes(of_layer["success"])})
+        bounded.append({})
+        if grouping.ratio:
+            plain[i] |= {name: mean_over_episodes(of_layer[name]) for name in ("numerator_mass", "denominator_mass")}
+            # With the mean and the episodes of the headline, so that ratio / uniform ratio is the lift.
+            uniform = baseline_logs(of_layer["uniform_ratio"], of_layer["log_ratio_mean"])
+            plain[i]["uniform_ratio"] = geometric_mean_over_episodes(uniform)
+            sides = (of_layer["numerator_mass"], of_layer["denominator_mass"])
+            bounded[i] = {
+                "ratio_mean": mean_over_episodes(of_layer["ratio_mean"], POSITIVE),
+                "ratio_of_means": ratio_of_means_over_episodes(*sides),
+                "geometric_mean": geometric_mean_over_episodes(of_layer["log_ratio_mean"]),
+                "ratio_lift": geometric_mean_over_episodes(_logs(of_layer["ratio_lift"])),
+            }
+    shares = [mean_over_episodes(column, SHARE) for i in layers for column in groups["fraction"][i].T]
+    statistics = [one for which in (plain, bounded) for of_layer in which for one in of_layer.values()]
+    found = iter(estimates([*statistics, *shares], tasks, estimand))
+    of_plain, of_bounded = (
+        [{name: next(found) for name in of_layer} for of_layer in which] for which in (plain, bounded)
+    )
+    means = {name: means_over_tasks(groups[name], tasks) for name in ("mass", "keys", "density", "lift")}
+    rows, group_rows = [], []
+    for i in layers:
+        row: dict[str, float | int | None] = {
+            "num_tasks": len(np.unique(tasks)),
+            "num_episodes": len(tasks),
+            "num_replans": int(columns["num_replans"][i].sum()),
         }
-        for i, name in enumerate(grouping.names)
-    ]
-    return row, of_groups
+        if grouping.ratio:
+            spread = summarize(columns["ratio_mean"][i])
+            row |= {f"ratio_{name}": getattr(spread, name) for name in ("std", "median", "min", "max")}
+            row["episodes_without_ratio"] = spread.num_nonfinite
+            counts = ("num_nonfinite", "geometric_left_out", "nonfinite_layers")
+            row |= {name: int(columns[name][i].sum()) for name in counts}
+        row |= {name: one.value for name, one in of_plain[i].items()}
+        for name, one in of_bounded[i].items():
+            row |= named_interval(name, one.value, one.interval(level))
+        rows.append(row)
+        of_groups = []
+        for j, name in enumerate(grouping.names):
+            share = next(found)
+            values = {measure: _none_for_nan(of[i, j]) for measure, of in means.items()}
+            of_groups.append(
+                {"group": name, **values, **named_interval("fraction", share.value, share.interval(level))}
+            )
+        group_rows.append(of_groups)
+    return rows, group_rows
+
+
+def _none_for_nan(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)
 
 
 def baseline_logs(uniform: NDArray[np.float64], log_ratios: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -322,12 +358,6 @@ def _finite_geometric_mean(values: NDArray[np.float64], axis: int | tuple[int, .
     """Geometric mean over the finite positive values along an axis; NaN where there is none."""
     logs: NDArray[np.float64] = np.exp(finite_mean(_logs(values), axis))
     return logs
-
-
-def _named(
-    statistics: Mapping[str, EpisodeStatistic], tasks: NDArray[np.float64], estimand: Estimand
-) -> list[tuple[str, Estimate]]:
-    return list(zip(statistics, estimates(list(statistics.values()), tasks, estimand), strict=True))
 
 
 def _logs(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -34,10 +34,17 @@ def split_words(text: str) -> list[tuple[int, int]]:
 def words_of(prompt: Prompt) -> tuple[Word, ...]:
     """The words of the prompt's instruction, in order. A piece that touches a word's characters belongs to it."""
     first, last = prompt.instruction
+    inside = tuple([piece for piece in prompt.pieces if piece.start < last and piece.stop > first])
+    return _words_in(prompt.text[first:last], first, inside)
+
+
+@functools.lru_cache(maxsize=4096)
+def _words_in(text: str, first: int, pieces: tuple[Piece, ...]) -> tuple[Word, ...]:
+    """The words of an instruction that begins at a character of its prompt. Prompts of a task differ in their state."""
     words = []
-    for start, stop in split_words(prompt.text[first:last]):
+    for start, stop in split_words(text):
         begin, end = first + start, first + stop
-        words.append(Word(prompt.text[begin:end], begin, end, _keys_between(prompt.pieces, begin, end)))
+        words.append(Word(text[start:stop], begin, end, _keys_between(pieces, begin, end)))
     return tuple(words)
 
 
@@ -80,4 +87,4 @@ def _occurrences(given: Sequence[str], wanted: Sequence[str]) -> Iterator[int]:
 
 
 def _keys_between(pieces: Sequence[Piece], begin: int, end: int) -> tuple[int, ...]:
-    return tuple(piece.key for piece in pieces if piece.start < end and piece.stop > begin)
+    return tuple([piece.key for piece in pieces if piece.start < end and piece.stop > begin])
