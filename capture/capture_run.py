@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal, cast
 
 import torch
 
+from vla_attention.capture.budgeted_recording import Budget, BudgetedRecording, open_within_budget
 from vla_attention.capture.environments.base import EnvironmentSettings, Task, check_initial_state_index
 from vla_attention.capture.environments.episode_protocol import WAIT_STEPS, EvaluationProtocol
 from vla_attention.capture.environments.suites import list_tasks
@@ -31,8 +33,8 @@ from vla_attention.capture.rollout.episode_loop import EpisodeLoop
 from vla_attention.capture.rollout.pipeline import PipelinedLoop, default_num_envs
 from vla_attention.capture.rollout.progress import say
 from vla_attention.capture.run_settings import RecordingSettings, RunSettings
-from vla_attention.capture.store.disk_estimate import describe, estimate_disk
-from vla_attention.capture.store.store_writer import RunStore, open_run
+from vla_attention.capture.store.disk_estimate import DiskEstimate, describe, estimate_disk
+from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.layers import select_layers
 from vla_attention.schemas.stores.store_format import (
@@ -154,7 +156,19 @@ def _record_missing(
     )
     if note:
         say(note)
-    store = open_run(settings.store, attributes, settings.mode)
+    environment_settings = EnvironmentSettings(evaluation, settings.libero_assets)
+    budgeted = None
+    if settings.budget is not None:
+        planned = {task.task_id for task in wanted} | set(settings.array_task_ids)
+        budgeted = BudgetedRecording(
+            Budget(settings.budget, settings.fixed, len(planned) * settings.num_episodes),
+            policy,
+            wanted,
+            environment_settings,
+            _plan_changes(settings, policy, tasks),
+            termination.check,
+        )
+    store, estimate = open_within_budget(settings.store, attributes, settings.mode, budgeted)
     if settings.mode == "overwrite":
         delete_jobs_folder(store.path)
     done = store.committed()
@@ -167,7 +181,7 @@ def _record_missing(
     todo.sort(key=lambda item: item[0].task_id)
     names = {episode_name(task.task_id, episode) for task in wanted for episode in range(settings.num_episodes)}
     damaged = find_damaged(store.path, names, settings.verify) if done else []
-    _announce(policy, store, len(names), len(todo), len(damaged))
+    _announce(policy, store, len(names), len(todo), len(damaged), estimate)
     for fault in damaged:
         say(f"Not recorded again without vla-capture repair: {fault.describe()}")
     damaged_names = [fault.name for fault in damaged]
@@ -184,7 +198,7 @@ def _record_missing(
     num_envs = min(settings.num_envs or default_num_envs(), len(todo))
     parts: dict[str, Any] = {
         "suite": settings.suite,
-        "environment_settings": EnvironmentSettings(evaluation, settings.libero_assets),
+        "environment_settings": environment_settings,
         "run": EpisodeRun(policy, store, machine, changes, termination.check),
         "worker": worker,
         "record": record,
@@ -221,7 +235,14 @@ def _checkpoint_line(identity: PolicyIdentity) -> str:
     )
 
 
-def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int, num_damaged: int) -> None:
+def _announce(
+    policy: Policy,
+    store: RunStore,
+    num_wanted: int,
+    num_todo: int,
+    num_damaged: int,
+    measured: DiskEstimate | None = None,
+) -> None:
     identity, recording, protocol = store.attributes.policy, store.attributes.recording, store.attributes.protocol
     for line in announcement(identity):
         say(line)
@@ -239,9 +260,12 @@ def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int, n
         f"{len(recording.heads)} heads, {_QUERIES[recording.queries]} {recording.num_action_queries} action queries, "
         f"{', '.join(str(site.num_keys) for site in store.attributes.sites)} keys."
     )
-    pictures = stored_picture_sizes(policy, protocol.image_size)
-    estimate = estimate_disk(recording, store.attributes.sites, pictures, max_replans(protocol), num_todo)
-    say(describe(estimate, store.path))
+    if measured is None:
+        pictures = stored_picture_sizes(policy, protocol.image_size)
+        bound = estimate_disk(recording, store.attributes.sites, pictures, max_replans(protocol), num_todo)
+    else:
+        bound = replace(measured, num_episodes=num_todo)
+    say(describe(bound, store.path))
     if num_todo < num_wanted:
         complete = num_wanted - num_todo - num_damaged
         damaged = f" and {num_damaged} damaged" if num_damaged else ""

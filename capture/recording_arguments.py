@@ -18,7 +18,6 @@ def add_recording_arguments(parser: argparse.ArgumentParser, layers: str, *, rer
     group.add_argument(
         "--denoise-steps",
         nargs="+",
-        default=["first", "last"],
         metavar="STEP",
         help=f"numbers, first, last or all{default('first last')}",
     )
@@ -31,7 +30,6 @@ def add_recording_arguments(parser: argparse.ArgumentParser, layers: str, *, rer
     bound = "which bounds the error of every ratio by 0.1 %%"
     group.add_argument(
         "--precision",
-        default=str(DEFAULT_MANTISSA_BITS),
         metavar="BITS",
         help="mantissa bits kept of each probability, or 'exact'" + default(f"{DEFAULT_MANTISSA_BITS}, {bound}"),
     )

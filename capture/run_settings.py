@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vla_attention.capture.budget import Fixed, parse_budget
 from vla_attention.capture.environments.base import Suite, check_task_id
 from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
 from vla_attention.capture.environments.suites import find_suite
@@ -17,11 +18,15 @@ from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions
-from vla_attention.schemas.precision import parse_precision
+from vla_attention.schemas.precision import DEFAULT_MANTISSA_BITS, parse_precision
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX
 
 if TYPE_CHECKING:
     from vla_attention.capture.store.store_writer import WriteMode
+
+
+#: The denoise steps that are recorded unless others are asked for.
+DEFAULT_STEPS = ("first", "last")
 
 
 @dataclass(frozen=True)
@@ -29,10 +34,10 @@ class RecordingSettings:
     """What is recorded of each policy call; None means everything."""
 
     layers: tuple[int, ...] | None = None
-    denoise_steps: tuple[str, ...] = ("first", "last")
+    denoise_steps: tuple[str, ...] = DEFAULT_STEPS
     heads: tuple[int, ...] | None = None
     queries: str = "mean"
-    mantissa_bits: int = 10
+    mantissa_bits: int = DEFAULT_MANTISSA_BITS
     frames: bool = True
     contributions: bool = True
 
@@ -46,7 +51,8 @@ class RunSettings:
     other processes of the same array job run; the store is expected to hold these too. verify: read every byte of the
     episodes that an existing store has, before they count as done. interventions: what is changed, with layer
     numbers as typed. allow_empty: leave a replan unchanged where a group of an intervention has no key. num_envs:
-    simulators that run at a time; None takes as many as there are cores.
+    simulators that run at a time; None takes as many as there are cores. budget: bytes of the store; what `fixed`
+    leaves open of the recording is chosen to fit. None: no choice is made.
     """
 
     suite: Suite
@@ -65,6 +71,8 @@ class RunSettings:
     interventions: Interventions = field(default_factory=Interventions)
     allow_empty: bool = False
     num_envs: int | None = None
+    budget: int | None = None
+    fixed: Fixed = field(default_factory=Fixed)
 
 
 def run_settings(arguments: argparse.Namespace) -> RunSettings:
@@ -96,6 +104,13 @@ def run_settings(arguments: argparse.Namespace) -> RunSettings:
         interventions=read_interventions(arguments),
         allow_empty=arguments.allow_empty,
         num_envs=arguments.num_envs,
+        budget=None if arguments.budget is None else parse_budget(arguments.budget),
+        fixed=Fixed(
+            precision=arguments.precision is not None,
+            denoise_steps=arguments.denoise_steps is not None,
+            layers=arguments.layers is not None,
+            heads=arguments.heads is not None,
+        ),
     )
 
 
@@ -103,10 +118,10 @@ def recording_settings(arguments: argparse.Namespace) -> RecordingSettings:
     """Return what the options of `recording_arguments.py` say."""
     return RecordingSettings(
         layers=None if arguments.layers is None else tuple(arguments.layers),
-        denoise_steps=tuple(arguments.denoise_steps),
+        denoise_steps=DEFAULT_STEPS if arguments.denoise_steps is None else tuple(arguments.denoise_steps),
         heads=None if arguments.heads is None else tuple(arguments.heads),
         queries=arguments.queries,
-        mantissa_bits=parse_precision(arguments.precision),
+        mantissa_bits=DEFAULT_MANTISSA_BITS if arguments.precision is None else parse_precision(arguments.precision),
         frames=not arguments.no_frames,
         contributions=arguments.contributions,
     )

@@ -1,0 +1,104 @@
+"""`--budget` on real policies and simulators: what the trial says is what is written, and the choice keeps to it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from vla_attention.capture.__main__ import main as capture
+from vla_attention.capture.arguments import build_parser
+from vla_attention.capture.capture_run import plan_protocol, plan_recording
+from vla_attention.capture.doctor.trial import Trial, run_trial
+from vla_attention.capture.environments.base import EnvironmentSettings
+from vla_attention.capture.environments.suites import list_tasks
+from vla_attention.capture.interventions.run_changes import RunChanges
+from vla_attention.capture.run_settings import run_settings
+from vla_attention.capture.store.measured_size import mean_size
+from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.precision import parse_precision
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import FORMAT_NAME, FORMAT_VERSION, RootAttributes
+
+pytestmark = pytest.mark.simulator
+
+
+def trials_of(arguments: list[str], tasks: tuple[int, ...]) -> list[Trial]:
+    """The trials of the run that `vla-capture` would make of these arguments."""
+    parsed = build_parser().parse_args(arguments)
+    settings = run_settings(parsed)
+    policy = parsed.family.build(parsed, "cpu")
+    attributes = RootAttributes(
+        FORMAT_NAME,
+        FORMAT_VERSION,
+        policy.identity(),
+        plan_protocol(settings, policy.default_protocol, policy),
+        plan_recording(settings.recording, policy)[0],
+        policy.sites,
+        {},
+    )
+    environment = EnvironmentSettings(policy.default_protocol)
+    changes = RunChanges(Interventions(), {})
+    return [run_trial(policy, attributes, list_tasks(settings.suite)[task], environment, changes) for task in tasks]
+
+
+def bytes_of(folder: Path) -> int:
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+
+
+@pytest.mark.parametrize(
+    ("words", "tried", "tasks", "precisions"),
+    [
+        ("pi --task-suite cubes", (0,), (3,), ("4", "10", "exact")),
+        ("pi --checkpoint untrained-tiny --task-suite robosuite --max-steps 100", (0,), (1,), ("7",)),
+        # Pictures are half of what this one stores, and those of the two scenes differ by a factor of two.
+        ("cosmos --checkpoint untrained-tiny --task-suite robosuite --max-steps 150", (0, 2), (0, 2), ("10",)),
+    ],
+    ids=["pi05_cubes", "untrained-tiny", "cosmos-untrained-tiny"],
+)
+def test_a_few_replans_say_what_a_replan_takes(tmp_path, words, tried, tasks, precisions):
+    trials = trials_of([*words.split(), "--store", str(tmp_path / "none.zarr")], tried)
+    for trial in trials:
+        assert trial.policy_seconds > 0
+        assert trial.start_seconds > 0
+        assert len(trial.sample.records) == 8
+    for precision in precisions:
+        store = tmp_path / f"{precision}.zarr"
+        options = ["--task-id", *map(str, tasks), "--num-episodes", "1", "--precision", precision]
+        assert capture([*words.split(), *options, "--store", str(store)]) == 0
+        recording = replace(trials[0].sample.attributes.recording, mantissa_bits=parse_precision(precision))
+        size = mean_size([trial.sample.size(recording) for trial in trials])
+        episodes = open_store(store).episodes
+        predicted = sum(size.bytes_of(episode.attributes.num_replans) for episode in episodes)
+        assert predicted == pytest.approx(sum(bytes_of(episode.folder) for episode in episodes), rel=0.1), precision
+    assert not (tmp_path / "none.zarr").exists()
+
+
+def test_a_budget_is_kept_and_a_resumed_run_keeps_the_choice(tmp_path, capsys):
+    store = tmp_path / "a.zarr"
+    arguments = ["pi", "--num-episodes", "1", "--store", str(store), "--max-steps", "100", "--budget", "600kB"]
+    assert capture([*arguments, "--task-id", "3", "4"]) == 0
+    said = capsys.readouterr().out
+    assert "Budget 600 kB: recording " in said
+    assert "Given up for it: " in said
+    assert "The next larger recording, " in said
+    assert "kB, measured, + " in said
+    assert bytes_of(store) <= 600_000
+    chosen = open_store(store).attributes.recording
+    assert len(chosen.denoise_steps) < 10
+    assert capture([*arguments, "--task-id", "3", "5", "--resume"]) == 0
+    said = capsys.readouterr().out
+    assert "The recording was chosen when the store was made, and --budget does not change it." in said
+    assert "1 of 2 episodes are complete already; 1 to run." in said
+    assert capture([*arguments, "--task-id", "5", "--resume", "--precision", "exact"]) == 2
+    assert "its recording." in capsys.readouterr().err
+
+
+def test_a_budget_that_nothing_fits_into_is_one_sentence(tmp_path, capsys):
+    store = tmp_path / "a.zarr"
+    assert capture(["pi", "--num-episodes", "1", "--task-id", "3", "--store", str(store), "--budget", "10kB"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("vla-capture: Cannot keep within --budget 10 kB: the smallest recording (denoise steps 9 of")
+    assert said.count("\n") == 1
+    assert not store.exists()
