@@ -7,7 +7,7 @@ computed beside it, for the wanted queries only.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -110,10 +110,7 @@ class AttentionCall:
     @property
     def precision(self) -> str:
         """The least precise dtype of what is multiplied and of its result: a softmax may be of higher precision."""
-        # Where there is a result after the output projection, the output before it would be a second computation.
-        result = getattr(self.tensors, "result", None)
-        kernel = self.output if result is None else result
-        dtypes = [self.value.dtype, kernel.dtype, getattr(torch, self.shape.dtype)]
+        dtypes = [self.value.dtype, self.output.dtype, getattr(torch, self.shape.dtype)]
         probabilities = getattr(self.tensors, "probabilities", None)
         if probabilities is not None:
             dtypes.append(probabilities.dtype)
@@ -125,20 +122,13 @@ class AttentionCall:
         rows: (batch, head, query, key) of the same queries and batch rows. Rows that are those of the kernel give
         rounding errors: some 1e-7 where it computes in float32, some 1e-3 to 1e-2 where in bfloat16.
         """
-        # Both as the policy computes them, under its autocast if it has one.
-        value = self.value
-        projected: Any = getattr(self.tensors, "projected", None)
-        kernel = self.output if projected is None else None
         with _exact():
-            value = at_positions(value, 0, batch).float()
+            value = at_positions(self.value, 0, batch).float()
             size, heads, count, keys = rows.shape
             # Heads that share a value head become extra queries of that head, without copies of the values.
             stacked = rows.reshape(size, value.shape[1], heads // value.shape[1] * count, keys)
             mixed = torch.matmul(stacked, value).reshape(size, heads, count, value.shape[3])
-            if kernel is None:
-                mixed, output = projected(mixed, queries, batch)
-            else:
-                output = at_positions(at_positions(kernel, 0, batch), 2, queries).float()
+            output = at_positions(at_positions(self.output, 0, batch), 2, queries).float()
             difference = (mixed - output).abs()
             if not difference.numel():
                 return 0.0
@@ -166,13 +156,17 @@ class Watcher(Protocol):
         ...
 
 
-@contextmanager
-def _exact() -> Iterator[None]:
+def _exact() -> AbstractContextManager[object]:
     """Compute without gradients, and in the dtypes that are written, whatever autocast the policy runs under."""
+    devices = [device for device in ("cpu", "cuda") if torch.is_autocast_enabled(device)]
+    return _without_autocast(devices) if devices else torch.no_grad()
+
+
+@contextmanager
+def _without_autocast(devices: Sequence[str]) -> Iterator[None]:
     with torch.no_grad(), ExitStack() as stack:
-        for device in ("cpu", "cuda"):
-            if torch.is_autocast_enabled(device):
-                stack.enter_context(torch.autocast(device, enabled=False))
+        for device in devices:
+            stack.enter_context(torch.autocast(device, enabled=False))
         yield
 
 
@@ -190,6 +184,7 @@ def at_positions(tensor: Tensor, axis: int, positions: Positions) -> Tensor:
 def position_numbers(positions: Positions, size: int, device: torch.device | str = "cpu") -> Tensor:
     """Return positions on an axis of `size` as (count,) int64 without negative numbers."""
     if isinstance(positions, slice):
-        positions = range(size)[positions]
+        chosen = range(size)[positions]
+        return torch.arange(len(chosen), device=device) * chosen.step + chosen.start
     numbers = torch.as_tensor(positions, dtype=torch.int64, device=device)
     return torch.where(numbers < 0, numbers + size, numbers)

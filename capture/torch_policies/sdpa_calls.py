@@ -99,7 +99,8 @@ def _lead(given: _Arguments) -> list[int]:
     if given.enable_gqa:
         heads = given.query.shape[-3]
         leads = [torch.Size((*lead[:-1], heads if lead[-1] > 1 else 1)) for lead in leads]
-    return list(np.broadcast_shapes(*leads))
+    first = leads[0]
+    return list(first if all(lead == first for lead in leads) else np.broadcast_shapes(*leads))
 
 
 def _folded(tensor: Tensor, lead: list[int], batch: int, kv_heads: int) -> Tensor:

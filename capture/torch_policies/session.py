@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run
-from vla_attention.capture.torch_policies.call_order import KnownCalls
+from vla_attention.capture.torch_policies.call_order import CallsDoNotFit, KnownCalls
 from vla_attention.capture.torch_policies.knockouts import SessionKnockouts
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
 from vla_attention.capture.torch_policies.policy_modules import find_policy
@@ -38,6 +38,12 @@ from vla_attention.schemas.stores.store_format import RootAttributes, StoreExist
 
 #: More replans than any episode has; the writer collects rows in blocks of two megabytes.
 _MANY_REPLANS = 1_000_000
+
+
+_BY_NAMES = (
+    "This policy call was watched at the names of torch's attention functions only, since all attention of an earlier "
+    "one was called by them. If it is called otherwise here, record again with run.every_function = True."
+)
 
 
 class RecordingStopped(UserError, RuntimeError):
@@ -213,6 +219,8 @@ class RecordedRun:
         num_dropped: replan blocks in which no attention ran.
         largest_error: largest difference of P·V from a kernel's output, relative to the largest output, of the stored
             episodes.
+        every_function: look at every function of torch at every policy call, which is slower. False: at an episode's
+            first, and at all where attention functions are called otherwise than by their names in torch.
     """
 
     def __init__(
@@ -245,6 +253,9 @@ class RecordedRun:
         self._durable = durable
         self._store: RunStore | None = None
         self._in_block = False
+        self.every_function = False
+        #: Whether it is not known yet that names are enough.
+        self._names_unknown = True
         self._sites = tuple(layout.site(site.name) for site in attributes.sites)
 
     def __enter__(self) -> RecordedRun:
@@ -353,6 +364,7 @@ class RecordedRun:
         steps = self.attributes.recording.denoise_steps
         times = self.layout.denoise_times or tuple(float(step) for step in range(self.layout.num_denoise_steps))
         chosen = np.array([times[step] for step in steps])
+        self._names_unknown = True
         return Episode(self, facts, stack.enter_context(store.episode(start, chosen, _MANY_REPLANS)))
 
     @contextmanager
@@ -385,11 +397,18 @@ class RecordedRun:
         replan = Replan()
         self._in_block = True
         try:
-            with watched_ids(self._embedding, text), watch_attention(self._found, recorder):
+            every_function = self.every_function or self._names_unknown
+            seen = watch_attention(self._found, recorder, every_function=every_function)
+            with watched_ids(self._embedding, text), seen as functions:
                 yield replan
         finally:
             self._in_block = False
-        self._store_replan(replan, recorder, text, episodes, given, rows)
+        if recorder.saw_attention:
+            self._names_unknown = not functions.by_names
+        try:
+            self._store_replan(replan, recorder, text, episodes, given, rows)
+        except CallsDoNotFit as error:
+            raise error if every_function else CallsDoNotFit(f"{error}\n{_BY_NAMES}") from None
 
     def _store_replan(
         self,

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 from torch import Tensor
 
@@ -107,7 +108,7 @@ class Product:
         """Return the product of the sizes of axes of the softmax."""
         return math.prod(self.axes.sizes[axis] for axis in axes)
 
-    @property
+    @cached_property
     def sizes(self) -> tuple[int, int, int, int, int]:
         """Batch, heads, kv_heads, queries, keys."""
         kv_heads = self.size(self.heads[: self.shared])
@@ -131,8 +132,10 @@ class Product:
         return found.reshape(self.size(self.batch), self.size(self.heads), *found.shape[-2:])
 
 
+# A policy makes the same few products hundreds of times in a call.
+@lru_cache(maxsize=1024)
 def find_product(
-    axes: Axes, letters: str, value_letters: str, output_letters: str, value_shape: Sequence[int]
+    axes: Axes, letters: str, value_letters: str, output_letters: str, value_shape: tuple[int, ...]
 ) -> Product | None:
     """Read a product in the notation of einsum: the probabilities' letters, the values' and the output's.
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -26,8 +27,9 @@ from vla_attention.capture.torch_policies.call_tensors import batch_and_heads, n
 from vla_attention.capture.torch_policies.softmax_axes import Axes, Product, find_product
 from vla_attention.capture.torch_policies.watched_block import WatchedBlock, Where
 
+#: `torch.nn.functional.softmax` calls the tensor's.
 SOFTMAXES: tuple[Callable[..., Any], ...] = (
-    torch.softmax, torch.nn.functional.softmax, Tensor.softmax, torch.special.softmax, torch._safe_softmax,
+    torch.softmax, Tensor.softmax, torch.special.softmax, torch._safe_softmax,
     torch.ops.aten.softmax, torch.ops.aten.softmax.int, torch.ops.aten._softmax, torch.ops.aten._softmax.default,
 )  # fmt: skip
 _MATMULS = {
@@ -200,7 +202,7 @@ class Softmaxes:
             change,
             (_times_written(logits), _times_written(result)),
         )
-        self._follow(result, _Followed(weakref.ref(result), softmax, Axes(sizes, first), altered=False))
+        self._follow(result, softmax, Axes(sizes, first), altered=False)
         return result
 
     def follow(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
@@ -220,7 +222,7 @@ class Softmaxes:
             axes = _axes_after(function, args, kwargs, given, result)
             if axes is not None:
                 altered = given.altered or (function not in _SAME_NUMBERS and not _no_dropout(function, args, kwargs))
-                self._follow(result, replace(given, tensor=weakref.ref(result), axes=axes, altered=altered))
+                self._follow(result, given.softmax, axes, altered=altered)
         return result
 
     def _may_attend(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> bool:
@@ -234,10 +236,10 @@ class Softmaxes:
         followed = self.followed.get(id(given))
         return followed if followed is not None and followed.tensor() is given else None
 
-    def _follow(self, tensor: Tensor, followed: _Followed) -> None:
+    def _follow(self, tensor: Tensor, softmax: _Softmax, axes: Axes, *, altered: bool) -> None:
         number, all_followed = id(tensor), self.followed
         reference = weakref.ref(tensor, lambda gone: _forget(all_followed, number, gone))
-        all_followed[number] = replace(followed, tensor=reference)
+        all_followed[number] = _Followed(reference, softmax, axes, altered)
 
     def _product(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], result: Any) -> None:
         if function is torch.einsum:
@@ -258,7 +260,7 @@ class Softmaxes:
             followed = self._found(operands[given])
             if followed is None:
                 continue
-            product = find_product(followed.axes, own, other, out, operands[values].shape)
+            product = find_product(followed.axes, own, other, out, tuple(operands[values].shape))
             if product is not None:
                 self._saw(followed, product, operands[given], operands[values], result)
                 return
@@ -275,7 +277,9 @@ class Softmaxes:
                 f"(batch {batch}, {heads} heads, {queries} queries) than the softmax. Leave this call out."
             )
             raise self._block.failed(refused)
-        shape = replace(before, batch=batch, heads=heads, kv_heads=kv_heads, queries=queries, keys=keys)
+        shape = before
+        if product.sizes != (before.batch, before.heads, before.kv_heads, before.queries, before.keys):
+            shape = replace(before, batch=batch, heads=heads, kv_heads=kv_heads, queries=queries, keys=keys)
         if softmax.change is not None:
             self._block.changed.remove(before)
         # Other tensors that come from this softmax need not be followed any more.
@@ -286,6 +290,8 @@ class Softmaxes:
         altered = followed.altered or softmax.altered or (own is not None and _times_written(own) != before_result)
         if softmax.logits is not None and _times_written(softmax.logits) != before_logits:
             softmax.logits = None
+        if not self._block.changes and self._block.passes(shape):
+            return
         tensors = SoftmaxTensors(softmax, product, probabilities, altered, values, result)
         self._block.saw(AttentionCall(shape, tensors, None if shape == replace(before, kv_heads=kv_heads) else before))
 
@@ -343,6 +349,7 @@ def _no_dropout(function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any])
     return not training or rate == 0
 
 
+@lru_cache(maxsize=1024)
 def _letters(equation: str | None, first: int, second: int) -> tuple[str, str, str] | None:
     """Return the letters of both operands and of the result; of a matmul (equation None) as einsum would write it."""
     spare = [chr(number) for number in range(0x3B1, 0x3B1 + 24)]

@@ -1,32 +1,24 @@
 """Seeing every attention call of a torch policy while its own code runs.
 
-One `TorchFunctionMode` sees the functions that compute attention. Compiled parts run eager meanwhile, and the fast path
-of `nn.MultiheadAttention`, which nothing sees, is off. The policy's own kernels compute what it returns: with nothing
+`seen_functions` sees the functions that compute attention. Compiled parts run eager meanwhile, and the fast path of
+`nn.MultiheadAttention`, which nothing sees, is off. The policy's own kernels compute what it returns: with nothing
 changed, actions are bit-equal with those of the same policy run eager with the fast path off.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import torch
-from torch.overrides import TorchFunctionMode
 
-from vla_attention.capture.torch_policies import flex_calls, multihead_calls, sdpa_calls, softmax_calls
 from vla_attention.capture.torch_policies.attention_calls import Watcher
 from vla_attention.capture.torch_policies.policy_modules import find_policy
-from vla_attention.capture.torch_policies.unseen_attention import (
-    ATTENTION_OPERATOR,
-    LOAD_WITH_SDPA,
-    UnseenAttention,
-)
+from vla_attention.capture.torch_policies.seen_functions import SeenFunctions
 from vla_attention.capture.torch_policies.watched_block import WatchedBlock
-from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.errors import BadArgument
 
-_OPERATORS = frozenset((torch._ops.OpOverload, torch._ops.OpOverloadPacket))
 _ACTIVE = threading.Lock()
 
 
@@ -35,8 +27,10 @@ class AlreadyWatched(BadArgument):
 
 
 @contextmanager
-def watch_attention(policy: object, watcher: Watcher) -> Iterator[None]:
+def watch_attention(policy: object, watcher: Watcher, *, every_function: bool = True) -> Iterator[SeenFunctions]:
     """Tell `watcher` about every attention call of `policy` inside the block, in whatever thread it runs.
+
+    The block gives `SeenFunctions`, whose `by_names` says whether `every_function` was needed.
 
     policy: an `nn.Module`, an object that holds modules, or what `find_policy` made of one, which spares the search for
     modules at every block.
@@ -60,8 +54,14 @@ def watch_attention(policy: object, watcher: Watcher) -> Iterator[None]:
     try:
         block = WatchedBlock(found, watcher)
         try:
-            with seen_by_python(), block.following_modules(lambda: _Mode(block)), _Mode(block):
-                yield
+            functions = SeenFunctions(block, every_function=every_function)
+            with (
+                seen_by_python(),
+                functions.names_replaced(),
+                block.following_modules(functions.in_this_thread, functions.at_module),
+                functions.in_this_thread(),
+            ):
+                yield functions
         except BaseException:
             block.abandon()
             raise
@@ -80,49 +80,3 @@ def seen_by_python() -> Iterator[None]:
             yield
     finally:
         torch.backends.mha.set_fastpath_enabled(fast_path)
-
-
-class _Mode(TorchFunctionMode):
-    """Sees the torch functions of one thread."""
-
-    def __init__(self, block: WatchedBlock) -> None:
-        super().__init__()
-        self._block = block
-        self._softmaxes = softmax_calls.Softmaxes(block)
-        #: Every function of the policy comes by here: one look at a dictionary says whether a softmax is followed.
-        self._followed = self._softmaxes.followed
-        self._handlers: dict[Any, Callable[..., Any]] = {
-            **{function: self._attend(sdpa_calls.watch_call) for function in sdpa_calls.FUNCTIONS},
-            **{function: self._attend(multihead_calls.watch_call) for function in multihead_calls.FUNCTIONS},
-            **{function: self._attend(flex_calls.watch_call) for function in flex_calls.FUNCTIONS},
-            **dict.fromkeys(softmax_calls.SOFTMAXES, self._softmaxes.softmax),
-        }
-
-    def __torch_function__(
-        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
-        handler = self._handlers.get(func)
-        if handler is not None:
-            return handler(func, args, kwargs or {})
-        if type(func) in _OPERATORS:
-            self._refuse_unseen(func)
-        if self._followed:
-            return self._softmaxes.follow(func, args, kwargs or {})
-        return func(*args, **kwargs) if kwargs else func(*args)
-
-    def _attend(self, watch_call: Callable[..., Any]) -> Callable[..., Any]:
-        def attend(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-            try:
-                return watch_call(self._block, func, args, kwargs)
-            except UserError as error:  # the policy's code may catch it
-                raise self._block.failed(error) from None
-
-        return attend
-
-    def _refuse_unseen(self, operator: Any) -> None:
-        """Raise `UnseenAttention` for an attention operator that no handler knows."""
-        name = str(getattr(operator, "_qualified_op_name", None) or operator.name())
-        if ATTENTION_OPERATOR.match(name):
-            raise self._block.failed(
-                UnseenAttention(f"The operator {name} computes attention in a way that gives no rows. {LOAD_WITH_SDPA}")
-            )

@@ -6,7 +6,7 @@ import sys
 import threading
 import types
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import update_wrapper
 from typing import Any
@@ -106,9 +106,14 @@ class WatchedBlock:
             queries=queries, keys=keys, dtype=str(dtype).removeprefix("torch."),
         )  # fmt: skip
 
+    @property
+    def changes(self) -> bool:
+        """Whether the watcher changes any call."""
+        return bool(getattr(self.watcher, "changes", True))
+
     def change(self, shape: CallShape) -> Tensor | None:
         """Ask the watcher for a change of the call that comes next."""
-        if not getattr(self.watcher, "changes", True):
+        if not self.changes:
             return None
         with self._lock, torch.no_grad(), self._failing():
             return None if self._closed else self.watcher.change(shape)
@@ -126,7 +131,7 @@ class WatchedBlock:
 
     def saw(self, call: AttentionCall) -> None:
         """Tell the watcher about a call, and count it."""
-        with self._lock, torch.no_grad(), self._failing():
+        with self._lock, torch.no_grad(), self._failing(), _without_modes():
             if self._closed:  # a thread that still runs; the block has ended with an error
                 return
             if call.shape.number != self._number:  # another call came in between, in this thread or in another
@@ -201,54 +206,66 @@ class WatchedBlock:
                 )
 
     @contextmanager
-    def following_modules(self, mode: Callable[[], AbstractContextManager[object]]) -> Iterator[None]:
+    def following_modules(
+        self, seeing: Callable[[], AbstractContextManager[object]], at_module: Callable[[], None]
+    ) -> Iterator[None]:
         """Keep track of which modules run, and see the calls of every thread that runs one of them.
 
-        Function modes belong to threads. A module that is called in a thread where none is active enters one for its
-        forward. Hooks would not do: `module.forward(...)` skips them, and so do some fast paths.
+        Calls are seen by threads. A module that is called in a thread where none are enters `seeing` for its forward.
+        `at_module` is called where a module begins or ends. Hooks would not do: `module.forward(...)` skips them, and
+        so do some fast paths.
         """
         attending, simple = self._found.attending, self._found.simple
         replaced: list[_Forward] = []
         self._thread.seen = True
         try:
-            replaced.extend(_Forward(module, self._followed(module, module.forward, mode)) for module in attending)
-            replaced.extend(_Forward(module, self._noticed(module.forward)) for module in simple)
+            replaced.extend(
+                _Forward(module, self._followed(module, module.forward, seeing, at_module)) for module in attending
+            )
+            replaced.extend(_Forward(module, self._noticed(module.forward, at_module)) for module in simple)
             yield
         finally:
             self._thread.seen = False
             for forward in replaced:
                 forward.give_back()
 
-    def _noticed(self, forward: Callable[..., Any]) -> Callable[..., Any]:
+    def _noticed(self, forward: Callable[..., Any], at_module: Callable[[], None]) -> Callable[..., Any]:
         """Notice a simple module that runs in another thread, outside every forward that could enter a mode there."""
         thread = self._thread
 
         def noticed(*args: Any, **kwargs: Any) -> Any:
             if not thread.seen:
                 self._unseen_thread = True
+            at_module()
             return forward(*args, **kwargs)
 
         return noticed
 
     def _followed(
-        self, module: nn.Module, forward: Callable[..., Any], mode: Callable[[], AbstractContextManager[object]]
+        self,
+        module: nn.Module,
+        forward: Callable[..., Any],
+        seeing: Callable[[], AbstractContextManager[object]],
+        at_module: Callable[[], None],
     ) -> Callable[..., Any]:
         thread = self._thread
 
         def followed(*args: Any, **kwargs: Any) -> Any:
             if not thread.seen:
                 return in_other_thread(args, kwargs)
+            at_module()
             thread.running.append(module)
             try:
                 return forward(*args, **kwargs)
             finally:
                 thread.running.pop()
+                at_module()
 
         def in_other_thread(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
             with self._lock:
                 self._elsewhere += 1
             try:
-                with mode():
+                with seeing():
                     thread.seen = True
                     try:
                         return followed(*args, **kwargs)
@@ -259,6 +276,11 @@ class WatchedBlock:
                     self._elsewhere -= 1
 
         return followed
+
+
+def _without_modes() -> AbstractContextManager[object]:
+    """Compute past function modes, those of the policy's code too: what a watcher computes is none of theirs."""
+    return torch._C.DisableTorchFunction() if torch._C._len_torch_function_stack() else nullcontext()
 
 
 class _Forward:

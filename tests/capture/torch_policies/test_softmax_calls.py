@@ -143,7 +143,7 @@ def test_rows_and_results(attend, data):
     expected = policy(hidden, memory, mask)
     taken.clear()
     seen = Seen()
-    with watch_attention(policy, seen):
+    with watch_attention(policy, seen, every_function=data.draw(st.booleans())):
         result = policy(hidden, memory, mask)
     assert torch.equal(result, expected)
     assert [shape.module for shape in seen.shapes] == ["layers.0", "layers.1"]

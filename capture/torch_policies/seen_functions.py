@@ -1,0 +1,237 @@
+"""The functions that compute attention, seen while the policy's own code calls them.
+
+Most policies call them by names in torch (`torch.nn.functional.scaled_dot_product_attention`, `tensor.softmax(-1)`).
+During a block something else stands under these names; other functions cost nothing more. What is called otherwise,
+such as a function that was imported by name, is seen by a `TorchFunctionMode` only, through which every function of
+torch goes: a few microseconds each, more than many policies compute in it. The result of a softmax is followed by that
+mode, from the softmax to the next module that begins or ends after its product with the values.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import wraps
+from typing import Any
+
+import torch
+from torch import overrides
+from torch.overrides import TorchFunctionMode
+
+from vla_attention.capture.torch_policies import flex_calls, multihead_calls, sdpa_calls, softmax_calls
+from vla_attention.capture.torch_policies.unseen_attention import ATTENTION_OPERATOR, LOAD_WITH_SDPA, UnseenAttention
+from vla_attention.capture.torch_policies.watched_block import WatchedBlock
+from vla_attention.schemas.errors import UserError
+
+#: Where policies find the functions. `F.softmax` calls the tensor's method; `torch.bmm` is called by
+#: `multi_head_attention_forward`.
+_NAMES: tuple[tuple[Any, str], ...] = (
+    (torch.nn.functional, "scaled_dot_product_attention"),
+    (torch.nn.functional, "multi_head_attention_forward"),
+    (torch.Tensor, "softmax"),
+    (torch, "softmax"),
+    (torch, "_safe_softmax"),
+    (torch.special, "softmax"),
+    (torch, "bmm"),
+)
+#: Functions of torch in Python that call the tensor's softmax, which is seen itself.
+_CALLS_SOFTMAX = frozenset((torch.nn.functional.softmax,))
+_OPERATORS = frozenset((torch._ops.OpOverload, torch._ops.OpOverloadPacket))
+#: The stack of function modes of this thread. Torch has no public name for it.
+_modes: Callable[[], list[TorchFunctionMode]] = overrides._get_current_function_mode_stack
+_pop: Callable[[], TorchFunctionMode] = overrides._pop_mode
+_push: Callable[[TorchFunctionMode], None] = overrides._push_mode
+_Call = Callable[[Any, tuple[Any, ...], Mapping[str, Any]], Any]
+
+
+class SeenFunctions:
+    """Sees the attention functions of one block, in every thread that asks for it.
+
+    every_function: look at every function of torch, not only at those under the usual names.
+
+    Attributes:
+        by_names: whether no attention function was seen that was called otherwise than by its usual name.
+    """
+
+    def __init__(self, block: WatchedBlock, *, every_function: bool) -> None:
+        self.by_names = True
+        self.every_function = every_function
+        self._block = block
+        self._threads = threading.local()
+        self._stand_ins: dict[Any, Any] = {}
+
+    @contextmanager
+    def names_replaced(self) -> Iterator[None]:
+        """Put what sees a call under the names of the functions; afterwards they are as before."""
+        replaced = []
+        try:
+            for owner, name in _NAMES:
+                function = getattr(owner, name)
+                self._stand_ins[function] = stand_in = self._in_place_of(function)
+                replaced.append((owner, name, owner.__dict__.get(name), stand_in))
+                setattr(owner, name, stand_in)
+            yield
+        finally:
+            for owner, name, own, stand_in in replaced:
+                if owner.__dict__.get(name) is not stand_in:
+                    continue  # the policy's code has set another one meanwhile
+                if own is None:  # inherited
+                    delattr(owner, name)
+                else:
+                    setattr(owner, name, own)
+
+    @contextmanager
+    def in_this_thread(self) -> Iterator[None]:
+        """See what is called in this thread."""
+        self._threads.own = own = _OfThread(self, self._block, self._stand_ins)
+        try:
+            if self.every_function:
+                with own.mode:
+                    yield
+            else:
+                yield
+        finally:
+            del self._threads.own
+            own.stop_following()
+
+    def at_module(self) -> None:
+        """Say that a module begins or ends: where no softmax is followed any more, the mode that follows ends."""
+        own = getattr(self._threads, "own", None)
+        if own is not None and own.following and not own.softmaxes.followed:
+            own.stop_following()
+
+    def _in_place_of(self, function: Any) -> Any:
+        threads = self._threads
+
+        @wraps(function)
+        def seen(*args: Any, **kwargs: Any) -> Any:
+            own = getattr(threads, "own", None)
+            if own is None:
+                return function(*args, **kwargs)
+            if own.inside:
+                result = function(*args, **kwargs)
+                if own.taken is not None:
+                    own.taken.append(multihead_calls.InnerCall(function, args, result))
+                return result
+            handler = own.handlers.get(function)
+            if handler is None:
+                return function(*args, **kwargs)
+            return own.handle(handler, function, args, kwargs)
+
+        return seen
+
+
+class _OfThread:
+    """What belongs to one thread.
+
+    Attributes:
+        softmaxes: the followed results of softmaxes.
+        handlers: what is done instead of a function.
+        inside: whether a handler runs; what it calls is no call of the policy's.
+        taken: collects what `nn.MultiheadAttention` calls inside, None elsewhere.
+        mode: sees every function of torch while it is entered.
+        following: whether it is entered for a softmax that is followed.
+    """
+
+    def __init__(self, functions: SeenFunctions, block: WatchedBlock, stand_ins: Mapping[Any, Any]) -> None:
+        self.block = block
+        self.functions = functions
+        self.softmaxes = softmax_calls.Softmaxes(block)
+        self.inside = False
+        self.taken: list[multihead_calls.InnerCall] | None = None
+        self.following = False
+        self._depth = len(_modes())
+        self.handlers: dict[Any, _Call] = {
+            **dict.fromkeys(sdpa_calls.FUNCTIONS, self._attend(sdpa_calls.watch_call)),
+            **dict.fromkeys(multihead_calls.FUNCTIONS, self._attend(self._multihead)),
+            **dict.fromkeys(flex_calls.FUNCTIONS, self._attend(flex_calls.watch_call)),
+            **dict.fromkeys(softmax_calls.SOFTMAXES, self.softmaxes.softmax),
+        }
+        # Some functions give the mode what stands under their name.
+        self.handlers |= {stand_ins[known]: self.handlers[known] for known in stand_ins if known in self.handlers}
+        self.mode = _EveryFunction(self)
+
+    def handle(self, handler: _Call, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
+        """Run a handler in place of a function."""
+        self.inside = True
+        try:
+            return handler(function, args, kwargs)
+        finally:
+            self.inside = False
+            if self.softmaxes.followed and not self.following and not self.functions.every_function:
+                self._follow()
+
+    def _attend(self, watch_call: Callable[..., Any]) -> _Call:
+        def attend(function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
+            try:
+                return watch_call(self.block, function, args, kwargs)
+            except UserError as error:  # the policy's code may catch it
+                raise self.block.failed(error) from None
+
+        return attend
+
+    def _multihead(
+        self, block: WatchedBlock, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]
+    ) -> Any:
+        def run(*args: Any, **kwargs: Any) -> tuple[Any, list[multihead_calls.InnerCall]]:
+            taken: list[multihead_calls.InnerCall] = []
+            self.taken = taken
+            try:
+                return function(*args, **kwargs), taken
+            finally:
+                self.taken = None
+
+        return multihead_calls.watch_call(block, run, args, kwargs)
+
+    def _follow(self) -> None:
+        """Enter the mode below the modes that the policy's code has entered, which leave from the top."""
+        above = [_pop() for _ in _modes()[self._depth :]]
+        for mode in (self.mode, *reversed(above)):
+            _push(mode)
+        self.following = True
+
+    def stop_following(self) -> None:
+        """Leave the mode that follows softmaxes, wherever it stands."""
+        if not self.following or self.mode not in _modes():
+            return  # inside of a function that the mode has seen, it is not there
+        above = []
+        while (mode := _pop()) is not self.mode:
+            above.append(mode)
+        for mode in reversed(above):
+            _push(mode)
+        self.following = False
+
+
+class _EveryFunction(TorchFunctionMode):
+    """Sees every torch function of one thread."""
+
+    def __init__(self, own: _OfThread) -> None:
+        super().__init__()
+        self._own = own
+        #: Every function of the policy comes by here: one look at a dictionary says whether a softmax is followed.
+        self._followed = own.softmaxes.followed
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        own = self._own
+        if own.inside:
+            return func(*args, **kwargs) if kwargs else func(*args)
+        handler = own.handlers.get(func)
+        if handler is not None:
+            own.functions.by_names = False
+            return own.handle(handler, func, args, kwargs or {})
+        if type(func) in _OPERATORS:
+            self._refuse_unseen(func)
+        if self._followed and func not in _CALLS_SOFTMAX:
+            return own.handle(own.softmaxes.follow, func, args, kwargs or {})
+        return func(*args, **kwargs) if kwargs else func(*args)
+
+    def _refuse_unseen(self, operator: Any) -> None:
+        """Raise `UnseenAttention` for an attention operator that no handler knows."""
+        name = str(getattr(operator, "_qualified_op_name", None) or operator.name())
+        if ATTENTION_OPERATOR.match(name):
+            raise self._own.block.failed(
+                UnseenAttention(f"The operator {name} computes attention in a way that gives no rows. {LOAD_WITH_SDPA}")
+            )
