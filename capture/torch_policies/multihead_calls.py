@@ -162,9 +162,7 @@ def _kernel(called: Sequence[InnerCall], heads: int) -> LogitTensors | _Weights:
         return LogitTensors(query, key, values, called[-1].result.detach(), mask, causal, scale, change=None)
     if names[-2:] == ["softmax", "bmm"]:
         softmax, product = called[-2:]
-        return _Weights(
-            apart(softmax.args[0]), apart(softmax.result), apart(product.args[1]), apart(product.result)
-        )
+        return _Weights(apart(softmax.args[0]), apart(softmax.result), apart(product.args[1]), apart(product.result))
     raise UnseenAttention(
         f"nn.MultiheadAttention of torch {torch.__version__} computes attention otherwise than in the versions that "
         "can be recorded (2.7 to 2.13). Report it with this version."

@@ -171,9 +171,7 @@ class _OfThread:
 
         return attend
 
-    def _multihead(
-        self, block: WatchedBlock, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]
-    ) -> Any:
+    def _multihead(self, block: WatchedBlock, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
         def run(*args: Any, **kwargs: Any) -> tuple[Any, list[multihead_calls.InnerCall]]:
             taken: list[multihead_calls.InnerCall] = []
             self.taken = taken
