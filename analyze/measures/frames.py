@@ -6,7 +6,7 @@ is null in a table; infinite ratios stay infinite.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -168,7 +168,8 @@ class Tables:
     """Tables of one level: steps, replans, episodes or tasks.
 
     Attributes:
-        cells: one row per cell, with the measures of the whole row and of the ratio.
+        cells: one row per cell, with the measures of the whole row and of the ratio. Of steps it is made at every
+            access, and not kept.
         groups: one row per cell and group: cells in the same order as in `cells`, groups in that of the grouping;
             column `group`. Of steps and replans it is made at every access, and not kept: it is several times as large
             as the masses.
@@ -176,17 +177,22 @@ class Tables:
 
     def __init__(
         self,
-        cells: pl.DataFrame,
+        cells: pl.DataFrame | Callable[[], pl.DataFrame],
         groups: pl.DataFrame | Callable[[], pl.DataFrame],
         parts: Sequence[Tables] = (),
     ) -> None:
-        self.cells = cells
+        self._cells = cells
         self._groups = groups
         self._parts = parts
 
     @property
+    def cells(self) -> pl.DataFrame:
+        """See the class."""
+        return self._cells() if callable(self._cells) else self._cells
+
+    @property
     def parts(self) -> Sequence[Tables]:
-        """The same rows in parts of whole episodes; aggregating `groups` part by part saves memory."""
+        """The same rows in parts of whole episodes; aggregating or writing them part by part saves memory."""
         return self._parts or (self,)
 
     @property
@@ -242,6 +248,31 @@ def concat_tables(parts: Sequence[Tables]) -> Tables:
     return Tables(
         pl.concat([part.cells for part in filled]), lambda: pl.concat([part.groups for part in filled]), filled
     )
+
+
+def tables_in_parts(parts: Sequence[Tables]) -> Tables:
+    """The rows of all parts, each of which has cells, in order; both tables are made when they are asked for."""
+    return Tables(
+        lambda: pl.concat([part.cells for part in parts]), lambda: pl.concat([part.groups for part in parts]), parts
+    )
+
+
+@dataclass(frozen=True)
+class TableInParts:
+    """One table of `Tables` for `show.output_files`: its parts are made one after the other while it is written."""
+
+    tables: Tables
+    of_groups: bool = False
+
+    def __iter__(self) -> Iterator[pl.DataFrame]:
+        """The parts, in order."""
+        for part in self.tables.parts:
+            yield part.groups if self.of_groups else part.cells
+
+
+def named_parts(name: str, level: Tables) -> dict[str, TableInParts]:
+    """The two tables of a level as `named_tables` has them, to be written in parts."""
+    return {name: TableInParts(level), f"{name}_groups": TableInParts(level, of_groups=True)}
 
 
 def named_tables(name: str, level: Tables) -> dict[str, pl.DataFrame]:

@@ -32,7 +32,7 @@ from vla_attention.analyze.measures.frames import (
     replan_axis,
 )
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_episode
 from vla_attention.analyze.statistics.intervals import Estimand
 from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.analyze.stores.selection import Selection
@@ -61,7 +61,7 @@ def whole_segments(item: SelectedEpisode, resolved: ResolvedGrouping, site: str)
     return parts
 
 
-def group_contribution_tables(question: Question, resolved: Sequence[ResolvedGrouping]) -> Tables | None:
+def group_contribution_tables(question: Question, resolved: Sequence[ResolvedGrouping] | None = None) -> Tables | None:
     """Norms for every (episode, replan, layer, denoise step); None without records or where every group cuts a segment.
 
     Norms are root mean squares over the action queries.
@@ -74,21 +74,35 @@ def group_contribution_tables(question: Question, resolved: Sequence[ResolvedGro
     """
     if not all(store.attributes.recording.contributions for store in question.stores):
         return None
-    chosen = [
-        whole_segments(item, groups, question.site) for item, groups in zip(question.selected, resolved, strict=True)
-    ]
+    known = [None] * len(question.selected) if resolved is None else resolved
+    take = partial(_segments_of_groups, site=question.site, grouping=question.grouping)
+    chosen = map_episodes(take, [(item, one) for item, one in zip(question.selected, known, strict=True)])
     # A group that cannot be measured in one episode would be a mean over the others only.
     names = [name for name in question.grouping.names if all(name in parts for parts in chosen)]
     if not names:
         return None
     measure = partial(_episode_norms, selection=question.selection, site=question.site, grouping=question.grouping)
     measurable = [{name: parts[name] for name in names} for parts in chosen]
-    return concat_tables(map_episodes(measure, list(zip(question.selected, measurable, strict=True))))
+    measured = map_episodes(measure, list(zip(question.selected, measurable, strict=True)))
+    return concat_tables(
+        [
+            _norm_tables(item, *one, names, question.selection)
+            for item, one in zip(question.selected, measured, strict=True)
+        ]
+    )
+
+
+def _segments_of_groups(
+    pair: tuple[SelectedEpisode, ResolvedGrouping | None], site: str, grouping: Grouping
+) -> dict[str, NDArray[np.bool_]]:
+    item, resolved = pair
+    return whole_segments(item, resolved or resolve_episode(grouping, item), site)
 
 
 def _episode_norms(
     pair: tuple[SelectedEpisode, Mapping[str, NDArray[np.bool_]]], selection: Selection, site: str, grouping: Grouping
-) -> Tables:
+) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64]]:
+    """The measures of both sides, (replan, layer, denoise) each, and norms (replan, layer, denoise, group)."""
     item, parts = pair
     gram = selected_gram(item, site, selection)
     norms = np.stack([joint_norm(gram, taken) for taken in parts.values()], axis=-1)
@@ -101,10 +115,19 @@ def _episode_norms(
             for taken in [np.any([parts[name] for name in side], axis=0)]
         )
         sides = {"numerator_norm": above[0], "denominator_norm": below[0], **ratio_columns(above, below)}
+    return sides, norms
+
+
+def _norm_tables(
+    item: SelectedEpisode,
+    sides: Mapping[str, NDArray[np.float64]],
+    norms: NDArray[np.float64],
+    names: Sequence[str],
+    selection: Selection,
+) -> Tables:
     axes = [replan_axis(item), layer_axis(selection), denoise_axis(selection)]
     return Tables(
-        long_table(item, axes, sides),
-        long_table(item, [*axes, {"group": list(parts)}], {"norm": norms}),
+        long_table(item, axes, sides), lambda: long_table(item, [*axes, {"group": list(names)}], {"norm": norms})
     )
 
 

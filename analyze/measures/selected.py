@@ -122,6 +122,17 @@ def check_not_empty(grouping: Grouping, num_keys: Sequence[NDArray[np.float64]])
             )
 
 
+def refuse_empty_groups(grouping: Grouping, selected: Sequence[SelectedEpisode]) -> None:
+    """Raise `EmptyGroup` as `resolve_all` does; resolves no more episodes than it needs, and keeps none."""
+    found: list[NDArray[np.float64]] = []
+    for item in selected:
+        found.append(resolve(grouping, item.tokens).num_keys.max(axis=0, keepdims=True))
+        present = np.any(np.concatenate(found) > 0, axis=0)
+        if all(there or name in grouping.allow_empty for name, there in zip(grouping.names, present, strict=True)):
+            return
+    check_not_empty(grouping, found)
+
+
 def _without(resolved: ResolvedGrouping, item: SelectedEpisode) -> ResolvedGrouping:
     """The grouping without the keys that were taken out of the episode: in no group, not valid, not counted."""
     weights = resolved.weights.copy()

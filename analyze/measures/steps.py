@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.cache.remembered import CachedQuestion, remembered
@@ -16,12 +17,12 @@ from vla_attention.analyze.measures.frames import (
     EPISODE_KEYS,
     Axis,
     Tables,
-    concat_tables,
     denoise_axis,
     head_axis,
     layer_axis,
     long_table,
     replan_axis,
+    tables_in_parts,
 )
 from vla_attention.analyze.measures.masses import (
     group_measures,
@@ -35,6 +36,7 @@ from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import (
     SelectedEpisode,
     check_not_empty,
+    refuse_empty_groups,
     resolve_all,
     resolve_episode,
 )
@@ -44,7 +46,7 @@ from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.groupings.grouping import Grouping
-from vla_attention.schemas.groupings.resolve import ResolvedGrouping, check_names
+from vla_attention.schemas.groupings.resolve import ResolvedGrouping, check_names, stack_over_keys
 from vla_attention.schemas.segments import segment_members, weights_on_segments
 
 #: The arrays of a `MeasuredEpisode`.
@@ -166,15 +168,11 @@ def _measured_or_kept(
         check_names(grouping, question.vocabulary, selected[0].tokens.layout)
 
     def measure(positions: Sequence[int]) -> Iterator[dict[str, NDArray[Any]]]:
-        items = [selected[i] for i in positions]
-        if resolved is not None:
-            known = [resolved[i] for i in positions]
-        elif len(items) == len(selected):
-            known = resolve_all(grouping, items, question.vocabulary)
-        else:
-            known = [resolve_episode(grouping, item) for item in items]
-        each = partial(_measured_arrays, selection=selection, site=question.site)
-        return each_episode(each, list(zip(items, known, strict=True)), progress)
+        if resolved is None and len(positions) == len(selected):
+            refuse_empty_groups(grouping, selected)
+        pairs = [(selected[i], None if resolved is None else resolved[i]) for i in positions]
+        each = partial(_measured_arrays, grouping=grouping, selection=selection, site=question.site)
+        return each_episode(each, pairs, progress)
 
     arrays = remembered(
         masses_question(grouping, selection, question.site),
@@ -220,9 +218,11 @@ def digest_of_weights(resolved: ResolvedGrouping) -> str:
 
 
 def _measured_arrays(
-    pair: tuple[SelectedEpisode, ResolvedGrouping], selection: Selection, site: str
+    pair: tuple[SelectedEpisode, ResolvedGrouping | None], grouping: Grouping, selection: Selection, site: str
 ) -> dict[str, NDArray[Any]]:
-    measured = measure_episode(*pair, selection, site)
+    # Resolved here, one episode at a time: weights of objects are megabytes an episode.
+    item, resolved = pair
+    measured = measure_episode(item, resolved or resolve_episode(grouping, item), selection, site)
     # In C order, as they come from the cache and from other processes: numpy's sums depend on the order in memory.
     return {name: np.ascontiguousarray(getattr(measured, name)) for name in MEASURED_ARRAYS}
 
@@ -237,12 +237,15 @@ def step_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Tabl
         groups: suite, task_id, episode_index, replan, layer, block, denoise_step, head, group, mass, fraction, keys,
             density, lift (see `masses.group_measures`).
     """
-    return concat_tables([_episode_steps(episode, grouping) for episode in measured])
+    return tables_in_parts([_episode_steps(episode, grouping) for episode in measured])
 
 
 def _episode_steps(measured: MeasuredEpisode, grouping: Grouping) -> Tables:
+    return Tables(lambda: _step_cells(measured, grouping), lambda: _step_groups(measured, grouping))
+
+
+def _step_cells(measured: MeasuredEpisode, grouping: Grouping) -> pl.DataFrame:
     item, selection, mass = measured.item, measured.selection, measured.mass
-    replans, layers, heads = replan_axis(item), layer_axis(selection), head_axis(selection)
     times = item.episode.read("denoise_time")[list(selection.denoise)].astype(np.float64)
     steps: Axis = {"denoise_step": selection.denoise_steps, "denoise_time": times}
     cells = {
@@ -255,15 +258,22 @@ def _episode_steps(measured: MeasuredEpisode, grouping: Grouping) -> Tables:
         value, uniform = ratio(above, below), _per_replan(uniform_ratio(measured.num_keys, grouping))
         cells |= {"numerator_mass": above, "denominator_mass": below, "ratio": value, "uniform_ratio": uniform}
         cells |= relative_to_uniform(value, uniform)
-    brief: list[Axis] = [{"replan": replans["replan"]}, layers, denoise_axis(selection), heads]
-    return Tables(
-        long_table(item, [replans, layers, steps, heads], cells, EPISODE_KEYS),
-        lambda: long_table(
-            item,
-            [*brief, {"group": grouping.names}],
-            group_measures(mass, measured.valid_mass, measured.num_keys, measured.num_valid).columns(),
-        ),
+    return long_table(
+        item, [replan_axis(item), layer_axis(selection), steps, head_axis(selection)], cells, EPISODE_KEYS
     )
+
+
+def _step_groups(measured: MeasuredEpisode, grouping: Grouping) -> pl.DataFrame:
+    selection, mass = measured.selection, measured.mass
+    axes: list[Axis] = [
+        {"replan": range(len(mass))},
+        layer_axis(selection),
+        denoise_axis(selection),
+        head_axis(selection),
+        {"group": grouping.names},
+    ]
+    measures = group_measures(mass, measured.valid_mass, measured.num_keys, measured.num_valid)
+    return long_table(measured.item, axes, measures.columns())
 
 
 def _per_replan(values: NDArray[np.int64] | NDArray[np.float64]) -> NDArray[np.float64]:
@@ -284,11 +294,8 @@ def segment_weights(item: SelectedEpisode, weights: NDArray[np.float32], site: s
 
 def with_valid(weights: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Weights (replan or 1, key, group) with one more group: the valid keys (replan or 1, key)."""
-    replans = max(len(weights), len(valid))
-    parts = [
-        np.broadcast_to(part, (replans, *part.shape[1:])) for part in (weights, valid[:, :, None].astype(np.float32))
-    ]
-    return np.concatenate(parts, axis=2)
+    columns = [weights[:, :, i] for i in range(weights.shape[2])]
+    return stack_over_keys([*columns, valid.astype(np.float32)])
 
 
 def selected_cells(values: NDArray[np.float32], selection: Selection) -> NDArray[np.float32]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.frames import EPISODE_KEYS, LAYERS_AVG, Tables
 from vla_attention.analyze.measures.masses import sides
@@ -22,7 +21,8 @@ _ACTION = "action"
 _SIDES = ("visual", "linguistic")
 _RATIO = "visual_linguistic_ratio"
 #: Fields of every step beside ratio, masses and fractions.
-_COUNTS = ("total_mass", "num_visual_tokens", "num_text_tokens")
+_KEYS = ("num_visual_tokens", "num_text_tokens")
+_COUNTS = ("total_mass", *_KEYS)
 
 
 def episode_documents(
@@ -46,9 +46,14 @@ def episode_documents(
     sides = [*_SIDES, _ACTION] if _ACTION in grouping.names and proxy is None else list(_SIDES)
     kinds = [f"{side}_{kind}" for side in sides for kind in ("mass", "fraction")]
     columns = ("layer", "replan", "step", _RATIO, *kinds, *_COUNTS)
-    table = _with_sides(replans, grouping, proxy).select(*EPISODE_KEYS, *columns)
+    # A few episodes at a time: tables of groups, and the documents, are several times as large as the cells.
+    tables = [_with_sides(part, grouping, proxy).select(*EPISODE_KEYS, *columns) for part in replans.parts]
+    # Numbers of keys are whole numbers in all episodes or in none.
+    whole = [name for name in _KEYS if all((table[name] == table[name].floor()).all() for table in tables)]
     extra = {} if proxy is None else proxy.fields()
-    for part in table.partition_by("suite", "task_id", "episode_index", maintain_order=True):
+    counted = (table.with_columns(pl.col(whole).cast(pl.Int64)) for table in tables)
+    of_episodes = (table.partition_by("suite", "task_id", "episode_index", maintain_order=True) for table in counted)
+    for part in itertools.chain.from_iterable(of_episodes):
         identity = part.select(EPISODE_KEYS).row(0, named=True)
         summaries = {row["layer"]: row for row in _summaries(part, kinds).iter_rows(named=True)}
         in_time = part.sort("replan", maintain_order=True).drop(*EPISODE_KEYS, "replan")
@@ -92,9 +97,10 @@ def write_results_of_suites(
 ) -> list[Path]:
     """Write `attention_ratio_results_<suite>.json` for every suite of the tables and return the paths."""
     paths = []
-    for suite in replans.cells["suite"].unique(maintain_order=True):
+    suites = replans.cells["suite"].unique(maintain_order=True)
+    for suite in suites:
         path = folder / results_file_name(suite)
-        of_suite = replans.filter(pl.col("suite") == suite).kept()
+        of_suite = replans if len(suites) == 1 else replans.filter(pl.col("suite") == suite)
         write_results(path, episode_documents(of_suite, grouping, denoise_steps, proxy))
         paths.append(path)
     return paths
@@ -102,6 +108,7 @@ def write_results_of_suites(
 
 def _with_sides(replans: Tables, grouping: Grouping, proxy: FrameProxy | None) -> pl.DataFrame:
     """Add step, ratio (null where it is not finite), masses, fractions and numbers of keys of the two sides."""
+    replans = replans.kept()
     cells = replans.cells
     visual, linguistic = cells["numerator_mass"], cells["denominator_mass"]
     queries = 1 if proxy is None else proxy.num_queries
@@ -115,8 +122,7 @@ def _with_sides(replans: Tables, grouping: Grouping, proxy: FrameProxy | None) -
         (visual / total).fill_nan(None).alias("visual_fraction"),
         (linguistic / total).fill_nan(None).alias("linguistic_fraction"),
         (total * queries).alias("total_mass"),
-        _count("num_visual_tokens", above),
-        _count("num_text_tokens", below),
+        *(pl.Series(name, keys) for name, keys in zip(_KEYS, (above, below), strict=True)),
     )
     if _ACTION in grouping.names:
         of_action = replans.of_group(_ACTION)
@@ -124,11 +130,6 @@ def _with_sides(replans: Tables, grouping: Grouping, proxy: FrameProxy | None) -
             of_action["mass"].alias(f"{_ACTION}_mass"), of_action["fraction"].alias(f"{_ACTION}_fraction")
         )
     return table
-
-
-def _count(name: str, keys: NDArray[np.float64]) -> pl.Series:
-    """Numbers of keys; whole numbers unless objects cover parts of patches."""
-    return pl.Series(name, keys.astype(np.int64) if (keys == np.floor(keys)).all() else keys)
 
 
 def _summaries(episode: pl.DataFrame, kinds: Sequence[str]) -> pl.DataFrame:

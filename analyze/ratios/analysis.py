@@ -19,7 +19,7 @@ from vla_attention.analyze.measures.aggregate import (
 )
 from vla_attention.analyze.measures.contribution_ratios import contribution_rows
 from vla_attention.analyze.measures.contributions import contribution_table
-from vla_attention.analyze.measures.frames import Tables, layer_name, named_tables
+from vla_attention.analyze.measures.frames import TableInParts, Tables, layer_name, named_parts, named_tables
 from vla_attention.analyze.measures.group_contributions import group_contribution_tables
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import resolve_all
@@ -117,7 +117,7 @@ class Analysis:
     @cached_property
     def group_contributions(self) -> Tables | None:
         """See `measures.group_contributions.group_contribution_tables`; None also when every group cuts a segment."""
-        return group_contribution_tables(self.question, self.resolved)
+        return group_contribution_tables(self.question)
 
     @cached_property
     def contribution_rows(self) -> pl.DataFrame | None:
@@ -236,13 +236,14 @@ def write_tables(analysis: Analysis, folder: Path) -> list[Path]:
     grouping = analysis.grouping
     # A table that is passed on alone says what its numbers are.
     about = {"grouping": grouping.name, "grouping_description": grouping.description, "mean_over": analysis.denoise}
-    for name in ("steps", "episodes", "tasks"):
+    written += write_parquet(folder, about, **named_parts("steps", analysis.steps))
+    for name in ("episodes", "tasks"):
         written += write_parquet(folder, about, **named_tables(name, getattr(analysis, name)))
-    recorded: dict[str, pl.DataFrame] = {}
+    recorded: dict[str, pl.DataFrame | TableInParts] = {}
     if analysis.contributions is not None:
         recorded["contributions"] = analysis.contributions
     if analysis.group_contributions is not None:
-        recorded["group_contributions"] = analysis.group_contributions.groups
+        recorded["group_contributions"] = TableInParts(analysis.group_contributions, of_groups=True)
         if "contribution_ratio" in analysis.group_contributions.cells.columns:
             recorded["group_contribution_ratios"] = analysis.group_contributions.cells
     written += write_parquet(folder, about, **recorded)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -54,25 +55,76 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def write_parquet(folder: Path, about: Mapping[str, str] | None = None, /, **tables: pl.DataFrame) -> list[Path]:
+def write_parquet(
+    folder: Path, about: Mapping[str, str] | None = None, /, **tables: pl.DataFrame | Iterable[pl.DataFrame]
+) -> list[Path]:
     """Write each table as `NAME.parquet` into a folder, which is made if it is missing; returns the paths.
 
-    `about` is written into the metadata of each file (`polars.read_parquet_metadata`).
+    `about` is written into the metadata of each file (`polars.read_parquet_metadata`). A table may be given in parts of
+    the same columns: each is written before the next one is asked for, so that one of them is in memory at a time.
 
     Raises:
         BadArgument: the folder cannot be made or written to.
     """
-    return _write(folder, "parquet", tables, lambda table, path: table.write_parquet(path, metadata=dict(about or {})))
+    metadata = dict(about or {})
+    return _write(
+        folder,
+        "parquet",
+        tables,
+        lambda table, path: table.write_parquet(path, metadata=metadata),
+        lambda parts, path: _write_parquet_parts(parts, path, metadata),
+    )
 
 
-def write_csv(folder: Path, **tables: pl.DataFrame) -> list[Path]:
+def write_csv(folder: Path, **tables: pl.DataFrame | Iterable[pl.DataFrame]) -> list[Path]:
     """As `write_parquet`, but `NAME.csv`: UTF-8, a header, nothing for null, `inf` for infinite."""
-    return _write(folder, "csv", tables, lambda table, path: table.write_csv(path))
+    return _write(folder, "csv", tables, lambda table, path: table.write_csv(path), _write_csv_parts)
+
+
+def _write_csv_parts(parts: Iterator[pl.DataFrame], path: Path) -> None:
+    with path.open("wb") as file:
+        for number, part in enumerate(parts):
+            part.write_csv(file, include_header=number == 0)
+
+
+#: Rows that a Parquet file holds together; the writer keeps as many in memory.
+_ROWS_TOGETHER = 30_000
+
+
+def _write_parquet_parts(parts: Iterator[pl.DataFrame], path: Path, metadata: Mapping[str, str]) -> None:
+    from polars.io.plugins import register_io_source
+
+    first = next(parts)
+    failed: list[BaseException] = []
+
+    def source(
+        columns: list[str] | None, predicate: pl.Expr | None, most: int | None, batch: int | None
+    ) -> Iterator[pl.DataFrame]:
+        try:
+            for part in itertools.chain([first], parts):
+                yield part if columns is None else part.select(columns)
+        except BaseException as error:  # polars raises an error of its own, with this one's text
+            failed.append(error)
+            raise
+
+    table = register_io_source(source, schema=first.schema)
+    try:
+        table.sink_parquet(path, metadata=dict(metadata), row_group_size=_ROWS_TOGETHER, engine="streaming")
+    except Exception:
+        if failed:
+            raise failed[0] from None
+        raise
 
 
 def _write(
-    folder: Path, ending: str, tables: Mapping[str, pl.DataFrame], write: Callable[[pl.DataFrame, Path], object]
+    folder: Path,
+    ending: str,
+    tables: Mapping[str, pl.DataFrame | Iterable[pl.DataFrame]],
+    write: Callable[[pl.DataFrame, Path], object],
+    write_parts: Callable[[Iterator[pl.DataFrame], Path], object],
 ) -> list[Path]:
+    import polars as pl
+
     written = []
     with writing("results", folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -81,7 +133,10 @@ def _write(
         for name, table in tables.items():
             path = folder / f"{name}.{ending}"
             with replacing(path) as temporary:
-                write(table, temporary)
+                if isinstance(table, pl.DataFrame):
+                    write(table, temporary)
+                else:
+                    write_parts(iter(table), temporary)
             written.append(path)
     return written
 

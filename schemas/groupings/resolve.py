@@ -7,6 +7,7 @@ intersection and difference are exact. A key's weight is the covered area of its
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,16 +65,27 @@ def resolve(grouping: Grouping, tokens: EpisodeTokens) -> ResolvedGrouping:
     """
     members = memberships(grouping, tokens)
     cells = cell_coverage(tokens) if any(member.shape[2] > 1 for member in members.values()) else None
-    weights = [_weights(member, cells) for member in members.values()]
-    replans = max(weight.shape[0] for weight in weights)
-    shape = (replans, tokens.layout.num_keys)
-    stacked = np.stack([np.broadcast_to(weight, shape) for weight in weights], axis=-1).astype(np.float32)
+    stacked = stack_over_keys([_weights(member, cells) for member in members.values()])
     return ResolvedGrouping(
         names=grouping.names,
         weights=stacked,
         num_keys=counted_keys(stacked, tokens.key_counts),
         num_valid=num_valid_keys(tokens.valid, tokens.key_counts),
     )
+
+
+def stack_over_keys(weights: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Weights (replan or 1, key) side by side: (replan or 1, key, group).
+
+    Where they are the same at all replans, one of these is in memory, and the result must not be written to: weights of
+    a word in hundreds of episodes then take little, and stay in the processor's cache.
+    """
+    replans = max(len(weight) for weight in weights)
+    each = [weight[:1] if (weight[1:] == weight[:-1]).all() else weight for weight in weights]
+    kept = max(len(weight) for weight in each)
+    keys = weights[0].shape[1]
+    stacked = np.stack([np.broadcast_to(weight, (kept, keys)) for weight in each], axis=-1, dtype=np.float32)
+    return np.broadcast_to(stacked, (replans, keys, len(weights)))
 
 
 def counted_keys(weights: NDArray[np.float32], counts: NDArray[np.float64] | None) -> NDArray[np.float64]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,11 @@ from polars.testing import assert_frame_equal
 from tests.kit.examples import examples
 from tests.kit.made_up_steps import flat
 from tests.kit.questions import question_about
-from vla_attention.analyze.measures.selected import load_tokens, resolve_all, vocabulary_of
-from vla_attention.analyze.measures.steps import measure_episode, step_tables
+from vla_attention.analyze.measures import steps
+from vla_attention.analyze.measures.selected import load_tokens, resolve_all, resolve_episode, vocabulary_of
+from vla_attention.analyze.measures.steps import measure_episode, measure_episodes, step_tables
 from vla_attention.analyze.ratios.analysis import analyse
+from vla_attention.analyze.stores import parallel
 from vla_attention.analyze.stores.selection import parse_denoise_steps, select
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.builtin_groupings import default
@@ -27,6 +30,7 @@ from vla_attention.schemas.groupings.resolve import EmptyGroup, resolve
 from vla_attention.schemas.precision import mass_error_bound
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import StoreError
+from vla_attention.schemas.threads import Threads
 from vla_attention.testing.stores import StoreSpec, root_attributes, write_store
 from vla_attention.testing.strategies import episode_tokens, groupings
 
@@ -195,3 +199,36 @@ def test_denoise_steps_by_name():
     assert parse_denoise_steps(["4"], (0, 4, 9)) == (4,)
     with pytest.raises(BadArgument, match="was not recorded"):
         parse_denoise_steps(["5"], (0, 4, 9))
+
+
+def test_weights_of_a_few_episodes_are_in_memory_at_a_time(tmp_path, monkeypatch):
+    """Weights of objects are megabytes an episode; those of a word are the same at every replan, and kept once."""
+    monkeypatch.setenv("VLA_CACHE", "off")
+    path = write_store(tmp_path / "a.zarr", tasks=(0,), episodes=14, replans=4)
+    alive: set[int] = set()
+    most: list[int] = []
+
+    def resolved(*given):
+        found = resolve_episode(*given)
+        alive.add(id(found))
+        weakref.finalize(found, alive.discard, id(found))
+        most.append(len(alive))
+        return found
+
+    monkeypatch.setattr(steps, "resolve_episode", resolved)
+    monkeypatch.setattr(parallel, "threads_of_this_process", lambda: Threads(2, "a test"))
+    question = question_about(path, grouping="objects")
+    assert len(measure_episodes(question)) == len(most) == 14
+    assert max(most) < 8
+    tokens = question.selected[0].tokens
+    weights = resolve(Grouping("words", {"a": ("word:the",), "rest": ("*",)}), tokens).weights
+    assert weights.shape[0] == 4
+    assert weights.strides[0] == 0
+
+
+def test_a_group_without_keys_anywhere_is_refused_before_rows_are_read(tmp_path, monkeypatch):
+    path = write_store(tmp_path / "a.zarr", tasks=(0, 1), episodes=2)
+    monkeypatch.setattr(StoredEpisode, "read_layers", lambda *_: pytest.fail("rows were read"))
+    question = question_about(path, groups=("a=word:the & camera:base_0_rgb", "b=word:the"))
+    with pytest.raises(EmptyGroup, match=r"Group 'a' .* has no key in any of the 4 selected episodes"):
+        measure_episodes(question)

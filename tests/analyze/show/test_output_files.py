@@ -40,3 +40,39 @@ def test_tables_become_files_and_are_listed(tmp_path: Path, capsys: pytest.Captu
     report_files(tmp_path / "out", [*files, *inside])
     printed = " ".join(capsys.readouterr().out.split())
     assert printed == f"5 files in {tmp_path / 'out'}: a (.parquet .csv); 3 in episodes/"
+
+
+def test_a_table_in_parts_is_the_table_and_each_part_is_made_when_it_is_written(tmp_path: Path) -> None:
+    whole = pl.DataFrame({"n": range(400_000), "name": ["a", None, "b,c", "d"] * 100_000, "x": [0.5, None] * 200_000})
+    alive: list[int] = []
+
+    class Part(pl.DataFrame):
+        def __del__(self) -> None:
+            alive.remove(id(self))
+
+    def parts():
+        for start in range(0, 400_000, 10_000):
+            part = Part(whole[start : start + 10_000])
+            alive.append(id(part))
+            most.append(len(alive))
+            yield part
+
+    most: list[int] = []
+    write_parquet(tmp_path, {"grouping": "g"}, table=parts())
+    assert pl.read_parquet(tmp_path / "table.parquet").equals(whole)
+    assert pl.read_parquet_metadata(tmp_path / "table.parquet")["grouping"] == "g"
+    assert len(most) == 40
+    assert max(most) < 30
+    write_csv(tmp_path, whole=whole, parts=(whole[start : start + 30_000] for start in range(0, 400_000, 30_000)))
+    assert (tmp_path / "parts.csv").read_bytes() == (tmp_path / "whole.csv").read_bytes()
+
+
+def test_an_error_in_a_part_is_raised_as_it_is_and_leaves_no_file(tmp_path: Path) -> None:
+    def parts():
+        yield pl.DataFrame({"n": [1]})
+        raise StoreNotFound("There is no store a.zarr.")
+
+    for write in (write_parquet, write_csv):
+        with pytest.raises(StoreNotFound, match="There is no store"):
+            write(tmp_path, table=parts())
+    assert not list(tmp_path.iterdir())
