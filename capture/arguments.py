@@ -197,6 +197,13 @@ def _add_evaluation_arguments(
         "(default: the cores that this process may use, at most 8)",
     )
     group.add_argument(
+        "--policy-batch",
+        type=int,
+        metavar="N",
+        help="most policy calls of different simulators that are made as one batch; from 2 on, last bits of what is "
+        "computed change (default: 1 on a processor, on a GPU the number of simulators)",
+    )
+    group.add_argument(
         "--libero-assets", type=Path, metavar="PATH", help="LIBERO asset folder (or set VLA_LIBERO_ASSETS)"
     )
 

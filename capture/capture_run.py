@@ -26,11 +26,11 @@ from vla_attention.capture.jobs.worker_records import (
     read_records,
 )
 from vla_attention.capture.policies.identity import announcement
-from vla_attention.capture.policies.policy import Policy, stored_picture_sizes
+from vla_attention.capture.policies.policy import BatchPolicy, Policy, stored_picture_sizes
 from vla_attention.capture.provenance import describe_machine
 from vla_attention.capture.rollout.episode import EpisodeResult, EpisodeRun, check_protocol, max_replans
 from vla_attention.capture.rollout.episode_loop import EpisodeLoop
-from vla_attention.capture.rollout.pipeline import PipelinedLoop, default_num_envs
+from vla_attention.capture.rollout.pipeline import PipelinedLoop, default_num_envs, default_policy_batch
 from vla_attention.capture.rollout.progress import say
 from vla_attention.capture.run_settings import RecordingSettings, RunSettings
 from vla_attention.capture.store.disk_estimate import DiskEstimate, describe, estimate_disk
@@ -204,13 +204,27 @@ def _record_missing(
         "record": record,
         "termination": termination,
     }
+    batch = _policy_batch(settings, policy, device, num_envs)
     if num_envs > 1:
-        say(f"Simulators: {num_envs} processes; --num-envs N changes it.")
-    loop = PipelinedLoop(**parts, num_envs=num_envs) if num_envs > 1 else EpisodeLoop(**parts)
+        batches = f" Policy calls in batches of at most {batch}; --policy-batch N changes it." if batch > 1 else ""
+        say(f"Simulators: {num_envs} processes; --num-envs N changes it.{batches}")
+    several = num_envs > 1
+    loop = PipelinedLoop(**parts, num_envs=num_envs, policy_batch=batch) if several else EpisodeLoop(**parts)
     results = loop.record_all(todo)
     if (empty := changes.describe_empty()) is not None:
         say(empty)
     return results, damaged_names
+
+
+def _policy_batch(settings: RunSettings, policy: Policy, device: str, num_envs: int) -> int:
+    """Return the largest batch of policy calls; larger ones than 1 need a policy that can make them."""
+    asked, changes = settings.policy_batch, settings.interventions
+    if asked is not None and asked > 1:
+        if not isinstance(policy, BatchPolicy):
+            raise BadArgument(f"Cannot use --policy-batch {asked}: policies of the kind {policy.family} make one call.")
+        if changes.changes_attention:
+            raise BadArgument(f"Cannot use --policy-batch {asked} with interventions on attention; leave it out.")
+    return min(asked or default_policy_batch(policy, device, num_envs), num_envs)
 
 
 def _plan_changes(settings: RunSettings, policy: Policy, tasks: Sequence[Task]) -> RunChanges:

@@ -73,6 +73,7 @@ class RunSettings:
     num_envs: int | None = None
     budget: int | None = None
     fixed: Fixed = field(default_factory=Fixed)
+    policy_batch: int | None = None
 
 
 def run_settings(arguments: argparse.Namespace) -> RunSettings:
@@ -84,6 +85,8 @@ def run_settings(arguments: argparse.Namespace) -> RunSettings:
         raise BadArgument(f"Cannot use --num-episodes {arguments.num_episodes}; expected at least 1.")
     if arguments.num_envs is not None and arguments.num_envs < 1:
         raise BadArgument(f"Cannot use --num-envs {arguments.num_envs}; expected at least 1.")
+    if arguments.policy_batch is not None and arguments.policy_batch < 1:
+        raise BadArgument(f"Cannot use --policy-batch {arguments.policy_batch}; expected at least 1.")
     if arguments.seed is not None and arguments.seed < 0:
         raise BadArgument(f"Cannot use --seed {arguments.seed}; expected 0 or more.")
     if arguments.verify and not arguments.resume:
@@ -111,6 +114,7 @@ def run_settings(arguments: argparse.Namespace) -> RunSettings:
             layers=arguments.layers is not None,
             heads=arguments.heads is not None,
         ),
+        policy_batch=arguments.policy_batch,
     )
 
 

@@ -6,10 +6,10 @@ needs a picture about every fifth step, and drawing takes most of the time of a 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 from vla_attention.capture.environments.episode_protocol import OPENPI, EvaluationProtocol
 from vla_attention.schemas.errors import BadArgument, unknown_name
@@ -137,6 +137,20 @@ class Environment(Protocol):
 
     def close(self) -> None:
         """Free the simulator and its drawing context. A second call does nothing."""
+
+
+@runtime_checkable
+class SharesResets(Protocol):
+    """An `Environment` that can be told what another one of the same task found out about resets.
+
+    Then it need not make the resets that `missing_resets` counts, and its episodes are the same.
+    """
+
+    def known_resets(self, seed: int) -> Sequence[Any]:
+        """Return what is known of the resets with a seed of the run, as `learn_resets` takes it. It can be pickled."""
+
+    def learn_resets(self, seed: int, resets: Sequence[Any]) -> None:
+        """Take over what another environment knows, if it knows more."""
 
 
 def check_task_id(suite: Suite, task_id: int) -> None:

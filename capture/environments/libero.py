@@ -107,6 +107,15 @@ class LiberoEnvironment(SimulatedEnvironment):
         known = len(self._reset_starts.get(seed, ())) or 1
         return max(0, initial_state_index - (known - 1))
 
+    def known_resets(self, seed: int) -> Sequence[ResetStart]:
+        """Return with what the resets of episodes 0, 1, ... begin, as far as known; see `SharesResets`."""
+        return tuple(self._reset_starts.get(seed, ()))
+
+    def learn_resets(self, seed: int, resets: Sequence[ResetStart]) -> None:
+        """Take over what another environment of this task knows; see `SharesResets`."""
+        if len(resets) > len(self._reset_starts.get(seed, ())):
+            self._reset_starts[seed] = list(resets)
+
     def _reset_simulator(self, initial_state_index: int, seed: int) -> None:
         if self._protocol.seeding != "once per task":
             resets = self._protocol.earlier_resets + initial_state_index

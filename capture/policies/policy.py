@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,6 +153,19 @@ class Policy(Protocol):
 
         recorders: the row collector of each recorded site. editors: the editor of each site whose attention changes.
         """
+
+
+@runtime_checkable
+class BatchPolicy(Protocol):
+    """A policy that can make several calls at a time."""
+
+    def act_batch(
+        self,
+        policy_inputs: Sequence[PolicyInput],
+        noise_seeds: Sequence[int],
+        recorders: Sequence[Mapping[str, RowCollector]],
+    ) -> list[NDArray[np.float64]]:
+        """Return what `act` gives for each input, its noise and its recorders; equal but for rounding."""
 
 
 def stored_picture_sizes(policy: Policy, image_size: int) -> list[int]:

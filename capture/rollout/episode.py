@@ -6,7 +6,7 @@ The simulator may be in this process (`record_episode`) or in another one (`pipe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol as Interface
@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from vla_attention.capture.environments.base import Environment, Task
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
 from vla_attention.capture.interventions.run_changes import RunChanges
-from vla_attention.capture.policies.policy import Policy, PolicyInput, camera_grid
-from vla_attention.capture.recording.attention import AttentionEditor
-from vla_attention.capture.rollout.policy_call import RecordedCall, record_call
+from vla_attention.capture.policies.policy import Policy, camera_grid
+from vla_attention.capture.rollout.policy_call import PreparedCall, RecordedCall, record_calls
 from vla_attention.capture.rollout.simulation import Advanced, Begun, CameraPatches, Seen, Simulation, StopCheck
 from vla_attention.capture.store.episode_writer import EpisodeStart, ReplanRecord
 from vla_attention.capture.store.store_writer import RunStore
@@ -79,21 +78,6 @@ class ReplanWriter(Interface):
 
     def append(self, record: ReplanRecord) -> None:
         """Add the next replan."""
-
-
-@dataclass(frozen=True)
-class PreparedCall:
-    """A policy call before it is made.
-
-    where: replan, environment step and episode, for messages. editors: the editor of each site whose attention changes.
-    """
-
-    env_step: int
-    where: str
-    policy_input: PolicyInput
-    noise_seed: int
-    coverage: Mapping[str, NDArray[np.float32]]
-    editors: Mapping[str, AttentionEditor] | None
 
 
 def episode_title(store: RunStore, task: Task, episode_index: int) -> str:
@@ -224,14 +208,7 @@ def record_episode(
             if result.seen is None:
                 raise ValueError("the environment gave no observation before a policy call")
             prepared = recording.prepare(result.seen)
-            call = record_call(
-                run.policy,
-                prepared.policy_input,
-                prepared.noise_seed,
-                store.attributes.recording,
-                prepared.where,
-                prepared.editors,
-            )
+            (call,) = record_calls(run.policy, [prepared], store.attributes.recording)
             recording.keep(prepared, call, writer)
             result = simulation.advance(*recording.next_actions(call))
             recording.advanced(result)

@@ -1,7 +1,8 @@
 """The loop over episodes with simulators in processes of their own: they, the policy and the writing overlap.
 
-This process has the policy, and calls it for one simulator after the other. So every call has the input that it has in
-the loop with one simulator, and every episode is the same to the bit. A thread writes (`background_writing.py`).
+This process has the policy. With batches of 1 it calls the policy for one simulator after the other: every call has the
+input that it has in the loop with one simulator, and every episode is the same to the bit. A larger batch changes the
+last bits of what the policy computes. A thread writes (`background_writing.py`).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from multiprocessing.connection import Connection, wait
 
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.claims import Holder
+from vla_attention.capture.policies.policy import BatchPolicy, Policy
 from vla_attention.capture.rollout.background_writing import BackgroundWriting, Committed, EpisodeInBackground
 from vla_attention.capture.rollout.episode import (
     EpisodeRecording,
@@ -28,13 +30,14 @@ from vla_attention.capture.rollout.episode import (
     recorded_times,
 )
 from vla_attention.capture.rollout.episode_loop import EpisodeLoop, TaskEpisode, describe_result
-from vla_attention.capture.rollout.policy_call import record_call
+from vla_attention.capture.rollout.policy_call import record_calls
 from vla_attention.capture.rollout.progress import EpisodeProgress
 from vla_attention.capture.rollout.simulation import Advanced, Begun, Seen
 from vla_attention.capture.rollout.simulator_process import (
     BeginEpisode,
     Execute,
     Failed,
+    KnownResets,
     ResetsFirst,
     SimulatorProcess,
     SimulatorSetup,
@@ -51,6 +54,11 @@ _LOOK_EVERY_S = 0.5
 
 #: The largest number of simulators that is taken without being asked for: one policy keeps few more busy.
 MOST_BY_DEFAULT = 8
+
+
+def default_policy_batch(policy: Policy, device: str, num_envs: int) -> int:
+    """Return the largest batch without `--policy-batch`: 1 on a processor, which does not gain by larger ones."""
+    return num_envs if isinstance(policy, BatchPolicy) and not device.startswith("cpu") else 1
 
 
 def default_num_envs() -> int:
@@ -83,16 +91,25 @@ class Simulator:
         """The name of the episode."""
         return episode_name(self.task.task_id, self.episode_index)
 
+    @property
+    def in_episode(self) -> tuple[EpisodeRecording, EpisodeInBackground]:
+        """The recording of the episode and its writer, after its reset."""
+        assert self.recording is not None
+        assert self.writer is not None
+        return self.recording, self.writer
+
 
 @dataclass
 class PipelinedLoop(EpisodeLoop):
     """Records episodes in several simulators at a time; see `EpisodeLoop`.
 
+    policy_batch: most policy calls that are made as one batch; what is ready is taken, without waiting for more.
     num_envs: number of simulators. Each stays with its task as long as possible, because another task needs another
     scene, and because LIBERO's published furniture depends on the resets of earlier episodes.
     """
 
     num_envs: int = 2
+    policy_batch: int = 1
     _idle: list[tuple[SimulatorProcess, int | None]] = field(default_factory=list, init=False)
     _running: list[Simulator] = field(default_factory=list, init=False)
     #: Episodes whose commit waits for the thread, with the progress of each.
@@ -100,6 +117,8 @@ class PipelinedLoop(EpisodeLoop):
         default_factory=dict, init=False
     )
     _ready: deque[tuple[Simulator, Seen]] = field(default_factory=deque, init=False)
+    #: What simulators of each task know of its resets, for the others.
+    _resets: dict[int, Sequence[object]] = field(default_factory=dict, init=False)
 
     @contextmanager
     def simulators(self) -> Iterator[None]:
@@ -174,7 +193,8 @@ class PipelinedLoop(EpisodeLoop):
     def _begin(self, simulator: Simulator) -> None:
         self.positions[simulator.name] = 0
         title = episode_title(self.run.store, simulator.task, simulator.episode_index)
-        simulator.process.begin(BeginEpisode(simulator.task.task_id, simulator.episode_index, title))
+        task_id = simulator.task.task_id
+        simulator.process.begin(BeginEpisode(task_id, simulator.episode_index, title, self._resets.get(task_id)))
 
     def _receive(self) -> None:
         """Take what the simulators have answered; waits for an answer unless the policy has something to do."""
@@ -196,6 +216,9 @@ class PipelinedLoop(EpisodeLoop):
         match answer:
             case ResetsFirst(number):
                 self.say_resets(simulator.name, number)
+            case KnownResets(resets):
+                known = self._resets.get(simulator.task.task_id, ())
+                self._resets[simulator.task.task_id] = max(known, resets, key=len)
             case Begun():
                 start = episode_start(self.run, simulator.task, simulator.episode_index, answer)
                 simulator.recording = EpisodeRecording(self.run, simulator.task, start)
@@ -215,9 +238,7 @@ class PipelinedLoop(EpisodeLoop):
                 )
 
     def _advanced(self, simulator: Simulator, result: Advanced) -> None:
-        recording, writer = simulator.recording, simulator.writer
-        assert recording is not None
-        assert writer is not None
+        recording, writer = simulator.in_episode
         recording.advanced(result)
         if recording.num_replans:
             self.positions[simulator.name] = recording.step
@@ -233,24 +254,17 @@ class PipelinedLoop(EpisodeLoop):
         writer.commit(recording.success, recording.step)
 
     def _call_policy(self) -> None:
-        """Make the next policy call, and let its simulator go on before the call is stored."""
+        """Make the next policy calls, and let their simulators go on before the calls are stored."""
         if not self._ready:
             return
-        simulator, seen = self._ready.popleft()
-        recording, writer = simulator.recording, simulator.writer
-        assert recording is not None
-        assert writer is not None
-        prepared = recording.prepare(seen)
-        call = record_call(
-            self.run.policy,
-            prepared.policy_input,
-            prepared.noise_seed,
-            self.run.store.attributes.recording,
-            prepared.where,
-            prepared.editors,
-        )
-        simulator.process.execute(Execute(*recording.next_actions(call)))
-        recording.keep(prepared, call, writer)
+        batch = [self._ready.popleft() for _ in range(min(self.policy_batch, len(self._ready)))]
+        prepared = [simulator.in_episode[0].prepare(seen) for simulator, seen in batch]
+        calls = record_calls(self.run.policy, prepared, self.run.store.attributes.recording)
+        for (simulator, _), call in zip(batch, calls, strict=True):
+            simulator.process.execute(Execute(*simulator.in_episode[0].next_actions(call)))
+        for (simulator, _), before, call in zip(batch, prepared, calls, strict=True):
+            recording, writer = simulator.in_episode
+            recording.keep(before, call, writer)
 
     def _begin_again(self, simulator: Simulator) -> None:
         """Begin the episode of a simulator that has died in a new one."""

@@ -1,15 +1,15 @@
-"""One policy call with recorders: its actions and rows, or the error that says where numbers stopped being finite."""
+"""Policy calls with recorders: their actions and rows, or the error that says where numbers stopped being finite."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vla_attention.capture.policies.policy import Policy, PolicyInput
+from vla_attention.capture.policies.policy import BatchPolicy, Policy, PolicyInput
 from vla_attention.capture.recording.attention import AttentionEditor
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite, all_finite, describe_origin
 from vla_attention.capture.recording.recorder import make_recorders
@@ -48,6 +48,47 @@ def record_call(
     if not all_finite(actions, rows):
         raise _not_finite(policy, policy_input, noise_seed, where, editors)
     return RecordedCall(actions, rows)
+
+
+@dataclass(frozen=True)
+class PreparedCall:
+    """A policy call before it is made.
+
+    where: replan, environment step and episode, for messages. coverage: policy camera -> (patch, object) float32.
+    editors: the editor of each site whose attention changes.
+    """
+
+    env_step: int
+    where: str
+    policy_input: PolicyInput
+    noise_seed: int
+    coverage: Mapping[str, NDArray[np.float32]]
+    editors: Mapping[str, AttentionEditor] | None
+
+
+def record_calls(policy: Policy, calls: Sequence[PreparedCall], recording: Recording) -> list[RecordedCall]:
+    """Make calls as one batch if the policy can, else one after the other, and record what `recording` says.
+
+    One call, and calls with editors, are made as `record_call` makes them, to the bit.
+
+    Raises:
+        NumbersNotFinite: as `record_call`.
+    """
+    if len(calls) == 1 or any(call.editors for call in calls) or not isinstance(policy, BatchPolicy):
+        return [
+            record_call(policy, call.policy_input, call.noise_seed, recording, call.where, call.editors)
+            for call in calls
+        ]
+    pools = policy.query_pools() if recording.queries == "steps" else None
+    recorders = [make_recorders(recording, policy.sites, call.policy_input.key_role, pools) for call in calls]
+    inputs, seeds = [call.policy_input for call in calls], [call.noise_seed for call in calls]
+    made = []
+    for call, actions, own in zip(calls, policy.act_batch(inputs, seeds, recorders), recorders, strict=True):
+        rows = {site: recorder.finish() for site, recorder in own.items()}
+        if not all_finite(actions, rows):
+            raise _not_finite(policy, call.policy_input, call.noise_seed, call.where, None)
+        made.append(RecordedCall(actions, rows))
+    return made
 
 
 def _not_finite(

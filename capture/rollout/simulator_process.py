@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 import traceback
+from collections.abc import Sequence
 from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
@@ -20,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Suite
+from vla_attention.capture.environments.base import Environment, EnvironmentSettings, SharesResets, Suite
 from vla_attention.capture.environments.suites import make_environment
 from vla_attention.capture.rollout.simulation import CameraPatches, Simulation
 from vla_attention.schemas.errors import UserError
@@ -48,11 +49,15 @@ class SimulatorSetup:
 
 @dataclass(frozen=True)
 class BeginEpisode:
-    """Asks for the beginning of an episode, with its waiting steps. title: its name in messages."""
+    """Asks for the beginning of an episode, with its waiting steps.
+
+    title: its name in messages. resets: what another simulator's `KnownResets` told about the task.
+    """
 
     task_id: int
     episode_index: int
     title: str
+    resets: Any = None
 
 
 @dataclass(frozen=True)
@@ -71,6 +76,13 @@ class ResetsFirst:
 
 
 @dataclass(frozen=True)
+class KnownResets:
+    """Tells what the environment of a task knows about its resets; see `SharesResets`."""
+
+    resets: Sequence[Any]
+
+
+@dataclass(frozen=True)
 class Failed:
     """Tells that the simulator failed, in one sentence, which is whole if it is `expected`: a mistake of the user."""
 
@@ -79,21 +91,21 @@ class Failed:
 
 
 class SimulatorProcess:
-    """A running process. `connection` gives its answers: `ResetsFirst`, `Begun`, `Advanced` and `Failed`."""
+    """A running process. `connection` has its answers: `ResetsFirst`, `KnownResets`, `Begun`, `Advanced`, `Failed`."""
 
     def __init__(self, setup: SimulatorSetup) -> None:
         self.connection, theirs = Pipe()
         one_thread = dict.fromkeys(("OMP_NUM_THREADS", *OTHER_LIBRARIES), "1")
         with theirs:
-            # A session of its own: Ctrl-C reaches the policy's process alone, which ends this one. It also ends when
-            # the other end of the connection closes, however the policy's process ended.
+            # A process group of its own: Ctrl-C reaches the policy's process alone, which ends this one. It also ends
+            # when the other end of the connection closes, however the policy's process ended.
             self._process = subprocess.Popen(
                 [sys.executable, "-c", _BOOT, str(theirs.fileno()), *sys.path],
                 stdin=subprocess.DEVNULL,
                 stdout=sys.stderr.fileno() if _has_descriptor(sys.stderr) else None,
                 pass_fds=[theirs.fileno()],
                 env=os.environ | one_thread,
-                start_new_session=True,
+                process_group=0,
             )
         self._send(setup)
 
@@ -157,12 +169,18 @@ class _Server:
                 self.connection.send(self.simulation.advance(message.actions, message.observe))
 
     def _begin(self, request: BeginEpisode) -> None:
-        environment = self._environment_of(request.task_id)
-        missing = environment.missing_resets(request.episode_index, self.setup.protocol.seed)
+        environment, seed = self._environment_of(request.task_id), self.setup.protocol.seed
+        shared = environment if isinstance(environment, SharesResets) else None
+        if shared is not None and request.resets is not None:
+            shared.learn_resets(seed, request.resets)
+        missing = environment.missing_resets(request.episode_index, seed)
         if missing:
             self.connection.send(ResetsFirst(missing))
         self.simulation = Simulation(environment, self.setup.protocol, self.setup.cameras)
-        self.connection.send(self.simulation.begin(request.episode_index, request.title))
+        begun = self.simulation.begin(request.episode_index, request.title)
+        if shared is not None:
+            self.connection.send(KnownResets(shared.known_resets(seed)))
+        self.connection.send(begun)
         self.connection.send(self.simulation.wait())
 
     def _environment_of(self, task_id: int) -> Environment:

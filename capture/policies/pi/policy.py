@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cached_property
 
@@ -25,6 +25,7 @@ from vla_attention.capture.policies.policy import GivenInputs, PolicyInput, came
 from vla_attention.capture.policies.precision import dtype_name
 from vla_attention.capture.policies.weights import weights_digest
 from vla_attention.capture.recording.attention import AttentionEditor, RowCollector
+from vla_attention.capture.recording.batches import BatchCollector
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, roles_from_spans
@@ -235,8 +236,39 @@ class PiPolicy:
         editors: Mapping[str, AttentionEditor] | None = None,
     ) -> NDArray[np.float64]:
         """Return the action chunk (horizon, action dim) for the robot; the noise depends on `noise_seed` only."""
-        config, tensors = self.model.config, policy_input.tensors
-        noise = initial_noise(noise_seed, (1, config.action_horizon, config.action_dim))
+        site = self.sites[0].name
+        sampled = self._sample(
+            policy_input.tensors, [noise_seed], (recorders or {}).get(site), (editors or {}).get(site)
+        )
+        return self.processing.environment_actions(sampled[0], policy_input.state)
+
+    def act_batch(
+        self,
+        policy_inputs: Sequence[PolicyInput],
+        noise_seeds: Sequence[int],
+        recorders: Sequence[Mapping[str, RowCollector]],
+    ) -> list[NDArray[np.float64]]:
+        """Make several calls as one batch; see `BatchPolicy`."""
+        site = self.sites[0].name
+        tensors = {name: torch.cat([each.tensors[name] for each in policy_inputs]) for name in policy_inputs[0].tensors}
+        collector = BatchCollector([each[site] for each in recorders]) if all(site in r for r in recorders) else None
+        sampled = self._sample(tensors, noise_seeds, collector, None)
+        return [
+            self.processing.environment_actions(actions, each.state)
+            for actions, each in zip(sampled, policy_inputs, strict=True)
+        ]
+
+    def _sample(
+        self,
+        tensors: Mapping[str, Tensor],
+        noise_seeds: Sequence[int],
+        recorder: RowCollector | None,
+        editor: AttentionEditor | None,
+    ) -> NDArray[np.float32]:
+        """Return the model's actions (batch, horizon, action dim), still normalised."""
+        config = self.model.config
+        shape = (1, config.action_horizon, config.action_dim)
+        noise = np.concatenate([initial_noise(seed, shape) for seed in noise_seeds])
         sampled = self.model.sample_actions(
             images={camera: tensors[f"image:{camera}"] for camera in config.cameras},
             image_masks={camera: tensors[f"image_mask:{camera}"] for camera in config.cameras},
@@ -244,7 +276,8 @@ class PiPolicy:
             token_mask=tensors["token_mask"],
             state=tensors["state"],
             noise=torch.from_numpy(noise).to(self.model.device),
-            recorder=(recorders or {}).get(self.sites[0].name),
-            editor=(editors or {}).get(self.sites[0].name),
+            recorder=recorder,
+            editor=editor,
         )
-        return self.processing.environment_actions(sampled[0].cpu().numpy(), policy_input.state)
+        actions: NDArray[np.float32] = sampled.cpu().numpy()
+        return actions

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -119,3 +120,16 @@ def test_two_seeds_do_not_disturb_each_other(libero_assets: Path) -> None:
         assert (environment.missing_resets(1, 7), environment.missing_resets(4, 7)) == (0, 2)
         np.testing.assert_array_equal(places(1, 7), first)
     np.testing.assert_array_equal(np.random.get_state(legacy=False)["state"]["key"], before)  # noqa: NPY002
+
+
+def test_an_environment_that_was_told_of_resets_makes_the_same_episodes(libero_assets: Path) -> None:
+    """Several simulators of a task tell each other what their resets began with."""
+    with environment_of(DRAWER, OPENPI, libero_assets) as first:
+        expected = [play(first, episode, 7, further_steps=3) for episode in (0, 1, 2)]
+        known = pickle.loads(pickle.dumps(first.known_resets(7)))
+    with environment_of(DRAWER, OPENPI, libero_assets) as second:
+        assert second.missing_resets(2, 7) == 2
+        second.learn_resets(7, known)
+        assert (second.missing_resets(2, 7), second.missing_resets(3, 7), second.missing_resets(1, 8)) == (0, 0, 1)
+        second.learn_resets(7, known[:1])  # who knows more keeps it
+        check(play(second, 2, 7, further_steps=3), expected[2])

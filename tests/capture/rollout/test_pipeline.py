@@ -25,6 +25,7 @@ from vla_attention.capture.jobs.status import store_status
 from vla_attention.capture.jobs.termination import EXIT_TERMINATED
 from vla_attention.capture.jobs.worker import Worker
 from vla_attention.capture.rollout import pipeline, simulator_process
+from vla_attention.capture.rollout.policy_call import record_calls
 from vla_attention.schemas.errors import MissingDependency
 
 NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2")
@@ -282,6 +283,67 @@ def test_simulators_stay_with_their_task(scene, tmp_path, monkeypatch):
     assert len(made) <= 5
 
 
+def in_whole_batches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Let the policy wait until every simulator that runs has come to its call; returns the sizes of batches."""
+    receive, sizes = pipeline.PipelinedLoop._receive, []
+
+    def receive_all(self: pipeline.PipelinedLoop) -> None:
+        receive(self)
+        while len(self._ready) < len(self._running):
+            receive(self)
+
+    def note(policy: Any, calls: Any, recording: Any) -> Any:
+        sizes.append(len(calls))
+        return record_calls(policy, calls, recording)
+
+    monkeypatch.setattr(pipeline.PipelinedLoop, "_receive", receive_all)
+    monkeypatch.setattr(pipeline, "record_calls", note)
+    return sizes
+
+
+@pytest.mark.parametrize("contributions", [True, False])
+def test_the_first_replan_of_a_batch_is_that_of_single_calls_but_for_rounding(
+    scene, tmp_path, monkeypatch, capsys, contributions
+):
+    words = ["--task-id", "0", "2", "--num-episodes", "2", *([] if contributions else ["--no-contributions"])]
+    assert record(tmp_path / "one.zarr", 1, *words) == 0
+    capsys.readouterr()
+    sizes = in_whole_batches(monkeypatch)
+    assert record(tmp_path / "four.zarr", 4, "--policy-batch", "3", *words) == 0
+    assert "Policy calls in batches of at most 3; --policy-batch N changes it." in capsys.readouterr().out
+    assert sizes[0] == 3
+    assert sum(sizes) == 8
+    for name in [f"task00{task}_episode00{episode}" for task in (0, 2) for episode in (0, 1)]:
+        one, four = (zarr.open_group(tmp_path / f"{kind}.zarr/episodes/{name}", mode="r") for kind in ("one", "four"))
+        for path in ["actions", "joint/row_sum", "joint/atoms", *(["joint/contribution"] if contributions else [])]:
+            np.testing.assert_allclose(four[path][0], one[path][0], rtol=1e-4, atol=1e-5, err_msg=path)
+        # Rows are stored with 11 bits: rounding may fall to the other side.
+        np.testing.assert_allclose(four["joint/rows"][0], one["joint/rows"][0], rtol=2e-3, atol=1e-7)
+        for path in ("noise_seed", "env_step", "joint/key_role", "frames/base_0_rgb"):
+            np.testing.assert_array_equal(four[path][:], one[path][:])
+    assert analyze(["verify", str(tmp_path / "four.zarr")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--num-envs", "0"], "Cannot use --num-envs 0; expected at least 1."),
+        (["--policy-batch", "0"], "Cannot use --policy-batch 0; expected at least 1."),
+        (["--policy-batch", "2", "--knockout", "camera:base_0_rgb"], "with interventions on attention; leave it out"),
+    ],
+)
+def test_what_does_not_work_is_refused(scene, tmp_path, capsys, words, said):
+    assert record(tmp_path / "a.zarr", 2, "--task-id", "0", "--num-episodes", "2", *words) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "a.zarr/episodes").exists() or not any((tmp_path / "a.zarr/episodes").glob("task*"))
+
+
+def test_a_policy_that_makes_single_calls_refuses_batches(scene, tmp_path, capsys):
+    words = ["cosmos", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--policy-batch", "2"]
+    assert capture([*words, "--store", str(tmp_path / "a.zarr"), "--num-envs", "2"]) == 2
+    assert "Cannot use --policy-batch 2: policies of the kind" in capsys.readouterr().err
+
+
 def test_a_process_that_simulates_needs_no_torch():
     code = (
         "import sys, vla_attention.capture.rollout.simulator_process as s\n"
@@ -306,6 +368,16 @@ def test_two_simulators_give_the_episodes_of_one_to_the_bit(suite, tmp_path, mon
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
     assert_same_episodes(tmp_path / "one.zarr", tmp_path / "two.zarr")
+
+
+@pytest.mark.simulator
+@pytest.mark.libero
+def test_simulators_that_share_a_task_of_libero_give_the_published_episodes(libero_assets, tmp_path):
+    words = [*TINY[:-1], "4", "--task-suite", "libero_goal", "--task-id", "0", "--num-episodes", "4"]
+    words += ["--libero-assets", str(libero_assets)]
+    for num_envs in ("1", "2"):
+        assert capture([*words, "--num-envs", num_envs, "--store", str(tmp_path / f"{num_envs}.zarr")]) == 0
+    assert_same_episodes(tmp_path / "1.zarr", tmp_path / "2.zarr")
 
 
 class Run:

@@ -1,0 +1,180 @@
+"""Episodes a minute: one simulator in the policy's process, several in processes of their own, and without writing.
+
+Usage: OMP_NUM_THREADS=1 python benchmarks/rollout_speed.py [--suite libero_10] [--episodes 6] [--max-steps 40]
+           [--rounds 3] [--num-envs 2] [--checkpoint untrained]
+
+Every policy and every renderer has one thread. All episodes have the same length, as random weights solve nothing. The
+rate of a run counts from the commits of its first `num_envs` episodes to the last commit, so that starting processes
+and building scenes is left out. The core-seconds of an episode are those of the run with one simulator, by part; the
+bound is the largest of their sum shared by the cores, the policy (one process calls it) and the simulation shared by
+the simulators. "without writing" drops every replan instead of giving it to the thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+
+from benchmarks.measurement import Table, fix_threads, in_turn, measured, ratios, write_rows  # noqa: E402
+
+fix_threads(1)
+os.environ.setdefault("MUJOCO_GL", "egl")
+
+from vla_attention.capture import capture_run  # noqa: E402
+from vla_attention.capture.arguments import build_parser  # noqa: E402
+from vla_attention.capture.device import load_torch  # noqa: E402
+from vla_attention.capture.policies.policy import Policy  # noqa: E402
+from vla_attention.capture.rollout import background_writing, episode, episode_loop, pipeline  # noqa: E402
+from vla_attention.capture.rollout.simulation import Simulation  # noqa: E402
+from vla_attention.capture.run_settings import run_settings  # noqa: E402
+from vla_attention.capture.store.episode_writer import EpisodeWriter  # noqa: E402
+from vla_attention.schemas.threads import use_threads  # noqa: E402
+
+
+class Parts:
+    """The processor time of parts of the run with one simulator, in seconds."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {"simulation": 0.0, "policy": 0.0, "writing": 0.0}
+        self.commits: list[float] = []
+
+    def timed(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        def timed_call(*given: Any, **options: Any) -> Any:
+            began = time.process_time()
+            try:
+                return call(*given, **options)
+            finally:
+                self.seconds[part] += time.process_time() - began
+
+        return timed_call
+
+
+class NotWritten(background_writing.EpisodeInBackground):
+    """Drops its replans; its commit gives a folder that holds nothing."""
+
+    folder = Path(tempfile.gettempdir())
+
+    def append(self, record: Any) -> None:
+        return
+
+    def commit(self, success: bool, num_steps: int) -> None:
+        name = f"task{self.start.task_id:03d}_episode{self.start.episode_index:03d}"
+        committed = background_writing.Committed(self, Path(name), 0)
+        self.writing.put(lambda: self.writing.done(committed), 0)
+
+
+def rate(policy: Policy, arguments: argparse.Namespace, num_envs: int, written: bool, parts: Parts) -> float:
+    """Run the episodes, and return how many a minute."""
+    with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
+        words = ["pi", "--checkpoint", arguments.checkpoint, "--task-suite", arguments.suite, "--task-id", "0"]
+        words += ["--num-episodes", str(arguments.episodes), "--max-steps", str(arguments.max_steps)]
+        words += ["--store", str(Path(folder) / "run.zarr"), "--num-envs", str(num_envs)]
+        settings = run_settings(build_parser().parse_args(words))
+        commits: list[float] = []
+        note, made = episode_loop.EpisodeLoop.note_commit, pipeline.BackgroundWriting.episode
+
+        def note_commit(loop: Any, result: Any) -> None:
+            commits.append(time.monotonic())
+            note(loop, result)
+
+        episode_loop.EpisodeLoop.note_commit = note_commit  # type: ignore[method-assign]
+        if not written:
+            pipeline.BackgroundWriting.episode = lambda self, *given: NotWritten(self, *given)  # type: ignore
+        own = {(Simulation, name): getattr(Simulation, name) for name in ("begin", "wait", "advance")} | {
+            (EpisodeWriter, name): getattr(EpisodeWriter, name) for name in ("append", "commit")
+        }
+        call, prepare = episode.record_call, episode.EpisodeRecording.prepare
+        if num_envs == 1:
+            for (kind, name), method in own.items():
+                setattr(kind, name, parts.timed("simulation" if kind is Simulation else "writing", method))
+            episode.record_call = parts.timed("policy", call)
+            episode.EpisodeRecording.prepare = parts.timed("policy", prepare)  # type: ignore[method-assign]
+        try:
+            capture_run.run_capture(settings, policy, "cpu")
+        finally:
+            episode_loop.EpisodeLoop.note_commit = note  # type: ignore[method-assign]
+            pipeline.BackgroundWriting.episode = made  # type: ignore[method-assign]
+            for (kind, name), method in own.items():
+                setattr(kind, name, method)
+            episode.record_call, episode.EpisodeRecording.prepare = call, prepare  # type: ignore[method-assign]
+        if num_envs == 1:
+            parts.commits.append(len(commits))
+    return 60 * (len(commits) - num_envs) / (commits[-1] - commits[num_envs - 1])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--suite", default="libero_10")
+    parser.add_argument("--checkpoint", default="untrained")
+    parser.add_argument("--episodes", type=int, default=6)
+    parser.add_argument("--max-steps", type=int, default=40)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--num-envs", type=int, default=2)
+    parser.add_argument("--folder", help="where the stores are written (default: the folder for temporary files)")
+    arguments = parser.parse_args()
+    use_threads(1)
+    load_torch("cpu", 1)
+    words = ["pi", "--checkpoint", arguments.checkpoint]
+    given = build_parser().parse_args(words)
+    policy = given.family.build(given, "cpu")
+    parts, cores, num = Parts(), len(os.sched_getaffinity(0)), arguments.num_envs
+    several, unwritten = f"{num} simulators", f"{num} simulators, without writing"
+    rates = in_turn(
+        {
+            "one simulator": lambda: rate(policy, arguments, 1, True, parts),
+            several: lambda: rate(policy, arguments, num, True, parts),
+            unwritten: lambda: rate(policy, arguments, num, False, parts),
+        },
+        arguments.rounds,
+        warm_up=0,
+    )
+    episodes = sum(parts.commits)
+    shares = {part: seconds / episodes for part, seconds in parts.seconds.items()}
+    total = sum(shares.values())
+    # No process but this one calls the policy, and a simulator is in one episode at a time.
+    least = max(total / cores, shares["policy"], shares["simulation"] / num)
+    bound = 60 / least
+    rows: list[dict[str, Any]] = [
+        {
+            "run": name,
+            "rate": measured(values),
+            "times": measured(ratios(values, rates["one simulator"])),
+            "of_bound": measured([value / bound for value in values]) if name != "one simulator" else None,
+        }
+        for name, values in rates.items()
+    ]
+    written = measured(ratios(rates[several], rates[unwritten]))
+    what = f"{arguments.checkpoint}, {arguments.suite} task 0, {arguments.max_steps} steps an episode"
+    note = (
+        f"{what}. Bound: {least:.2f} s an episode on {cores} cores = {bound:.1f} episodes a minute. With writing "
+        f" {written.median:.3f} ({written.lowest:.3f} to {written.highest:.3f}) of the rate without."
+    )
+    columns = {"run": "run", "rate": "episodes a minute", "times": "times one simulator", "of_bound": "of the bound"}
+    costs = [
+        {"part": part, "seconds": round(seconds, 3), "share": round(seconds / total, 3)}
+        for part, seconds in shares.items()
+    ]
+    tables = {
+        f"{arguments.suite}": Table(columns, rows, note),
+        f"{arguments.suite}-parts": Table(
+            {"part": "part", "seconds": "core-seconds an episode", "share": "share"}, costs, f"{what}."
+        ),
+    }
+    path = write_rows("rollout_speed", tables)
+    for row in [*rows, *costs]:
+        print(row)
+    print(note)
+    print(f"Written: {path}")
+
+
+if __name__ == "__main__":
+    main()
