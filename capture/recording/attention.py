@@ -6,10 +6,11 @@ cast to the compute precision: probabilities rounded to bfloat16 sum to 1 only w
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from vla_attention.capture.recording.contributions import Projection
@@ -22,9 +23,29 @@ MASKED_LOGIT = -2.3819763e38
 LogitChange = Callable[[Tensor], Tensor]
 #: Takes the rows (batch, head, query, key) of a call.
 RowSink = Callable[[Tensor], None]
+#: Takes what each piece of the keys adds to the mixed values of a call, (batch, head, query, dim) by piece.
+PieceSink = Callable[[Sequence[Tensor]], None]
 #: Takes the values (batch, kv_head, key, dim) of a call, its projection to the residual stream, and its update of the
 #: residual stream (batch, query, width).
 UpdateSink = Callable[[Tensor, Projection, Tensor], None]
+
+
+def attend_unseen(query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None, scale: float) -> Tensor:
+    """Return what `attend` does, up to rounding, through torch's fused attention: for calls that nobody records.
+
+    The probabilities never exist as a whole. A call whose rows may be recorded must not come here, even when they are
+    not recorded: recording would then change the actions in their last digits. Arguments and result are those of
+    `attend`; every query needs an allowed key.
+    """
+    batch, heads, queries, dim = query.shape
+    kv_heads = key.shape[1]
+    if heads % kv_heads:
+        raise ValueError(f"{heads} query heads cannot share {kv_heads} key heads evenly")
+    stacked = query.reshape(batch, kv_heads, heads // kv_heads * queries, dim)
+    if mask is not None:
+        mask = mask[:, None] if mask.shape[1] == 1 else mask[:, None].repeat(1, 1, heads // kv_heads, 1)
+    mixed = F.scaled_dot_product_attention(stacked, key, value, attn_mask=mask, scale=scale)
+    return mixed.view(batch, heads, queries, value.shape[-1])
 
 
 def attend(
@@ -36,12 +57,14 @@ def attend(
     *,
     change: LogitChange | None = None,
     rows_to: RowSink | None = None,
+    pieces: Sequence[slice] | None = None,
+    pieces_to: PieceSink | None = None,
 ) -> Tensor:
     """Return softmax(scale · query · keyᵀ, masked) · value, and pass the probabilities to `rows_to`.
 
     Scaled dot-product attention (Vaswani et al. 2017, eq. 1) with grouped queries: head h uses the key/value head
     h // (heads / kv_heads). Logits and softmax are float32 for every input dtype. The probabilities are cast to the
-    dtype of `value` for the value product only. The arithmetic does not depend on `rows_to`.
+    dtype of `value` for the value product only. The arithmetic does not depend on `rows_to` and `pieces_to`.
 
     Args:
         query: (batch, head, query, dim).
@@ -52,6 +75,9 @@ def attend(
         scale: factor of the logits.
         change: an intervention on the logits, after the mask; None leaves them as they are.
         rows_to: called once with the float32 probabilities (batch, head, query, key).
+        pieces: runs of keys, which do not overlap and hold all allowed keys. The value product is then made piece by
+            piece and leaves out the keys between them; None makes it at once over all keys.
+        pieces_to: called once with the value products of the pieces, if there are any.
 
     Returns:
         (batch, head, query, dim) in the dtype of `value`.
@@ -73,12 +99,29 @@ def attend(
     rows = torch.softmax(logits, dim=-1)
     if rows_to is not None:
         rows_to(rows)
-    mixed = torch.matmul(rows.to(value.dtype).view(batch, kv_heads, -1, keys), value)
-    return mixed.view(batch, heads, queries, value.shape[-1])
+    shared = rows.to(value.dtype).view(batch, kv_heads, -1, keys)
+    shape = (batch, heads, queries, value.shape[-1])
+    if pieces is None:
+        return torch.matmul(shared, value).view(shape)
+    parts = [torch.matmul(shared[..., piece], value[:, :, piece]).view(shape) for piece in pieces]
+    if pieces_to is not None:
+        pieces_to(parts)
+    mixed = parts[0]
+    for part in parts[1:]:
+        mixed = mixed + part
+    return mixed
 
 
 class RowCollector(Protocol):
     """Receives rows. A model asks it for a receiver at every block and denoise step."""
+
+    def begin_call(self, allowed: Tensor, lasting: slice, pieces: Sequence[slice] | None) -> None:
+        """Learn about the keys before the first denoise step; a model that does not know them does not call it.
+
+        allowed: (key,) bool, keys that some action query may read. lasting: the keys whose values are the same at all
+        denoise steps. pieces: the pieces of the value products that `piece_sink` gets.
+        """
+        return
 
     def begin_block(self, layer: int, denoise_step: int) -> None:
         """Learn that the model begins this block; models call it before everything else of the block."""
@@ -90,6 +133,10 @@ class RowCollector(Protocol):
         action_queries: positions of the action queries on the query axis of the rows.
         """
         ...
+
+    def piece_sink(self, layer: int, denoise_step: int, action_queries: slice) -> PieceSink | None:
+        """Return the function that takes the value products of this call after its rows, or None."""
+        return None
 
     def update_sink(self, layer: int, denoise_step: int, action_queries: slice) -> UpdateSink | None:
         """Return the function that takes the update of this call after its rows, or None if it is not wanted."""

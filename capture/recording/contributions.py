@@ -10,15 +10,32 @@ and what the recording leaves out: over all other parts, 1ᵀ G 1 is the squared
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-#: Maps mixed values (any, head · dim) to the residual stream (any, width): the output projection, and the gate of a
-#: gated block.
-Projection = Callable[[Tensor], Tensor]
+#: Maps mixed values (any, head · dim) to the residual stream (any, width).
+Projector = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Maps mixed values (any, head · dim) to the residual stream (any, width) float32.
+
+    weight: (width, head · dim), the output projection. gate: (1, width), that of a gated block, or None.
+    """
+
+    weight: Tensor
+    gate: Tensor | None
+
+    def __call__(self, mixed: Tensor) -> Tensor:
+        """Return gate · (weight · mixed)."""
+        projected = F.linear(mixed, self.weight.float())
+        return projected if self.gate is None else projected * self.gate.float()
 
 
 def keys_of_parts(members: NDArray[np.bool_], device: torch.device) -> list[slice | Tensor]:
@@ -36,31 +53,39 @@ def keys_of_parts(members: NDArray[np.bool_], device: torch.device) -> list[slic
     return parts
 
 
-def part_contributions(rows: Tensor, values: Tensor, parts: Sequence[slice | Tensor], project: Projection) -> Tensor:
-    """Return the contribution of each part of the keys to each query, (query, part, width) float32.
+def part_values(rows: Tensor, values: Tensor, parts: Sequence[slice | Tensor]) -> Tensor:
+    """Return the mixed values of each part of the keys, (..., query, part, head · dim) float32.
 
     Args:
-        rows: (head, query, key) float32 probabilities, all heads.
-        values: (kv_head, key, dim); head h uses the key/value head h // (heads / kv_heads).
+        rows: (..., head, query, key) float32 probabilities, all heads.
+        values: (..., kv_head, key, dim); head h uses the key/value head h // (heads / kv_heads).
         parts: the keys of each part, from `keys_of_parts`; parts are disjoint.
-        project: applied to (query · part, head · dim) float32.
     """
-    heads, queries, keys = rows.shape
-    kv_heads, _, dim = values.shape
+    *calls, heads, queries, keys = rows.shape
+    kv_heads, _, dim = values.shape[-3:]
     # Heads that share a key/value head become extra queries of that head, so the values need no copies.
-    shared = rows.reshape(kv_heads, heads // kv_heads * queries, keys)
+    shared = rows.reshape(*calls, kv_heads, heads // kv_heads * queries, keys)
     values = values.float()
-    mixed = torch.stack([torch.matmul(shared[:, :, part], values[:, part]) for part in parts])
-    # (part, kv_head, shared head · query, dim) becomes (query, part, head · dim), so that one product projects all
-    # parts.
-    mixed = mixed.view(len(parts), heads, queries, dim).permute(2, 0, 1, 3).reshape(queries * len(parts), heads * dim)
-    return project(mixed).float().view(queries, len(parts), -1)
+    mixed = torch.stack([torch.matmul(shared[..., part], values[..., part, :]) for part in parts], dim=-4)
+    # (..., part, kv_head, shared head · query, dim) becomes (..., query, part, head, dim)
+    return mixed.view(*calls, len(parts), heads, queries, dim).movedim(-2, -4).flatten(-2)
+
+
+def part_contributions(rows: Tensor, values: Tensor, parts: Sequence[slice | Tensor], project: Projector) -> Tensor:
+    """Return the contribution of each part of the keys to each query, (query, part, width) float32.
+
+    rows: (head, query, key). values: (kv_head, key, dim). parts: as in `part_values`. project: applied to
+    (query · part, head · dim) float32, so that one product projects all parts.
+    """
+    mixed = part_values(rows, values, parts)
+    return project(mixed.flatten(0, 1)).float().view(*mixed.shape[:2], -1)
 
 
 def gram_matrix(contributions: Tensor, update: Tensor) -> Tensor:
-    """Return the mean over queries of the inner products of all parts and the update, (part + 1, part + 1) float32.
+    """Return the mean over queries of the inner products of parts and update, (..., part + 1, part + 1) float32.
 
-    contributions: (query, part, width); update: (query, width), the block's whole addition to the residual stream.
+    contributions: (..., query, part, width); update: (..., query, width), the block's whole addition to the residual
+    stream.
     """
-    vectors = torch.cat([contributions, update.float()[:, None]], dim=1)
-    return torch.matmul(vectors, vectors.transpose(1, 2)).mean(dim=0)
+    vectors = torch.cat([contributions, update.float()[..., None, :]], dim=-2)
+    return torch.matmul(vectors, vectors.transpose(-1, -2)).mean(dim=-3)

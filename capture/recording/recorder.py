@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -11,16 +13,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vla_attention.capture.recording.attention import RowCollector, RowSink, UpdateSink
-from vla_attention.capture.recording.contributions import Projection, gram_matrix, keys_of_parts, part_contributions
+from vla_attention.capture.recording.attention import PieceSink, RowCollector, RowSink, UpdateSink
+from vla_attention.capture.recording.call_contributions import CallContributions, Cell, KeyFacts
+from vla_attention.capture.recording.contributions import Projection
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.segments import segment_members, segments_of
 from vla_attention.schemas.stores.store_format import Recording
 
-#: Copies with more numbers than this move to the CPU immediately instead of waiting on the device.
-_LARGE_COPY = 2**20
+#: Rows of a replan with more bytes than this are moved to the processor call by call.
+_LARGEST_BUFFER = 2**29
 
 
 class SiteNotRecorded(RuntimeError):
@@ -62,10 +65,10 @@ class RecordingPlan:
 class AttentionRecorder(RowCollector):
     """Collects the rows of one site during one replan (batch 1). Every replan needs a new one.
 
-    The recorder copies only the planned heads and the action queries, so no array of the size query x query outlives a
-    call. The copies stay on the device until `finish` moves them all at once, because one transfer per block would
-    stall a GPU. Large copies (all queries of a Cosmos policy) are moved immediately, because they would fill the GPU's
-    memory.
+    The recorder keeps only the planned heads and the action queries, so no array of the size query x query outlives a
+    call. Each call writes into one buffer on the device, and `finish` moves this buffer and the contributions to the
+    processor in one copy through pinned memory: nothing in the loop of the model waits for a GPU. Rows that would fill
+    the GPU's memory (all queries of a Cosmos policy) are moved call by call.
 
     parts: (key, part) bool, disjoint parts of the keys whose contributions are recorded, or None for rows only.
     pools: (pool, action query) weights of the means that `queries = "steps"` records.
@@ -75,15 +78,32 @@ class AttentionRecorder(RowCollector):
     num_keys: int
     parts: NDArray[np.bool_] | None = None
     pools: NDArray[np.float64] | None = None
-    _rows: dict[tuple[int, int], list[Tensor]] = field(default_factory=dict, init=False, repr=False)
-    _grams: dict[tuple[int, int], list[Tensor]] = field(default_factory=dict, init=False, repr=False)
-    _keys_of_parts: list[slice | Tensor] | None = field(default=None, init=False, repr=False)
-    #: Rows (head, action query, key) of all heads, kept until the update of the same call arrives.
+    _cells: dict[Cell, int] = field(init=False, repr=False)
+    _buffer: Tensor | None = field(default=None, init=False, repr=False)
+    #: The planned heads and the weights of the pools on the device; None for all heads in their order.
+    _heads: Tensor | None = field(default=None, init=False, repr=False)
+    _pools: Tensor | None = field(default=None, init=False, repr=False)
+    _rows_seen: Counter[Cell] = field(default_factory=Counter, init=False, repr=False)
+    _updates_seen: Counter[Cell] = field(default_factory=Counter, init=False, repr=False)
+    _contributions: CallContributions | None = field(default=None, init=False, repr=False)
+    #: Rows (head, action query, key) of all heads and the value products, kept until the update of the call arrives.
     _awaited: Tensor | None = field(default=None, init=False, repr=False)
+    _pieces: Sequence[Tensor] | None = field(default=None, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        pairs = [(layer, step) for layer in self.plan.layers for step in self.plan.denoise_steps]
+        self._cells = {pair: number for number, pair in enumerate(pairs)}
+        if self.parts is not None:
+            self._contributions = CallContributions(self.parts, pairs)
 
     def wants(self, layer: int, denoise_step: int) -> bool:
         """Return whether the plan contains this block at this denoise step."""
-        return layer in self.plan.layers and denoise_step in self.plan.denoise_steps
+        return (layer, denoise_step) in self._cells
+
+    def begin_call(self, allowed: Tensor, lasting: slice, pieces: Sequence[slice] | None) -> None:
+        """Keep what the model says about its keys, if it makes value products by pieces."""
+        if self._contributions is not None and pieces is not None:
+            self._contributions.facts = KeyFacts(allowed.numpy(), lasting, tuple(pieces))
 
     def sink(self, layer: int, denoise_step: int, action_queries: slice) -> RowSink | None:
         """Return the function that takes the rows of this call, or None if the plan does not contain them."""
@@ -91,29 +111,37 @@ class AttentionRecorder(RowCollector):
             return None
 
         def take(rows: Tensor) -> None:
-            self._take(layer, denoise_step, rows, action_queries)
+            self._take((layer, denoise_step), rows, action_queries)
+
+        return take
+
+    def piece_sink(self, layer: int, denoise_step: int, action_queries: slice) -> PieceSink | None:
+        """Return the function that takes the value products of this call, or None if contributions are not recorded."""
+        if self.parts is None or not self.wants(layer, denoise_step):
+            return None
+
+        def take(pieces: Sequence[Tensor]) -> None:
+            self._pieces = [piece[0, :, action_queries] for piece in pieces]
 
         return take
 
     def update_sink(self, layer: int, denoise_step: int, action_queries: slice) -> UpdateSink | None:
         """Return the function that takes the update of this call, or None if contributions are not recorded."""
-        if self.parts is None or not self.wants(layer, denoise_step):
+        contributions = self._contributions
+        if contributions is None or not self.wants(layer, denoise_step):
             return None
-        members = self.parts
 
-        def take(values: Tensor, project: Projection, update: Tensor) -> None:
+        def take(values: Tensor, projection: Projection, update: Tensor) -> None:
             if self._awaited is None:
                 raise SiteNotRecorded(f"Layer {layer} passed on its update before its rows.")
-            if self._keys_of_parts is None:
-                self._keys_of_parts = keys_of_parts(members, values.device)
-            each = part_contributions(self._awaited, values[0], self._keys_of_parts, project)
-            gram = gram_matrix(each, update[0, action_queries])
-            self._grams.setdefault((layer, denoise_step), []).append(gram)
-            self._awaited = None
+            cell = (layer, denoise_step)
+            contributions.take(cell, self._awaited, self._pieces, values[0], projection, update[0, action_queries])
+            self._updates_seen[cell] += 1
+            self._awaited = self._pieces = None
 
         return take
 
-    def _take(self, layer: int, denoise_step: int, rows: Tensor, action_queries: slice) -> None:
+    def _take(self, cell: Cell, rows: Tensor, action_queries: slice) -> None:
         batch, heads, _, keys = rows.shape
         if batch != 1:
             raise ValueError(f"rows are recorded for a batch of 1, not of {batch}")
@@ -124,42 +152,86 @@ class AttentionRecorder(RowCollector):
         of_actions = rows[0, :, action_queries].detach()
         if self.parts is not None:
             self._awaited = of_actions
-        wanted = torch.tensor(self.plan.heads, device=rows.device)
-        chosen = of_actions.index_select(0, wanted)
+        if self._buffer is None:
+            self._buffer = self._allocate(of_actions)
+        slot = self._buffer[self._cells[cell]]
+        self._rows_seen[cell] += 1
+        chosen = of_actions if self._heads is None else of_actions.index_select(0, self._heads)
+        straight = slot.device == chosen.device
         if self.plan.queries == "mean":
+            if straight:
+                torch.mean(chosen, dim=1, keepdim=True, out=slot)
+                return
             chosen = chosen.mean(dim=1, keepdim=True)
+        elif self._pools is not None:
+            chosen = torch.matmul(self._pools, chosen)
+        slot.copy_(chosen)
+
+    def _allocate(self, of_actions: Tensor) -> Tensor:
+        """Return the buffer (cell, head, query, key), and move the choice of heads and pools to the device.
+
+        of_actions: (head, action query, key), the first rows that were taken.
+        """
+        heads, queries, _ = of_actions.shape
+        device = of_actions.device
+        if self.plan.heads != tuple(range(heads)):
+            self._heads = torch.tensor(self.plan.heads, device=device)
+        if self.plan.queries == "mean":
+            queries = 1
         elif self.plan.queries == "steps":
             if self.pools is None:
                 raise BadArgument(
                     f"The queries of site '{self.plan.site}' have no weights per action step; record their mean."
                 )
-            chosen = torch.matmul(torch.from_numpy(self.pools).to(chosen), chosen)
-        if chosen.numel() > _LARGE_COPY:
-            chosen = chosen.cpu()
-        self._rows.setdefault((layer, denoise_step), []).append(chosen)
+            self._pools = torch.from_numpy(self.pools).to(of_actions)
+            queries = len(self.pools)
+        shape = (len(self._cells), len(self.plan.heads), queries, self.num_keys)
+        large = math.prod(shape) * of_actions.element_size() > _LARGEST_BUFFER
+        return torch.empty(shape, device="cpu" if large else device)
 
     def finish(self) -> RecordedRows:
         """Return the rows of the whole plan; raise `SiteNotRecorded` if a call is missing or was recorded twice."""
-        rows = self._stacked(self._rows, "rows")
-        contribution = None if self.parts is None else self._stacked(self._grams, "updates")
-        return RecordedRows(rows, rows.sum(axis=-1, dtype=np.float64).astype(np.float32), contribution)
+        moved = [array.numpy() for array in to_processor(self.on_device())]
+        axes = (len(self.plan.layers), len(self.plan.denoise_steps))
+        rows, *grams = (array.reshape(*axes, *array.shape[1:]) for array in moved)
+        sums = rows.sum(axis=-1, dtype=np.float64).astype(np.float32)
+        return RecordedRows(rows, sums, grams[0] if grams else None)
 
-    def _stacked(self, collected: dict[tuple[int, int], list[Tensor]], what: str) -> NDArray[np.float32]:
-        """Stack the tensors of all calls into (layer, denoise, ...), and move them off the device in one transfer."""
-        cells = [(layer, step) for layer in self.plan.layers for step in self.plan.denoise_steps]
+    def on_device(self) -> list[Tensor]:
+        """Return the rows (cell, head, query, key) and, if recorded, the Gram matrices, where the model made them."""
+        self._check(self._rows_seen, "rows")
+        assert self._buffer is not None
+        if self._contributions is None:
+            return [self._buffer]
+        self._check(self._updates_seen, "updates")
+        return [self._buffer, self._contributions.finish()]
+
+    def _check(self, seen: Counter[Cell], what: str) -> None:
+        """Raise `SiteNotRecorded` unless every planned call passed on its tensors once."""
         faults = []
-        for layer, step in cells:
-            times = len(collected.get((layer, step), ()))
+        for layer, step in self._cells:
+            times = seen[layer, step]
             if times != 1:
                 faults.append(f"layer {layer} at denoise step {step} {f'{times} times' if times else 'never'}")
         if faults:
             raise SiteNotRecorded(
-                f"The model must pass on the {what} of site '{self.plan.site}' exactly once for each of {len(cells)} "
-                f"pairs of layer and denoise step, but passed on {'; '.join(faults[:6])}"
+                f"The model must pass on the {what} of site '{self.plan.site}' exactly once for each of "
+                f"{len(self._cells)} pairs of layer and denoise step, but passed on {'; '.join(faults[:6])}"
                 f"{' ...' if len(faults) > 6 else ''}."
             )
-        stacked: NDArray[np.float32] = torch.stack([collected[cell][0] for cell in cells]).cpu().numpy()
-        return stacked.reshape(len(self.plan.layers), len(self.plan.denoise_steps), *stacked.shape[1:])
+
+
+def to_processor(tensors: Sequence[Tensor]) -> list[Tensor]:
+    """Return the tensors in the processor's memory: all that are on a GPU in one copy, through pinned memory."""
+    there = [tensor for tensor in tensors if tensor.device.type == "cuda"]
+    if not there:
+        return list(tensors)
+    packed = torch.cat([tensor.reshape(-1) for tensor in there])
+    pinned = torch.empty(packed.shape, dtype=packed.dtype, pin_memory=True)
+    pinned.copy_(packed, non_blocking=True)
+    torch.cuda.current_stream(packed.device).synchronize()
+    moved = iter(pinned.split([tensor.numel() for tensor in there]))
+    return [next(moved).view(tensor.shape) if tensor.device.type == "cuda" else tensor for tensor in tensors]
 
 
 def make_recorders(

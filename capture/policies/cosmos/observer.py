@@ -5,19 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import torch.nn.functional as F
 from torch import Tensor
 
 from vla_attention.capture.policies.cosmos.dit import Attention
 from vla_attention.capture.policies.cosmos.layout import SELF
 from vla_attention.capture.recording.attention import AttentionEditor, LogitChange, RowCollector, RowSink, UpdateSink
 from vla_attention.capture.recording.contributions import Projection
-
-
-def projection(output_weight: Tensor, gate: Tensor) -> Projection:
-    """Return the map from mixed values (any, head · dim) to the gated update (any, width); gate: (1, width)."""
-    weight, factor = output_weight.float(), gate.float()
-    return lambda mixed: F.linear(mixed, weight) * factor
 
 
 @dataclass
@@ -67,7 +60,7 @@ class CallObserver:
         """Pass values, projection and update of the recorded queries on to the recorders."""
         for site, sink in self._update_sinks(layer).items():
             value, weight = self._seen.pop(site)
-            sink(value, projection(weight, gates[site][0, self.query_frame]), updates[site][:, self.query_frame])
+            sink(value, Projection(weight, gates[site][0, self.query_frame]), updates[site][:, self.query_frame])
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,11 @@ from vla_attention.capture.policies.cosmos.case import CosmosCase, read_case
 from vla_attention.capture.policies.cosmos.dit import Attention
 from vla_attention.capture.policies.cosmos.latents import condition_mask, read_actions, read_value
 from vla_attention.capture.policies.cosmos.model import CallTrace, CosmosModel
-from vla_attention.capture.policies.cosmos.observer import projection
 from vla_attention.capture.policies.cosmos.preprocess import make_statistics, model_picture
 from vla_attention.capture.policies.cosmos.sampler import sample, seeded_noise
 from vla_attention.capture.policies.parity_case import UnusableCase, json_number, print_results
 from vla_attention.capture.recording.attention import RowSink
-from vla_attention.capture.recording.contributions import part_contributions
+from vla_attention.capture.recording.contributions import Projection, part_contributions
 
 
 @dataclass(frozen=True)
@@ -134,8 +133,7 @@ class EverythingObserver:
                 tokens = rows.shape[2]
                 spans = [slice(start, start + tokens) for start in range(0, rows.shape[3], tokens)]
                 weight = attention.output_proj.weight
-                # A gate of 1: the block's own gate is applied in `updates`.
-                ungated = projection(weight, torch.ones(1, len(weight), device=rows.device))
+                ungated = Projection(weight, None)  # the block's own gate is applied in `updates`
                 parts = torch.stack([part_contributions(rows[b], value[b], spans, ungated) for b in range(len(rows))])
                 self._contributions.setdefault(layer, []).append(parts)
 

@@ -7,6 +7,7 @@ checkpoints. Architecture: Gemma Team 2024; adaptive norm: Peebles & Xie 2023 (a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -16,7 +17,7 @@ from torch import Tensor, nn
 
 from vla_attention.capture.policies.heads import join_heads, split_heads
 from vla_attention.capture.policies.pi.config import GemmaConfig
-from vla_attention.capture.recording.attention import LogitChange, RowSink, UpdateSink, attend
+from vla_attention.capture.recording.attention import LogitChange, PieceSink, RowSink, UpdateSink, attend, attend_unseen
 from vla_attention.capture.recording.contributions import Projection
 
 RMS_NORM_EPS = 1e-6
@@ -107,6 +108,20 @@ def add_branch(x: Tensor, branch: Tensor, gate: Tensor | None) -> Tensor:
     return x + gated(branch, gate)
 
 
+@dataclass(frozen=True)
+class AttentionCalls:
+    """What is called during the attention of a block whose rows may be recorded, and the pieces of its value product.
+
+    A block that gets None instead uses torch's fused attention: nothing of it is ever recorded or changed.
+    """
+
+    change: LogitChange | None = None
+    rows_to: RowSink | None = None
+    pieces: Sequence[slice] | None = None
+    pieces_to: PieceSink | None = None
+    update_to: UpdateSink | None = None
+
+
 class GemmaAttention(nn.Module):
     """Multi-query attention without biases."""
 
@@ -130,12 +145,24 @@ class GemmaAttention(nn.Module):
         seen: KeysValues,
         mask: Tensor | None,
         rotation: Rotation,
-        change: LogitChange | None,
-        rows_to: RowSink | None,
+        calls: AttentionCalls | None,
     ) -> Tensor:
         """Attend from the tokens (batch, token, width) to all `seen` keys, mask (batch, token or 1, key)."""
         query = rotation.apply(split_heads(self.q_proj(x), self.head_dim))
-        mixed = attend(query, seen.keys, seen.values, mask, self.scale, change=change, rows_to=rows_to)
+        if calls is None:
+            mixed = attend_unseen(query, seen.keys, seen.values, mask, self.scale)
+        else:
+            mixed = attend(
+                query,
+                seen.keys,
+                seen.values,
+                mask,
+                self.scale,
+                change=calls.change,
+                rows_to=calls.rows_to,
+                pieces=calls.pieces,
+                pieces_to=calls.pieces_to,
+            )
         update: Tensor = self.o_proj(join_heads(mixed))
         return update
 
@@ -183,9 +210,7 @@ class GemmaBlock(nn.Module):
         *,
         before: KeysValues | None = None,
         condition: Tensor | None = None,
-        change: LogitChange | None = None,
-        rows_to: RowSink | None = None,
-        update_to: UpdateSink | None = None,
+        calls: AttentionCalls | None = None,
     ) -> tuple[Tensor, KeysValues]:
         """Run the tokens x (batch, token, width) through the block.
 
@@ -195,17 +220,13 @@ class GemmaBlock(nn.Module):
         normed, gate = self.input_layernorm(x, condition)
         own = self.self_attn.keys_values(normed, rotation)
         seen = own if before is None else before.then(own)
-        branch = self.self_attn(normed, seen, mask, rotation, change, rows_to)
-        if update_to is not None:
-            update_to(seen.values, self._projection(gate), gated(branch, gate))
-        x = add_branch(x, branch, gate)
+        update = gated(self.self_attn(normed, seen, mask, rotation, calls), gate)
+        if calls is not None and calls.update_to is not None:
+            factor = None if gate is None else gate[0]
+            calls.update_to(seen.values, Projection(self.self_attn.o_proj.weight, factor), update)
+        x = x + update
         normed, gate = self.post_attention_layernorm(x, condition)
         return add_branch(x, self.mlp(normed), gate), own
-
-    def _projection(self, gate: Tensor | None) -> Projection:
-        """Return the map from mixed values (query, head · dim) to the residual stream, in float32, for batch 1."""
-        weight = self.self_attn.o_proj.weight.float()
-        return lambda mixed: gated(F.linear(mixed, weight), None if gate is None else gate[0].float())
 
 
 class GemmaModel(nn.Module):

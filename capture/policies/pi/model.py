@@ -16,7 +16,8 @@ from torch import Tensor, nn
 
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.flow_time import denoise_times, embed_times
-from vla_attention.capture.policies.pi.gemma import GemmaModel, KeysValues, Rotation
+from vla_attention.capture.policies.pi.gemma import AttentionCalls, GemmaModel, KeysValues, Rotation
+from vla_attention.capture.policies.pi.pieces import pieces_of_keys
 from vla_attention.capture.policies.pi.siglip import Projector, VisionTower
 from vla_attention.capture.recording.attention import AttentionEditor, RowCollector
 
@@ -154,8 +155,9 @@ class PiModel(nn.Module):
         after them. With a batch of one, invalid tokens are left out of the computation, which saves nearly half of it
         in LIBERO. Their cached keys are zeros; no query attends to them.
 
-        editor: changes the attention of every block but the last, where no token of the prefix reads. tokens: the keys
-        that the embedded tokens are, (prefix key,); None counts them from 0.
+        editor: changes the attention of every block but the last, where no token of the prefix reads; blocks that it
+        does not change use torch's fused attention. tokens: the keys that the embedded tokens are, (prefix key,); None
+        counts them from 0.
         """
         if embedded.shape[0] == 1 and not bool(valid.all()):
             real = valid[0].nonzero()[:, 0]
@@ -169,7 +171,7 @@ class PiModel(nn.Module):
         keys = torch.arange(embedded.shape[1], device=embedded.device) if tokens is None else tokens
         for layer, block in enumerate(earlier):
             change = editor.prefix_change(layer, keys) if editor is not None else None
-            x, own = block(x, mask, rotation, change=change)
+            x, own = block(x, mask, rotation, calls=None if change is None else AttentionCalls(change=change))
             cache.append(own)
         cache.append(last.keys_values(x, rotation))
         return Prefix(cache=tuple(cache), valid=valid)
@@ -234,6 +236,9 @@ class PiModel(nn.Module):
         action_queries = slice(config.first_action_query, config.suffix_len)
         prefix_len = prefix.valid.shape[1]
         suffix_keys = slice(prefix_len, prefix_len + config.suffix_len)
+        pieces = pieces_of_keys(config, prefix.valid)
+        if recorder is not None:
+            recorder.begin_call(mask[0].any(dim=0), slice(0, prefix_len), pieces)
 
         steps = config.num_denoise_steps if num_steps is None else num_steps
         all_waves = embed_times(
@@ -256,9 +261,13 @@ class PiModel(nn.Module):
                     rotation,
                     before=prefix.cache[layer],
                     condition=condition,
-                    change=editor.step_change(layer, step, action_queries, suffix_keys) if editor is not None else None,
-                    rows_to=recorder.sink(layer, step, action_queries) if recorder is not None else None,
-                    update_to=recorder.update_sink(layer, step, action_queries) if recorder is not None else None,
+                    calls=AttentionCalls(
+                        editor.step_change(layer, step, action_queries, suffix_keys) if editor is not None else None,
+                        recorder.sink(layer, step, action_queries) if recorder is not None else None,
+                        pieces,
+                        recorder.piece_sink(layer, step, action_queries) if recorder is not None else None,
+                        recorder.update_sink(layer, step, action_queries) if recorder is not None else None,
+                    ),
                 )
             normed, _ = self._expert.norm(hidden[:, action_queries], condition)
             x = x + (-1.0 / steps) * self.action_out_proj(normed.float())

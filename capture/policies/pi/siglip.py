@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from vla_attention.capture.policies.heads import join_heads, split_heads
 from vla_attention.capture.policies.pi.config import SiglipConfig
-from vla_attention.capture.recording.attention import attend
+from vla_attention.capture.recording.attention import attend_unseen
 
 LAYER_NORM_EPS = 1e-6
 
@@ -51,7 +51,7 @@ class SiglipAttention(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map (image, patch, width) to the same shape."""
         query, key, value = (split_heads(layer(x), self.head_dim) for layer in (self.q_proj, self.k_proj, self.v_proj))
-        update: Tensor = self.out_proj(join_heads(attend(query, key, value, None, self.scale)))
+        update: Tensor = self.out_proj(join_heads(attend_unseen(query, key, value, None, self.scale)))
         return update
 
 

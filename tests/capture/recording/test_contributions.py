@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from vla_attention.capture.policies.pi.config import GemmaConfig
-from vla_attention.capture.policies.pi.gemma import GemmaBlock, Rotation
+from vla_attention.capture.policies.pi.gemma import AttentionCalls, GemmaBlock, Rotation
 from vla_attention.capture.recording.attention import attend
 from vla_attention.capture.recording.contributions import gram_matrix, keys_of_parts, part_contributions
 from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan, SiteNotRecorded, make_recorders
@@ -93,8 +93,10 @@ def test_a_block_passes_its_whole_update_to_the_recorder(condition_width):
             None,
             rotation,
             condition=condition,
-            rows_to=recorder.sink(0, 0, actions),
-            update_to=lambda values, project, update: (seen.append(update), take_update(values, project, update)),
+            calls=AttentionCalls(
+                rows_to=recorder.sink(0, 0, actions),
+                update_to=lambda values, project, update: (seen.append(update), take_update(values, project, update)),
+            ),
         )
     gram = recorder.finish().contribution
     assert gram is not None
