@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -138,3 +140,41 @@ def test_contributions_are_those_of_the_segments_of_the_replan():
     assert parts is not None
     assert parts.shape == (tokens.layout.num_keys, len(segments_of(tokens.layout, tokens.key_role[1])))
     assert (parts.sum(axis=1) == 1).all()
+
+
+@pytest.mark.parametrize("state_digits", [False, True])
+@pytest.mark.parametrize("pi05", [True, False])
+def test_contributions_of_all_steps_at_once_are_those_of_each_call(pi05, state_digits):
+    """Value products of pieces, single keys and the part that is left: against rows times values, call by call."""
+    from tests.kit.policy_inputs import make_observation
+    from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, build_random_model, dummy_policy
+    from vla_attention.capture.policies.pi.policy import PiPolicy
+
+    tiny = dummy_policy()
+    config = dataclasses.replace(DUMMY_CONFIG, pi05=pi05, discrete_state_input=pi05 and state_digits)
+    policy = PiPolicy(build_random_model(config, 3), tiny.tokenizer, tiny.processing, tiny.source)
+    given = policy.prepare(make_observation(1), "put the red cube on the plate beside the very small green cube")
+    layers, steps = (2, 0), (2, 0, 1)
+    recording = Recording(layers, layers, steps, tuple(range(8)), "mean", 4, 10, contributions=True)
+
+    class EachCall(AttentionRecorder):
+        """Keeps no facts about the keys, so that every call is computed for itself from its rows."""
+
+        def begin_call(self, allowed, lasting, pieces):
+            return
+
+    at_once = make_recorders(recording, policy.sites, given.key_role)["joint"]
+    each = EachCall(at_once.plan, at_once.num_keys, at_once.parts)
+    actions = [policy.act(given, 7, {"joint": recorder}) for recorder in (at_once, each)]
+    np.testing.assert_array_equal(*actions)
+    got, expected = at_once.finish(), each.finish()
+    np.testing.assert_array_equal(got.rows, expected.rows)
+    assert got.contribution is not None
+    assert expected.contribution is not None
+    scale = expected.contribution[..., -1:, -1:]
+    np.testing.assert_allclose(got.contribution / scale, expected.contribution / scale, rtol=2e-4, atol=2e-6)
+    masked = ~(given.tensors["token_mask"][0].numpy())
+    assert masked.any()
+    nothing_read = (expected.contribution == 0).all(axis=(0, 1, 2))
+    assert nothing_read.any()  # the absent camera, the padding
+    assert (got.contribution[..., nothing_read, :] == 0).all()
