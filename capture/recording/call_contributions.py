@@ -238,7 +238,7 @@ class CallContributions:
         values = self._single_values[layer]
         dim = values.shape[-1]
         of_heads = values.repeat_interleave(heads // len(values), dim=0)  # (head, key, dim)
-        per_head = weight.unflatten(1, (heads, dim)).permute(1, 2, 0)  # (head, dim, width)
+        per_head = torch.unflatten(weight, 1, (heads, dim)).permute(1, 2, 0)  # (head, dim, width)
         projected = torch.matmul(of_heads, per_head)  # (head, key, width)
         rows = rows.transpose(1, 2)  # (step, query, head, key)
         for number, (_, keys) in enumerate(self._shares.single):

@@ -230,7 +230,7 @@ def to_processor(tensors: Sequence[Tensor]) -> list[Tensor]:
     pinned = torch.empty(packed.shape, dtype=packed.dtype, pin_memory=True)
     pinned.copy_(packed, non_blocking=True)
     torch.cuda.current_stream(packed.device).synchronize()
-    moved = iter(pinned.split([tensor.numel() for tensor in there]))
+    moved = iter(torch.split(pinned, [tensor.numel() for tensor in there]))
     return [next(moved).view(tensor.shape) if tensor.device.type == "cuda" else tensor for tensor in tensors]
 
 
