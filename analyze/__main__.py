@@ -56,7 +56,7 @@ def _run(name: str, arguments: Sequence[str]) -> int:
     use_threads(parsed.threads)
     os.environ.update(dict.fromkeys(_ONE_THREAD_EACH, "1"))
     try:
-        with _cache_of(parsed):
+        with _cache_of(parsed), _engine(parsed):
             code: int = command.run(parsed)
         return code
     except UserError as error:
@@ -70,6 +70,17 @@ def _cache_of(parsed: argparse.Namespace) -> AbstractContextManager[None]:
     from vla_attention.analyze.cache.places import switched_off
 
     return switched_off()
+
+
+def _engine(parsed: argparse.Namespace) -> AbstractContextManager[object]:
+    """Where `arguments.add_workers` says that episodes are worked on; nothing is imported for the default."""
+    where = getattr(parsed, "scheduler", None)
+    where = getattr(parsed, "workers", None) if where is None else where
+    if where is None:
+        return nullcontext()
+    from vla_attention.analyze.stores.parallel import workers
+
+    return workers(where)
 
 
 def _with_way_out(error: UserError, can_skip: bool) -> UserError:

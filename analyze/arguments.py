@@ -60,7 +60,8 @@ def add_episode(parser: argparse.ArgumentParser, title: str) -> argparse._Argume
 
 
 def add_selection(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
-    """--site, --layers, --denoise, --heads, --tasks and --skip-corrupt."""
+    """--site, --layers, --denoise, --heads, --tasks and --skip-corrupt, and where episodes are measured."""
+    add_workers(parser)
     chosen = parser.add_argument_group("selection")
     add_site_and_tasks(chosen)
     chosen.add_argument("--layers", type=int, nargs="+", metavar="N", help="layers (default: all recorded)")
@@ -74,6 +75,17 @@ def add_selection(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
         help="check every episode first, and leave out, by name, those that are damaged or hold no replan",
     )
     return chosen
+
+
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """--workers and --scheduler; `__main__` hands episodes to what they name."""
+    where = parser.add_argument_group("where episodes are read").add_mutually_exclusive_group()
+    where.add_argument(
+        "--workers", type=int, metavar="N", help="N processes of this machine, one thread each (default: threads)"
+    )
+    where.add_argument(
+        "--scheduler", metavar="ADDRESS", help="the workers of a running dask scheduler, as tcp://HOST:8786"
+    )
 
 
 def add_intervals(parser: argparse.ArgumentParser) -> None:

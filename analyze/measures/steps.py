@@ -126,8 +126,10 @@ def measured_from(
     row_sum: NDArray[np.float64],
 ) -> MeasuredEpisode:
     """A `MeasuredEpisode` from masses (replan, layer, denoise, head, group + 1); the last mass is of all valid keys."""
+    # In C order, as they come from the cache and from other processes: numpy's sums depend on the order in memory.
+    groups, valid = np.ascontiguousarray(mass[..., :-1]), np.ascontiguousarray(mass[..., -1])
     return MeasuredEpisode(
-        item, selection, mass[..., :-1], mass[..., -1], row_sum, resolved.num_keys, resolved.num_valid
+        item, selection, groups, valid, np.ascontiguousarray(row_sum), resolved.num_keys, resolved.num_valid
     )
 
 
@@ -223,7 +225,6 @@ def _measured_arrays(
     # Resolved here, one episode at a time: weights of objects are megabytes an episode.
     item, resolved = pair
     measured = measure_episode(item, resolved or resolve_episode(grouping, item), selection, site)
-    # In C order, as they come from the cache and from other processes: numpy's sums depend on the order in memory.
     return {name: np.ascontiguousarray(getattr(measured, name)) for name in MEASURED_ARRAYS}
 
 

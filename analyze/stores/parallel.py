@@ -1,8 +1,8 @@
 """The same work on many episodes, several at once: the episode is the one unit of work everywhere.
 
-Threads of this process unless `episodes_with` says otherwise: one waits for its chunks while another is computed. The
-functions that are handed over here are picklable: defined at the top of their module, or a `functools.partial` of such
-a function with plain arguments. Any of them can then be computed in another process.
+Threads of this process unless `workers` or `episodes_with` says otherwise: one waits for its chunks while another is
+computed. The functions that are handed over here are picklable: defined at the top of their module, or a
+`functools.partial` of such a function with plain arguments. Any of them can then be computed in another process.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from functools import partial
 from typing import Any, Protocol, TypeVar
 
 from vla_attention.analyze.stores.blas import one_blas_thread
+from vla_attention.analyze.stores.dask_scheduler import DaskScheduler
+from vla_attention.analyze.stores.worker_processes import WorkerProcesses
 from vla_attention.schemas.threads import threads_of_this_process
 
 Item = TypeVar("Item")
@@ -32,7 +34,7 @@ class Engine(Protocol):
     """Computes a function of each item somewhere."""
 
     def results(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-        """Results in the order of the items; the first item's error that fails is raised."""
+        """Results in the order of the items; raises the error of the first item that fails."""
 
 
 class Threads:
@@ -60,6 +62,23 @@ def episodes_with(engine: Engine) -> Iterator[None]:
         yield
     finally:
         _engine.reset(token)
+
+
+@contextmanager
+def workers(where: int | str) -> Iterator[None]:
+    """Within the block, episodes are worked on elsewhere; results are the same to the last bit.
+
+    Args:
+        where: a number of processes on this machine, or the address of a dask scheduler that runs.
+
+    Raises:
+        BadArgument: fewer than one process, or no scheduler answers.
+        MissingDependency: dask is not installed.
+    """
+    engine: WorkerProcesses | DaskScheduler
+    engine = DaskScheduler(where) if isinstance(where, str) else WorkerProcesses(where)
+    with engine, episodes_with(engine):
+        yield
 
 
 def each_episode(
