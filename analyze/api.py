@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, Unpack, cast, get_args
 import polars as pl
 
 from vla_attention.analyze.measures.frames import Tables
-from vla_attention.analyze.measures.question import Question, ask
+from vla_attention.analyze.measures.question import KnownEpisodes, Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings, SettingKeywords, settings_from_keywords
 from vla_attention.analyze.ratios.analysis import Analysis, analyse
 from vla_attention.analyze.stores.contents import describe_store, episodes_table, header_lines, one_line
@@ -62,6 +62,7 @@ class OpenStores:
     def __init__(self, stores: Sequence[Store]) -> None:
         self.stores = tuple(stores)
         self._analyses: OrderedDict[AnalysisSettings, Analysis] = OrderedDict()
+        self._known: KnownEpisodes = {}
 
     @property
     def attributes(self) -> RootAttributes:
@@ -83,13 +84,13 @@ class OpenStores:
         >>> va.open(store).ask(grouping="cameras", layers=2).selection.blocks
         (2,)
         """
-        return ask(self.stores, settings_from_keywords(**settings))
+        return ask(self.stores, settings_from_keywords(**settings), self._known)
 
     def analysis(self, **settings: Unpack[SettingKeywords]) -> Analysis:
         """All tables and the summary of one grouping, as `vla-analyze STORE` computes them; the last few are kept."""
         wanted = settings_from_keywords(**settings)
         if wanted not in self._analyses:
-            self._analyses[wanted] = analyse(ask(self.stores, wanted))
+            self._analyses[wanted] = analyse(ask(self.stores, wanted, self._known))
         self._analyses.move_to_end(wanted)
         while len(self._analyses) > _KEPT:
             self._analyses.popitem(last=False)

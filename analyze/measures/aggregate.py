@@ -3,7 +3,7 @@
     level      a row of `cells` is                                        made by
     steps      (episode, replan, layer, denoise step[, head])             `steps.step_tables`
     replans    (episode, replan, layer or "layers_avg")                   `replan_tables`
-    episodes   (episode, layer or "layers_avg")                           `episode_tables`
+    episodes   (episode, layer or "layers_avg")                           `episodes.episode_tables`
     tasks      (task, all tasks or all suites; layer or "layers_avg")     `task_tables`
 
 From replans on, `layer` is a string (the number that the user typed, or "layers_avg") and `layer_number` the number,
@@ -19,6 +19,14 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.measures.episodes import (
+    LAYER_KEYS,
+    logs_of,
+    replan_values,
+    sorted_by_episode,
+)
+from vla_attention.analyze.measures.episodes import episode_tables as episode_tables
+from vla_attention.analyze.measures.episodes import episode_tables_of as episode_tables_of
 from vla_attention.analyze.measures.frames import (
     EPISODE_ID,
     EPISODE_KEYS,
@@ -30,14 +38,6 @@ from vla_attention.analyze.measures.frames import (
     float_values,
     long_table,
     replan_axis,
-)
-from vla_attention.analyze.measures.masses import (
-    finite_mean,
-    group_measures,
-    ratio,
-    relative_to_uniform,
-    sides,
-    uniform_ratio,
 )
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.steps import MeasuredEpisode, measure_episodes
@@ -61,7 +61,6 @@ from vla_attention.schemas.groupings.grouping import Grouping
 #: The ratio that texts and pictures show first: with few episodes and strong spread, its interval alone covers the
 #: truth as often as its level says (docs/benchmarks.md).
 HEADLINE = "geometric_mean"
-_LAYER_KEYS = ("layer", "layer_number", "block")
 _TASK = "_task_of_suite"
 
 
@@ -92,88 +91,12 @@ def replan_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Ta
 
 
 def _episode_replans(measured: MeasuredEpisode, grouping: Grouping) -> Tables:
-    layers, item = LayerAxis.of(measured.selection), measured.item
-    mass, valid_mass, row_sum = (
-        layers.with_average(values.mean(axis=(2, 3)))
-        for values in (measured.mass, measured.valid_mass, measured.row_sum)
-    )
-    cells: dict[str, NDArray[Any]] = {
-        "row_sum": row_sum,
-        "valid_mass": valid_mass,
-        "num_valid": measured.num_valid[:, None].astype(np.float64),
-    }
-    if grouping.ratio is not None:
-        above, below = sides(mass, grouping)
-        of_layers = ratio(above, below)[:, : len(measured.selection.layers)]
-        left_out = ~np.isfinite(of_layers)
-        value = layers.with_average(of_layers, mean=finite_mean)
-        uniform = uniform_ratio(measured.num_keys, grouping)[:, None]
-        cells |= {"numerator_mass": above, "denominator_mass": below, "uniform_ratio": uniform, "ratio": value}
-        cells["nonfinite_layers"] = layers.with_average(left_out.astype(np.int64), mean=np.sum)
-        # The mean of logarithms over layers has no preference for either side; the published mean of ratios has.
-        cells |= relative_to_uniform(layers.with_average(of_layers, mean=_finite_geometric_mean), uniform)
-    axes = [replan_axis(item), layers.columns]
+    item, values = measured.item, replan_values(measured, grouping)
+    axes = [replan_axis(item), LayerAxis.of(measured.selection).columns]
     return Tables(
-        long_table(item, axes, cells, EPISODE_KEYS),
-        lambda: long_table(
-            item,
-            [*axes, {"group": grouping.names}],
-            group_measures(mass, valid_mass, measured.num_keys, measured.num_valid).columns(),
-        ),
+        long_table(item, axes, values.cells, EPISODE_KEYS),
+        lambda: long_table(item, [*axes, {"group": grouping.names}], values.groups()),
     )
-
-
-def episode_tables(replans: Tables, grouping: Grouping) -> Tables:
-    """Every (episode, layer), over the episode's replans; standard deviations with ddof 0.
-
-    Returns:
-        cells: `EPISODE_KEYS`, layer, layer_number, block, num_replans, row_sum and num_valid (means); with a ratio
-            numerator_mass, denominator_mass  means
-            ratio_mean, ratio_std, ratio_median, ratio_min, ratio_max   over the finite ratios
-            ratio_of_means      mean numerator mass / mean denominator mass
-            geometric_mean      exp(log_ratio_mean), log_ratio_mean = mean log ratio over finite positive ratios
-            num_nonfinite       replans whose ratio is infinite or undefined
-            geometric_left_out  replans whose ratio has no finite logarithm (not finite, or 0)
-            nonfinite_layers    sum over replans of the layers left out of "layers_avg"
-            uniform_ratio       geometric mean of the ratios that uniform attention would give
-            ratio_lift          geometric mean over replans of ratio / uniform_ratio, finite positive ones
-        groups: suite, task_id, episode_index, layer, layer_number, block, group; mass, mass_std, fraction,
-            fraction_std, keys, density (means over replans), lift (over replans where it is finite).
-    """
-    columns = [pl.len().cast(pl.Int64).alias("num_replans"), pl.col("row_sum").mean(), pl.col("num_valid").mean()]
-    if grouping.ratio:
-        value = _finite("ratio")
-        columns += [
-            pl.col("numerator_mass").mean(),
-            pl.col("denominator_mass").mean(),
-            value.mean().alias("ratio_mean"),
-            value.std(ddof=0).alias("ratio_std"),
-            value.median().alias("ratio_median"),
-            value.min().alias("ratio_min"),
-            value.max().alias("ratio_max"),
-            _quotient(pl.col("numerator_mass").mean(), pl.col("denominator_mass").mean()).alias("ratio_of_means"),
-            (_finite("log2_ratio").mean() * np.log(2.0)).alias("log_ratio_mean"),
-            (~_is_finite("ratio")).sum().cast(pl.Int64).alias("num_nonfinite"),
-            (~_is_finite("log2_ratio")).sum().cast(pl.Int64).alias("geometric_left_out"),
-            pl.col("nonfinite_layers").sum(),
-            _geometric("uniform_ratio"),
-            _geometric("ratio_lift"),
-        ]
-    cells = replans.cells.group_by(*EPISODE_KEYS, *_LAYER_KEYS, maintain_order=True).agg(*columns)
-    if grouping.ratio:
-        cells = cells.with_columns(pl.col("log_ratio_mean").exp().alias("geometric_mean"))
-    measures = (
-        pl.col("mass").mean(),
-        pl.col("mass").std(ddof=0).alias("mass_std"),
-        pl.col("fraction").mean(),
-        pl.col("fraction").std(ddof=0).alias("fraction_std"),
-        pl.col("keys").mean(),
-        pl.col("density").mean(),
-        _finite("lift").mean(),
-    )
-    by = (*EPISODE_ID, *_LAYER_KEYS, "group")
-    groups = pl.concat([part.groups.group_by(*by, maintain_order=True).agg(*measures) for part in replans.parts])
-    return Tables(_sorted(cells), _sorted(groups))
 
 
 def task_tables(
@@ -197,8 +120,8 @@ def task_tables(
         groups: scope, suite, task_id, instruction, layer, layer_number, block, group; mass, keys, density, lift
             (means); fraction, fraction_low, fraction_high.
     """
-    cells = _sorted(episodes.cells)
-    ordered = Tables(cells, _sorted(episodes.groups))
+    cells = sorted_by_episode(episodes.cells)
+    ordered = Tables(cells, sorted_by_episode(episodes.groups))
     # As arrays, once: there can be thousands of (task, layer) pairs. numpy has no null: NaN.
     columns = {name: float_values(cells[name]) for name in _columns_over_episodes(grouping)}
     columns[_TASK] = cells.select(task_number()).to_series().to_numpy()
@@ -251,7 +174,7 @@ def _scopes(cells: pl.DataFrame) -> Iterator[tuple[dict[str, object], list[dict[
     """
     several = cells["suite"].n_unique() > 1
     indexed = cells.select(
-        *("suite", "task_id", "instruction", *_LAYER_KEYS),
+        *("suite", "task_id", "instruction", *LAYER_KEYS),
         pl.int_range(pl.len()).alias("_position"),
         pl.struct(EPISODE_ID).rank("dense").alias("_episode"),
     )
@@ -262,7 +185,7 @@ def _scopes(cells: pl.DataFrame) -> Iterator[tuple[dict[str, object], list[dict[
         found: dict[bytes, tuple[list[dict[str, object]], list[NDArray[np.int64]]]] = {}
         for of_layer in part.partition_by("layer", maintain_order=True):
             names, positions = found.setdefault(of_layer["_episode"].to_numpy().tobytes(), ([], []))
-            names.append(of_layer.select(_LAYER_KEYS).row(0, named=True))
+            names.append(of_layer.select(LAYER_KEYS).row(0, named=True))
             positions.append(of_layer["_position"].to_numpy())
         for names, positions in found.values():
             yield scope, names, np.stack(positions)
@@ -307,7 +230,7 @@ def _task_rows(
                 "ratio_mean": mean_over_episodes(of_layer["ratio_mean"], POSITIVE),
                 "ratio_of_means": ratio_of_means_over_episodes(*sides),
                 "geometric_mean": geometric_mean_over_episodes(of_layer["log_ratio_mean"]),
-                "ratio_lift": geometric_mean_over_episodes(_logs(of_layer["ratio_lift"])),
+                "ratio_lift": geometric_mean_over_episodes(logs_of(of_layer["ratio_lift"])),
             }
     shares = [mean_over_episodes(column, SHARE) for i in layers for column in groups["fraction"][i].T]
     statistics = [one for which in (plain, bounded) for of_layer in which for one in of_layer.values()]
@@ -351,19 +274,7 @@ def _none_for_nan(value: float) -> float | None:
 def baseline_logs(uniform: NDArray[np.float64], log_ratios: NDArray[np.float64]) -> NDArray[np.float64]:
     """Logarithms of uniform ratios (episode,) of the episodes that have a ratio; of all where none has."""
     having = np.isfinite(log_ratios)
-    return np.where(having | ~having.any(), _logs(uniform), np.nan)
-
-
-def _finite_geometric_mean(values: NDArray[np.float64], axis: int | tuple[int, ...] = 0) -> NDArray[np.float64]:
-    """Geometric mean over the finite positive values along an axis; NaN where there is none."""
-    logs: NDArray[np.float64] = np.exp(finite_mean(_logs(values), axis))
-    return logs
-
-
-def _logs(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Natural logarithms, not finite where a value has none."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.log(values)
+    return np.where(having | ~having.any(), logs_of(uniform), np.nan)
 
 
 _NAMES: dict[str, type[pl.DataType]] = {
@@ -398,26 +309,3 @@ def _task_frame(rows: Sequence[dict[str, Any]], schema: dict[str, type[pl.DataTy
     return pl.DataFrame(rows, schema=schema).sort(
         pl.col("suite").is_null(), "suite", order, "task_id", "layer_number", nulls_last=True, maintain_order=True
     )
-
-
-def _quotient(above: pl.Expr, below: pl.Expr) -> pl.Expr:
-    """above / below; +inf over zero, null for 0 / 0."""
-    return (above / below).fill_nan(None)
-
-
-def _is_finite(column: str) -> pl.Expr:
-    return pl.col(column).is_finite().fill_null(False)
-
-
-def _finite(column: str) -> pl.Expr:
-    return pl.col(column).filter(_is_finite(column))
-
-
-def _geometric(column: str) -> pl.Expr:
-    logs = pl.col(column).log()
-    return logs.filter(logs.is_finite().fill_null(False)).mean().exp().alias(column)
-
-
-def _sorted(table: pl.DataFrame) -> pl.DataFrame:
-    """Sorted by episode and layer: results do not depend on the order in which episodes were read."""
-    return table.sort(*EPISODE_ID, "layer_number", nulls_last=True, maintain_order=True)

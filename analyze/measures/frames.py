@@ -69,6 +69,11 @@ def _constant(name: str, item: SelectedEpisode, height: int) -> pl.Series:
     return _labels(name, [visible(value) if isinstance(value, str) else value]).new_from_index(0, height)
 
 
+def episode_columns(items: Sequence[SelectedEpisode], keys: Sequence[str]) -> dict[str, pl.Series]:
+    """The columns that describe episodes, of `EPISODE_KEYS`, with one value for each episode."""
+    return {name: pl.concat([_constant(name, item, 1) for item in items]) for name in keys}
+
+
 def _labels(name: str, labels: Sequence[Any] | NDArray[Any] | pl.Series) -> pl.Series:
     if isinstance(labels, pl.Series):  # a Series keeps its type where all labels are null
         return labels

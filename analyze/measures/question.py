@@ -92,8 +92,17 @@ class Question:
         )
 
 
-def ask(stores: Sequence[Store], settings: AnalysisSettings) -> Question:
+#: Site and tasks -> the episodes with their tokens, and their vocabulary.
+KnownEpisodes = dict[tuple[str, tuple[int, ...] | None], tuple[tuple[SelectedEpisode, ...], Vocabulary]]
+
+
+def ask(stores: Sequence[Store], settings: AnalysisSettings, known: KnownEpisodes | None = None) -> Question:
     """Check the settings against what the stores hold. Reads the episodes' attributes and roles, no rows.
+
+    Args:
+        stores: of one policy and one kind of recording.
+        settings: what is asked.
+        known: what earlier questions about the same stores have read; what this one reads is added.
 
     Raises:
         UserError: a subclass that says what does not fit; see `vla_attention.analyze.stores.selection` and
@@ -103,13 +112,18 @@ def ask(stores: Sequence[Store], settings: AnalysisSettings) -> Question:
     root = stores[0].attributes
     site = choose_site(root, settings.site)
     selection = select(root, settings.layers, settings.denoise, settings.heads, settings.per_head, site)
-    chosen = [(store, episode) for store in stores for episode in select_episodes(store, settings.tasks)]
     skipped: list[str] = []
-    if settings.skip_corrupt:
-        chosen, skipped = _without_faulty(chosen)
-    _refuse_empty(chosen)
-    selected = tuple(load_tokens(chosen, site))
-    vocabulary = vocabulary_of(selected)
+    if known is not None and not settings.skip_corrupt and (site, settings.tasks) in known:
+        selected, vocabulary = known[site, settings.tasks]
+    else:
+        chosen = [(store, episode) for store in stores for episode in select_episodes(store, settings.tasks)]
+        if settings.skip_corrupt:
+            chosen, skipped = _without_faulty(chosen)
+        _refuse_empty(chosen)
+        selected = tuple(load_tokens(chosen, site))
+        vocabulary = vocabulary_of(selected)
+        if known is not None and not settings.skip_corrupt:
+            known[site, settings.tasks] = selected, vocabulary
     grouping = choose_grouping(settings, vocabulary)
     notes = _denoise_notes(root, selection, grouping)
     return Question(tuple(stores), settings, selection, site, selected, grouping, vocabulary, tuple(skipped), notes)

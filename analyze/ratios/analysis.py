@@ -11,7 +11,7 @@ from typing import Any
 import polars as pl
 
 from vla_attention.analyze.measures.aggregate import (
-    episode_tables,
+    episode_tables_of,
     overall_layer,
     overall_rows,
     replan_tables,
@@ -63,7 +63,6 @@ class Analysis:
 
     question: Question
     measured: Sequence[MeasuredEpisode]
-    replans: Tables
     episodes: Tables
     tasks: Tables
     sinks: pl.DataFrame | None = None
@@ -77,6 +76,11 @@ class Analysis:
     def resolved(self) -> Sequence[ResolvedGrouping]:
         """The grouping on every episode."""
         return resolve_all(self.grouping, self.question.selected, self.question.vocabulary)
+
+    @cached_property
+    def replans(self) -> Tables:
+        """See `measures.aggregate.replan_tables`."""
+        return replan_tables(self.measured, self.grouping)
 
     @cached_property
     def overall(self) -> dict[str, Any]:
@@ -205,10 +209,9 @@ def analyse(question: Question, without_sinks: SinkRule | None = None) -> Analys
         question = question_without_sinks(question, sinks, without_sinks)
     grouping = question.grouping
     measured = measure_episodes(question)
-    replans = replan_tables(measured, grouping)
-    episodes = episode_tables(replans, grouping)
+    episodes = episode_tables_of(measured, grouping)
     tasks = task_tables(episodes, grouping, estimand=question.settings.intervals)
-    return Analysis(question, measured, replans, episodes, tasks, sinks)
+    return Analysis(question, measured, episodes, tasks, sinks)
 
 
 def _described(analysis: Analysis) -> AnalysedRun:
