@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import types
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import nn
 
+from vla_attention.capture.torch_policies.attention_calls import CallShape
 from vla_attention.capture.torch_policies.unseen_attention import refuse_unseen_settings
 from vla_attention.schemas.errors import BadArgument
 
@@ -40,12 +41,15 @@ class FoundPolicy:
         modules: by path, see `modules_of`.
         attending: those in whose own forward attention can run.
         simple: the others that have a forward: torch's modules without children, such as `nn.Linear`.
+        softmaxes: filled by blocks that look at every function: what a softmax by hand turned out to be, if all that
+            looked alike were attention of one shape, and None if not; see `WatchedBlock.expected`.
     """
 
     policy: object
     modules: Mapping[str, nn.Module]
     attending: tuple[nn.Module, ...]
     simple: tuple[nn.Module, ...]
+    softmaxes: dict[CallShape, CallShape | None] = field(default_factory=dict)
 
 
 def find_policy(policy: object) -> FoundPolicy:

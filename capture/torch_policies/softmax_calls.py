@@ -178,6 +178,11 @@ class Softmaxes:
         # Of (batch, kv_head, group, query, key), the heads are both; of one axis, the module tells the heads.
         batch, heads = (lead[0], lead[1] * lead[2]) if len(lead) == 3 else batch_and_heads(lead, where.module)
         shape = self._block.new_shape(where, "softmax", (batch, heads, heads, queries, keys), logits.dtype)
+        asked = replace(shape, number=0)
+        expected = self._block.expected(asked)
+        if expected is not None and self._block.passes(replace(expected, number=shape.number)):
+            return function(*args, **kwargs)  # attention that is not wanted need not be followed
+        self._block.began_softmax(asked)
         change = self._block.change(shape)
         if change is None:
             result = function(*args, **kwargs)
@@ -290,6 +295,7 @@ class Softmaxes:
         altered = followed.altered or softmax.altered or (own is not None and _times_written(own) != before_result)
         if softmax.logits is not None and _times_written(softmax.logits) != before_logits:
             softmax.logits = None
+        self._block.softmax_met_values(before, shape)
         if not self._block.changes and self._block.passes(shape):
             return
         tensors = SoftmaxTensors(softmax, product, probabilities, altered, values, result)

@@ -52,7 +52,7 @@ def watch_attention(policy: object, watcher: Watcher, *, every_function: bool = 
             "one block records one policy. Close the other block first."
         )
     try:
-        block = WatchedBlock(found, watcher)
+        block = WatchedBlock(found, watcher, every_function=every_function)
         try:
             functions = SeenFunctions(block, every_function=every_function)
             with (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import types
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -52,7 +53,7 @@ class _ThreadState(threading.local):
 class WatchedBlock:
     """What `watch_attention` and the kinds of calls share during one block."""
 
-    def __init__(self, found: FoundPolicy, watcher: Watcher) -> None:
+    def __init__(self, found: FoundPolicy, watcher: Watcher, *, every_function: bool = True) -> None:
         self.policy = found.policy
         self.paths = {id(module): path for path, module in found.modules.items()}
         self.watcher = watcher
@@ -60,6 +61,10 @@ class WatchedBlock:
         self.error: BaseException | None = None
         #: Softmaxes by hand that were changed and met no values yet.
         self.changed: list[CallShape] = []
+        #: Softmaxes by hand that began, and those that met values: the shape as it began, and as it turned out to be.
+        self._began: Counter[CallShape] = Counter()
+        self._met_values: Counter[tuple[CallShape, CallShape]] = Counter()
+        self._every_function = every_function
         self._found = found
         #: Whether simple modules ran in a thread where nothing is seen.
         self._unseen_thread = False
@@ -128,6 +133,30 @@ class WatchedBlock:
                 return self._closed
             self._number += 1
             return True
+
+    def expected(self, asked: CallShape) -> CallShape | None:
+        """Return what a softmax by hand turns out to be, if blocks that looked at every function know.
+
+        asked: its shape without a number. None: it is not known, or looked at again in this block.
+        """
+        return None if self._every_function or self.changes else self._found.softmaxes.get(asked)
+
+    def began_softmax(self, asked: CallShape) -> None:
+        """Note a softmax by hand; asked: its shape without a number."""
+        if self._every_function:
+            self._began[asked] += 1
+
+    def softmax_met_values(self, asked: CallShape, shape: CallShape) -> None:
+        """Note that a softmax by hand met values: its shape as it began, and as it turned out to be."""
+        if self._every_function:
+            self._met_values[replace(asked, number=0), replace(shape, number=0)] += 1
+
+    def _learn(self) -> None:
+        """Remember what the softmaxes by hand of this block turned out to be."""
+        known = self._found.softmaxes
+        for asked, count in self._began.items():
+            found = [shape for (before, shape), times in self._met_values.items() if before == asked and times == count]
+            known[asked] = found[0] if found and known.get(asked, found[0]) == found[0] else None
 
     def saw(self, call: AttentionCall) -> None:
         """Tell the watcher about a call, and count it."""
@@ -204,6 +233,7 @@ class WatchedBlock:
                     "in methods that are no forward of a module, and no attention was seen. Call it in the "
                     "thread of the block."
                 )
+            self._learn()
 
     @contextmanager
     def following_modules(

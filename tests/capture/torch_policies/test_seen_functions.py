@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 
 import pytest
 import torch
@@ -16,7 +17,10 @@ import vla_attention as va
 from tests.capture.torch_policies.test_odd_policies import OddPolicy, layout
 from tests.kit.attention_modules import Attention, Policy, Seen
 from vla_attention.capture.torch_policies import seen_functions
+from vla_attention.capture.torch_policies.attention_calls import CallShape
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
+from vla_attention.capture.torch_policies.policy_modules import find_policy
+from vla_attention.capture.torch_policies.softmax_calls import Softmaxes
 from vla_attention.capture.torch_policies.watch import watch_attention
 from vla_attention.schemas.stores.reader import open_store
 
@@ -242,6 +246,81 @@ def test_a_session_looks_at_every_function_until_it_knows_better(tmp_path, monke
     assert asked == ways
     rows = [episode.read("joint/rows") for episode in open_store(tmp_path / "a.zarr").episodes]
     assert all((one == rows[0][0]).all() for episode in rows for one in episode)
+
+
+@dataclass
+class Wanting:
+    """A watcher that wants the calls of some modules only."""
+
+    wanted: tuple[str, ...] = ()
+    changes: bool = False
+    passed: list[CallShape] = field(default_factory=list)
+    seen: list[CallShape] = field(default_factory=list)
+
+    def change(self, shape):
+        raise AssertionError("nothing is changed")
+
+    def passes(self, shape):
+        if shape.module in self.wanted:
+            return False
+        self.passed.append(shape)
+        return True
+
+    def saw(self, call):
+        self.seen.append(call.shape)
+
+
+def test_softmaxes_that_are_not_wanted_are_followed_only_while_it_is_unknown_what_they_are(monkeypatch):
+    def grouped(query, key, value, mask):  # eight heads that share four of the values
+        rows = torch.softmax(query @ key.repeat_interleave(2, 1).transpose(-1, -2), -1)
+        torch.softmax(query.sum(-1), -1)  # no attention
+        return torch.einsum("bhgqk,bhkd->bhgqd", rows.unflatten(1, (4, 2)), value).flatten(1, 2)
+
+    policy, followed = small_policy(grouped, heads=8, kv_heads=4), []
+    own = Softmaxes._follow
+    monkeypatch.setattr(
+        Softmaxes,
+        "_follow",
+        lambda self, tensor, *given, **more: followed.append(1) or own(self, tensor, *given, **more),
+    )
+    hidden, memory = torch.randn(2, 5, 64), torch.randn(2, 7, 64)
+    found, expected = find_policy(policy), policy(hidden, memory)
+    counts, watchers = [], []
+    for every_function, wanted in ((True, ()), (False, ()), (False, ("layers.1",)), (True, ())):
+        followed.clear()
+        watchers.append(Wanting(wanted))
+        with watch_attention(found, watchers[-1], every_function=every_function):
+            assert torch.equal(policy(hidden, memory), expected)
+        counts.append(len(followed))
+    every, names, one, again = watchers
+    assert names.passed == every.passed == again.passed
+    assert [shape.kv_heads for shape in every.passed] == [4, 4]
+    assert [*one.passed, *one.seen] == every.passed
+    # Only what was seen to be attention throughout is passed; the other softmax is always followed.
+    assert counts[0] == counts[3] > counts[2] > counts[1] > 0
+
+
+def test_a_softmax_that_is_attention_only_at_times_is_always_followed():
+    def sometimes(query, key, value, mask):
+        rows = torch.softmax(query @ key.transpose(-1, -2), -1)
+        if not gates:
+            return rows @ value
+        gates.pop()
+        return functional.scaled_dot_product_attention(query, key, value)
+
+    gates: list[bool] = [True]
+    policy = small_policy(sometimes)
+    found = find_policy(policy)
+    kinds = []
+    for every_function, count in ((True, 1), (False, 1), (False, 0), (True, 0), (False, 1)):
+        gates[:] = [True] * count
+        watcher = Wanting()
+        with watch_attention(found, watcher, every_function=every_function):
+            policy(HIDDEN, MEMORY)
+        kinds.append([(shape.module, shape.kind) for shape in watcher.passed])
+    with_gate = [("layers.0", "sdpa"), ("layers.1", "softmax")]
+    without = [("layers.0", "softmax"), ("layers.1", "softmax")]
+    assert kinds == [with_gate, with_gate, without, without, with_gate]
 
 
 def test_a_later_call_by_another_name_is_an_error_that_says_so(tmp_path):
