@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vla_attention.capture.capture_command import run_capture_of_family
+from vla_attention.capture.doctor.arguments import DOCTOR_EXAMPLES, add_doctor_arguments
 from vla_attention.capture.environments.suites import ALL_SUITES, STANDARD_SUITES, SUITES
 from vla_attention.capture.interventions.arguments import add_intervention_arguments
 from vla_attention.capture.jobs.termination import Termination
@@ -24,6 +25,7 @@ from vla_attention.schemas.errors import listing
 _FURTHER_EXAMPLES = """\
   vla-capture status runs/libero_10.zarr                     what is there, what is missing, who is writing
   vla-capture repair runs/libero_10.zarr                     move damaged episodes aside; --resume records them again
+  vla-capture doctor                                         what this machine can do, and what is missing
   vla-capture parity CASE                                    our numbers against a reference's, on your own checkpoint
 """
 _VERIFY_HELP = "read every byte, instead of only seals, presence and sizes of files"
@@ -96,6 +98,17 @@ def build_parser(given: Sequence[str] = ()) -> argparse.ArgumentParser:
         "torch nor a GPU.",
     )
     _add_status_arguments(status)
+    doctor = commands.add_parser(
+        "doctor",
+        help="what this machine can do for a run, and what is missing for it",
+        description="Takes the options of a capture and prints a line for everything that it needs: threads, memory, "
+        "GPU, drawing, simulator and assets, disk, checkpoint, precision, time and size, each with what to do. Exit "
+        "code 1 when something is missing. With --accept, ten episodes of a published checkpoint are held against its "
+        "published success rate.",
+        epilog=f"examples:\n{DOCTOR_EXAMPLES}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_doctor_arguments(doctor, given[1:] if "doctor" in given[:1] else (), _add_capture_arguments)
     tasks = commands.add_parser("tasks", help="the tasks of a suite", description="The tasks of a suite by their ids.")
     tasks.add_argument("suite", metavar="SUITE", help="task suite")
     tasks.add_argument("--array", action="store_true", help="only the range of ids, as sbatch --array takes it")

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vla_attention.capture.budget import Choice, Fixed, choose_recording, recordings_by_size
-from vla_attention.capture.doctor.trial import run_trial, spread
 from vla_attention.capture.environments.base import EnvironmentSettings, Task
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.policies.policy import Policy
@@ -18,6 +17,7 @@ from vla_attention.capture.store.disk_estimate import DiskEstimate
 from vla_attention.capture.store.measured_size import mean_size
 from vla_attention.capture.store.store_root import read_existing_root
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run
+from vla_attention.capture.trial import run_trial, spread
 from vla_attention.schemas.stores.store_format import Recording, RootAttributes, RunMismatch
 
 #: Tasks whose first replans are tried: pictures of one scene may take twice as much as those of another.

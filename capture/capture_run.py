@@ -142,7 +142,7 @@ def _record_missing(
     wanted = tasks if settings.task_ids is None else tuple(tasks[number] for number in settings.task_ids)
     for task in wanted:
         check_initial_state_index(task, settings.num_episodes - 1)
-    changes = _plan_changes(settings, policy, tasks)
+    changes = plan_changes(settings, policy, tasks)
     machine = describe_machine(device)
     attributes = RootAttributes(
         format=FORMAT_NAME,
@@ -165,7 +165,7 @@ def _record_missing(
             policy,
             wanted,
             environment_settings,
-            _plan_changes(settings, policy, tasks),
+            plan_changes(settings, policy, tasks),
             termination.check,
         )
     store, estimate = open_within_budget(settings.store, attributes, settings.mode, budgeted)
@@ -227,7 +227,7 @@ def _policy_batch(settings: RunSettings, policy: Policy, device: str, num_envs: 
     return min(asked or default_policy_batch(policy, device, num_envs), num_envs)
 
 
-def _plan_changes(settings: RunSettings, policy: Policy, tasks: Sequence[Task]) -> RunChanges:
+def plan_changes(settings: RunSettings, policy: Policy, tasks: Sequence[Task]) -> RunChanges:
     """Return the run's interventions; what is known to be wrong with them is an error now, before the first episode."""
     instructions = {task.task_id: task.instruction for task in tasks}
     changes = RunChanges(interventions_for(settings.interventions, policy), instructions, settings.allow_empty)

@@ -19,6 +19,14 @@ def policy_families() -> tuple[PolicyFamily, ...]:
     return tuple(_load(module) for module in FAMILY_MODULES)
 
 
+def default_family() -> PolicyFamily:
+    """Return the family of the trained policy that comes along: the one whose success rate is known."""
+    families = policy_families()
+    return next(
+        family for family in families if any(rate.checkpoint in family.built_in for rate in family.published_rates)
+    )
+
+
 def family_of_kind(kind: str) -> PolicyFamily:
     """Return the family whose policies stores name `kind`; `UnknownName` lists the kinds of all families."""
     kinds = {known: family for family in policy_families() for known in family.kinds or (family.name,)}

@@ -10,6 +10,7 @@ from vla_attention.capture.policies.families import policy_families
 COMMANDS = [
     [],
     *([family.name] for family in policy_families()),
+    ["doctor"],
     ["parity"],
     ["repair"],
     ["rerun"],

@@ -10,12 +10,12 @@ import pytest
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.arguments import build_parser
 from vla_attention.capture.capture_run import plan_protocol, plan_recording
-from vla_attention.capture.doctor.trial import Trial, run_trial
 from vla_attention.capture.environments.base import EnvironmentSettings
 from vla_attention.capture.environments.suites import list_tasks
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.run_settings import run_settings
 from vla_attention.capture.store.measured_size import mean_size
+from vla_attention.capture.trial import Trial, run_trial
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.precision import parse_precision
 from vla_attention.schemas.stores.reader import open_store

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from vla_attention.capture.policies.cosmos.protocol import COSMOS
+from vla_attention.capture.policies.cosmos.published_rates import CHECKPOINT, PUBLISHED_RATES
 from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedScript
 from vla_attention.capture.policies.model_arguments import FORMER_NAMES, UNTRAINED_POLICIES, add_model_arguments
 from vla_attention.schemas.errors import BadArgument
@@ -15,10 +16,9 @@ if TYPE_CHECKING:
     from vla_attention.capture.policies.cosmos.policy import CosmosPolicy
     from vla_attention.schemas.stores.store_format import PolicyIdentity
 
-_CHECKPOINT = "nvidia/Cosmos-Policy-LIBERO-Predict2-2B"
 _EXAMPLES = f"""\
   vla-capture cosmos                                         untrained policy, built-in tasks
-  vla-capture cosmos --ckpt-path {_CHECKPOINT} --task-suite libero_10
+  vla-capture cosmos --ckpt-path {CHECKPOINT} --task-suite libero_10
 """
 
 
@@ -141,9 +141,10 @@ FAMILY = PolicyFamily(
     parity=ParityCases(recognises=_is_cosmos_case, run=_run_parity),
     published=PublishedScript(
         program="evaluate-attention-ratio-cosmos",
-        checkpoint=_CHECKPOINT,
+        checkpoint=CHECKPOINT,
         layers=(25, 26, 27),
         variables={"QUERY_FRAME": "--query-frame", "VISUAL_FRAME": "--visual-frame", "TEXT_FRAME": "--text-frame"},
     ),
+    published_rates=PUBLISHED_RATES,
     rebuild=_rebuild,
 )

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from vla_attention.capture.environments.episode_protocol import LEROBOT, OPENPI
 from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedScript
 from vla_attention.capture.policies.model_arguments import FORMER_NAMES, UNTRAINED_POLICIES, add_model_arguments
+from vla_attention.capture.policies.pi.published_rates import PUBLISHED_RATES
 from vla_attention.capture.policies.pi.shipped import CUBES_POLICY, SHIPPED
 from vla_attention.capture.policies.robot import Robot
 from vla_attention.schemas.jsonable import from_json
@@ -128,6 +129,7 @@ FAMILY = PolicyFamily(
         layers=(25, 26, 27),
         variables={"PROTOCOL": "--protocol"},
     ),
+    published_rates=PUBLISHED_RATES,
     kinds=("pi0", "pi05"),
     reads_data_sets=True,
     rebuild=_rebuild,

@@ -45,9 +45,14 @@ class Trial:
     step_seconds: float
     start_seconds: float
 
-    def seconds_of(self, replans: int, replan_steps: int) -> float:
-        """Seconds of one episode of that many replans, in one process that does one thing after another."""
-        return self.start_seconds + replans * (self.policy_seconds + replan_steps * self.step_seconds)
+    def seconds_of(self, replans: int, replan_steps: int, num_envs: int = 1) -> float:
+        """Seconds of one episode of that many replans, where `num_envs` simulators run at a time beside the policy.
+
+        The policy makes one call after another, and a simulator waits for its call and then makes its steps.
+        """
+        steps = replan_steps * self.step_seconds
+        per_replan = max(self.policy_seconds, (self.policy_seconds + steps) / num_envs)
+        return self.start_seconds / num_envs + replans * per_replan
 
 
 def run_trial(

@@ -1,0 +1,281 @@
+"""`vla-capture doctor`: a line for everything that the described run needs, and `--accept`."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vla_attention.capture.command_line import check_writable
+from vla_attention.capture.doctor.acceptance import find_published_rate, judge, share_of_tasks
+from vla_attention.capture.doctor.findings import Finding, something_missing
+from vla_attention.capture.doctor.machine import (
+    checked,
+    find_drawing,
+    find_gpu,
+    find_memory,
+    find_precision,
+    find_processor,
+)
+from vla_attention.capture.doctor.simulators import find_simulator
+from vla_attention.capture.jobs.termination import Termination
+from vla_attention.capture.run_settings import RecordingSettings, RunSettings, run_settings
+from vla_attention.schemas.command_line import format_bytes
+from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.threads import use_threads
+
+if TYPE_CHECKING:
+    from vla_attention.capture.policies.policy import Policy
+    from vla_attention.capture.trial import Trial
+    from vla_attention.schemas.stores.store_format import RootAttributes
+
+
+def run_doctor(arguments: argparse.Namespace, termination: Termination) -> int:
+    """Run `vla-capture doctor` on parsed arguments.
+
+    Returns 1 when something that the described run needs is missing, or `--accept` does not accept; otherwise 0.
+    """
+    if arguments.accept is not None:
+        return _accept(arguments, termination)
+    if arguments.published_rate is not None:
+        raise BadArgument("Cannot use --published-rate without --accept CHECKPOINT.")
+    if arguments.task_suite is None:
+        arguments.task_suite = arguments.family.default_suite
+    settings = run_settings(arguments)
+    findings = []
+    for finding in _findings(arguments, settings, termination):
+        findings.append(finding)
+        print(finding.describe(), flush=True)
+    if something_missing(findings):
+        missing = ", ".join(finding.what for finding in findings if finding.status == "missing")
+        print(f"\nThe run cannot be made as described: {missing}.")
+        return 1
+    print("\nNothing is missing for the run.")
+    return 0
+
+
+def _findings(arguments: argparse.Namespace, settings: RunSettings, termination: Termination) -> Iterator[Finding]:
+    threads = use_threads(arguments.threads)
+    yield find_processor(threads)
+    try:
+        import torch
+
+        from vla_attention.capture.device import load_torch
+    except ImportError as error:
+        yield Finding("torch", "missing", f"torch cannot be loaded ({error}).", "Run 'make setup'.")
+        return
+    yield find_memory()
+    gpu = find_gpu(arguments.device, torch)
+    yield gpu
+    drawing = find_drawing()
+    yield drawing
+    simulator = find_simulator(settings.suite, settings.libero_assets)
+    yield from simulator
+    store = _find_place(settings)
+    yield store
+    if gpu.status == "missing":
+        return  # the policy cannot be loaded there
+    device = load_torch(arguments.device, threads.number)
+    if arguments.no_trial:
+        text = f"{arguments.checkpoint} is not loaded, nor are time and size measured (--no-trial)."
+        yield Finding("checkpoint", "note", text)
+        return
+    policy, checkpoint = _load(arguments, device)
+    yield checkpoint
+    if policy is None:
+        return
+    identity = policy.identity()
+    yield find_precision(str(identity.config.get("dtype", "")), device, torch)
+    if something_missing([drawing, *simulator, store]):
+        yield Finding("trial", "note", "Time and size are not measured before what is missing is there.")
+        return
+    yield from _try(settings, policy, device, termination)
+
+
+def _load(arguments: argparse.Namespace, device: str) -> tuple[Policy | None, Finding]:
+    """Load the policy of the described run; None, and why, where that is impossible."""
+    import torch
+
+    loaded: list[Policy] = []
+
+    def load() -> str:
+        loaded.append(arguments.family.build(arguments, device))
+        identity = loaded[0].identity()
+        size = sum(tensor.nbytes for tensor in loaded[0].model.state_dict().values())
+        facts = ", ".join([identity.family, identity.checkpoint_format, f"{format_bytes(size)} of weights"])
+        return f"{identity.name} ({facts}), {'random weights' if identity.untrained else 'trained'}."
+
+    try:
+        finding = checked("checkpoint", load)
+    except (MemoryError, torch.OutOfMemoryError) as error:
+        line = str(error).splitlines()[0] if str(error) else "not enough memory"
+        to_do = "Use a machine with more memory, or --dtype bfloat16."
+        finding = Finding("checkpoint", "missing", f"{arguments.checkpoint} does not fit ({line}).", to_do)
+    return (loaded[0] if finding.status == "ok" else None), finding
+
+
+def _find_place(settings: RunSettings) -> Finding:
+    """Return whether the store can be written where the run would write it, and the room there."""
+
+    def look() -> str:
+        from vla_attention.capture.store.store_writer import refuse_existing
+
+        if settings.mode == "new" and settings.store.exists():
+            refuse_existing(settings.store)
+        check_writable(settings.store.parent, "--store")
+        return f"{format_bytes(_free(settings.store))} free for {settings.store}."
+
+    return checked("disk", look)
+
+
+def _free(path: Path) -> int:
+    existing = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
+    return shutil.disk_usage(existing).free
+
+
+@dataclass(frozen=True)
+class _PlannedRun:
+    attributes: RootAttributes
+    num_tasks: int
+    trial: Trial
+
+
+def _try(settings: RunSettings, policy: Policy, device: str, termination: Termination) -> Iterator[Finding]:
+    """Run the first replans; yield time and size of the run that is described."""
+    from vla_attention.capture.budget import choose_recording, recordings_by_size
+    from vla_attention.capture.rollout.episode import max_replans
+    from vla_attention.schemas.stores.store_format import Recording
+
+    try:
+        planned = _plan(settings, policy, device, termination)
+    except UserError as error:
+        yield Finding("trial", "missing", str(error))
+        return
+    trial, attributes = planned.trial, planned.attributes
+    protocol, episodes = attributes.protocol, planned.num_tasks * settings.num_episodes
+    replans = max_replans(protocol)
+    yield _time(settings, trial, replans, protocol.replan_steps, episodes)
+    candidates: tuple[Recording, ...] = (attributes.recording,)
+    if settings.budget is not None:
+        candidates = recordings_by_size(attributes.recording, policy.num_denoise_steps, settings.fixed)
+    try:
+        budget = settings.budget if settings.budget is not None else 1 << 62
+        choice = choose_recording(
+            candidates,
+            budget,
+            lambda recording: trial.sample.size(recording).estimate(replans, episodes),
+            policy.num_denoise_steps,
+        )
+    except UserError as error:
+        yield Finding("size", "missing", str(error))
+        return
+    estimate, free = choice.estimate, _free(settings.store)
+    text = (
+        f"At most {format_bytes(estimate.total_bytes)}: {episodes} episodes, up to {replans} replans each, "
+        f"{format_bytes(estimate.bytes_per_replan)} a replan and {format_bytes(estimate.episode_overhead)} an episode; "
+        f"measured on {len(trial.sample.records)} replans."
+    )
+    if settings.budget is not None:
+        text = " ".join([text, *choice.lines])
+    if estimate.total_bytes > free:
+        to_do = f"{format_bytes(free)} are free: give --budget, fewer episodes, or another --store."
+        yield Finding("size", "missing", text, to_do)
+    else:
+        yield Finding("size", "ok", text)
+
+
+def _plan(settings: RunSettings, policy: Policy, device: str, termination: Termination) -> _PlannedRun:
+    """Plan the run as `run_capture` does, and try its first replans."""
+    from vla_attention.capture.budget import recordings_by_size
+    from vla_attention.capture.capture_run import plan_changes, plan_protocol, plan_recording
+    from vla_attention.capture.environments.base import EnvironmentSettings
+    from vla_attention.capture.environments.suites import list_tasks
+    from vla_attention.capture.provenance import describe_machine
+    from vla_attention.capture.rollout.episode import check_protocol
+    from vla_attention.capture.trial import run_trial
+    from vla_attention.schemas.stores.store_format import FORMAT_NAME, FORMAT_VERSION, RootAttributes
+
+    evaluation = settings.protocol or policy.default_protocol
+    protocol = plan_protocol(settings, evaluation, policy)
+    check_protocol(protocol, policy)
+    tasks = list_tasks(settings.suite)
+    wanted = tasks if settings.task_ids is None else tuple(tasks[number] for number in settings.task_ids)
+    attributes = RootAttributes(
+        format=FORMAT_NAME,
+        format_version=FORMAT_VERSION,
+        policy=policy.identity(),
+        protocol=protocol,
+        recording=plan_recording(settings.recording, policy)[0],
+        sites=policy.sites,
+        provenance=describe_machine(device),
+    )
+    tried = attributes
+    if settings.budget is not None:
+        largest = recordings_by_size(attributes.recording, policy.num_denoise_steps, settings.fixed)[0]
+        tried = replace(attributes, recording=largest)
+    changes = plan_changes(settings, policy, tasks)
+    environment = EnvironmentSettings(evaluation, settings.libero_assets)
+    trial = run_trial(policy, tried, wanted[0], environment, changes, termination.check)
+    return _PlannedRun(attributes, len(wanted), trial)
+
+
+def _time(settings: RunSettings, trial: Trial, replans: int, replan_steps: int, episodes: int) -> Finding:
+    from vla_attention.capture.rollout.pipeline import default_num_envs
+
+    num_envs = min(settings.num_envs or default_num_envs(), episodes)
+    seconds = trial.seconds_of(replans, replan_steps, num_envs) * episodes
+    simulators = f"{num_envs} simulators" if num_envs > 1 else "one simulator"
+    return Finding(
+        "time",
+        "ok",
+        f"At most {_duration(seconds)}, with {simulators}, if every episode runs to its last step: a policy call takes "
+        f"{trial.policy_seconds:.2g} s, a step {trial.step_seconds:.2g} s, the start of an episode "
+        f"{trial.start_seconds:.2g} s.",
+    )
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def _accept(arguments: argparse.Namespace, termination: Termination) -> int:
+    """Run ten episodes of the checkpoint, and print how its success stands to the published rate."""
+    if arguments.task_id is not None or arguments.no_trial or arguments.budget is not None or arguments.resume:
+        raise BadArgument("Cannot use --task-id, --budget, --resume or --no-trial with --accept: it runs ten episodes.")
+    published = find_published_rate(arguments.accept, arguments.task_suite, arguments.family, arguments.published_rate)
+    arguments.checkpoint, arguments.task_suite = arguments.accept, published.suite
+    threads = use_threads(arguments.threads)
+    settings = run_settings(arguments)
+
+    from vla_attention.capture.capture_run import run_capture
+    from vla_attention.capture.device import load_torch
+    from vla_attention.capture.trial import spread
+
+    tasks, episodes = share_of_tasks(settings.suite.num_tasks)
+    chosen = spread(range(settings.suite.num_tasks), tasks)
+    device = load_torch(arguments.device, threads.number)
+    policy = arguments.family.build(arguments, device)
+    with ExitStack() as stack:
+        settings = replace(settings, task_ids=tuple(chosen), num_episodes=episodes)
+        if arguments.store is None:
+            # Success is all that is asked: the least is recorded, and nothing of it is kept.
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="vla-accept-")))
+            least = RecordingSettings(
+                layers=(policy.num_layers - 1,), denoise_steps=("last",), frames=False, contributions=False
+            )
+            settings = replace(settings, store=folder / settings.store.name, mode="new", recording=least)
+        results = run_capture(settings, policy, device, termination)
+    failed = [f"task {result.task_id} episode {result.episode_index}" for result in results if not result.success]
+    verdict = judge(len(results) - len(failed), len(results), published, failed)
+    print()
+    for line in verdict.lines:
+        print(line)
+    return 0 if verdict.accepted else 1

@@ -1,0 +1,190 @@
+"""What the machine has: processor and threads, GPU, precision, memory, drawing without a display."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from vla_attention.capture.doctor.findings import Finding
+from vla_attention.schemas.command_line import format_bytes
+from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.threads import Threads
+
+#: Seconds after which a check of drawing counts as hanging; the first picture of a GPU's driver can take half a minute.
+_DRAWING_TIMEOUT_S = 120
+#: Instructions with which a processor multiplies bfloat16 itself.
+_BFLOAT16_FLAGS = ("amx_bf16", "avx512_bf16", "bf16")
+
+_DRAW = """
+import json, os, sys
+import mujoco
+model = mujoco.MjModel.from_xml_string(
+    "<mujoco><worldbody><light pos='0 0 3'/><geom type='box' size='.2 .2 .2' rgba='1 0 0 1'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+with mujoco.Renderer(model, 64, 64) as renderer:
+    renderer.update_scene(data)
+    picture = renderer.render()
+    from OpenGL import GL
+    name = GL.glGetString(GL.GL_RENDERER).decode()
+print(json.dumps({"renderer": name, "varies": bool(picture.std() > 1)}))
+"""
+
+
+def find_processor(threads: Threads) -> Finding:
+    """Return the number of cores and threads."""
+    try:
+        cores = len(os.sched_getaffinity(0))
+    except AttributeError:  # macOS and Windows bind no process to processors
+        cores = os.cpu_count() or 1
+    text = f"{cores} processors for this process, {threads.number} threads for the policy ({threads.source})."
+    if threads.number > cores:
+        return Finding(
+            "processor", "note", text, f"More threads than processors wait for each other: --threads {cores}."
+        )
+    return Finding("processor", "ok", text)
+
+
+def find_memory(needed: int = 0, meminfo: Path = Path("/proc/meminfo")) -> Finding:
+    """Return the memory that is available; it is missing where that is less than `needed` bytes."""
+    available = _available_memory(meminfo)
+    if available is None:
+        return Finding("memory", "note", "This system does not say how much is available.")
+    text = f"{format_bytes(available)} available."
+    if needed > available:
+        return Finding(
+            "memory",
+            "missing",
+            text,
+            f"The weights take {format_bytes(needed)}: use a machine with more, or --dtype bfloat16.",
+        )
+    return Finding("memory", "ok", text)
+
+
+def _available_memory(meminfo: Path) -> int | None:
+    try:
+        lines = meminfo.read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    values = [line.split()[1] for line in lines if line.startswith("MemAvailable:")]
+    return int(values[0]) * 1024 if values and values[0].isdecimal() else None
+
+
+def find_gpu(device: str, torch: Any, driver: Path = Path("/proc/driver/nvidia/version")) -> Finding:
+    """Return the GPU that the run would use; it is missing where `device` (the value of `--device`) asks for one.
+
+    torch: the module. driver: a file that NVIDIA's driver makes.
+    """
+    asked = device.startswith("cuda")
+    if not torch.cuda.is_available():
+        if torch.version.cuda is None:
+            why = f"torch {torch.__version__} is built without CUDA"
+            to_do = "For a GPU install a build with CUDA, see pytorch.org."
+        elif driver.exists():
+            why = f"torch {torch.__version__} finds none, though there is a driver"
+            visible = os.environ.get("CUDA_VISIBLE_DEVICES", "not set")
+            to_do = f"Look at CUDA_VISIBLE_DEVICES ('{visible}') and at the driver's version."
+        else:
+            why, to_do = "there is no NVIDIA driver", "In a batch job ask for one, for instance sbatch --gres=gpu:1."
+        text = f"None: {why}."
+        if asked:
+            return Finding("GPU", "missing", f"{text} --device {device} needs one.", f"{to_do} Or use --device cpu.")
+        return Finding("GPU", "note", f"{text} The policy runs on the processor.", to_do)
+    properties = torch.cuda.get_device_properties(device if asked else "cuda")
+    free, total = torch.cuda.mem_get_info(device if asked else "cuda")
+    text = (
+        f"{properties.name}, {format_bytes(free)} of {format_bytes(total)} free, compute capability "
+        f"{properties.major}.{properties.minor}, torch {torch.__version__} with CUDA {torch.version.cuda}."
+    )
+    if device == "cpu":
+        return Finding("GPU", "note", f"{text} --device cpu leaves it unused.")
+    return Finding("GPU", "ok", text)
+
+
+def find_precision(dtype: str, device: str, torch: Any, cpuinfo: Path = Path("/proc/cpuinfo")) -> Finding:
+    """Return the precision that the policy computes in, and whether this device is made for it.
+
+    dtype: `float32` or `bfloat16`, empty where the policy does not say. device: without `auto`.
+    """
+    text = f"{dtype or 'float32'} on {device}."
+    if dtype != "bfloat16":
+        return Finding("precision", "ok", text)
+    if device.startswith("cuda"):
+        if torch.cuda.is_bf16_supported(including_emulation=False):
+            return Finding("precision", "ok", text)
+        return Finding("precision", "note", f"{text} This GPU has no bfloat16 of its own.", "--dtype float32 is exact.")
+    if any(flag in _processor_flags(cpuinfo) for flag in _BFLOAT16_FLAGS):
+        return Finding("precision", "ok", text)
+    return Finding(
+        "precision",
+        "note",
+        f"{text} This processor has no instructions for it ({', '.join(_BFLOAT16_FLAGS)}).",
+        "It saves memory, and --dtype float32 is as fast or faster.",
+    )
+
+
+def _processor_flags(cpuinfo: Path) -> set[str]:
+    try:
+        lines = cpuinfo.read_text(encoding="ascii", errors="replace").splitlines()
+    except OSError:
+        return set()
+    return {flag for line in lines if line.startswith(("flags", "Features")) for flag in line.split(":")[1].split()}
+
+
+#: Runs a Python program in a process of its own with an environment; returns its exit code, output and errors.
+RunProgram = Callable[[str, Mapping[str, str]], tuple[int, str, str]]
+
+
+def _run_program(program: str, environment: Mapping[str, str]) -> tuple[int, str, str]:
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", program],
+            env=dict(environment),
+            capture_output=True,
+            text=True,
+            timeout=_DRAWING_TIMEOUT_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return 1, "", f"no picture within {_DRAWING_TIMEOUT_S} s"
+    return done.returncode, done.stdout, done.stderr
+
+
+def find_drawing(run_program: RunProgram = _run_program) -> Finding:
+    """Draw a picture without a display, in a process of its own: drivers that do not fit end the whole process."""
+    if importlib.util.find_spec("mujoco") is None:
+        return Finding("drawing", "missing", "MuJoCo is not installed.", "Run 'make setup'.")
+    backend = os.environ.get("MUJOCO_GL", "egl")
+    code, output, errors = run_program(_DRAW, {**os.environ, "MUJOCO_GL": backend})
+    if code:
+        last = (errors.strip().splitlines() or [f"the process ended with code {code}"])[-1]
+        return Finding(
+            "drawing",
+            "missing",
+            f"MuJoCo cannot draw with MUJOCO_GL={backend} ({last}).",
+            "Run scripts/ensure_rendering.sh, which names the system's packages; on a node with a GPU its driver needs "
+            "libEGL_nvidia; MUJOCO_GL=osmesa draws without EGL.",
+        )
+    drawn = json.loads(output.splitlines()[-1])
+    text = f"MUJOCO_GL={backend} draws with {drawn['renderer']}."
+    if not drawn["varies"]:
+        return Finding("drawing", "missing", f"{text} The picture is empty.", "Try MUJOCO_EGL_DEVICE_ID=0, 1 ...")
+    if "llvmpipe" in drawn["renderer"].casefold() or "softpipe" in drawn["renderer"].casefold():
+        return Finding(
+            "drawing", "note", f"{text} That is the processor.", "On a node with a GPU, its EGL driver is faster."
+        )
+    return Finding("drawing", "ok", text)
+
+
+def checked(what: str, check: Callable[[], str]) -> Finding:
+    """Return a check that gives a text when all is well, and raises a `UserError` that says what to do otherwise."""
+    try:
+        return Finding(what, "ok", check())
+    except UserError as error:
+        return Finding(what, "missing", str(error))
