@@ -1,57 +1,59 @@
-"""Time and memory of an analysis of fifty episodes on a laptop, beside plain zarr-python and xarray with dask.
+"""Time, bytes and memory of an analysis, beside only decoding the same chunks, zarr-python, and xarray with dask.
 
-Usage: python benchmarks/analysis_speed.py [--store PATH] [--episodes 50] [--replans 52] [--only NAME ...]
+Usage: OMP_NUM_THREADS=2 python benchmarks/analysis_speed.py [--store PATH] [--episodes 50] [--parts scan ...]
 
 Writes a store of the shape of pi0.5 in LIBERO with the real writer, unless it exists: ten tasks, 18 layers, 8 heads,
-first and last denoise step, 978 keys, rows averaged over the queries, made-up rows with sinks and heavy tails. Each
-measurement is a process of its own; its wall time from start to end and its peak resident memory are printed. Nothing
-is asserted. The comparison with xarray needs dask (`pip install dask`).
+first and last denoise step, 978 keys, rows averaged over the queries, made-up rows with sinks and heavy tails. What it
+measures goes to docs/benchmarks/analysis_speed.json; nothing is asserted. The parts:
+
+    scan       in one process, in turn, with OMP_NUM_THREADS threads: decoding every chunk of the rows (read, crc32c,
+               Blosc) and nothing else; masses of words; the whole question from opening the store to tables with
+               intervals; the same masses by a loop with zarr-python, and by xarray with dask (`pip install dask`)
+    bytes      what the process reads for all layers and for three of eighteen, as Linux counts it
+    processes  whole `vla-analyze` processes without the cache: wall seconds and peak memory
+    memory     peak memory at 50, 100 and 200 episodes; of one head, because masses of more are as large
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import resource
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
-import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
+
+from measurement import ROOT, Table, measured, ratios, run_process, take_turns, write_rows
+
+sys.path.insert(0, str(ROOT))
 
 import numpy as np
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
+from vla_attention.analyze.measures.question import ask
+from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.measures.steps import measure_episodes
+from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 
-PYTHON_LOOP = """
-import sys, numpy as np, zarr
-from pathlib import Path
-weights = np.load(sys.argv[2])
-out = []
-for episode in sorted(Path(sys.argv[1], "episodes").glob("task*")):
-    rows = zarr.open_array(episode / "joint/rows", mode="r")
-    for layer in range(rows.shape[1]):
-        for denoise in range(rows.shape[2]):
-            out.append(rows[:, layer, denoise].mean(axis=(1, 2)) @ weights)
-print(np.concatenate(out).shape)
-"""
-XARRAY_DASK = """
-import sys, numpy as np, xarray as xr
-from pathlib import Path
-weights = xr.DataArray(np.load(sys.argv[2]), dims=("key", "group"))
-out = []
-for episode in sorted(Path(sys.argv[1], "episodes").glob("task*")):
-    data = xr.open_zarr(episode / "joint", consolidated=False, zarr_format=3, chunks={})
-    out.append(data["rows"].mean(("head", "query")).dot(weights, dim="key").compute())
-print(sum(part.size for part in out))
-"""
+WORDS = ("--group", "soup=word:soup", "--group", "v=role:image", "--ratio", "v/soup")
+SETTINGS = AnalysisSettings(groups=("soup=word:soup", "v=role:image"), ratio="v/soup")
+#: The command of each row of the part `processes`, after `vla-analyze STORE`.
+COMMANDS = {
+    "default: tables, results file, summary, pictures": (),
+    "default, --no-plots": ("--no-plots",),
+    "spans (--grouping cameras --no-plots)": ("--grouping", "cameras", "--no-plots"),
+    "words (--group soup=word:soup ... --no-plots)": (*WORDS, "--no-plots"),
+    "objects (--grouping objects --no-plots)": ("--grouping", "objects", "--no-plots"),
+}
 
 
-def make_store(path: Path, episodes: int, replans: int) -> None:
-    """Write the store; fifty episodes take a minute or two."""
+def make_store(path: Path, episodes: int, replans: int, heads: int) -> None:
+    """Write the store; fifty episodes of eight heads take a minute or two."""
     from vla_attention.testing.stores import StoreSpec, write_store
     from vla_attention.testing.tokens import libero_tokens
 
@@ -61,26 +63,162 @@ def make_store(path: Path, episodes: int, replans: int) -> None:
         episodes=episodes // 10,
         layers=tuple(range(18)),
         num_layers=18,
-        heads=tuple(range(8)),
+        heads=tuple(range(heads)),
         frames=False,
         contributions=True,
         num_action_queries=10,
         tokens=libero_tokens(replans),
     )
-    began = time.perf_counter()
     write_store(path, spec=spec)
-    print(f"wrote {path} in {time.perf_counter() - began:.0f} s")
 
 
-def measured(command: list[str]) -> tuple[float, float]:
-    """Wall seconds and peak resident megabytes of a process."""
-    began = time.perf_counter()
-    # What is measured is an analysis without the cache of an earlier one.
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, cwd=ROOT, env={**os.environ, "VLA_CACHE": "off"})
-    _, status, usage = os.wait4(process.pid, 0)
-    if status:
-        raise SystemExit(f"failed: {' '.join(command)}")
-    return time.perf_counter() - began, usage.ru_maxrss / 1024
+def made(path: Path, episodes: int, replans: int, heads: int = 8) -> Path:
+    """The store, written by a process of its own: a child's peak memory counts from what its parent holds."""
+    if not path.exists():
+        numbers = [str(number) for number in (episodes, replans, heads)]
+        subprocess.run([sys.executable, __file__, "--make", str(path), *numbers], check=True)
+    return path
+
+
+def decode_only(store: Path, threads: int) -> Callable[[], None]:
+    """Read and decode every chunk of the rows, into memory that is used again; the positions are read beforehand."""
+    from vla_attention.schemas.stores.digest import crc32c
+
+    def positions(episode: StoredEpisode) -> tuple[Path, list[tuple[int, int]], int]:
+        name = "joint/rows/c/0/0/0/0/0/0"
+        shard = episode.files.shard(name)
+        assert shard is not None
+        replans, *_, heads, queries, keys = episode.shape_of("joint/rows")
+        block = -(-replans // 8) * 8
+        return (
+            episode.folder / name,
+            [(int(at), int(size) - 4) for at, size in shard.index],
+            block * heads * queries * keys,
+        )
+
+    def decode(of_episode: tuple[Path, list[tuple[int, int]], int]) -> None:
+        from numcodecs import blosc
+
+        path, places, numbers = of_episode
+        memory = np.empty(numbers, np.float32)
+        with path.open("rb", buffering=0) as file:
+            for at, size in places:
+                frame = os.pread(file.fileno(), size, at)
+                crc32c(frame)
+                blosc.decompress(frame, memory)
+
+    known = [positions(episode) for episode in open_store(store).episodes]
+
+    def run() -> None:
+        with ThreadPoolExecutor(threads) as executor:
+            list(executor.map(decode, known))
+
+    return run
+
+
+def scan_of(store: Path) -> Callable[[], None]:
+    """Masses of a grouping of words, from a store whose tokens are known."""
+    question = ask([open_store(store)], SETTINGS)
+    return lambda: (measure_episodes(question, progress=lambda _: None), None)[1]
+
+
+def whole_question(store: Path) -> None:
+    """From opening the store to all tables with intervals."""
+    from vla_attention.analyze.ratios.analysis import analyse
+
+    analyse(ask([open_store(store)], SETTINGS))
+
+
+def zarr_loop(store: Path, weights: np.ndarray[Any, Any]) -> None:
+    """Masses of as many groups, a layer and denoise step at a time."""
+    import zarr
+
+    for episode in sorted(Path(store, "episodes").glob("task*")):
+        rows: Any = zarr.open_array(episode / "joint/rows", mode="r")
+        for layer in range(rows.shape[1]):
+            for denoise in range(rows.shape[2]):
+                rows[:, layer, denoise].mean(axis=(1, 2)) @ weights
+
+
+def xarray_dask(store: Path, weights: np.ndarray[Any, Any], threads: int) -> None:
+    """The same with chunks as dask's tasks."""
+    import dask
+    import xarray
+
+    named = xarray.DataArray(weights, dims=("key", "group"))
+    with dask.config.set(scheduler="threads", num_workers=threads):
+        for episode in sorted(Path(store, "episodes").glob("task*")):
+            data = xarray.open_zarr(episode / "joint", consolidated=False, zarr_format=3, chunks={})
+            data["rows"].mean(("head", "query")).dot(named, dim="key").compute()
+
+
+def measure_scan(store: Path, rounds: int, threads: int) -> Table:
+    """The part `scan`."""
+    weights = np.random.default_rng(0).random((978, 3)).astype(np.float32)
+    decode = "decoding alone"
+    calls: dict[str, Callable[[], object]] = {
+        decode: decode_only(store, threads),
+        "masses of words (scan)": scan_of(store),
+        "the whole question: open, resolve, scan, tables with intervals": lambda: whole_question(store),
+        "a loop with zarr-python: masses alone": lambda: zarr_loop(store, weights),
+    }
+    if find_spec("dask") is not None:
+        calls["xarray and dask: masses alone"] = lambda: xarray_dask(store, weights, threads)
+    seconds = take_turns(calls, rounds)
+    rows = [
+        {"what": what, "seconds": measured(values), "times": measured(ratios(values, seconds[decode]))}
+        for what, values in seconds.items()
+    ]
+    scan = seconds["masses of words (scan)"]
+    for row, values in zip(rows, seconds.values(), strict=True):
+        row["of_scan"] = measured(ratios(values, scan))
+    count = len(open_store(store).episodes)
+    columns = {"what": "what", "seconds": "seconds", "times": "times decoding", "of_scan": "times the scan"}
+    return Table(columns, rows, f"{count} episodes, {threads} threads; ratios are of the same round.")
+
+
+def measure_bytes(store: Path) -> Table:
+    """The part `bytes`."""
+
+    def bytes_read(layers: tuple[int, ...] | None) -> int:
+        def so_far() -> int:
+            found = re.search(r"rchar: (\d+)", Path("/proc/self/io").read_text())
+            assert found is not None
+            return int(found[1])
+
+        before = so_far()
+        settings = AnalysisSettings(groups=SETTINGS.groups, ratio=SETTINGS.ratio, layers=layers)
+        measure_episodes(ask([open_store(store)], settings), progress=lambda _: None)
+        return so_far() - before
+
+    bytes_read((0,))  # modules that are imported on first use
+    every, three = bytes_read(None), bytes_read((3, 4, 17))
+    rows = [
+        {"what": "all 18 layers", "megabytes": every / 1e6, "part": 1.0},
+        {"what": "three layers", "megabytes": three / 1e6, "part": three / every},
+    ]
+    return Table({"what": "masses of words", "megabytes": "MB read", "part": "part"}, rows)
+
+
+def measure_processes(stores: Sequence[Path], rounds: int, kinds: Sequence[str]) -> Table:
+    """The parts `processes` and `memory`."""
+    rows = []
+    for kind in kinds:
+        row: dict[str, Any] = {"what": kind}
+        for store in stores:
+            with tempfile.TemporaryDirectory() as output:
+                given = [str(store), *COMMANDS[kind], "--output", output]
+                command = [sys.executable, "-m", "vla_attention.analyze", *given]
+                costs = [run_process(command, cwd=ROOT) for _ in range(rounds)]
+            of = f" of {store.stem}" if len(stores) > 1 else ""
+            row |= {f"seconds{of}": measured([cost.seconds for cost in costs])}
+            row |= {f"peak{of}": max(cost.peak_mb for cost in costs)}
+        rows.append(row)
+    columns = {"what": "vla-analyze STORE ..."}
+    for name in rows[0]:
+        if name != "what":
+            columns[name] = name.replace("peak", "peak MB").replace(" of ", ", ")
+    return Table(columns, rows)
 
 
 def main() -> None:
@@ -88,82 +226,33 @@ def main() -> None:
     parser.add_argument("--store", type=Path, help="written if it does not exist (default: a temporary one)")
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--replans", type=int, default=52)
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="measure only these")
-    parser.add_argument("--repeats", type=int, default=3, help="runs of each; the fastest is printed (default: 3)")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--parts", nargs="+", default=["scan", "bytes", "processes"])
     arguments = parser.parse_args()
+    os.environ["VLA_CACHE"] = "off"  # an analysis that was made before is not measured
+    threads = int(os.environ.get("OMP_NUM_THREADS", "2"))
     scratch = Path(tempfile.mkdtemp(prefix="analysis_speed_"))
-    store = arguments.store or scratch / "fifty.zarr"
-    if not store.exists():
-        # In a process of its own: a child's peak memory counts from what its parent holds when it starts it.
-        subprocess.run(
-            [sys.executable, __file__, "--make", str(store), str(arguments.episodes), str(arguments.replans)],
-            check=True,
-        )
-    size = sum(file.stat().st_size for file in store.rglob("*") if file.is_file())
-    print(f"{store}: {size / 1e9:.2f} GB in {sum(1 for _ in store.rglob('*'))} files; {os.cpu_count()} cores")
-    weights = np.random.default_rng(0).random((978, 4)).astype(np.float32)
-    np.save(scratch / "weights.npy", weights)
-    ours = [sys.executable, "-m", "vla_attention.analyze"]
-    rest = [str(store), "--output", str(scratch / "out")]
-    cases = {
-        "default": [*ours, *rest],
-        "default-no-plots": [*ours, *rest, "--no-plots"],
-        "span": [*ours, *rest, "--no-plots", "--grouping", "cameras"],
-        "span-tables": ["env", "OPENBLAS_NUM_THREADS=1", sys.executable, __file__, "--span-tables", str(store)],
-        "words": [
-            *ours,
-            *rest,
-            "--no-plots",
-            "--group",
-            "soup=word:soup",
-            "--group",
-            "v=role:image",
-            "--ratio",
-            "v/soup",
-        ],
-        "objects": [*ours, *rest, "--no-plots", "--grouping", "objects"],
-        "plain-zarr": [sys.executable, "-c", PYTHON_LOOP, str(store), str(scratch / "weights.npy")],
-        "xarray-dask": [sys.executable, "-c", XARRAY_DASK, str(store), str(scratch / "weights.npy")],
-    }
-    unknown = set(arguments.only or []) - set(cases)
-    if unknown:
-        raise SystemExit(f"unknown: {', '.join(sorted(unknown))}; existing: {', '.join(cases)}")
-    print(f"{'what':<20}{'seconds':>10}{'peak MB':>10}")
-    for name, command in cases.items():
-        if name == "xarray-dask" and find_spec("dask") is None:
-            print(f"{name:<20} not measured: dask is not installed")
-            continue
-        if arguments.only is None or name in arguments.only:
-            runs = [measured(command) for _ in range(arguments.repeats)]
-            print(f"{name:<20}{min(run[0] for run in runs):>10.2f}{max(run[1] for run in runs):>10.0f}", flush=True)
+    tables: dict[str, Table] = {}
+    if {"scan", "bytes", "processes"} & set(arguments.parts):
+        store = made(arguments.store or scratch / "store.zarr", arguments.episodes, arguments.replans)
+        name = f"_{arguments.episodes}"
+        if "scan" in arguments.parts:
+            tables[f"scan{name}"] = measure_scan(store, arguments.rounds, threads)
+        if "bytes" in arguments.parts:
+            tables["bytes"] = measure_bytes(store)
+        if "processes" in arguments.parts:
+            tables["processes"] = measure_processes([store], 3, list(COMMANDS))
+    if "memory" in arguments.parts:
+        stores = [made(scratch / f"{count} episodes.zarr", count, arguments.replans, 1) for count in (50, 100, 200)]
+        tables["memory"] = measure_processes(stores, 1, [kind for kind in COMMANDS if "--no-plots" in kind])
     shutil.rmtree(scratch)
-
-
-def span_tables(store: Path) -> None:
-    """Time all tables with intervals of a grouping of spans in this process: of a new store, then of an open one.
-
-    One BLAS thread, as in `vla-analyze`, which measures episodes in threads of its own.
-    """
-    from vla_attention.analyze.measures.question import ask
-    from vla_attention.analyze.measures.question_settings import AnalysisSettings
-    from vla_attention.analyze.ratios.analysis import analyse
-    from vla_attention.schemas.stores.reader import open_store
-
-    began = time.perf_counter()
-    opened = [open_store(store)]
-    analyse(ask(opened, AnalysisSettings(grouping="cameras")))
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"first: {time.perf_counter() - began:.2f} s, {peak:.0f} MB", file=sys.stderr)
-    began = time.perf_counter()
-    analyse(ask(opened, AnalysisSettings(grouping="instruction")))
-    print(f"second: {time.perf_counter() - began:.2f} s", file=sys.stderr)
+    print(write_rows("analysis_speed", tables))
+    for table_name, table in tables.items():
+        print(table_name, *table.rows, table.note, sep="\n  ")
 
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--make"]:
-        make_store(Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))
-        raise SystemExit
-    if sys.argv[1:2] == ["--span-tables"]:
-        span_tables(Path(sys.argv[2]))
+        make_store(Path(sys.argv[2]), *(int(number) for number in sys.argv[3:]))
     else:
         main()

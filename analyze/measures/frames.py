@@ -54,11 +54,11 @@ def long_table(
         inner = int(np.prod(shape[i + 1 :]))
         position = np.tile(np.repeat(np.arange(shape[i]), inner), height // max(1, shape[i] * inner))
         for name, labels in axis.items():
-            columns[name] = _labels(name, labels).gather(position)
-    for name, array in values.items():
-        series = pl.Series(name, np.broadcast_to(array, shape).ravel())
-        columns[name] = series.fill_nan(None) if series.dtype.is_float() else series
-    return pl.DataFrame(columns)
+            columns[name] = _labels(name, labels)[position]
+    columns |= {name: pl.Series(name, np.broadcast_to(array, shape).ravel()) for name, array in values.items()}
+    measured = [name for name in values if columns[name].dtype.is_float()]
+    # At once: each call takes polars as long as a column of one episode.
+    return pl.DataFrame(columns).with_columns(pl.col(measured).fill_nan(None))
 
 
 def _constant(name: str, item: SelectedEpisode, height: int) -> pl.Series:

@@ -41,9 +41,10 @@ from vla_attention.analyze.objects.pointing_and_iou import (
     intersection_over_union,
     mask_sizes,
     otsu_regions,
-    percentile_regions,
     pointing_hits,
+    regions_of_percentiles,
     shifted_iou,
+    shifted_masks,
 )
 from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.parallel import map_episodes
@@ -53,6 +54,8 @@ from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import NO_COVERAGE
 
 Array = NDArray[np.float64]
+#: Maps of a replan that are compared with masks at once: of two denoise steps of 18 layers, or of as many heads.
+_MAPS_TOGETHER = 36
 
 
 @dataclass(frozen=True)
@@ -177,6 +180,9 @@ def _measure_episode(
     heads = len(selection.heads) if selection.per_head else 1
     cells = (item.tokens.num_replans, len(selection.layers), len(selection.denoise), heads)
     maps = {view.camera: np.zeros((*cells[:2], heads, view.grid.num_patches)) for view in views}
+    waiting: dict[str, list[NDArray[np.float32]]] = {view.camera: [] for view in views}
+    places: list[tuple[int, int]] = []
+    done = 0
     for part in layer_rows(item.episode, selection, site):
         rows = part.rows
         if item.without:
@@ -185,13 +191,21 @@ def _measure_episode(
         for view in views:
             own = rows[:, :, view.span.start : view.span.stop]
             maps[view.camera][:, part.layer] += own / len(selection.denoise)
-            values = _measure_maps(own, view, settings)
-            of_camera = measured[view.camera]
-            for one in fields(_Measured):
-                target = getattr(of_camera, one.name)
-                for name, array in getattr(values, one.name).items():
-                    whole = target.setdefault(name, np.empty((*cells, *array.shape[2:])))
-                    whole[:, part.layer, part.denoise] = array
+            mass = np.matmul(own, view.area).astype(np.float64)
+            _put(measured[view.camera].by_item, "mass", mass[:, None], [(part.layer, part.denoise)], cells)
+            waiting[view.camera].append(own.copy())
+        places.append((part.layer, part.denoise))
+        if len(places) * heads >= _MAPS_TOGETHER or len(places) == cells[1] * cells[2] - done:
+            for view in views:
+                together = np.concatenate(waiting[view.camera], axis=1)
+                waiting[view.camera].clear()
+                values = _measure_maps(together, view, settings)
+                for one in fields(_Measured):
+                    for name, array in getattr(values, one.name).items():
+                        of_places = array.reshape(len(array), len(places), heads, *array.shape[2:])
+                        _put(getattr(measured[view.camera], one.name), name, of_places, places, cells)
+            done += len(places)
+            places.clear()
     items = {label: [name[i] for name in names] for i, label in enumerate(("kind", "item", "object_class"))}
     layers = LayerAxis.of(selection, average_one=False)
     averaged = {camera: layers.with_average(values) for camera, values in maps.items()}
@@ -217,9 +231,21 @@ def _measure_episode(
     return tables, ControlParts(item, sources, axes, names)
 
 
+def _put(
+    target: dict[str, Array], name: str, values: Array, places: Sequence[tuple[int, int]], cells: tuple[int, ...]
+) -> None:
+    """Put values (replan, place, head, ...) where they belong in an array (replan, layer, denoise, head, ...)."""
+    whole = target.setdefault(name, np.empty((*cells, *values.shape[3:])))
+    layers, steps = zip(*places, strict=True)
+    whole[:, layers, steps] = values
+
+
 def _measure_maps(maps: NDArray[np.float32], view: View, settings: ObjectSettings) -> _Measured:
-    """Measures of maps (replan, head, patch) of one layer and denoise step, each (replan, head, ...)."""
-    by_item = {"mass": np.matmul(maps, view.area).astype(np.float64)}
+    """Measures of maps (replan, map, patch), each (replan, map, ...), but for the masses of items.
+
+    Maps of many layers and heads at once: masks at many places are megabytes, which each call has to go through.
+    """
+    by_item: dict[str, Array] = {}
     by_map = {"camera_mass": maps.sum(axis=-1, dtype=np.float64)}
     if not settings.spatial:
         return _Measured(by_map, by_item)
@@ -229,10 +255,11 @@ def _measure_maps(maps: NDArray[np.float32], view: View, settings: ObjectSetting
     distance = distance_in_pictures(centre[:, :, None, :], view.item_centres[:, None], rows, columns)
     by_item["distance"] = np.where(view.sizes[:, None, :] > 0, distance, np.nan)
     by_item["pointing"] = pointing_hits(maps, view.hit_masks)
-    regions = [*(percentile_regions(maps, value) for value in settings.percentiles), otsu_regions(maps)]
+    regions = [*regions_of_percentiles(maps, settings.percentiles), otsu_regions(maps)]
+    shifted = shifted_masks(view.masks, rows, columns)
     by_threshold = {
         "iou": np.stack([intersection_over_union(region, view.masks) for region in regions], axis=2),
-        "iou_chance": np.stack([shifted_iou(region, view.shifted_masks) for region in regions], axis=2),
+        "iou_chance": np.stack([shifted_iou(region, shifted) for region in regions], axis=2),
     }
     return _Measured(by_map, by_item, by_threshold)
 

@@ -20,7 +20,6 @@ from vla_attention.analyze.objects.pointing_and_iou import (
     near_patches,
     object_masks,
     patch_centres,
-    shifted_masks,
 )
 from vla_attention.analyze.stores.selection import site_that
 from vla_attention.schemas.errors import BadArgument
@@ -45,7 +44,6 @@ class View:
         grid: how they tile the picture.
         area: covered share of each patch (replan, patch, item) float32, 0..1.
         masks: 1 for the patches that belong to an item, else 0, (replan, patch, item) float32.
-        shifted_masks: `masks` at many places, (replan, patch, shift, item); no shift without `ObjectSettings.spatial`.
         hit_masks: `masks` with the patches that count as hits in the pointing game.
         sizes: number of patches of each mask, (replan, item).
         centres: of the patches, (patch, 2).
@@ -57,7 +55,6 @@ class View:
     grid: PatchGrid
     area: NDArray[np.float32]
     masks: NDArray[np.float32]
-    shifted_masks: NDArray[np.float32]
     hit_masks: NDArray[np.float32]
     sizes: NDArray[np.int64]
     centres: Array
@@ -115,9 +112,6 @@ def views_of(item: SelectedEpisode, members: NDArray[np.float32], settings: Obje
         # Areas of objects add up to that of their class; the sum may exceed 1 by rounding.
         area = np.minimum(coverage[camera] @ members, np.float32(1.0))
         masks = object_masks(area, settings.mask_coverage)
-        shifted = np.empty((*masks.shape[:2], 0, masks.shape[2]), np.float32)
-        if settings.spatial:
-            shifted = shifted_masks(masks, grid.rows, grid.columns)
         near = near_patches(grid.rows, grid.columns, settings.tolerance)
         centres = patch_centres(grid.rows, grid.columns)
         views.append(
@@ -127,7 +121,6 @@ def views_of(item: SelectedEpisode, members: NDArray[np.float32], settings: Obje
                 grid=grid,
                 area=area,
                 masks=masks.astype(np.float32),
-                shifted_masks=shifted,
                 hit_masks=(grown(masks, near) if settings.spatial else masks).astype(np.float32),
                 sizes=mask_sizes(masks).astype(np.int64),
                 centres=centres,

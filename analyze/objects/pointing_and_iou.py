@@ -6,6 +6,7 @@ of patches. Axes are named in the docstrings; `...` stands for any axes in betwe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -83,7 +84,13 @@ def percentile_regions(maps: NDArray[np.floating], percentile: float) -> Masks:
 
     Of 256 patches that is 26 at 90 and 52 at 80; of a constant map it is all.
     """
-    return np.asarray(maps >= np.percentile(maps, percentile, axis=-1, keepdims=True))
+    return regions_of_percentiles(maps, [percentile])[0]
+
+
+def regions_of_percentiles(maps: NDArray[np.floating], percentiles: Sequence[float]) -> list[Masks]:
+    """`percentile_regions` of several percentiles, for which the values are put in order once."""
+    limits = np.percentile(maps, list(percentiles), axis=-1, keepdims=True)
+    return [np.asarray(maps >= limit) for limit in limits]
 
 
 def otsu_thresholds(maps: NDArray[np.floating]) -> Floats:
@@ -152,10 +159,12 @@ def shifted_masks(masks: Masks | NDArray[np.float32], rows: int, columns: int) -
     strides = -(-rows // row_shifts), -(-columns // column_shifts)
     for replan in range(replans):
         first = replan % strides[0], replan // strides[0] % strides[1]
+        four = np.tile(pictures[replan], (2, 2, 1))  # a part of four copies is the picture, moved around
         for i in range(row_shifts):
             for j in range(column_shifts):
-                by = (first[0] + i * rows // row_shifts, first[1] + j * columns // column_shifts)
-                shifted[replan, :, :, i, j] = np.roll(pictures[replan], by, axis=(0, 1))
+                by = (first[0] + i * rows // row_shifts) % rows, (first[1] + j * columns // column_shifts) % columns
+                top, left = rows - by[0], columns - by[1]
+                shifted[replan, :, :, i, j] = four[top : top + rows, left : left + columns]
     return shifted.reshape(replans, patches, row_shifts * column_shifts, items)
 
 

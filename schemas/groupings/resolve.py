@@ -90,6 +90,8 @@ def stack_over_keys(weights: Sequence[NDArray[np.float32]]) -> NDArray[np.float3
 
 def counted_keys(weights: NDArray[np.float32], counts: NDArray[np.float64] | None) -> NDArray[np.float64]:
     """Numbers of keys (replan or 1, group) from weights (replan or 1, key, group) and the `key_counts`."""
+    if counts is None and weights.strides[0] == 0:  # the same at all replans, see `stack_over_keys`
+        return np.repeat(weights[:1].sum(axis=1, dtype=np.float64), len(weights), axis=0)
     counted = weights if counts is None else weights * counts[:, :, None]
     numbers: NDArray[np.float64] = counted.sum(axis=1, dtype=np.float64)
     return numbers

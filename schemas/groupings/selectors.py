@@ -113,7 +113,10 @@ def _role_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> 
 
 
 def _word_keys(argument: str, tokens: EpisodeTokens) -> Membership:
-    return _keys_of_words(tokens, [find_phrase(words, argument) for words in tokens.words])
+    # Prompts that differ in their state share their words (`words_of`): the phrase is looked for once.
+    found = {id(words): words for words in tokens.words}
+    places = {of: find_phrase(words, argument) for of, words in found.items()}
+    return _keys_of_words(tokens, [places[id(words)] for words in tokens.words])
 
 
 def _word_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
