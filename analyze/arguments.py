@@ -99,11 +99,17 @@ def add_intervals(parser: argparse.ArgumentParser) -> None:
 
 
 def add_output(parser: argparse.ArgumentParser, default: str = "results/STORE/GROUPING") -> argparse._ArgumentGroup:
-    """--output and --no-plots."""
+    """--output, --no-plots and --pdf."""
     output = parser.add_argument_group("output")
     output.add_argument("--output", type=Path, metavar="PATH", help=f"folder (default: {default})")
     output.add_argument("--no-plots", action="store_true", help="numbers only")
+    add_pdf(output)
     return output
+
+
+def add_pdf(output: argparse._ArgumentGroup) -> None:
+    """--pdf."""
+    output.add_argument("--pdf", action="store_true", help="pictures as PDF too (takes twice the time)")
 
 
 def add_sink_rule(parser: argparse._ArgumentGroup) -> None:

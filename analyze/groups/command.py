@@ -8,6 +8,7 @@ from pathlib import Path
 from vla_attention.analyze.arguments import (
     add_episode,
     add_grouping,
+    add_pdf,
     add_site_and_tasks,
     add_stores,
     output_folder,
@@ -44,6 +45,7 @@ def build_parser() -> argparse.ArgumentParser:
     output = parser.add_argument_group("output")
     output.add_argument("--output", type=Path, metavar="PATH", help="folder (default: results/STORE/groups)")
     output.add_argument("--no-plots", action="store_true", help="text and tables only")
+    add_pdf(output)
     return parser
 
 

@@ -17,7 +17,7 @@ EPISODES_FOLDER = "episodes"
 
 
 def write_plots(analysis: Analysis, folder: Path, every_episode: bool) -> list[Path]:
-    """Draw all pictures of an analysis into `folder`, each as PNG and PDF with its data as CSV; returns the paths.
+    """Draw all pictures of an analysis into `folder`, each with its data as CSV; returns the paths.
 
     Pictures of ratios are drawn when the grouping has one; `every_episode` adds one per episode and layer.
     """

@@ -47,7 +47,7 @@ def evolution_stem(task_id: int, instruction: str, episode_index: int, layer: st
 
 @drawn_in_our_style
 def plot_ratio_evolution(
-    level: Tables, grouping: Grouping, folder: Path, formats: Sequence[str] = ("png", "pdf")
+    level: Tables, grouping: Grouping, folder: Path, formats: Sequence[str] | None = None
 ) -> list[Path]:
     """Draw one episode in one layer; returns the paths of png, pdf and csv.
 
@@ -98,12 +98,12 @@ def plot_all_evolutions(
     replans: Tables,
     grouping: Grouping,
     folder: Path,
-    formats: Sequence[str] = ("png", "pdf"),
+    formats: Sequence[str] | None = None,
     progress: Callable[[int], object] | None = None,
 ) -> list[Path]:
     """Draw every (episode, layer) of the table of replans; into a folder per suite when there are several.
 
-    About a second each, half of it for the pdf; `progress` is called with 1 after each.
+    A third of a second each, and as much again for a pdf; `progress` is called with 1 after each.
     """
     paths = []
     several = replans.cells["suite"].n_unique() > 1

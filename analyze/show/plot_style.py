@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from vla_attention.analyze.show.output_files import replacing
+from vla_attention.analyze.show.picture_formats import picture_formats
 
 if TYPE_CHECKING:
     import polars as pl
@@ -77,14 +78,15 @@ def save_figure(
     folder: Path,
     stem: str,
     data: pl.DataFrame | Mapping[str, pl.DataFrame],
-    formats: Sequence[str] = ("png", "pdf"),
+    formats: Sequence[str] | None = None,
 ) -> list[Path]:
     """Save `stem`.png, .pdf and .csv (the plotted data) into a folder, each atomically, and return their paths.
 
-    `data`: one table, or several by what their files' names have after `stem`.
+    `data`: one table, or several by what their files' names have after `stem`. `formats`: those of
+    `picture_formats`, PNG and PDF unless a command line says otherwise.
     """
     paths = []
-    for kind in formats:
+    for kind in formats or picture_formats():
         path = folder / f"{stem}.{kind}"
         # Without a creation date the same data give the same file.
         metadata = {"CreationDate": None} if kind == "pdf" else None

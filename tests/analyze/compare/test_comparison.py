@@ -320,7 +320,17 @@ def test_a_path_that_holds_an_equals_sign_is_a_path(stores, tmp_path):
 def test_the_command_writes_tables_and_pictures(stores, tmp_path, capsys):
     out = tmp_path / "out"
     assert (
-        main(["compare", str(stores["base"]), f"new={stores['higher']}", str(stores["lower"]), "--output", str(out)])
+        main(
+            [
+                "compare",
+                str(stores["base"]),
+                f"new={stores['higher']}",
+                str(stores["lower"]),
+                "--pdf",
+                "--output",
+                str(out),
+            ]
+        )
         == 0
     )
     assert "new AGAINST base" in capsys.readouterr().out

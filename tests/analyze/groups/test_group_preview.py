@@ -71,7 +71,15 @@ def test_overlaps_and_keys_without_a_group_are_printed(store, tmp_path, capsys):
     assert {(row["span"], row["role"]) for row in untaken.slice(1).iter_rows(named=True)} == {
         ("prompt", "bos"), ("prompt", "state"), ("prompt", "instruction"), ("prompt", "padding"), ("actions", "action"),
     }  # fmt: skip
-    arguments = ["groups", str(store), "--grouping", str(tmp_path / "g.toml"), "--output", str(tmp_path / "out")]
+    arguments = [
+        "groups",
+        str(store),
+        "--grouping",
+        str(tmp_path / "g.toml"),
+        "--output",
+        str(tmp_path / "out"),
+        "--pdf",
+    ]
     assert main(arguments) == 0
     printed = capsys.readouterr().out
     assert "Groups 'looks' and 'bowl' share 6.500 keys." in printed

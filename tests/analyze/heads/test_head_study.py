@@ -308,7 +308,10 @@ def test_the_command_writes_tables_and_pictures_and_names_the_nearest_key(tmp_pa
     from vla_attention.analyze.__main__ import main
 
     path = write_store(tmp_path / "a.zarr")
-    assert main(["heads", str(path), "--output", str(tmp_path / "out"), "--sink-factor", "1000", "--top", "2"]) == 0
+    assert (
+        main(["heads", str(path), "--output", str(tmp_path / "out"), "--sink-factor", "1000", "--top", "2", "--pdf"])
+        == 0
+    )
     assert "SINKS" in capsys.readouterr().out
     said = (tmp_path / "out" / "summary.txt").read_text()
     assert "The key that comes nearest, key " in " ".join(said.split())

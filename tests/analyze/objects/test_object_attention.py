@@ -296,7 +296,17 @@ def test_sites_are_chosen_by_what_they_hold():
 
 @pytest.mark.pdf
 def test_the_command_prints_writes_and_draws(follower_store, tmp_path, capsys):
-    arguments = ["objects", str(follower_store), "--output", str(tmp_path), "--per-head", "--save-steps", "--task", "1"]
+    arguments = [
+        "objects",
+        str(follower_store),
+        "--output",
+        str(tmp_path),
+        "--per-head",
+        "--save-steps",
+        "--task",
+        "1",
+        "--pdf",
+    ]
     assert main(arguments) == 0
     assert len(capsys.readouterr().out.splitlines()) <= 40
     whole = (tmp_path / "summary.txt").read_text()

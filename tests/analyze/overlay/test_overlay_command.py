@@ -104,7 +104,18 @@ def test_the_csv_has_the_raw_rows_numbers(made: Path, tmp_path: Path, capsys: py
         "1",
     ]
     assert (
-        main([*arguments, "--denoise", "last", "--output", str(tmp_path), "--group", f"spot=patch:{CAMERA}[0:1,0:2]"])
+        main(
+            [
+                *arguments,
+                "--denoise",
+                "last",
+                "--pdf",
+                "--output",
+                str(tmp_path),
+                "--group",
+                f"spot=patch:{CAMERA}[0:1,0:2]",
+            ]
+        )
         == 0
     )
     stem = tmp_path / "overlay_task001_episode001"

@@ -231,7 +231,7 @@ def test_one_class_alone_is_said_and_not_computed(tmp_path):
 
 @pytest.mark.pdf
 def test_the_command_writes_tables_and_pictures(store, tmp_path, capsys):
-    assert main(["time", str(store), "--output", str(tmp_path / "out"), "--bins", "4", "--window", "2"]) == 0
+    assert main(["time", str(store), "--output", str(tmp_path / "out"), "--bins", "4", "--window", "2", "--pdf"]) == 0
     assert "SUCCESS AGAINST FAILURE" in capsys.readouterr().out
     table = pl.read_parquet(tmp_path / "out" / "time_course.parquet")
     assert table["alignment"].unique().sort().to_list() == ["episode", "gripper"]

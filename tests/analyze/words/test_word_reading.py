@@ -149,7 +149,7 @@ def test_words_of_several_tasks_are_averaged_over_the_episodes_that_have_them(tm
 
 @pytest.mark.pdf
 def test_the_command_prints_writes_and_draws(reader_store, tmp_path, capsys):
-    assert main(["words", str(reader_store), "--output", str(tmp_path), "--per-head"]) == 0
+    assert main(["words", str(reader_store), "--output", str(tmp_path), "--per-head", "--pdf"]) == 0
     printed = capsys.readouterr().out
     words = " ".join(printed.split())
     assert "'bowl' has a higher lift (3.627) than each of the other 5 words" in words
