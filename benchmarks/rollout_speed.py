@@ -45,7 +45,9 @@ class Parts:
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {"simulation": 0.0, "policy": 0.0, "writing": 0.0}
-        self.commits: list[float] = []
+        self.num_episodes = 0
+        #: The largest memory of each process that simulated.
+        self.peak_mb: list[float] = []
 
     def timed(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
         def timed_call(*given: Any, **options: Any) -> Any:
@@ -86,28 +88,37 @@ def rate(policy: Policy, arguments: argparse.Namespace, num_envs: int, written: 
             commits.append(time.monotonic())
             note(loop, result)
 
+        close = pipeline.SimulatorProcess.close
+
+        def close_measured(process: Any) -> None:
+            status = Path(f"/proc/{process.number}/status").read_text()
+            parts.peak_mb.append(float(status.partition("VmHWM:")[2].split()[0]) / 1024)
+            close(process)
+
         episode_loop.EpisodeLoop.note_commit = note_commit  # type: ignore[method-assign]
+        pipeline.SimulatorProcess.close = close_measured  # type: ignore[method-assign]
         if not written:
             pipeline.BackgroundWriting.episode = lambda self, *given: NotWritten(self, *given)  # type: ignore
         own = {(Simulation, name): getattr(Simulation, name) for name in ("begin", "wait", "advance")} | {
             (EpisodeWriter, name): getattr(EpisodeWriter, name) for name in ("append", "commit")
         }
-        call, prepare = episode.record_call, episode.EpisodeRecording.prepare
+        call, prepare = episode.record_calls, episode.EpisodeRecording.prepare
         if num_envs == 1:
             for (kind, name), method in own.items():
                 setattr(kind, name, parts.timed("simulation" if kind is Simulation else "writing", method))
-            episode.record_call = parts.timed("policy", call)
+            episode.record_calls = parts.timed("policy", call)
             episode.EpisodeRecording.prepare = parts.timed("policy", prepare)  # type: ignore[method-assign]
         try:
             capture_run.run_capture(settings, policy, "cpu")
         finally:
+            pipeline.SimulatorProcess.close = close  # type: ignore[method-assign]
             episode_loop.EpisodeLoop.note_commit = note  # type: ignore[method-assign]
             pipeline.BackgroundWriting.episode = made  # type: ignore[method-assign]
             for (kind, name), method in own.items():
                 setattr(kind, name, method)
-            episode.record_call, episode.EpisodeRecording.prepare = call, prepare  # type: ignore[method-assign]
+            episode.record_calls, episode.EpisodeRecording.prepare = call, prepare  # type: ignore[method-assign]
         if num_envs == 1:
-            parts.commits.append(len(commits))
+            parts.num_episodes += len(commits)
     return 60 * (len(commits) - num_envs) / (commits[-1] - commits[num_envs - 1])
 
 
@@ -137,8 +148,7 @@ def main() -> None:
         arguments.rounds,
         warm_up=0,
     )
-    episodes = sum(parts.commits)
-    shares = {part: seconds / episodes for part, seconds in parts.seconds.items()}
+    shares = {part: seconds / parts.num_episodes for part, seconds in parts.seconds.items()}
     total = sum(shares.values())
     # No process but this one calls the policy, and a simulator is in one episode at a time.
     least = max(total / cores, shares["policy"], shares["simulation"] / num)
@@ -156,7 +166,8 @@ def main() -> None:
     what = f"{arguments.checkpoint}, {arguments.suite} task 0, {arguments.max_steps} steps an episode"
     note = (
         f"{what}. Bound: {least:.2f} s an episode on {cores} cores = {bound:.1f} episodes a minute. With writing "
-        f" {written.median:.3f} ({written.lowest:.3f} to {written.highest:.3f}) of the rate without."
+        f"{written.median:.3f} ({written.lowest:.3f} to {written.highest:.3f}) of the rate without. A "
+        f"simulator's process took {max(parts.peak_mb):.0f} MB."
     )
     columns = {"run": "run", "rate": "episodes a minute", "times": "times one simulator", "of_bound": "of the bound"}
     costs = [

@@ -207,7 +207,7 @@ def _add_evaluation_arguments(
         type=int,
         metavar="N",
         help="simulators that run at a time, each in a process of its own; 1 simulates in the policy's process "
-        "(default: the cores that this process may use, at most 8)",
+        "(default: the cores that this process may use, at most 8, and 2 GB of memory each)",
     )
     group.add_argument(
         "--policy-batch",

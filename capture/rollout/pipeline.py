@@ -8,6 +8,8 @@ last bits of what the policy computes. A thread writes (`background_writing.py`)
 from __future__ import annotations
 
 import contextlib
+import os
+import re
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -15,6 +17,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
+from pathlib import Path
 
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.claims import Holder
@@ -54,6 +57,8 @@ _LOOK_EVERY_S = 0.5
 
 #: The largest number of simulators that is taken without being asked for: one policy keeps few more busy.
 MOST_BY_DEFAULT = 8
+#: Memory of a simulator, for their number without being asked: in LIBERO 1.8 GB, of which the scene is most.
+SIMULATOR_BYTES = 2e9
 
 
 def default_policy_batch(policy: Policy, device: str, num_envs: int) -> int:
@@ -62,8 +67,34 @@ def default_policy_batch(policy: Policy, device: str, num_envs: int) -> int:
 
 
 def default_num_envs() -> int:
-    """Return the number of simulators without `--num-envs`: as many as there are cores."""
-    return min(available_cores(), MOST_BY_DEFAULT)
+    """Return the number of simulators without `--num-envs`: as many as there are cores, and as fit into memory."""
+    return max(1, int(min(available_cores(), MOST_BY_DEFAULT, memory_left() / SIMULATOR_BYTES)))
+
+
+def memory_left() -> float:
+    """Return the bytes of memory that the machine, and the SLURM job of this process, have left.
+
+    Infinite where neither says.
+    """
+    left = [float("inf")]
+    available = re.search(r"^MemAvailable:\s+(\d+) kB", _text(Path("/proc/meminfo")), re.MULTILINE)
+    if available:
+        left.append(1024.0 * int(available[1]))
+    of_job = os.environ.get("SLURM_MEM_PER_NODE", "")  # megabytes; 0 is the whole node
+    own = re.search(r"^VmRSS:\s+(\d+) kB", _text(Path("/proc/self/status")), re.MULTILINE)
+    if of_job.isdecimal() and int(of_job) and own:
+        left.append(1024.0 * (1024 * int(of_job) - int(own[1])))
+    return min(left)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError:
+        return ""
+
+
+_WHY_KILLED = "Signal 9 mostly means that the memory was full. "
 
 
 class SimulationFailed(UserError):
@@ -119,6 +150,7 @@ class PipelinedLoop(EpisodeLoop):
     _ready: deque[tuple[Simulator, Seen]] = field(default_factory=deque, init=False)
     #: What simulators of each task know of its resets, for the others.
     _resets: dict[int, Sequence[object]] = field(default_factory=dict, init=False)
+    _told_of_resets: set[int] = field(default_factory=set, init=False)
 
     @contextmanager
     def simulators(self) -> Iterator[None]:
@@ -215,7 +247,10 @@ class PipelinedLoop(EpisodeLoop):
     def _take(self, simulator: Simulator, answer: object) -> None:
         match answer:
             case ResetsFirst(number):
-                self.say_resets(simulator.name, number)
+                # Once a task: simulators that begin at the same time cannot know of each other's resets yet.
+                if simulator.task.task_id not in self._told_of_resets:
+                    self._told_of_resets.add(simulator.task.task_id)
+                    self.say_resets(simulator.name, number)
             case KnownResets(resets):
                 known = self._resets.get(simulator.task.task_id, ())
                 self._resets[simulator.task.task_id] = max(known, resets, key=len)
@@ -278,8 +313,8 @@ class PipelinedLoop(EpisodeLoop):
         if simulator.begun_times > MOST_RESTARTS:
             raise SimulatorDied(
                 f"The simulator of {title} ended {simulator.begun_times} times, the last time {how}. Nothing of this "
-                "episode was kept, and the episodes before it are unharmed. Signal 9 mostly means that the memory was "
-                "full: go on with --resume and a smaller --num-envs; 1 keeps the simulator in this process."
+                f"episode was kept, and the episodes before it are unharmed. {_WHY_KILLED if 'signal 9' in how else ''}"
+                "Go on with --resume and a smaller --num-envs; 1 keeps the simulator in this process."
             )
         self.progress.say(f"{simulator.name}: its simulator ended ({how}); the episode begins again.")
         simulator.begun_times += 1

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from vla_attention.schemas import threads
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.schemas.threads import choose_threads, count_cores, cpu_quota, use_threads
+from vla_attention.schemas.threads import available_cores, choose_threads, count_cores, cpu_quota, use_threads
 
 V1_MOUNT = "32 31 0:29 {tree} /sys/fs/cgroup/cpu,cpuacct rw shared:9 - cgroup cgroup rw,cpu,cpuacct\n"
 V2_MOUNT = "30 23 0:26 {tree} /sys/fs/cgroup rw,nosuid shared:4 - cgroup2 cgroup2 rw,nsdelegate\n"
@@ -162,3 +163,14 @@ def test_a_library_that_the_user_limited_keeps_its_number_unless_threads_is_give
     assert (os.environ["POLARS_MAX_THREADS"], os.environ["MKL_NUM_THREADS"]) == ("2", "6")
     use_threads(4)
     assert {os.environ[name] for name in ("OMP_NUM_THREADS", "POLARS_MAX_THREADS", "MKL_NUM_THREADS")} == {"4"}
+
+
+def test_available_cores_are_not_what_the_user_gives_to_the_policy(monkeypatch):
+    for name in ("SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.setattr(threads, "_cores", lambda: 12)
+    monkeypatch.setattr(threads, "cpu_quota", lambda: None)
+    assert available_cores() == 12
+    monkeypatch.setenv("SLURM_CPUS_PER_TASK", "3")
+    assert available_cores() == 3

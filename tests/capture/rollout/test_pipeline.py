@@ -456,3 +456,33 @@ def test_a_killed_simulator_is_replaced(tmp_path):
     assert run.log.read_text().count("its simulator ended (killed by signal 9); the episode begins again.") == 1
     assert store_status(run.store).complete
     assert analyze(["verify", str(run.store)]) == 0
+
+
+@pytest.mark.parametrize(("cores", "expected"), [(1, 1), (3, 3), (64, 8)])
+def test_there_are_as_many_simulators_as_cores_and_no_more_than_eight(cores, expected, monkeypatch):
+    monkeypatch.setattr(pipeline, "available_cores", lambda: cores)
+    monkeypatch.setattr(pipeline, "memory_left", lambda: 1e12)
+    assert pipeline.default_num_envs() == expected
+
+
+@pytest.mark.parametrize(("left", "expected"), [(7e9, 3), (1e9, 1), (float("inf"), 8)])
+def test_simulators_fit_into_the_memory(left, expected, monkeypatch):
+    monkeypatch.setattr(pipeline, "available_cores", lambda: 64)
+    monkeypatch.setattr(pipeline, "memory_left", lambda: left)
+    assert pipeline.default_num_envs() == expected
+
+
+def test_memory_is_that_of_the_job_where_it_has_less_than_the_machine(monkeypatch):
+    texts = {
+        "/proc/meminfo": "MemTotal: 99 kB\nMemAvailable:   16000000 kB\n",
+        "/proc/self/status": "VmRSS:\t 1024 kB\n",
+    }
+    monkeypatch.setattr(pipeline, "_text", lambda path: texts[str(path)])
+    monkeypatch.delenv("SLURM_MEM_PER_NODE", raising=False)
+    assert pipeline.memory_left() == 1024 * 16_000_000
+    monkeypatch.setenv("SLURM_MEM_PER_NODE", "4001")
+    assert pipeline.memory_left() == 4000 * 2**20
+    monkeypatch.setenv("SLURM_MEM_PER_NODE", "0")
+    assert pipeline.memory_left() == 1024 * 16_000_000
+    monkeypatch.setattr(pipeline, "_text", lambda path: "")
+    assert pipeline.memory_left() == float("inf")
