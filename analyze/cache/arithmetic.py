@@ -18,6 +18,8 @@ _SOURCES = (
     "schemas/stores/*.py",
     "analyze/stores/*.py",
     "analyze/measures/*.py",
+    "analyze/heads/*.py",
+    "analyze/words/*.py",
 )
 
 

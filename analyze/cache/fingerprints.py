@@ -11,12 +11,16 @@ from __future__ import annotations
 import hashlib
 import os
 import time
+from pathlib import Path
 
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.store_format import SEAL_GROUP
 
 #: Files that changed less than this ago may change again without a difference that file systems' clocks show.
 SETTLED_SECONDS = 2.0
+#: The state of an episode that is not in a file system of this machine: its seal, which is read there at every opening,
+#: has to suffice.
+_ELSEWHERE = hashlib.sha256(b"elsewhere").digest()
 #: Pictures are in no measure of attention, and are most of the files.
 _NOT_MEASURED = "frames/"
 
@@ -27,11 +31,18 @@ def file_state(episode: StoredEpisode) -> bytes | None:
     Raises:
         CorruptEpisode: its seal cannot be read or is not its own.
     """
-    names = [name for name in episode.files.records if not name.startswith(_NOT_MEASURED)]
-    folder, newest, stats = str(episode.folder), 0, []
-    for name in (*names, f"{SEAL_GROUP}/zarr.json"):
+    place = episode.folder
+    if not isinstance(place, Path):
+        return _ELSEWHERE
+    if place.is_file():
+        paths = {"": str(place)}  # the episode is one zip
+    else:
+        names = [name for name in episode.files.records if not name.startswith(_NOT_MEASURED)]
+        paths = {name: f"{place}/{name}" for name in (*names, f"{SEAL_GROUP}/zarr.json")}
+    newest, stats = 0, []
+    for name, path in paths.items():
         try:
-            found = os.stat(f"{folder}/{name}")
+            found = os.stat(path)
         except OSError:
             return None
         newest = max(newest, found.st_mtime_ns, found.st_ctime_ns)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,7 +64,7 @@ def remembered(
     measure: Callable[[Sequence[int]], Iterable[Arrays]],
     arguments: Sequence[Any] | None = None,
     progress: Callable[[int], object] | None = None,
-) -> list[Arrays]:
+) -> Iterator[Arrays]:
     """The numbers of every episode, in order; those from the cache are bit for bit those that were measured.
 
     Args:
@@ -77,7 +77,8 @@ def remembered(
     """
     place = cache_place()
     if place is None:
-        return list(measure(range(len(episodes))))
+        yield from measure(range(len(episodes)))
+        return
     cache = _Lookup(question, place)
     extra = arguments or [None] * len(episodes)
     keys = [_episode_key(episode, one) for episode, one in zip(episodes, extra, strict=True)]
@@ -89,14 +90,16 @@ def remembered(
     missing = [i for i, arrays in enumerate(found) if arrays is None]
     if progress is not None and len(missing) < len(episodes):
         progress(len(episodes) - len(missing))
-    if missing:
-        with _Keeper(cache.digest, question.about, place) as keeper:
-            for i, arrays in zip(missing, measure(missing), strict=True):
-                state = states[i]
-                if state is not None:
-                    keeper.add(keys[i], state, arrays)
-                found[i] = arrays
-    return [arrays for arrays in found if arrays is not None]
+    with _Keeper(cache.digest, question.about, place) as keeper:
+        measured = iter(measure(missing) if missing else ())
+        for key, state, known in zip(keys, states, found, strict=True):
+            if known is not None:
+                yield known
+                continue
+            arrays = next(measured)
+            if state is not None:
+                keeper.add(key, state, arrays)
+            yield arrays
 
 
 def _episode_key(episode: StoredEpisode, arguments: Any) -> bytes:
@@ -170,6 +173,7 @@ class _Keeper:
         if self._writer is not None:
             with suppress(OSError):  # what cannot be flushed is a record that is not whole
                 self._writer.close()
+            self._finished += self._writer.size
             self._writer = None
 
     def __enter__(self) -> _Keeper:
@@ -177,4 +181,5 @@ class _Keeper:
 
     def __exit__(self, *_: object) -> None:
         self._stop()
-        make_room(self._place)
+        if self._finished:
+            make_room(self._place)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.heads.entropy import effective_keys, entropies, top_mass
 from vla_attention.analyze.measures.frames import EPISODE_ID, Tables, denoise_axis, head_axis, layer_axis, long_table
+from vla_attention.analyze.measures.kept import digest_of_weights, measured_once
 from vla_attention.analyze.measures.masses import masses
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
@@ -62,14 +64,21 @@ class RowMeasures:
     mass: NDArray[np.float32] | None
     shares: KeyShares
 
-    def take(self, measured: RowMeasures) -> None:
-        """Copy the values of the same measures of the same episode."""
-        self.entropy[:] = measured.entropy
-        self.top[:] = measured.top
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays by name, in C order."""
+        found = {"entropy": self.entropy, "top": self.top, "above": self.shares.above, "held": self.shares.held}
         if self.mass is not None:
-            self.mass[:] = measured.mass
-        self.shares.above[:] = measured.shares.above
-        self.shares.held[:] = measured.shares.held
+            found["mass"] = self.mass
+        return {name: np.ascontiguousarray(array) for name, array in found.items()}
+
+    def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Copy the `arrays` of the same measures of the same episode."""
+        self.entropy[:] = arrays["entropy"]
+        self.top[:] = arrays["top"]
+        if self.mass is not None:
+            self.mass[:] = arrays["mass"]
+        self.shares.above[:] = arrays["above"]
+        self.shares.held[:] = arrays["held"]
 
 
 def empty_measures(
@@ -223,7 +232,7 @@ def measure_all_rows(
     """`measure_rows` of every episode, a few at a time; shows progress."""
     num_masses = len(question.grouping.names) + 1 if with_masses else None
     room = empty_measures(question.selected, question.selection, options, len(shown) + 1, num_masses)
-    measure = partial(
+    scan = partial(
         _episode_measures,
         selection=question.selection,
         site=question.site,
@@ -231,10 +240,30 @@ def measure_all_rows(
         shown=shown,
         num_masses=num_masses,
     )
-    pairs = list(zip(question.selected, resolved, strict=True))
     with progress_bar(len(room), "episodes' rows") as advance:
-        for kept, measured in zip(room, each_episode(measure, pairs, advance), strict=True):
-            kept.take(measured)
+
+        def measure(positions: Sequence[int]) -> Iterator[dict[str, NDArray[Any]]]:
+            return each_episode(scan, [(question.selected[i], resolved[i]) for i in positions], advance)
+
+        measured = measured_once(
+            "rows",
+            f"entropy, top keys and shares of keys of grouping {question.grouping.name}",
+            question.selected,
+            replace(question.selection, per_head=True),
+            question.site,
+            measure,
+            {
+                "top": options.top,
+                "factor": options.rule.factor,
+                "groups": resolved[0].names,
+                "shown": list(shown),
+                "masses": with_masses,
+            },
+            [digest_of_weights(groups) for groups in resolved],
+            advance,
+        )
+        for kept, arrays in zip(room, measured, strict=True):
+            kept.take(arrays)
     return room
 
 
@@ -245,11 +274,11 @@ def _episode_measures(
     options: RowOptions,
     shown: Sequence[str],
     num_masses: int | None,
-) -> RowMeasures:
-    """`measure_rows` of one episode into arrays of its own."""
+) -> dict[str, NDArray[Any]]:
+    """The arrays of `measure_rows` of one episode."""
     (out,) = empty_measures([pair[0]], selection, options, len(shown) + 1, num_masses)
     measure_rows(*pair, selection, site, options, shown, out)
-    return out
+    return out.arrays()
 
 
 def row_metrics(question: Question, options: RowOptions | None = None) -> Tables:

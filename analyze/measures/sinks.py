@@ -23,20 +23,22 @@ sink from a key that deserves attention in most rows: look at the listed keys be
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.measures.kept import measured_once
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.measures.sink_kinds import value_ratios
 from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.show.progress import progress_bar
-from vla_attention.analyze.stores.parallel import map_episodes
+from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import BadArgument, listing
@@ -260,10 +262,22 @@ def search_of(question: Question, shares: Sequence[KeyShares], rule: SinkRule) -
 def search_sinks(question: Question, rule: SinkRule | None = None) -> SinkSearch:
     """Look for sinks in every task; reads all selected rows once."""
     rule = rule or SinkRule()
-    measure = partial(episode_key_shares, selection=question.selection, site=question.site, rule=rule)
-    with progress_bar(len(question.selected), "episodes searched for sinks") as advance:
-        shares = map_episodes(measure, question.selected, advance)
+    selected, selection, site = question.selected, question.selection, question.site
+    with progress_bar(len(selected), "episodes searched for sinks") as advance:
+
+        def measure(positions: Sequence[int]) -> Iterator[dict[str, NDArray[Any]]]:
+            scan = partial(_share_arrays, selection=selection, site=site, rule=rule)
+            return each_episode(scan, [selected[i] for i in positions], advance)
+
+        about, arguments = "shares of keys", {"factor": rule.factor}
+        arrays = measured_once("shares", about, selected, selection, site, measure, arguments, progress=advance)
+        shares = [KeyShares(**one) for one in arrays]
     return search_of(question, shares, rule)
+
+
+def _share_arrays(item: SelectedEpisode, selection: Selection, site: str, rule: SinkRule) -> dict[str, NDArray[Any]]:
+    shares = episode_key_shares(item, selection, site, rule)
+    return {"above": shares.above, "held": shares.held}
 
 
 def without_sinks(question: Question, sinks: pl.DataFrame, rule: SinkRule) -> Question:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,7 +11,6 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.cache.remembered import CachedQuestion, remembered
 from vla_attention.analyze.measures.frames import (
     EPISODE_KEYS,
     Axis,
@@ -24,6 +22,7 @@ from vla_attention.analyze.measures.frames import (
     replan_axis,
     tables_in_parts,
 )
+from vla_attention.analyze.measures.kept import digest_of_weights, measured_once
 from vla_attention.analyze.measures.masses import (
     group_measures,
     masses,
@@ -40,7 +39,6 @@ from vla_attention.analyze.measures.selected import (
     resolve_all,
     resolve_episode,
 )
-from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
@@ -176,47 +174,25 @@ def _measured_or_kept(
         each = partial(_measured_arrays, grouping=grouping, selection=selection, site=question.site)
         return each_episode(each, pairs, progress)
 
-    arrays = remembered(
-        masses_question(grouping, selection, question.site),
-        [item.episode for item in selected],
-        measure,
-        arguments=[
-            [item.without, None if resolved is None else digest_of_weights(resolved[i])]
-            for i, item in enumerate(selected)
-        ],
-        progress=progress,
+    arrays = list(
+        measured_once(
+            "masses",
+            f"masses of grouping {grouping.name}",
+            selected,
+            selection,
+            question.site,
+            measure,
+            {
+                "groups": [[name, list(selectors)] for name, selectors in grouping.groups.items()],
+                "overlap": grouping.overlap,
+            },
+            None if resolved is None else [digest_of_weights(one) for one in resolved],
+            progress,
+        )
     )
     if resolved is None:
         check_not_empty(grouping, [one["num_keys"] for one in arrays])
     return [MeasuredEpisode(item, selection, **one) for item, one in zip(selected, arrays, strict=True)]
-
-
-def masses_question(grouping: Grouping, selection: Selection, site: str) -> CachedQuestion:
-    """What the masses of an episode depend on besides the episode."""
-    heads = f"{plural(len(selection.heads), 'head')}{' apart' if selection.per_head else ''}"
-    return CachedQuestion(
-        "masses",
-        {
-            "groups": [[name, list(selectors)] for name, selectors in grouping.groups.items()],
-            "overlap": grouping.overlap,
-            "site": site,
-            "layers": selection.layers,
-            "denoise": selection.denoise,
-            "heads": selection.heads,
-            "per_head": selection.per_head,
-        },
-        f"masses of grouping {grouping.name}, site {site}, {plural(len(selection.layers), 'layer')}, "
-        f"{plural(len(selection.denoise), 'denoise step')}, {heads}",
-    )
-
-
-def digest_of_weights(resolved: ResolvedGrouping) -> str:
-    """A digest of what masses depend on of a grouping that was resolved by the caller."""
-    digest = hashlib.sha256()
-    for array in (resolved.weights, resolved.num_keys, resolved.num_valid):
-        digest.update(f"{array.dtype.str}{array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()
 
 
 def _measured_arrays(

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.frames import EPISODE_KEYS, LayerAxis, head_axis, long_table
+from vla_attention.analyze.measures.kept import measured_once
 from vla_attention.analyze.measures.masses import finite_mean, group_measures, masses
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.show.progress import progress_bar
-from vla_attention.analyze.stores.parallel import map_episodes
+from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import BadArgument
@@ -62,9 +65,17 @@ def words_table(question: Question) -> pl.DataFrame:
     """
     if not question.vocabulary.words:
         raise BadArgument(f"Site '{question.site}': {NO_WORDS}.")
-    measure = partial(_episode_words, selection=question.selection, site=question.site)
-    with progress_bar(len(question.selected), "episodes") as advance:
-        return pl.concat(map_episodes(measure, question.selected, advance))
+    selected, selection, site = question.selected, question.selection, question.site
+    with progress_bar(len(selected), "episodes") as advance:
+
+        def measure(positions: Sequence[int]) -> Iterator[dict[str, NDArray[Any]]]:
+            scan = partial(_word_masses, selection=selection, site=site)
+            return each_episode(scan, [selected[i] for i in positions], advance)
+
+        arrays = measured_once("words", "masses of words", selected, selection, site, measure, {}, progress=advance)
+        return pl.concat(
+            [_episode_words(item, one["mass"], selection) for item, one in zip(selected, arrays, strict=True)]
+        )
 
 
 def _episode_items(item: SelectedEpisode) -> _Items:
@@ -100,12 +111,18 @@ def _episode_items(item: SelectedEpisode) -> _Items:
     return _Items(tuple(names), whole)
 
 
-def _episode_words(item: SelectedEpisode, selection: Selection, site: str) -> pl.DataFrame:
+def _word_masses(item: SelectedEpisode, selection: Selection, site: str) -> dict[str, NDArray[Any]]:
+    """`mass` (replan, layer, head or 1, item), mean over denoise steps; the items are those of `_episode_items`."""
     items = _episode_items(item)
     heads = len(selection.heads) if selection.per_head else 1
     mass = np.zeros((item.tokens.num_replans, len(selection.layers), heads, items.weights.shape[2]))
     for part in layer_rows(item.episode, selection, site):
         mass[:, part.layer] += masses(part.rows, items.weights) / len(selection.denoise)
+    return {"mass": mass}
+
+
+def _episode_words(item: SelectedEpisode, mass: NDArray[np.float64], selection: Selection) -> pl.DataFrame:
+    items = _episode_items(item)
     layers = LayerAxis.of(selection, average_one=False)
     mass = layers.with_average(mass)
     keys = counted_keys(items.weights, item.key_counts)

@@ -6,16 +6,17 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
+from numpy.typing import NDArray
 
 import vla_attention as va
-from tests.kit.attacks import attacks, files_of, first, two
+from tests.kit.attacks import attacks, encode_again, files_of, first, two
 from tests.kit.slow import slow_except
 from vla_attention.analyze.cache import fingerprints, remembered
 from vla_attention.analyze.cache.housekeeping import kept_segments
@@ -26,7 +27,7 @@ from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.measures.steps import measure_episodes
 from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.schemas.groupings.resolve import EmptyGroup
-from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 from vla_attention.testing.stores import StoreSpec, write_store
 
@@ -167,6 +168,38 @@ def test_masses_without_some_keys_are_kept_apart(cache, originals, measured):
     assert not np.array_equal(found[0, 1][0], found[0, 2][0])
 
 
+ROWS: dict[str, Callable[[Path], list[pl.DataFrame]]] = {
+    "words": lambda path: [va.open(path).words(), va.open(path).words("episodes", per_head=True)],
+    "heads": lambda path: [va.open(path).heads(), va.open(path).row_metrics()],
+    "sinks": lambda path: [va.open(path).sinks()],
+    "sinks of words": lambda path: [va.open(path).row_metrics(groups={"bowl": "word:bowl", "rest": "*"})],
+}
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_rows_are_read_once(cache, stores, monkeypatch, name):
+    """The other questions that read rows: the same bits, without a row, and not of a damaged store."""
+    with monkeypatch.context() as patch:
+        patch.setenv("VLA_CACHE", "off")
+        expected = ROWS[name](stores[0])
+    for question in ROWS.values():
+        assert question is not ROWS[name] or same(question(stores[0]), expected)
+    read: list[str] = []
+    read_layers = StoredEpisode.read_layers
+
+    def watched(self: StoredEpisode, array: str, places: Iterable[tuple[int, int]]) -> Iterator[NDArray[np.float32]]:
+        read.append(array)
+        return read_layers(self, array, places)
+
+    monkeypatch.setattr(StoredEpisode, "read_layers", watched)
+    assert same(ROWS[name](stores[0]), expected)
+    assert read == []
+    encode_again(first(stores[0]), "joint/rows")
+    with pytest.raises(CorruptEpisode, match="task000_episode000"):
+        ROWS[name](stores[0])
+    assert read
+
+
 FAST = (
     "files of joint/atoms exchanged",
     "joint/atoms exchanged",
@@ -263,6 +296,21 @@ def test_a_moved_store_is_known_and_a_copied_one_is_measured(cache, stores, meas
     shutil.copytree(moved, tmp_path / "copied.zarr")
     tables(tmp_path / "copied.zarr", **SPANS)  # copying may damage files
     assert len(measured) == 4
+
+
+def test_the_state_of_a_zip_is_that_of_the_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(fingerprints, "SETTLED_SECONDS", 0.0)
+    path = tmp_path / "task000_episode000.zip"
+    path.write_bytes(b"some bytes")
+    episode = StoredEpisode(path, path.stem, "")
+    state = fingerprints.file_state(episode)
+    assert state == fingerprints.file_state(episode) is not None
+    before = path.stat()
+    path.write_bytes(b"same bytes")
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert fingerprints.file_state(episode) not in (state, None)
+    monkeypatch.setattr(fingerprints, "SETTLED_SECONDS", 3600.0)
+    assert fingerprints.file_state(episode) is None
 
 
 def test_an_empty_group_is_refused_from_the_cache_too(cache, stores):
