@@ -64,6 +64,7 @@ def run_trial(
     check: StopCheck = lambda: None,
     *,
     environment: Environment | None = None,
+    most_replans: int = TRIAL_REPLANS,
 ) -> Trial:
     """Run the first replans of a task's first episode in an environment of its own; nothing of them is stored.
 
@@ -71,7 +72,7 @@ def run_trial(
     of the suite's own.
     """
     protocol = attributes.protocol
-    replans = max(FEWEST_REPLANS, min(TRIAL_REPLANS, _MOST_BYTES // _bytes_of_rows(attributes)))
+    replans = max(FEWEST_REPLANS, min(most_replans, _MOST_BYTES // _bytes_of_rows(attributes)))
     protocol = replace(attributes.protocol, max_steps=replans * attributes.protocol.replan_steps)
     kept, timed = _KeptEpisode(replace(attributes, protocol=protocol)), _TimedPolicy(policy)
     begun = time.perf_counter()

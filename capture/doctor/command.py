@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -82,8 +83,7 @@ def _findings(arguments: argparse.Namespace, settings: RunSettings, termination:
         return  # the policy cannot be loaded there
     device = load_torch(arguments.device, threads.number)
     if arguments.no_trial:
-        text = f"{arguments.checkpoint} is not loaded, nor are time and size measured (--no-trial)."
-        yield Finding("checkpoint", "note", text)
+        yield _look_for_checkpoint(arguments)
         return
     policy, checkpoint = _load(arguments, device)
     yield checkpoint
@@ -95,6 +95,24 @@ def _findings(arguments: argparse.Namespace, settings: RunSettings, termination:
         yield Finding("trial", "note", "Time and size are not measured before what is missing is there.")
         return
     yield from _try(settings, policy, device, termination)
+
+
+def _look_for_checkpoint(arguments: argparse.Namespace) -> Finding:
+    """Return where the checkpoint is, without loading it."""
+    name, path = arguments.checkpoint, Path(arguments.checkpoint).expanduser()
+    not_loaded = "It is not loaded, nor are time and size measured (--no-trial)."
+    if path.exists():
+        size = format_bytes(_bytes_below(path))
+        return Finding("checkpoint", "note", f"{name}, {size} of files. {not_loaded}")
+    if name in arguments.family.built_in:
+        return Finding("checkpoint", "note", f"{name} comes with the program. {not_loaded}")
+    text = f"{name} is no folder here: a run looks for it in the caches of the hub and of openpi, then downloads it."
+    return Finding("checkpoint", "note", f"{text} {not_loaded}")
+
+
+def _bytes_below(path: Path) -> int:
+    files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+    return sum(file.stat().st_size for file in files)
 
 
 def _load(arguments: argparse.Namespace, device: str) -> tuple[Policy | None, Finding]:
@@ -160,6 +178,7 @@ def _try(settings: RunSettings, policy: Policy, device: str, termination: Termin
     protocol, episodes = attributes.protocol, planned.num_tasks * settings.num_episodes
     replans = max_replans(protocol)
     yield _time(settings, trial, replans, protocol.replan_steps, episodes)
+    yield _memory_taken(device)
     candidates: tuple[Recording, ...] = (attributes.recording,)
     if settings.budget is not None:
         candidates = recordings_by_size(attributes.recording, policy.num_denoise_steps, settings.fixed)
@@ -237,6 +256,23 @@ def _time(settings: RunSettings, trial: Trial, replans: int, replan_steps: int, 
         f"{trial.policy_seconds:.2g} s, a step {trial.step_seconds:.2g} s, the start of an episode "
         f"{trial.start_seconds:.2g} s.",
     )
+
+
+def _memory_taken(device: str) -> Finding:
+    """Return what this process has taken, loading and calling the policy; simulators of their own take more."""
+    import torch
+
+    text = f"The policy's process took up to {format_bytes(_peak_bytes())}"
+    if device.startswith("cuda"):
+        text += f", and {format_bytes(torch.cuda.max_memory_reserved(device))} of the GPU's memory"
+    return Finding("memory", "ok", f"{text}. Each simulator in a process of its own takes about 0.5 GB more.")
+
+
+def _peak_bytes() -> int:
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024  # kilobytes, except on macOS
 
 
 def _duration(seconds: float) -> str:

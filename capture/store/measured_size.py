@@ -92,24 +92,29 @@ class SampleOfReplans:
 
     def size(self, recording: Recording) -> EpisodeSize:
         """Return what episodes take when they are recorded like this; writes the sample into a temporary folder."""
-        full = self.attributes.recording
-        records = [smaller_record(record, full, recording, self.attributes.sites) for record in self.records]
-        attributes = replace(self.attributes, recording=recording)
-        times = self.denoise_times[_places(full.denoise_steps, recording.denoise_steps)]
-        if len(records) < FEWEST_REPLANS:
-            raise ValueError(f"a sample of {len(records)} replans says nothing; it needs {FEWEST_REPLANS}")
-        half = len(records) // 2
-        with tempfile.TemporaryDirectory(prefix="vla-size-") as folder:
-            of_half, of_all = (
-                _write(Path(folder) / f"{count}{STORE_SUFFIX}", attributes, self.start, times, records[:count])
-                for count in (half, len(records))
-            )
+        count = len(self.records)
+        if count < FEWEST_REPLANS:
+            raise ValueError(f"a sample of {count} replans says nothing; it needs {FEWEST_REPLANS}")
+        half = count // 2
+        of_half, of_all = self._written(recording, half), self._written(recording, count)
         sizes = {}
         for name, (measured, chunk) in of_all.items():
             before = of_half.get(name, (0, 1))[0]
-            slope = max(0.0, (measured - before) / (len(records) - half))
-            sizes[name] = ArraySize(max(0.0, measured - slope * len(records)), slope, chunk)
+            slope = max(0.0, (measured - before) / (count - half))
+            sizes[name] = ArraySize(max(0.0, measured - slope * count), slope, chunk)
         return EpisodeSize(sizes)
+
+    def bytes_written(self, recording: Recording) -> int:
+        """Return the bytes of one episode of all replans of the sample, when they are recorded like this."""
+        return sum(measured for measured, _ in self._written(recording, len(self.records)).values())
+
+    def _written(self, recording: Recording, count: int) -> dict[str, tuple[int, int]]:
+        full, sites = self.attributes.recording, self.attributes.sites
+        records = [smaller_record(record, full, recording, sites) for record in self.records[:count]]
+        times = self.denoise_times[_places(full.denoise_steps, recording.denoise_steps)]
+        attributes = replace(self.attributes, recording=recording)
+        with tempfile.TemporaryDirectory(prefix="vla-size-") as folder:
+            return _write(Path(folder) / f"sample{STORE_SUFFIX}", attributes, self.start, times, records)
 
 
 def smaller_record(

@@ -29,6 +29,7 @@ def test_the_run_of_the_policy_that_comes_along(tmp_path, capfd):
         *("processor", "memory", "GPU", "drawing", "robosuite", "LIBERO", "disk", "checkpoint", "precision"),
         *("time", "size"),
     ]
+    assert "The policy's process took up to" in found["memory"][1]
     assert "pi05_cubes (pi05, openpi_torch, 5.95 MB of weights), trained." in found["checkpoint"][1]
     assert re.match(
         r"At most \d+ (s|min), with one simulator, if every episode runs to its last step", found["time"][1]
@@ -48,7 +49,7 @@ def test_what_a_run_needs_and_lacks_is_exit_code_1(tmp_path, capfd, monkeypatch)
     assert "lacks scenes" in found["assets"][1]
     assert found["checkpoint"] == (
         "note",
-        "pi05_cubes is not loaded, nor are time and size measured (--no-trial).",
+        "pi05_cubes comes with the program. It is not loaded, nor are time and size measured (--no-trial).",
     )
     assert said.endswith("The run cannot be made as described: assets.\n")
     nowhere = ["--checkpoint", str(tmp_path / "nowhere"), "--store", str(tmp_path / "a.zarr")]

@@ -85,6 +85,12 @@ def test_pictures_in_front_of_one_background_are_counted_by_the_chunk(tmp_path):
     assert sample.size(attributes.recording).bytes_of(60) == pytest.approx(real, rel=0.1)
 
 
+def test_the_bytes_of_a_sample_are_those_of_its_episode(tmp_path):
+    whole = sample_of(SPEC, 40)
+    # Only the outcome, which nobody knows of a sample, is written otherwise.
+    assert whole.bytes_written(whole.attributes.recording) == pytest.approx(bytes_written(SPEC, tmp_path), rel=1e-4)
+
+
 def test_bytes_of_an_array():
     size = ArraySize(per_chunk=100, per_replan=10, chunk=4)
     assert [size.bytes_of(count) for count in (1, 4, 5, 8, 9)] == [110, 140, 250, 280, 390]
