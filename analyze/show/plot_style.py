@@ -86,13 +86,18 @@ def save_figure(
     `picture_formats`, PNG and PDF unless a command line says otherwise.
     """
     paths = []
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        # Places are found once, for every format. While a figure has an engine, matplotlib draws all of it twice.
+        figure.set_dpi(DPI)
+        engine.execute(figure)
+        figure.set_layout_engine(None)
     for kind in formats or picture_formats():
         path = folder / f"{stem}.{kind}"
         # Without a creation date the same data give the same file.
         metadata = {"CreationDate": None} if kind == "pdf" else None
         with replacing(path) as temporary:
             figure.savefig(temporary, format=kind, dpi=DPI, metadata=metadata)
-        figure.set_layout_engine("none")  # the places are found: they are the same in every format
         paths.append(path)
     tables = data if isinstance(data, Mapping) else {"": data}
     for end, table in tables.items():

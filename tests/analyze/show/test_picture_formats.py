@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import polars as pl
 import pytest
+from matplotlib.figure import Figure
 
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.show.picture_formats import picture_formats, pictures_saved_as
+from vla_attention.analyze.show.plot_style import new_figure, save_figure
 from vla_attention.testing.stores import write_store
 
 
@@ -33,3 +36,14 @@ def test_the_formats_are_back_after_an_error():
     with pytest.raises(KeyError):
         fail()
     assert picture_formats() == ("png", "pdf")
+
+
+def test_a_picture_is_drawn_once_for_a_format(tmp_path, monkeypatch):
+    drawn = []
+    draw = Figure.draw
+    monkeypatch.setattr(Figure, "draw", lambda figure, renderer: drawn.append(renderer) or draw(figure, renderer))
+    figure = new_figure(3, 2)
+    figure.add_subplot().plot([1, 2])
+    save_figure(figure, tmp_path, "line", pl.DataFrame({"x": [1, 2]}), ("png",))
+    assert len(drawn) == 1
+    assert (tmp_path / "line.png").read_bytes()[:4] == b"\x89PNG"
