@@ -5,7 +5,7 @@ denoise step, so one product for all steps replaces ten small ones. There are th
 
 - shared: on a processor in float32, the model's own value products of its pieces of the keys are those of most parts,
   and are not made again. A part of a few keys whose values are the same at all steps (words) is projected key by key,
-  once for all steps. The part that adds most at a block's first step is what the others leave of the block's update,
+  once for all steps. The part that adds most at the first call is what the others leave of the blocks' updates,
   and needs no product; its rounding error is that of the update.
 - later: on a GPU, rows, values and updates stay on the device until the denoise steps are done.
 - now: rows that would fill the memory (all tokens of a Cosmos policy) are used at once.
@@ -33,6 +33,8 @@ from vla_attention.capture.recording.contributions import (
 
 #: Rows of all calls of a replan with more bytes than this are used at once instead of waiting on the GPU.
 _MOST_WAITING_BYTES = 2**29
+#: Vectors of contributions that are made together, in bytes.
+_MOST_VECTOR_BYTES = 2**21
 #: A part of more keys is not projected key by key.
 _MOST_SINGLE_KEYS = 24
 
@@ -53,12 +55,12 @@ class _Kept:
     """What is kept of one call."""
 
     projection: Projection
-    #: (action query, width)
+    #: (1, action query, width)
     update: Tensor
     #: later: (head, action query, key) and (kv_head, key, dim)
     rows: Tensor | None = None
     values: Tensor | None = None
-    #: shared: (head, action query, dim) of each part that is mixed, and (head, action query, key) of the single keys
+    #: shared: (1, head, action query, dim) of each part that is mixed, (1, head, action query, key) of the single keys
     mixed: tuple[Tensor, ...] = ()
     single: Tensor | None = None
 
@@ -73,7 +75,7 @@ class _Shares:
     """
 
     mixed: tuple[tuple[int, int | slice | Tensor], ...]
-    single: tuple[tuple[int, Tensor], ...]
+    single: tuple[tuple[int, slice | Tensor], ...]
     single_keys: slice | Tensor | None
     complete: bool
 
@@ -101,10 +103,11 @@ class _Shares:
         together = np.zeros(len(members), dtype=bool)
         for _, keys in single:
             together[keys] = True
-        position = np.cumsum(together) - 1
+        # The places of each part's keys among all single keys.
+        places = keys_of_parts(read[together][:, [part for part, _ in single]], torch.device("cpu"))
         return cls(
             tuple(mixed),
-            tuple((part, torch.from_numpy(position[keys])) for part, keys in single),
+            tuple((part, place) for (part, _), place in zip(single, places, strict=True)),
             keys_of_parts(together[:, None], torch.device("cpu"))[0] if single else None,
             bool((read.any(axis=1) | ~facts.allowed).all()),
         )
@@ -137,31 +140,38 @@ class CallContributions:
         projection: Projection,
         update: Tensor,
     ) -> None:
-        """Take one call: rows (head, action query, key), values (kv_head, key, dim), update (action query, width).
+        """Take one call: rows (1, head, action query, key), values (1, kv_head, key, dim), update (1, query, width).
 
-        pieces: (head, action query, dim) value products of the model's pieces, if it made any.
+        pieces: (1, head, action query, dim) value products of the model's pieces, if it made any.
         """
         if self._way is None:
             self._way = self._choose(rows, pieces, values, projection, update)
         if self._way == "now":
-            each = part_contributions(rows, values, self._parts, projection)
-            self._grams[cell] = gram_matrix(each, update)
+            each = part_contributions(rows[0], values[0], self._parts, projection)
+            self._grams[cell] = gram_matrix(each, update[0])
             return
         if self._way == "later":
-            self._kept[cell] = _Kept(projection, update, rows, values)
+            self._kept[cell] = _Kept(projection, update, rows[0], values[0])
             return
         assert self._shares is not None
         assert pieces is not None
         mixed = tuple(
-            pieces[source] if isinstance(source, int) else _mixed(rows, values, source)
+            pieces[source] if isinstance(source, int) else _mixed(rows[0], values[0], source)
             for _, source in self._shares.mixed
         )
         single = None
         if self._shares.single_keys is not None:
-            single = rows[..., self._shares.single_keys].clone()
+            single = self._single_rows(rows)
             if cell[0] not in self._single_values:
-                self._single_values[cell[0]] = values[:, self._shares.single_keys].clone()
+                self._single_values[cell[0]] = values[0, :, self._shares.single_keys].clone()
         self._kept[cell] = _Kept(projection, update, mixed=mixed, single=single)
+
+    def _single_rows(self, rows: Tensor) -> Tensor:
+        """Return a copy of the rows (1, head, action query, single key)."""
+        keys = self._shares.single_keys if self._shares is not None else None
+        if isinstance(keys, slice):
+            return torch.narrow_copy(rows, 3, keys.start, keys.stop - keys.start)
+        return rows[..., keys]
 
     def _choose(
         self, rows: Tensor, pieces: Sequence[Tensor] | None, values: Tensor, projection: Projection, update: Tensor
@@ -178,49 +188,55 @@ class CallContributions:
         """Return the Gram matrices of all cells in their order, (cell, part + 1, part + 1) float32 on the device."""
         if self._way == "now":
             return torch.stack([self._grams[cell] for cell in self.cells])
-        steps: dict[int, list[_Kept]] = {}
-        for cell in self.cells:
-            steps.setdefault(cell[0], []).append(self._kept[cell])
-        one = self._of_layer_later if self._way == "later" else self._of_layer_shared
-        return torch.cat([one(layer, kept) for layer, kept in steps.items()])
+        layers = list(dict.fromkeys(layer for layer, _ in self.cells))
+        steps = len(self.cells) // len(layers)
+        together = 1
+        if self._way == "shared":  # layers together, as long as their vectors stay in the processor's cache
+            one = self._kept[self.cells[0]].update
+            together = max(1, _MOST_VECTOR_BYTES // (steps * (self.members.shape[1] + 1) * one.numel() * 4))
+        make = self._gram_matrices_later if self._way == "later" else self._gram_matrices_shared
+        count = together * steps
+        return torch.cat([make(self.cells[i : i + count], steps) for i in range(0, len(self.cells), count)])
 
-    def _of_layer_later(self, layer: int, kept: Sequence[_Kept]) -> Tensor:
-        """Return the Gram matrices (step, part + 1, part + 1) of one layer from its rows and values."""
+    def _gram_matrices_later(self, cells: Sequence[Cell], steps: int) -> Tensor:
+        """Return the Gram matrices (cell, part + 1, part + 1) of one layer from its rows and values."""
+        kept = [self._kept[cell] for cell in cells]
         rows = torch.stack([call.rows for call in kept if call.rows is not None])
         values = torch.stack([call.values for call in kept if call.values is not None])
         each = F.linear(part_values(rows, values, self._parts), kept[0].projection.weight.float())
         gates = _gates(kept)
-        return gram_matrix(each if gates is None else each * gates, torch.stack([call.update for call in kept]))
+        return gram_matrix(each if gates is None else each * gates, torch.cat([call.update for call in kept]))
 
-    def _of_layer_shared(self, layer: int, kept: Sequence[_Kept]) -> Tensor:
-        """Return the Gram matrices (step, part + 1, part + 1) of one layer from mixed values and single keys."""
+    def _gram_matrices_shared(self, cells: Sequence[Cell], steps: int) -> Tensor:
+        """Return the Gram matrices (cell, part + 1, part + 1) of some layers from mixed values and single keys."""
         shares = self._shares
         assert shares is not None
-        weight = kept[0].projection.weight
-        update = torch.stack([call.update for call in kept])
-        steps, queries, width = update.shape
+        kept = [self._kept[cell] for cell in cells]
+        weights = [call.projection.weight for call in kept[::steps]]
+        gates = _gates(kept)
+        update = torch.cat([call.update for call in kept])
         rest = self._largest(kept[0]) if shares.complete else None
         mixed = [number for number in range(len(shares.mixed)) if number != rest]
         order = [shares.mixed[number][0] for number in mixed] + [part for part, _ in shares.single]
-        # (step, part, query, width); the update comes last, what the others leave of it before it
-        vectors = update.new_empty(steps, len(order) + (rest is not None) + 1, queries, width)
+        # (cell, part, query, width); the update comes last, what the others leave of it before it
+        vectors = update.new_empty(len(cells), len(order) + (rest is not None) + 1, *update.shape[1:])
+        others, last = vectors[:, : len(order)], vectors[:, -1]
         if mixed:
-            given = torch.stack([torch.stack([call.mixed[number] for number in mixed]) for call in kept])
-            vectors[:, : len(mixed)] = F.linear(given.transpose(2, 3).flatten(3), weight)
+            given = torch.cat([call.mixed[number] for call in kept for number in mixed])
+            given = given.transpose(1, 2).reshape(len(weights), -1, weights[0].shape[1])
+            made = torch.stack([F.linear(one, weight) for one, weight in zip(given, weights, strict=True)])
+            _times(made.view(len(cells), len(mixed), *update.shape[1:]), gates, others[:, : len(mixed)])
         if shares.single:
-            self._project_keys(layer, kept, weight, vectors[:, len(mixed) : len(order)])
-        gates = _gates(kept)
-        if gates is not None:
-            vectors[:, : len(order)] *= gates
+            self._project_keys(cells, steps, weights, gates, others[:, len(mixed) :])
         if rest is not None:
-            torch.sub(update, vectors[:, : len(order)].sum(dim=1), out=vectors[:, len(order)])
+            torch.sub(update, others.sum(dim=1), out=vectors[:, len(order)])
             order.append(shares.mixed[rest][0])
-        vectors[:, -1] = update
+        last.copy_(update)
         flat = vectors.flatten(2)
-        inner = torch.matmul(flat, flat.transpose(1, 2)) / queries
+        inner = torch.matmul(flat, flat.transpose(1, 2)) / update.shape[1]
         size = self.members.shape[1] + 1
         place = torch.tensor([*order, size - 1])
-        gram = inner.new_zeros(steps, size, size)
+        gram = inner.new_zeros(len(cells), size, size)
         gram[:, place[:, None], place] = inner
         return gram
 
@@ -230,30 +246,58 @@ class CallContributions:
             return None
         return max(range(len(call.mixed)), key=lambda number: float(call.mixed[number].square().sum()))
 
-    def _project_keys(self, layer: int, kept: Sequence[_Kept], weight: Tensor, out: Tensor) -> None:
-        """Write the contributions of the parts of single keys, (step, part, query, width) before the gates."""
+    def _project_keys(
+        self, cells: Sequence[Cell], steps: int, weights: Sequence[Tensor], gates: Tensor | None, out: Tensor
+    ) -> None:
+        """Write the contributions (cell, part, query, width) of the parts of single keys."""
         assert self._shares is not None
-        rows = torch.stack([call.single for call in kept if call.single is not None])  # (step, head, query, key)
-        steps, heads, queries, _ = rows.shape
-        values = self._single_values[layer]
-        dim = values.shape[-1]
-        of_heads = values.repeat_interleave(heads // len(values), dim=0)  # (head, key, dim)
-        per_head = torch.unflatten(weight, 1, (heads, dim)).permute(1, 2, 0)  # (head, dim, width)
-        projected = torch.matmul(of_heads, per_head)  # (head, key, width)
-        rows = rows.transpose(1, 2)  # (step, query, head, key)
-        for number, (_, keys) in enumerate(self._shares.single):
-            weights = rows[..., keys].reshape(steps * queries, -1)
-            out[:, number] = torch.matmul(weights, projected[:, keys].flatten(0, 1)).view(steps, queries, -1)
+        singles = [self._kept[cell].single for cell in cells]
+        rows = torch.cat([single for single in singles if single is not None]).transpose(
+            1, 2
+        )  # (cell, query, head, key)
+        rows = rows.transpose(2, 3)  # (cell, query, key, head)
+        queries, heads = rows.shape[1], rows.shape[3]
+        keys = torch.stack(
+            [
+                _projected(self._single_values[layer], weight, heads)
+                for (layer, _), weight in zip(cells[::steps], weights, strict=True)
+            ]
+        )  # (layer, key, head, width)
+        for number, (_, place) in enumerate(self._shares.single):
+            of_keys = keys[:, place].flatten(1, 2)
+            made = torch.matmul(rows[:, :, place].reshape(len(weights), -1, of_keys.shape[1]), of_keys)
+            _times(made.view(len(cells), 1, queries, -1), gates, out[:, number : number + 1])
+
+
+def _projected(values: Tensor, weight: Tensor, heads: int) -> Tensor:
+    """Return what each head adds to the residual stream with a weight of 1 on a key, (key, head, width).
+
+    values: (kv_head, key, dim). weight: (width, head · dim).
+    """
+    kv_heads, keys, dim = values.shape
+    by_head = weight.view(-1, kv_heads, heads // kv_heads, dim)
+    made = [
+        F.linear(values[kv], by_head[:, kv].reshape(-1, dim)) for kv in range(kv_heads)
+    ]  # (key, width · shared head)
+    return torch.stack(made, dim=1).view(keys, kv_heads, len(weight), -1).movedim(2, 3).flatten(1, 2)
 
 
 def _gates(kept: Sequence[_Kept]) -> Tensor | None:
-    """Return the gates of the steps, (step, 1, 1, width) float32, or None without gates."""
-    gates = [call.projection.gate for call in kept]
-    return None if gates[0] is None else torch.stack([gate.float() for gate in gates if gate is not None])[:, None]
+    """Return the gates of the calls, (call, 1, 1, width) float32, or None without gates."""
+    gates = [call.projection.gate for call in kept if call.projection.gate is not None]
+    return torch.cat(gates).float()[:, None, None] if gates else None
+
+
+def _times(made: Tensor, gates: Tensor | None, out: Tensor) -> None:
+    """Write contributions (call, part, query, width) times their gates."""
+    if gates is None:
+        out.copy_(made)
+    else:
+        torch.mul(made, gates, out=out)
 
 
 def _mixed(rows: Tensor, values: Tensor, keys: slice | Tensor) -> Tensor:
-    """Return the mixed values (head, query, dim) of some keys."""
+    """Return the mixed values (1, head, query, dim) of some keys."""
     heads, queries, _ = rows.shape
     shared = rows[..., keys].reshape(len(values), heads // len(values) * queries, -1)
-    return torch.matmul(shared, values[:, keys]).view(heads, queries, -1)
+    return torch.matmul(shared, values[:, keys]).view(1, heads, queries, -1)

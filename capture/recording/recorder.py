@@ -80,13 +80,17 @@ class AttentionRecorder(RowCollector):
     pools: NDArray[np.float64] | None = None
     _cells: dict[Cell, int] = field(init=False, repr=False)
     _buffer: Tensor | None = field(default=None, init=False, repr=False)
+    _slots: tuple[Tensor, ...] = field(default=(), init=False, repr=False)
+    #: The shape of rows that were found right.
+    _shape: tuple[int, ...] = field(default=(), init=False, repr=False)
+    _num_queries: int = field(default=1, init=False, repr=False)
     #: The planned heads and the weights of the pools on the device; None for all heads in their order.
     _heads: Tensor | None = field(default=None, init=False, repr=False)
     _pools: Tensor | None = field(default=None, init=False, repr=False)
     _rows_seen: Counter[Cell] = field(default_factory=Counter, init=False, repr=False)
     _updates_seen: Counter[Cell] = field(default_factory=Counter, init=False, repr=False)
     _contributions: CallContributions | None = field(default=None, init=False, repr=False)
-    #: Rows (head, action query, key) of all heads and the value products, kept until the update of the call arrives.
+    #: Rows (1, head, action query, key) of all heads and the value products, kept until the update of the call arrives.
     _awaited: Tensor | None = field(default=None, init=False, repr=False)
     _pieces: Sequence[Tensor] | None = field(default=None, init=False, repr=False)
 
@@ -121,7 +125,7 @@ class AttentionRecorder(RowCollector):
             return None
 
         def take(pieces: Sequence[Tensor]) -> None:
-            self._pieces = [piece[0, :, action_queries] for piece in pieces]
+            self._pieces = [_of_queries(piece, 2, action_queries) for piece in pieces]
 
         return take
 
@@ -135,13 +139,39 @@ class AttentionRecorder(RowCollector):
             if self._awaited is None:
                 raise SiteNotRecorded(f"Layer {layer} passed on its update before its rows.")
             cell = (layer, denoise_step)
-            contributions.take(cell, self._awaited, self._pieces, values[0], projection, update[0, action_queries])
+            update = _of_queries(update, 1, action_queries)
+            contributions.take(cell, self._awaited, self._pieces, values, projection, update)
             self._updates_seen[cell] += 1
             self._awaited = self._pieces = None
 
         return take
 
     def _take(self, cell: Cell, rows: Tensor, action_queries: slice) -> None:
+        if rows.shape != self._shape:
+            self._check_shape(rows)
+        of_actions = _of_queries(rows, 2, action_queries)
+        if self.parts is not None:
+            self._awaited = of_actions
+        chosen = of_actions[0]
+        if self._buffer is None:
+            self._buffer = self._allocate(chosen)
+            self._slots = self._buffer.unbind()
+        slot = self._slots[self._cells[cell]]
+        self._rows_seen[cell] += 1
+        if self._heads is not None:
+            chosen = chosen.index_select(0, self._heads)
+        if self.plan.queries == "mean":
+            if slot.device == chosen.device:
+                torch.sum(chosen, dim=1, keepdim=True, out=slot)  # `on_device` divides all at once
+            else:
+                slot.copy_(chosen.sum(dim=1, keepdim=True))
+        elif self._pools is not None:
+            slot.copy_(torch.matmul(self._pools, chosen))
+        else:
+            slot.copy_(chosen)
+
+    def _check_shape(self, rows: Tensor) -> None:
+        """Raise an error unless rows (batch, head, query, key) are those of this site and have the planned heads."""
         batch, heads, _, keys = rows.shape
         if batch != 1:
             raise ValueError(f"rows are recorded for a batch of 1, not of {batch}")
@@ -149,23 +179,7 @@ class AttentionRecorder(RowCollector):
             raise ValueError(f"site '{self.plan.site}' has {self.num_keys} keys, but the model gave rows of {keys}")
         if max(self.plan.heads) >= heads:
             raise BadArgument(f"Head {max(self.plan.heads)} does not exist: the model's heads are 0 to {heads - 1}.")
-        of_actions = rows[0, :, action_queries].detach()
-        if self.parts is not None:
-            self._awaited = of_actions
-        if self._buffer is None:
-            self._buffer = self._allocate(of_actions)
-        slot = self._buffer[self._cells[cell]]
-        self._rows_seen[cell] += 1
-        chosen = of_actions if self._heads is None else of_actions.index_select(0, self._heads)
-        straight = slot.device == chosen.device
-        if self.plan.queries == "mean":
-            if straight:
-                torch.mean(chosen, dim=1, keepdim=True, out=slot)
-                return
-            chosen = chosen.mean(dim=1, keepdim=True)
-        elif self._pools is not None:
-            chosen = torch.matmul(self._pools, chosen)
-        slot.copy_(chosen)
+        self._shape = rows.shape
 
     def _allocate(self, of_actions: Tensor) -> Tensor:
         """Return the buffer (cell, head, query, key), and move the choice of heads and pools to the device.
@@ -173,6 +187,7 @@ class AttentionRecorder(RowCollector):
         of_actions: (head, action query, key), the first rows that were taken.
         """
         heads, queries, _ = of_actions.shape
+        self._num_queries = queries
         device = of_actions.device
         if self.plan.heads != tuple(range(heads)):
             self._heads = torch.tensor(self.plan.heads, device=device)
@@ -198,9 +213,14 @@ class AttentionRecorder(RowCollector):
         return RecordedRows(rows, sums, grams[0] if grams else None)
 
     def on_device(self) -> list[Tensor]:
-        """Return the rows (cell, head, query, key) and, if recorded, the Gram matrices, where the model made them."""
+        """Return the rows (cell, head, query, key) and, if recorded, the Gram matrices, where the model made them.
+
+        It is called once, after the model.
+        """
         self._check(self._rows_seen, "rows")
         assert self._buffer is not None
+        if self.plan.queries == "mean":
+            self._buffer.div_(self._num_queries)
         if self._contributions is None:
             return [self._buffer]
         self._check(self._updates_seen, "updates")
@@ -219,6 +239,13 @@ class AttentionRecorder(RowCollector):
                 f"{len(self._cells)} pairs of layer and denoise step, but passed on {'; '.join(faults[:6])}"
                 f"{' ...' if len(faults) > 6 else ''}."
             )
+
+
+def _of_queries(tensor: Tensor, axis: int, queries: slice) -> Tensor:
+    """Return the entries of some queries; the tensor itself if these are all."""
+    length = tensor.shape[axis]
+    start, stop, _ = queries.indices(length)
+    return tensor if (start, stop) == (0, length) else tensor.narrow(axis, start, stop - start)
 
 
 def to_processor(tensors: Sequence[Tensor]) -> list[Tensor]:
