@@ -131,6 +131,10 @@ class CallContributions:
     #: layer -> values (kv_head, single key, dim)
     _single_values: dict[int, Tensor] = field(default_factory=dict, init=False)
 
+    def prepare(self, device: torch.device) -> None:
+        """Move the keys of the parts to a device; called before the first call is taken."""
+        self._parts = keys_of_parts(self.members, device)
+
     def take(
         self,
         cell: Cell,
@@ -180,7 +184,6 @@ class CallContributions:
         if self.facts is not None and pieces is not None and exact and rows.device.type == "cpu":
             self._shares = _Shares.of(self.members, self.facts)
             return "shared"
-        self._parts = keys_of_parts(self.members, rows.device)
         waiting = rows.numel() * rows.element_size() * len(self.cells)
         return "later" if rows.device.type != "cpu" and waiting <= _MOST_WAITING_BYTES else "now"
 

@@ -46,6 +46,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     model.add_argument(
         "--num-open-loop-steps", type=int, metavar="N", help="actions executed per call (default: the chunk)"
     )
+    model.add_argument("--compile", action="store_true", help=argparse.SUPPRESS)  # refused in `_build`
     frames = parser.add_argument_group("frames of the published proxy (the store keeps all of them)")
     frames.add_argument(
         "--query-frame", default="action", metavar="NAME", help="whose queries are recorded (default: action)"
@@ -66,6 +67,8 @@ def _build(arguments: argparse.Namespace, device: str) -> CosmosPolicy:
     from vla_attention.capture.policies.cosmos.build import build_cosmos_policy
     from vla_attention.capture.policies.cosmos.config import DEFAULT_CONFIG_NAME
 
+    if getattr(arguments, "compile", False):
+        raise BadArgument("Cannot use --compile with a Cosmos policy: so far only pi models have it; leave it out.")
     return build_cosmos_policy(
         arguments.checkpoint,
         device=device,

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from vla_attention.capture.policies.model_arguments import UNTRAINED, UNTRAINED_TINY, check_not_renamed
+from vla_attention.capture.policies.pi.compiled import compile_steps
 from vla_attention.capture.policies.pi.config import GEMMA_VARIANTS, GemmaConfig, find_config, find_variant
 from vla_attention.capture.policies.pi.data_set_robot import untrained_robot
 from vla_attention.capture.policies.pi.embedded import dummy_policy, embedded_policy
@@ -38,12 +39,14 @@ def build_pi_policy(
     num_image_tokens: int | None = None,
     data: RobotData | None = None,
     robot: Robot | None = None,
+    compiled: bool = False,
 ) -> PiPolicy:
     """Build the policy and check the options against it.
 
     `checkpoint` is a folder, a name on a hub, or one of the two untrained policies that come with the package:
-    `untrained`, `untrained-tiny`. `data` and `robot`: see `load_pi_policy`. Raises `BadArgument` if a variant or the
-    number of image tokens contradicts the policy.
+    `untrained`, `untrained-tiny`. `compiled`: denoise steps through torch.compile. `data` and `robot`: see
+    `load_pi_policy`. Raises `BadArgument` if a variant or the number of image tokens contradicts the policy, or if
+    nothing can be compiled here.
     """
     wanted = {
         "--paligemma-variant": find_variant(paligemma_variant) if paligemma_variant else None,
@@ -90,6 +93,8 @@ def build_pi_policy(
             f"--num-image-tokens {num_image_tokens} contradicts the layout: each of the cameras "
             f"{listing(config.cameras)} has {config.siglip.num_tokens} keys; leave the option out."
         )
+    if compiled:
+        compile_steps(policy.model)
     return policy
 
 

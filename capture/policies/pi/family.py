@@ -57,6 +57,11 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     model.add_argument(
         "--action-expert-variant", metavar="NAME", help="checked against the checkpoint (gemma_300m ...)"
     )
+    model.add_argument(
+        "--compile",
+        action="store_true",
+        help="denoise steps through torch.compile, as CUDA graphs on a GPU; the first call takes minutes",
+    )
     model.add_argument("--num-image-tokens", type=int, metavar="N", help="checked against the policy's layout")
 
 
@@ -77,14 +82,16 @@ def _build(arguments: argparse.Namespace, device: str) -> PiPolicy:
         num_image_tokens=arguments.num_image_tokens,
         data=getattr(arguments, "robot_data", None),
         robot=getattr(arguments, "robot", None),
+        compiled=getattr(arguments, "compile", False),
     )
 
 
 def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
     of_data_set = {"robot": from_json(Robot, identity.config["robot"])} if "robot" in identity.config else {}
+    same = {**of_data_set, "compile": True} if "denoise_steps" in identity.config else of_data_set
     if identity.checkpoint_format == "seeded":
-        return {"checkpoint": FORMER_NAMES.get(identity.name, identity.name), **of_data_set}
-    settings = {"checkpoint": identity.checkpoint, "dtype": identity.config["dtype"], **of_data_set}
+        return {"checkpoint": FORMER_NAMES.get(identity.name, identity.name), **same}
+    settings = {"checkpoint": identity.checkpoint, "dtype": identity.config["dtype"], **same}
     if identity.checkpoint_format in ("openpi_torch", "openpi_jax", "lerobot"):
         settings["checkpoint_format"] = identity.checkpoint_format
     if identity.checkpoint_format.startswith("openpi"):

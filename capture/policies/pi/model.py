@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
@@ -21,6 +22,9 @@ from vla_attention.capture.policies.pi.pieces import pieces_of_keys
 from vla_attention.capture.policies.pi.siglip import Projector, VisionTower
 from vla_attention.capture.recording.attention import AttentionEditor, RowCollector
 
+if TYPE_CHECKING:
+    from vla_attention.capture.policies.pi.compiled import CompiledSteps
+
 
 @dataclass(frozen=True)
 class Prefix:
@@ -31,6 +35,21 @@ class Prefix:
 
     cache: tuple[KeysValues, ...]
     valid: Tensor
+
+
+@dataclass(frozen=True)
+class Denoising:
+    """What all denoise steps of a call have in common.
+
+    state: (batch, action dim). rotation, mask (batch, suffix query, key) bool: of the suffix. cache: as in `Prefix`.
+    pieces: of the value products (`pieces.py`), or None for one product.
+    """
+
+    state: Tensor
+    rotation: Rotation
+    mask: Tensor
+    cache: tuple[KeysValues, ...]
+    pieces: tuple[slice, ...] | None
 
 
 class PaliGemmaInner(nn.Module):
@@ -97,6 +116,8 @@ class PiModel(nn.Module):
             self.action_time_mlp_out = nn.Linear(expert, expert)
         self._place_precision(dtype)
         self.eval()
+        #: Set by `compile_steps`: makes the denoise steps of a single call through torch.compile.
+        self.compiled_steps: CompiledSteps | None = None
 
     def _place_precision(self, dtype: torch.dtype) -> None:
         if dtype not in (torch.float32, torch.bfloat16):
@@ -227,18 +248,21 @@ class PiModel(nn.Module):
         Returns:
             (batch, horizon, action dim) float32, still normalised.
         """
-        config = self.config
+        config, compiled = self.config, self.compiled_steps
+        through_compiled = compiled is not None and compiled.takes(noise, recorder, editor)
         prefix = self.encode_prefix(*self.embed_prefix(images, image_masks, tokens, token_mask), editor)
         suffix_positions = torch.arange(config.suffix_len, device=noise.device)
         positions = prefix.valid.sum(dim=1, keepdim=True) + suffix_positions
-        rotation = Rotation.at(positions, config.action_expert.head_dim)
-        mask = self._suffix_mask(prefix.valid)
-        action_queries = slice(config.first_action_query, config.suffix_len)
-        prefix_len = prefix.valid.shape[1]
-        suffix_keys = slice(prefix_len, prefix_len + config.suffix_len)
-        pieces = pieces_of_keys(config, prefix.valid)
+        denoising = Denoising(
+            state,
+            Rotation.at(positions, config.action_expert.head_dim),
+            self._suffix_mask(prefix.valid),
+            prefix.cache,
+            pieces_of_keys(config, prefix.valid),
+        )
         if recorder is not None:
-            recorder.begin_call(mask[0].any(dim=0), slice(0, prefix_len), pieces)
+            lasting = slice(0, prefix.valid.shape[1])
+            recorder.begin_call(denoising.mask[0].any(dim=0), lasting, denoising.pieces)
 
         steps = config.num_denoise_steps if num_steps is None else num_steps
         all_waves = embed_times(
@@ -248,27 +272,48 @@ class PiModel(nn.Module):
             min_period=config.min_period,
             max_period=config.max_period,
         ).to(noise.device)
+        if compiled is not None and through_compiled:
+            return compiled.integrate(noise, all_waves, denoising, recorder)
         x = noise
         for step, waves in enumerate(all_waves):
-            tokens_now, condition = self._embed_suffix(state, x, waves)
-            hidden = tokens_now.to(self.dtype)
-            for layer, block in enumerate(self._expert.blocks):
-                if recorder is not None:
-                    recorder.begin_block(layer, step)
-                hidden, _ = block(
-                    hidden,
-                    mask,
-                    rotation,
-                    before=prefix.cache[layer],
-                    condition=condition,
-                    calls=AttentionCalls(
-                        editor.step_change(layer, step, action_queries, suffix_keys) if editor is not None else None,
-                        recorder.sink(layer, step, action_queries) if recorder is not None else None,
-                        pieces,
-                        recorder.piece_sink(layer, step, action_queries) if recorder is not None else None,
-                        recorder.update_sink(layer, step, action_queries) if recorder is not None else None,
-                    ),
-                )
-            normed, _ = self._expert.norm(hidden[:, action_queries], condition)
-            x = x + (-1.0 / steps) * self.action_out_proj(normed.float())
+            x = x + (-1.0 / steps) * self.velocity(x, step, waves, denoising, recorder, editor)
         return x
+
+    def velocity(
+        self,
+        x: Tensor,
+        step: int,
+        waves: Tensor,
+        denoising: Denoising,
+        recorder: RowCollector | None = None,
+        editor: AttentionEditor | None = None,
+    ) -> Tensor:
+        """Return the flow's velocity (batch, horizon, action dim) float32 at the noisy actions x, of the same shape.
+
+        step: number of the denoise step. waves: its time embedding (width,).
+        """
+        config = self.config
+        action_queries = slice(config.first_action_query, config.suffix_len)
+        suffix_keys = slice(config.prefix_len, config.prefix_len + config.suffix_len)
+        tokens, condition = self._embed_suffix(denoising.state, x, waves)
+        hidden = tokens.to(self.dtype)
+        for layer, block in enumerate(self._expert.blocks):
+            if recorder is not None:
+                recorder.begin_block(layer, step)
+            hidden, _ = block(
+                hidden,
+                denoising.mask,
+                denoising.rotation,
+                before=denoising.cache[layer],
+                condition=condition,
+                calls=AttentionCalls(
+                    editor.step_change(layer, step, action_queries, suffix_keys) if editor is not None else None,
+                    recorder.sink(layer, step, action_queries) if recorder is not None else None,
+                    denoising.pieces,
+                    recorder.piece_sink(layer, step, action_queries) if recorder is not None else None,
+                    recorder.update_sink(layer, step, action_queries) if recorder is not None else None,
+                ),
+            )
+        normed, _ = self._expert.norm(hidden[:, action_queries], condition)
+        velocity: Tensor = self.action_out_proj(normed.float())
+        return velocity

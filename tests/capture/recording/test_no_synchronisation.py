@@ -1,0 +1,118 @@
+"""A recorded call asks nothing of a GPU inside its denoise steps, and moves what it recorded in one copy.
+
+The device is torch's meta device, whose tensors have shapes and no numbers: an operation that needs a number
+(`.item()`, `.cpu()`, a choice by value) is an error there, as it would be a wait on a GPU. Copies to the device are
+collected.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG
+from vla_attention.capture.policies.pi.gemma import KeysValues, Rotation
+from vla_attention.capture.policies.pi.model import Denoising, PiModel
+from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
+
+GPU = torch.device("meta")
+CONFIG = DUMMY_CONFIG
+
+
+class Transfers(TorchDispatchMode):
+    """Collects the copies between devices."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        made = func(*args, **(kwargs or {}))
+        devices = {
+            tensor.device.type
+            for value in (*args, *(kwargs or {}).values(), made)
+            for tensor in (value if isinstance(value, (list, tuple)) else [value])
+            if isinstance(tensor, torch.Tensor)
+        }
+        if func._schema.name in ("aten::_to_copy", "aten::copy_") and len(devices) > 1:
+            self.found.append(func._schema.name)
+        return made
+
+
+def recorder_of(queries: str) -> AttentionRecorder:
+    plan = RecordingPlan((0, 1, 2), (0, 1, 2), (5, 0), queries, "joint")
+    parts = np.zeros((CONFIG.key_len, 3), dtype=bool)
+    parts[:4, 0], parts[4::2, 1], parts[5::2, 2] = True, True, True
+    pools = np.eye(4)[:2] if queries == "steps" else None
+    return AttentionRecorder(plan, CONFIG.key_len, parts, pools)
+
+
+def fake_call(recorder: AttentionRecorder, dtype: torch.dtype) -> tuple[list[str], list[str], list[torch.Tensor]]:
+    """The transfers of the steps, those after them, and what was recorded, on a fake GPU."""
+    with GPU:
+        model = PiModel(CONFIG, dtype)
+    with torch.no_grad():
+        expert = CONFIG.action_expert
+
+        def keys() -> torch.Tensor:
+            return torch.empty(1, expert.num_kv_heads, CONFIG.prefix_len, expert.head_dim, device=GPU, dtype=dtype)
+
+        denoising = Denoising(
+            torch.empty(1, CONFIG.action_dim, device=GPU),
+            Rotation.at(torch.zeros(1, CONFIG.suffix_len, dtype=torch.int64, device=GPU), expert.head_dim),
+            torch.ones(1, CONFIG.suffix_len, CONFIG.key_len, dtype=torch.bool, device=GPU),
+            tuple(KeysValues(keys(), keys()) for _ in range(expert.depth)),
+            None,
+        )
+        x = torch.empty(1, CONFIG.action_horizon, CONFIG.action_dim, device=GPU)
+        recorder.begin_call(denoising.mask[0].any(dim=0), slice(0, CONFIG.prefix_len), None)
+        with Transfers() as inside:
+            for step in range(3):
+                x = x - model.velocity(x, step, torch.empty(expert.width, device=GPU), denoising, recorder)
+        with Transfers() as after:
+            recorded = recorder.on_device()
+    return inside.found, after.found, recorded
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("queries", ["mean", "steps", "all"])
+def test_nothing_waits_for_the_gpu_in_the_denoise_steps(queries, dtype):
+    inside, after, recorded = fake_call(recorder_of(queries), dtype)
+    assert inside == []
+    assert after == []
+    assert {tensor.device for tensor in recorded} == {GPU}
+    length = {"mean": 1, "steps": 2, "all": 4}[queries]
+    assert [tuple(tensor.shape) for tensor in recorded] == [(9, 2, length, CONFIG.key_len), (9, 4, 4)]
+
+
+@pytest.mark.parametrize(
+    "careless",
+    [
+        lambda rows: rows.sum().item(),
+        lambda rows: rows.cpu(),
+        lambda rows: bool((rows > 1).any()),
+        lambda rows: rows.nonzero(),
+    ],
+    ids=["item", "cpu", "bool", "nonzero"],
+)
+def test_a_recorder_that_waits_would_be_found(careless):
+    class Careless(AttentionRecorder):
+        def _take(self, cell, rows, action_queries):
+            careless(rows)
+            super()._take(cell, rows, action_queries)
+
+    good = recorder_of("mean")
+    with pytest.raises((RuntimeError, NotImplementedError), match="meta"):
+        fake_call(Careless(good.plan, good.num_keys, good.parts), torch.float32)
+
+
+def test_a_copy_to_the_device_would_be_found():
+    class Careless(AttentionRecorder):
+        def _take(self, cell, rows, action_queries):
+            torch.zeros(3).to(rows.device)
+            super()._take(cell, rows, action_queries)
+
+    good = recorder_of("mean")
+    assert fake_call(Careless(good.plan, good.num_keys, good.parts), torch.float32)[0]
