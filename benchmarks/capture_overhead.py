@@ -71,7 +71,10 @@ def make_policy(name: str, device: str = "cpu", dtype: str = "float32") -> Any:
             model = PiModel(config, getattr(torch, dtype))
         model = model.to_empty(device=device)
         generator = torch.Generator(device).manual_seed(0)
-        for parameter in model.parameters():
+        for parameter_name, parameter in model.named_parameters():
+            if "vision_tower" in parameter_name and "norm" in parameter_name and parameter_name.endswith("weight"):
+                parameter.data.fill_(1)
+                continue
             spread = parameter[0].numel() ** -0.5 if parameter.dim() > 1 else 0.02
             parameter.data.normal_(0, spread, generator=generator)
     else:
@@ -124,7 +127,7 @@ def usual_way(kept: list[Any]) -> Iterator[None]:
         kept.append(matrices.cpu().numpy())
         return torch.matmul(matrices.to(value.dtype), value)
 
-    with mock.patch.object(gemma, "attend", eager):
+    with mock.patch.object(gemma, "attend", eager), mock.patch.object(gemma, "attend_unseen", eager):
         yield
 
 
