@@ -11,7 +11,9 @@ measures goes to docs/benchmarks/analysis_speed.json; nothing is asserted. The p
                intervals; the same masses by a loop with zarr-python, and by xarray with dask (`pip install dask`)
     bytes      what the process reads for all layers and for three of eighteen, as Linux counts it
     processes  whole `vla-analyze` processes without the cache: wall seconds and peak memory
-    memory     peak memory at 50, 100 and 200 episodes; of one head, because masses of more are as large
+    memory     peak memory of whole processes at 50, 100 and 200 episodes; of one head, because masses of more are as
+               large
+    masses     the same of processes that compute masses and nothing else
 """
 
 from __future__ import annotations
@@ -23,13 +25,15 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from measurement import ROOT, Table, measured, ratios, run_process, take_turns, write_rows
+from measurement import ROOT, Table, in_turn, measured, ratios, run_process, write_rows
 
 sys.path.insert(0, str(ROOT))
 
@@ -155,25 +159,46 @@ def xarray_dask(store: Path, weights: np.ndarray[Any, Any], threads: int) -> Non
 def measure_scan(store: Path, rounds: int, threads: int) -> Table:
     """The part `scan`."""
     weights = np.random.default_rng(0).random((978, 3)).astype(np.float32)
-    decode = "decoding alone"
+    decode, scan = "decoding alone", "masses of words (scan)"
     calls: dict[str, Callable[[], object]] = {
         decode: decode_only(store, threads),
-        "masses of words (scan)": scan_of(store),
+        scan: scan_of(store),
         "the whole question: open, resolve, scan, tables with intervals": lambda: whole_question(store),
         "a loop with zarr-python: masses alone": lambda: zarr_loop(store, weights),
     }
     if find_spec("dask") is not None:
         calls["xarray and dask: masses alone"] = lambda: xarray_dask(store, weights, threads)
-    seconds = take_turns(calls, rounds)
+    wall: dict[str, list[float]] = {name: [] for name in calls}
+
+    def measurer(name: str) -> float:
+        began, began_processor = time.perf_counter(), time.process_time()
+        calls[name]()
+        wall[name].append(time.perf_counter() - began)
+        return time.process_time() - began_processor
+
+    processor = in_turn({name: partial(measurer, name) for name in calls}, rounds)
+    # The first of each is the warm-up's.
+    wall = {name: values[1:] for name, values in wall.items()}
     rows = [
-        {"what": what, "seconds": measured(values), "times": measured(ratios(values, seconds[decode]))}
-        for what, values in seconds.items()
+        {
+            "what": name,
+            "seconds": measured(wall[name]),
+            "times": measured(ratios(wall[name], wall[decode])),
+            "processor": measured(processor[name]),
+            "processor_times": measured(ratios(processor[name], processor[decode])),
+            "of_scan": measured(ratios(wall[name], wall[scan])),
+        }
+        for name in calls
     ]
-    scan = seconds["masses of words (scan)"]
-    for row, values in zip(rows, seconds.values(), strict=True):
-        row["of_scan"] = measured(ratios(values, scan))
+    columns = {
+        "what": "what",
+        "seconds": "seconds",
+        "times": "times decoding",
+        "processor": "processor's seconds",
+        "processor_times": "times decoding's",
+        "of_scan": "seconds, times the scan",
+    }
     count = len(open_store(store).episodes)
-    columns = {"what": "what", "seconds": "seconds", "times": "times decoding", "of_scan": "times the scan"}
     return Table(columns, rows, f"{count} episodes, {threads} threads; ratios are of the same round.")
 
 
@@ -221,6 +246,23 @@ def measure_processes(stores: Sequence[Path], rounds: int, kinds: Sequence[str])
     return Table(columns, rows)
 
 
+def measure_masses(stores: Sequence[Path]) -> Table:
+    """The part `masses`."""
+    rows: list[dict[str, Any]] = []
+    for kind in ("words", "objects"):
+        row: dict[str, Any] = {"what": f"masses of a grouping of {kind}"}
+        for store in stores:
+            row[store.stem] = run_process([sys.executable, __file__, "--masses", str(store), kind]).peak_mb
+        rows.append(row)
+    return Table({name: name if name == "what" else f"peak MB, {name}" for name in rows[0]}, rows)
+
+
+def only_masses(store: Path, kind: str) -> None:
+    """Compute the masses of all episodes."""
+    settings = SETTINGS if kind == "words" else AnalysisSettings(grouping="objects")
+    measure_episodes(ask([open_store(store)], settings), progress=lambda _: None)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--store", type=Path, help="written if it does not exist (default: a temporary one)")
@@ -242,11 +284,17 @@ def main() -> None:
             tables["bytes"] = measure_bytes(store)
         if "processes" in arguments.parts:
             tables["processes"] = measure_processes([store], 3, list(COMMANDS))
-    if "memory" in arguments.parts:
+    if {"memory", "masses"} & set(arguments.parts):
         stores = [made(scratch / f"{count} episodes.zarr", count, arguments.replans, 1) for count in (50, 100, 200)]
+    if "masses" in arguments.parts:
+        tables["masses"] = measure_masses(stores)
+    if "memory" in arguments.parts:
         tables["memory"] = measure_processes(stores, 1, [kind for kind in COMMANDS if "--no-plots" in kind])
     shutil.rmtree(scratch)
-    print(write_rows("analysis_speed", tables))
+    # Where the store was kept is of no interest.
+    given = ["--episodes", str(arguments.episodes), "--parts", *arguments.parts, "--rounds", str(arguments.rounds)]
+    command = " ".join([f"OMP_NUM_THREADS={threads} python benchmarks/analysis_speed.py", *given])
+    print(write_rows("analysis_speed", tables, command=command))
     for table_name, table in tables.items():
         print(table_name, *table.rows, table.note, sep="\n  ")
 
@@ -254,5 +302,7 @@ def main() -> None:
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--make"]:
         make_store(Path(sys.argv[2]), *(int(number) for number in sys.argv[3:]))
+    elif sys.argv[1:2] == ["--masses"]:
+        only_masses(Path(sys.argv[2]), sys.argv[3])
     else:
         main()

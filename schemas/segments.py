@@ -68,16 +68,6 @@ def weights_on_segments(weights: NDArray[np.float32], members: NDArray[np.bool_]
     Returns:
         (replan or 1, segment, group) float32, 0 for a segment without keys at a replan.
     """
-    # The first replan alone tells most groups that cut a segment.
-    for part in (slice(0, 1), slice(None)):
-        result = _alike(weights[part], members[part])
-        if result is None:
-            return None
-    return result
-
-
-def _alike(weights: NDArray[np.float32], members: NDArray[np.bool_]) -> NDArray[np.float32] | None:
-    """`weights_on_segments` of some replans."""
     replans = max(weights.shape[0], members.shape[0])
     result = np.zeros((replans, members.shape[2], weights.shape[2]), dtype=np.float32)
     for segment in range(members.shape[2]):

@@ -266,7 +266,11 @@ def row_sums(item: SelectedEpisode, selection: Selection, site: str) -> NDArray[
 def segment_weights(item: SelectedEpisode, weights: NDArray[np.float32], site: str) -> NDArray[np.float32] | None:
     """Weights (replan or 1, key, group) as weights (replan or 1, segment, group); None where a group cuts a segment."""
     tokens, segments = item.tokens, item.episode.attributes.segments[site]
-    return weights_on_segments(weights, segment_members(tokens.layout, tokens.static_roles, segments))
+    roles = tokens.static_roles
+    # The first replan alone tells most groups that cut a segment.
+    if weights_on_segments(weights[:1], segment_members(tokens.layout, roles[:1], segments)) is None:
+        return None
+    return weights_on_segments(weights, segment_members(tokens.layout, roles, segments))
 
 
 def with_valid(weights: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
