@@ -148,8 +148,12 @@ def _literal_decoder(arguments: tuple[Any, ...]) -> Callable[[Any], Any]:
 
 def _sequence_decoder(made: type, declared: Any) -> Callable[[Any], Any]:
     decoder = _decoder(declared)
+    plain = {declared} if declared in (str, int, bool) else None
 
     def decode(data: Any) -> Any:
+        # Shapes and axes: that each item is of its type is all there is to check.
+        if plain is not None and type(data) is list and plain.issuperset(map(type, data)):
+            return made(data)
         items: list[Any] = []
         try:
             for item in _expect(list, data):
@@ -177,7 +181,17 @@ def _fixed_tuple_decoder(arguments: tuple[Any, ...]) -> Callable[[Any], Any]:
 
 def _dict_decoder(declared: Any) -> Callable[[Any], Any]:
     decoder = _decoder(declared)
-    return lambda data: {key: _at(f".{key}", decoder, item) for key, item in _expect(dict, data).items()}
+
+    def decode(data: Any) -> dict[str, Any]:
+        values = {}
+        for key, item in _expect(dict, data).items():
+            try:
+                values[key] = decoder(item)
+            except _Misfit as misfit:
+                raise misfit.inside(f".{key}") from None
+        return values
+
+    return decode
 
 
 def _dataclass_decoder(declared: type) -> Callable[[Any], Any]:

@@ -7,6 +7,7 @@ writing, what a reader takes it for.
 
 from __future__ import annotations
 
+import functools
 import re
 import sys
 from collections.abc import Iterator
@@ -47,6 +48,7 @@ def check_text(what: str, text: str) -> None:
     _check_printable(what, text)
 
 
+@functools.lru_cache(maxsize=4096)
 def check_inner_path(path: str) -> None:
     """Raise `BadArgument` unless a path of a file or array stays inside the folder that it is relative to."""
     _check_printable("path", path)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import polars as pl
 
@@ -11,7 +13,7 @@ from vla_attention.analyze.show.numbers import of_tasks, plural, solved_text
 from vla_attention.analyze.stores.selection import select_episodes
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS
-from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vocabulary
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Names
 from vla_attention.schemas.layers import block_of_labels
 from vla_attention.schemas.layout import Role, Span
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, mass_error_bound
@@ -41,19 +43,29 @@ def episodes_table(stores: Sequence[Store]) -> pl.DataFrame:
         | {name: getattr(episode.attributes, name) for name in _EPISODE_COLUMNS}
         | {"instruction": visible(episode.attributes.instruction)}
         for store in stores
-        for episode in store.episodes
+        for episode in read_one_by_one(store.episodes)
     ]
     return pl.DataFrame(rows, schema_overrides={"task_id": pl.Int64})
 
 
+def read_one_by_one(episodes: Iterable[StoredEpisode]) -> Iterator[StoredEpisode]:
+    """The same episodes, each made anew: what is read of one is gone when the next one is read.
+
+    What an episode keeps when it was read (its seal lists every file) is 20 kB, of thousands of episodes too much.
+    """
+    return (replace(episode) for episode in episodes)
+
+
 def one_line(stores: Sequence[Store]) -> str:
     """Numbers of stores, episodes, tasks, solved episodes and replans, and the suites."""
-    episodes = [episode.attributes for store in stores for episode in store.episodes]
+    success, replans = [], 0
+    for episode in read_one_by_one(episode for store in stores for episode in store.episodes):
+        success.append(episode.attributes.success)
+        replans += episode.attributes.num_replans
     tasks = {(store.suite, task) for store in stores for task in store.task_ids}
-    replans = sum(one.num_replans for one in episodes)
-    solved = solved_text(one.success for one in episodes)
     return (
-        f"{plural(len(stores), 'store')}: {of_tasks(len(episodes), len(tasks))} ({solved}), {replans} replans, "
+        f"{plural(len(stores), 'store')}: {of_tasks(len(success), len(tasks))} ({solved_text(success)}), "
+        f"{replans} replans, "
         f"suite {listing(dict.fromkeys(store.suite for store in stores))}"
     )
 
@@ -89,8 +101,8 @@ def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
     yield f"  run        suite {protocol.suite}, protocol {protocol_text(protocol)}"
     if root.data_set is not None:
         yield f"  data set   {root.data_set.describe()}"
-    solved = solved_text(episode.attributes.success for episode in episodes)
-    yield f"  episodes   {len(episodes)} ({solved}), tasks {listing(store.task_ids, 100)}"
+    found = _Found.of(root, episodes)
+    yield f"  episodes   {len(episodes)} ({solved_text(found.success)}), tasks {listing(store.task_ids, 100)}"
     labels = [
         f"{label} (block {block})" if label != block else str(block)
         for label, block in zip(
@@ -105,27 +117,55 @@ def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
     error = "exact" if exact else f"masses within {mass_error_bound(recording.mantissa_bits):.1e} (relative)"
     yield f"  precision  {recording.mantissa_bits} mantissa bits: {error}"
     for site in root.sites:
-        tokens = [episode.tokens(root, site.name) for episode in episodes]
         own = f" ({own_parts(root, site.name)})" if site.layers or site.heads or site.num_action_queries else ""
         yield f"Site '{site.name}'{own}: {site.num_keys} keys; span, keys, roles (number of keys, of the first replan)"
         for span in site.spans:
-            yield f"  {_describe_span(span, tokens[0])}"
-        vocabulary = collect_vocabulary(tokens)
+            yield f"  {_describe_span(span, found.first[site.name])}"
+        vocabulary = found.names[site.name].vocabulary()
         yield f"  words      {listing(vocabulary.words, 200)}"
         yield f"  objects    {listing(vocabulary.objects, 200)}"
     yield "Tasks"
-    seen: set[int] = set()
-    for episode in episodes:
-        attributes = episode.attributes
-        if attributes.task_id not in seen:
-            seen.add(attributes.task_id)
-            count = sum(other.attributes.task_id == attributes.task_id for other in episodes)
-            interest = listing([thing.name for thing in attributes.objects if thing.of_interest])
-            held = f"({count} episodes; objects of interest: {interest})"
-            yield f"  {attributes.task_id:>3}  {visible(attributes.instruction)}  {held}"
+    for task, (instruction, interest) in found.tasks.items():
+        held = f"({found.num_episodes[task]} episodes; objects of interest: {interest})"
+        yield f"  {task:>3}  {instruction}  {held}"
     yield "Selectors"
     for name, kind in SELECTOR_KINDS.items():
         yield f"  {name + ':':<10} {kind.takes}"
+
+
+@dataclass
+class _Found:
+    """What `_lines` says of episodes, read one after the other.
+
+    Attributes:
+        success: outcome of each.
+        tasks: instruction and objects of interest of each task's first episode.
+        num_episodes: by task.
+        first: the first episode's tokens, by site.
+        names: all names, by site.
+    """
+
+    success: list[bool | None] = field(default_factory=list)
+    tasks: dict[int, tuple[str, str]] = field(default_factory=dict)
+    num_episodes: Counter[int] = field(default_factory=Counter)
+    first: dict[str, EpisodeTokens] = field(default_factory=dict)
+    names: dict[str, Names] = field(default_factory=lambda: defaultdict(Names))
+
+    @classmethod
+    def of(cls, root: RootAttributes, episodes: Iterable[StoredEpisode]) -> _Found:
+        found = cls()
+        for episode in read_one_by_one(episodes):
+            attributes = episode.attributes
+            found.success.append(attributes.success)
+            found.num_episodes[attributes.task_id] += 1
+            if attributes.task_id not in found.tasks:
+                interest = listing([thing.name for thing in attributes.objects if thing.of_interest])
+                found.tasks[attributes.task_id] = visible(attributes.instruction), interest
+            for site in root.sites:
+                tokens = episode.tokens(root, site.name)
+                found.first.setdefault(site.name, tokens)
+                found.names[site.name].add(tokens)
+        return found
 
 
 def _describe_span(span: Span, tokens: EpisodeTokens) -> str:

@@ -116,28 +116,51 @@ class Vocabulary:
 
 def collect_vocabulary(episodes: Iterable[EpisodeTokens]) -> Vocabulary:
     """Union of the names in the given episodes in order of appearance, without cameras that are always masked."""
-    cameras: dict[str, None] = {}
-    spans: dict[str, None] = {}
-    roles: dict[str, None] = {}
-    words: dict[str, None] = {}
-    objects: dict[str, None] = {}
-    sentences: dict[tuple[str, ...], None] = {}
-    layout: SiteLayout | None = None
+    names = Names()
     for tokens in episodes:
-        layout = tokens.layout
+        names.add(tokens)
+    return names.vocabulary()
+
+
+class Names:
+    """The names in episodes that come one after the other; none of the episodes is kept."""
+
+    def __init__(self) -> None:
+        self._cameras: dict[str, None] = {}
+        self._spans: dict[str, None] = {}
+        self._roles: dict[str, None] = {}
+        self._words: dict[str, None] = {}
+        self._objects: dict[str, None] = {}
+        self._sentences: dict[tuple[str, ...], None] = {}
+        self._layout: SiteLayout | None = None
+
+    def add(self, tokens: EpisodeTokens) -> None:
+        """Add the names in one episode."""
+        self._layout = tokens.layout
         for span in tokens.layout.spans:
-            spans[span.name] = None
-            if span.camera is not None and (tokens.static_roles[:, span.start : span.stop] != Role.MASKED_IMAGE).any():
-                cameras[span.camera] = None
-        roles.update({Role(code).label: None for code in np.unique(tokens.static_roles)})
+            self._spans[span.name] = None
+            if span.camera is None or span.camera in self._cameras:
+                continue
+            if (tokens.static_roles[:, span.start : span.stop] != Role.MASKED_IMAGE).any():
+                self._cameras[span.camera] = None
+        self._roles.update({Role(code).label: None for code in np.unique(tokens.static_roles)})
         for line in tokens.words:
             if not any(word.keys for word in line):
                 continue  # a text that was captured without its tokenizer
             sentence = tuple(word.text.casefold() for word in line)
-            sentences[sentence] = None
-            words.update(dict.fromkeys(sentence))
+            self._sentences[sentence] = None
+            self._words.update(dict.fromkeys(sentence))
         if tokens.coverage:
-            objects.update({thing.name: None for thing in tokens.objects})
-    return Vocabulary(
-        tuple(cameras), tuple(spans), tuple(roles), tuple(words), tuple(objects), layout, tuple(sentences)
-    )
+            self._objects.update({thing.name: None for thing in tokens.objects})
+
+    def vocabulary(self) -> Vocabulary:
+        """The union of what was added, in order of appearance."""
+        return Vocabulary(
+            tuple(self._cameras),
+            tuple(self._spans),
+            tuple(self._roles),
+            tuple(self._words),
+            tuple(self._objects),
+            self._layout,
+            tuple(self._sentences),
+        )
