@@ -8,7 +8,7 @@
     with va.record("run.zarr", policy, layout=va.layouts.smolvla(policy)) as run:    # docs/your-policy.md
         ...
 
-Public names: `open` and `OpenStores` (stage two); `record`, `inspect`, `layouts` and the parts of a `PolicyLayout`
+Public names: `open`, `workers` and `OpenStores` (stage two); `record`, `inspect`, `layouts` and the parts of a `PolicyLayout`
 (stage one, from your own code; they need torch); `UserError` (the base of every error that a user can cause) and
 `__version__`. `vla_attention.datasets` reads data sets of robots. `vla_attention.testing` makes small stores with known
 content. This import loads neither torch nor zarr, polars or numpy.
@@ -17,6 +17,7 @@ content. This import loads neither torch nor zarr, polars or numpy.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,7 +40,7 @@ _RECORDER = {
     "schemas.layout": ("PatchGrid", "SiteLayout", "Span"),
 }
 
-__all__ = ["OpenStores", "UserError", "__version__", "inspect", "open"]
+__all__ = ["OpenStores", "UserError", "__version__", "inspect", "open", "workers"]
 
 
 def __dir__() -> list[str]:
@@ -61,6 +62,27 @@ def open(stores: str | Path | Sequence[str | Path]) -> OpenStores:
     from vla_attention.analyze.api import open_stores
 
     return open_stores(stores)
+
+
+def workers(where: int | str) -> AbstractContextManager[None]:
+    """Return a block within which episodes are worked on elsewhere; results are the same to the last bit.
+
+    `where`: a number of processes on this machine, or the address of a running dask scheduler (docs/cluster.md). In a
+    script, processes need `if __name__ == "__main__":` around it, as everywhere with Python's multiprocessing.
+
+    >>> with va.workers(2):
+    ...     elsewhere = va.open(store).ratios()
+    >>> elsewhere.equals(va.open(store).ratios())
+    True
+
+    Raises:
+        BadArgument: fewer than one process, or no scheduler answers.
+        MissingDependency: dask.distributed is not installed.
+    """
+    # Imported here: `import vla_attention` loads no numpy.
+    from vla_attention.analyze.stores.parallel import workers as workers_there
+
+    return workers_there(where)
 
 
 def inspect(policy: object, call: Callable[[], object]) -> CallTable:
