@@ -73,7 +73,7 @@ test-policies: .venv-transformers/installed .venv-lerobot/installed
 # Takes about ten minutes, most of it waiting: SLURM holds a requeued job back for two. Works with any environment that is active.
 test-slurm:
 	@sinfo >/dev/null 2>&1 || { echo "make test-slurm needs a running SLURM: sinfo does not answer here (is SLURM_CONF set?)." >&2; exit 2; }
-	VLA_TEST_SLURM=1 $(if $(wildcard $(BIN)/pytest),$(BIN)/)pytest tests/end_to_end/test_slurm_array.py $(ARGS)
+	VLA_TEST_SLURM=1 $(if $(wildcard $(BIN)/pytest),$(BIN)/)pytest tests/end_to_end/test_slurm_array.py tests/end_to_end/test_slurm_dask.py $(ARGS)
 
 schemas: .venv/capture-installed
 	$(BIN)/python -m vla_attention.schemas.json_files

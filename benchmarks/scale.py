@@ -86,7 +86,10 @@ def listing_rows(stores: dict[int, Path], rounds: int) -> Table:
                 costs[key].append(cost)
     rows = []
     for (name, count), found in costs.items():
-        seconds, processor = measured([cost.seconds for cost in found]), measured([cost.processor_seconds for cost in found])
+        seconds, processor = (
+            measured([cost.seconds for cost in found]),
+            measured([cost.processor_seconds for cost in found]),
+        )
         peak: Measured = measured([cost.peak_mb for cost in found])
         rows.append({"what": name, "episodes": count, "seconds": seconds, "processor": processor, "peak": peak})
         print(name, count, seconds, processor, peak, flush=True)

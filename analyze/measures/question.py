@@ -13,6 +13,7 @@ from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
 from vla_attention.analyze.show.headings import run_header
 from vla_attention.analyze.show.progress import progress_bar
+from vla_attention.analyze.stores.checking import faults_of_each
 from vla_attention.analyze.stores.selection import (
     Selection,
     check_combinable,
@@ -27,7 +28,6 @@ from vla_attention.schemas.groupings.grouping import Grouping, parse_group_argum
 from vla_attention.schemas.groupings.vocabulary import Vocabulary
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import RootAttributes, StoreError
-from vla_attention.schemas.stores.verify import episode_faults
 
 DEFAULT_GROUPING = "default"
 
@@ -177,15 +177,13 @@ def _without_faulty(
     """The episodes that are undamaged and hold a replan, and a line on each of the others. Reads everything once."""
     kept, skipped = [], []
     with progress_bar(len(chosen), "episodes checked") as advance:
-        for store, episode in chosen:
-            faults = episode_faults(store, episode)
+        for (store, episode), faults in zip(chosen, faults_of_each(chosen, advance), strict=True):
             if faults:
                 skipped.append(f"{episode.name} of {store.path} is left out: {faults[0].problem.rstrip('.')}")
             elif episode.attributes.num_replans == 0:
                 skipped.append(f"{episode.name} of {store.path} is left out: it holds no replan")
             else:
                 kept.append((store, episode))
-            advance(1)
     if not kept:
         raise StoreError(
             f"None of the {len(chosen)} selected episodes can be used; the first: {skipped[0]}. Capture them again."

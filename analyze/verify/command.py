@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from vla_attention.analyze.arguments import add_workers
 from vla_attention.analyze.show.numbers import plural
 from vla_attention.schemas.command_line import command_parser
 
@@ -17,20 +18,22 @@ def build_parser() -> argparse.ArgumentParser:
         "wrong.",
     )
     parser.add_argument("stores", nargs="+", type=Path, metavar="STORE", help="one or several NAME.zarr")
+    add_workers(parser)
     return parser
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Verify every store; 1 if anything is wrong."""
     from vla_attention.analyze.show.progress import progress_bar
+    from vla_attention.analyze.stores.checking import faults_of_each
     from vla_attention.schemas.stores.reader import open_store
-    from vla_attention.schemas.stores.verify import verify_store
 
     faulty = False
     for path in arguments.stores:
         store = open_store(path)
         with progress_bar(len(store.episodes), "episodes") as advance:
-            faults = verify_store(store, advance)
+            pairs = ((store, episode) for episode in store.episodes)
+            faults = [fault for found in faults_of_each(pairs, advance) for fault in found]
         for fault in faults:
             print(f"{path}: {fault.episode}: {fault.problem}")
         result = plural(len(faults), "fault") if faults else "all whole"
