@@ -6,7 +6,7 @@ denoise step, so one product for all steps replaces ten small ones. There are th
 - shared: on a processor in float32, the model's own value products of its pieces of the keys are those of most parts,
   and are not made again. A part of a few keys whose values are the same at all steps (words) is projected key by key,
   once for all steps. The part that adds most at the first call is what the others leave of the blocks' updates,
-  and needs no product; its rounding error is that of the update.
+  and needs no product; its rounding error is that of the update. Where the model read none of its keys, it is zero.
 - later: on a GPU, rows, values and updates stay on the device until the denoise steps are done.
 - now: rows that would fill the memory (all tokens of a Cosmos policy) are used at once.
 """
@@ -232,7 +232,11 @@ class CallContributions:
         if shares.single:
             self._project_keys(cells, steps, weights, gates, others[:, len(mixed) :])
         if rest is not None:
-            torch.sub(update, others.sum(dim=1), out=vectors[:, len(order)])
+            left = vectors[:, len(order)]
+            torch.sub(update, others.sum(dim=1), out=left)
+            for number, call in enumerate(kept):
+                if _is_zero(call.mixed[rest]):  # knocked out in this call: nothing, and not what rounding leaves
+                    left[number] = 0
             order.append(shares.mixed[rest][0])
         last.copy_(update)
         flat = vectors.flatten(2)
@@ -297,6 +301,11 @@ def _times(made: Tensor, gates: Tensor | None, out: Tensor) -> None:
         out.copy_(made)
     else:
         torch.mul(made, gates, out=out)
+
+
+def _is_zero(mixed: Tensor) -> bool:
+    """Return whether mixed values (1, head, query, dim) are all zero; looks at one query first, which mostly tells."""
+    return not mixed[:, :, 0].any() and not mixed.any()
 
 
 def _mixed(rows: Tensor, values: Tensor, keys: slice | Tensor) -> Tensor:

@@ -77,6 +77,18 @@ def test_what_is_stored(base, tmp_path, capsys):
     assert main(["status", str(tmp_path / "a.zarr")]) == 0
 
 
+def test_a_camera_that_later_layers_do_not_read_adds_exactly_nothing_there(tmp_path):
+    """Its contribution is what the other parts leave of the update, because it adds most in the first layer."""
+    words = ("--checkpoint", "pi05_cubes", "--knockout", "camera:base_0_rgb", "--knockout-layers", "1", "2", "3")
+    episode = captured(tmp_path / "a.zarr", "--task-id", "0", *words).episodes[0]
+    mass = episode.read("joint/atoms").sum(axis=(3, 4))  # (replan, layer, denoise, part)
+    squared = np.diagonal(episode.read("joint/contribution"), axis1=-2, axis2=-1)[..., :-1]
+    knocked_out = (mass[:, 0] > 0).all(axis=(0, 1)) & (mass[:, 1:] == 0).all(axis=(0, 1, 2))
+    assert knocked_out.sum() == 1
+    assert (squared[:, 0, :, knocked_out] > 0).all()
+    assert (squared[:, 1:, :, knocked_out] == 0).all()
+
+
 def test_resumed_runs_apply_them_bit_for_bit_and_others_are_refused(tmp_path, capsys):
     whole = captured(tmp_path / "whole.zarr", "--task-id", "0", "1", *CHANGES, "--random-keys", "3")
     path = tmp_path / "resumed.zarr"
