@@ -239,7 +239,7 @@ class PipelinedLoop(EpisodeLoop):
             simulator = by_connection[connection]  # type: ignore[index]
             try:
                 answer = simulator.process.connection.recv()
-            except (EOFError, ConnectionError):
+            except (EOFError, OSError):  # OSError: it ended inside of an answer
                 self._begin_again(simulator)
             else:
                 self._take(simulator, answer)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+import struct
 import subprocess
 import sys
 import threading
 import time
 from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,6 +29,7 @@ from vla_attention.capture.jobs.termination import EXIT_TERMINATED
 from vla_attention.capture.jobs.worker import Worker
 from vla_attention.capture.rollout import pipeline, simulator_process
 from vla_attention.capture.rollout.policy_call import record_calls
+from vla_attention.capture.rollout.simulation import Advanced
 from vla_attention.schemas.errors import MissingDependency
 
 NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2")
@@ -158,6 +162,26 @@ def test_an_episode_whose_simulator_died_begins_again(scene, tmp_path, capsys):
     assert capsys.readouterr().out.count(again) == 2
     assert_same_episodes(tmp_path / "one.zarr", tmp_path / "a.zarr")
     assert not (tmp_path / "a.zarr.partial").exists()
+
+
+def test_a_simulator_may_end_inside_of_an_answer(scene, tmp_path, monkeypatch, capsys):
+    """A killed process leaves the beginning of what it was sending."""
+    left = [1]
+
+    class Cut(Connection):
+        def send(self, answer: Any) -> None:
+            if left[0] and isinstance(answer, Advanced) and answer.steps:
+                left[0] -= 1
+                data = bytes(ForkingPickler.dumps(answer))
+                os.write(self.fileno(), struct.pack("!i", len(data)) + data[: len(data) // 2])
+                raise EOFError
+            super().send(answer)
+
+    monkeypatch.setattr(simulator_process, "Connection", Cut)
+    words = ["--task-id", "0", "--num-episodes", "2"]
+    assert record(tmp_path / "a.zarr", 2, *words) == 0
+    assert left == [0]
+    assert capsys.readouterr().out.count("its simulator ended (killed by signal 9); the episode begins again.") == 1
 
 
 def test_an_episode_begins_again_at_most_twice(scene, tmp_path, capsys):
