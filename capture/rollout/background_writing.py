@@ -185,7 +185,7 @@ class BackgroundWriting:
         except BaseException as error:
             self._failure = error
         finally:
-            for episode in self._episodes:
+            for episode in list(self._episodes):  # others may begin meanwhile
                 episode.close()
         if self._failure is not None:
             with self._changed:
