@@ -181,7 +181,7 @@ def _describe(recording: Recording, num_denoise_steps: int) -> str:
     steps = (
         f"all {num_denoise_steps} denoise steps"
         if len(recording.denoise_steps) == num_denoise_steps
-        else f"denoise steps {listing(recording.denoise_steps, 40)} of {num_denoise_steps}"
+        else f"denoise steps {listing(recording.denoise_steps, 40)} of 0 to {num_denoise_steps - 1}"
     )
     return f"{steps}, {precision}, layers {_numbers(recording.layers)}, heads {_numbers(recording.heads)}"
 

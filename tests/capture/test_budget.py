@@ -110,13 +110,13 @@ def test_what_was_chosen_and_given_up_is_said() -> None:
     order = recordings_by_size(PI, 10, Fixed())
     one = bytes_of(order[11]).total_bytes
     said = choose_recording(order, one, bytes_of, 10).lines
-    assert said[0].startswith("Budget 3.06 GB: recording denoise steps 9 of 10, 7 mantissa bits, layers 1, 3, 5, 7")
+    assert said[0].startswith("Budget 3.06 GB: recording denoise steps 9 of 0 to 9, 7 mantissa bits, layers 1, 3, 5, 7")
     assert "heads 0 to 7, which takes at most 3.06 GB" in said[0]
     assert said[1] == (
         "Given up for it: 9 of 10 denoise steps; 9 of 18 layers; 3 of 10 mantissa bits (a ratio is within 0.78 % of "
         "what was computed, instead of 0.098 %)."
     )
-    assert said[2].startswith("The next larger recording, denoise steps 9 of 10, 4 mantissa bits, layers 0 to 17")
+    assert said[2].startswith("The next larger recording, denoise steps 9 of 0 to 9, 4 mantissa bits, layers 0 to 17")
     everything = choose_recording(order, 10**15, bytes_of, 10).lines
     assert everything[1] == "Nothing was given up for it."
     assert "recording all 10 denoise steps, 10 mantissa bits, layers 0 to 17, heads 0 to 7" in everything[0]
