@@ -13,7 +13,7 @@ from vla_attention.capture.environments.base import EnvironmentSettings, Task, c
 from vla_attention.capture.environments.episode_protocol import WAIT_STEPS, EvaluationProtocol
 from vla_attention.capture.environments.suites import list_tasks
 from vla_attention.capture.interventions.prompts import check_synonyms
-from vla_attention.capture.interventions.resolution import interventions_for
+from vla_attention.capture.interventions.resolution import check_not_compiled, interventions_for
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.jobs.damaged_episodes import DamagedEpisodesLeft, find_damaged, what_to_do
 from vla_attention.capture.jobs.termination import Termination
@@ -26,7 +26,7 @@ from vla_attention.capture.jobs.worker_records import (
     read_records,
 )
 from vla_attention.capture.policies.identity import announcement
-from vla_attention.capture.policies.policy import BatchPolicy, Policy, stored_picture_sizes
+from vla_attention.capture.policies.policy import BatchPolicy, Policy, is_compiled, stored_picture_sizes
 from vla_attention.capture.provenance import describe_machine
 from vla_attention.capture.rollout.episode import EpisodeResult, EpisodeRun, check_protocol, max_replans
 from vla_attention.capture.rollout.episode_loop import EpisodeLoop
@@ -143,6 +143,7 @@ def _record_missing(
     for task in wanted:
         check_initial_state_index(task, settings.num_episodes - 1)
     changes = plan_changes(settings, policy, tasks)
+    largest_batch = _policy_batch(settings, policy, device)
     machine = describe_machine(device)
     attributes = RootAttributes(
         format=FORMAT_NAME,
@@ -204,7 +205,7 @@ def _record_missing(
         "record": record,
         "termination": termination,
     }
-    batch = _policy_batch(settings, policy, device, num_envs)
+    batch = num_envs if largest_batch is None else min(largest_batch, num_envs)
     if num_envs > 1:
         batches = f" Policy calls in batches of at most {batch}; --policy-batch N changes it." if batch > 1 else ""
         say(f"Simulators: {num_envs} processes; --num-envs N changes it.{batches}")
@@ -216,20 +217,31 @@ def _record_missing(
     return results, damaged_names
 
 
-def _policy_batch(settings: RunSettings, policy: Policy, device: str, num_envs: int) -> int:
-    """Return the largest batch of policy calls; larger ones than 1 need a policy that can make them."""
-    asked, changes = settings.policy_batch, settings.interventions
+def _policy_batch(settings: RunSettings, policy: Policy, device: str) -> int | None:
+    """Return the largest batch of policy calls, None for the number of simulators.
+
+    Raises:
+        BadArgument: `--policy-batch` asks for more than 1, and policy or interventions need single calls.
+    """
+    asked, single = settings.policy_batch, None
+    if not isinstance(policy, BatchPolicy):
+        single = f": policies of the kind {policy.family} make one call"
+    elif is_compiled(policy.identity()):
+        single = " with --compile, whose calls are made one by one"
+    elif settings.interventions.changes_attention:
+        single = " with interventions on attention, whose calls are made one by one"
+    if single is None:
+        return default_policy_batch(device) if asked is None else asked
     if asked is not None and asked > 1:
-        if not isinstance(policy, BatchPolicy):
-            raise BadArgument(f"Cannot use --policy-batch {asked}: policies of the kind {policy.family} make one call.")
-        if changes.changes_attention:
-            raise BadArgument(f"Cannot use --policy-batch {asked} with interventions on attention; leave it out.")
-    return min(asked or default_policy_batch(policy, device, num_envs), num_envs)
+        raise BadArgument(f"Cannot use --policy-batch {asked}{single}; leave it out.")
+    return 1
 
 
 def plan_changes(settings: RunSettings, policy: Policy, tasks: Sequence[Task]) -> RunChanges:
     """Return the run's interventions; what is known to be wrong with them is an error now, before the first episode."""
     instructions = {task.task_id: task.instruction for task in tasks}
+    if settings.interventions.changes_attention:
+        check_not_compiled(policy.identity())
     changes = RunChanges(interventions_for(settings.interventions, policy), instructions, settings.allow_empty)
     if changes.interventions.prompt is not None:
         check_synonyms(changes.interventions.prompt, instructions.values())

@@ -8,7 +8,7 @@ from pathlib import Path
 from vla_attention.capture.capture_run import plan_recording
 from vla_attention.capture.command_line import check_writable
 from vla_attention.capture.device import load_torch
-from vla_attention.capture.interventions.resolution import check_places, interventions_for
+from vla_attention.capture.interventions.resolution import check_not_compiled, check_places, interventions_for
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.provenance import describe_machine
@@ -35,6 +35,7 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
         raise BadArgument(f"Cannot use --check {arguments.check}; expected 0 or more policy calls.")
     base = open_base(arguments.base, arguments.task_id, arguments.num_episodes)
     if arguments.series is not None:
+        check_not_compiled(base.attributes.policy)
         series = SeriesRun.planned(arguments, base)
         rerun = _prepare(arguments, base, threads, termination)
         series.write(rerun, rerun.check(arguments.check))
@@ -42,6 +43,8 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
     _refuse_options_of_series(arguments)
     interventions = rerun_interventions(arguments)
     check_may_change(base, interventions)
+    if interventions.changes_attention:
+        check_not_compiled(base.attributes.policy)
     # All mistakes that need no model are errors now, before the minutes for loading one. Those of the changes come
     # first: whoever asks for a layer that there is not would not be helped by another place for the store.
     check_places(interventions, base.attributes.policy)

@@ -21,7 +21,6 @@ from pathlib import Path
 
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.claims import Holder
-from vla_attention.capture.policies.policy import BatchPolicy, Policy
 from vla_attention.capture.rollout.background_writing import BackgroundWriting, Committed, EpisodeInBackground
 from vla_attention.capture.rollout.episode import (
     EpisodeRecording,
@@ -61,9 +60,12 @@ MOST_BY_DEFAULT = 8
 SIMULATOR_BYTES = 2e9
 
 
-def default_policy_batch(policy: Policy, device: str, num_envs: int) -> int:
-    """Return the largest batch without `--policy-batch`: 1 on a processor, which does not gain by larger ones."""
-    return num_envs if isinstance(policy, BatchPolicy) and not device.startswith("cpu") else 1
+def default_policy_batch(device: str) -> int | None:
+    """Return the largest batch without `--policy-batch`, None for the number of simulators.
+
+    It is 1 on a processor, which does not gain by larger ones.
+    """
+    return 1 if device.startswith("cpu") else None
 
 
 def default_num_envs() -> int:

@@ -154,3 +154,28 @@ def test_empty_groups_are_allowed_on_request(base, tmp_path, capsys):
     same = captured(tmp_path / "a.zarr", "--task-id", "0", *words)
     assert "In 2 of 2 replans a group of an intervention had no key" in capsys.readouterr().out
     np.testing.assert_array_equal(same.episodes[0].read("actions"), base.episodes[0].read("actions"))
+
+
+def test_compiled_denoise_steps_refuse_interventions_and_batches_before_a_store_is_made(tmp_path, monkeypatch, capsys):
+    from vla_attention.capture.policies.pi import build
+    from vla_attention.capture.policies.pi.compiled import compile_steps
+
+    monkeypatch.setattr(build, "compile_steps", lambda model: compile_steps(model, backend="eager"))
+    store, refused = tmp_path / "a.zarr", "with compiled denoise steps (--compile), which no intervention reaches"
+    compiled = ("--task-id", "0", "--compile")
+    assert run(store, *compiled, "--knockout", "camera:base_0_rgb") == 2
+    assert refused in capsys.readouterr().err
+    assert run(store, *compiled, "--policy-batch", "2") == 2
+    assert (
+        "Cannot use --policy-batch 2 with --compile, whose calls are made one by one; leave" in capsys.readouterr().err
+    )
+    assert run(store, "--task-id", "0", "--policy-batch", "2", "--knockout", "camera:base_0_rgb") == 2
+    assert not store.exists()
+    captured(store, *compiled)
+    for words in (["--knockout", "camera:base_0_rgb"], ["--series", "default"]):
+        capsys.readouterr()
+        assert main(["rerun", str(store), *words]) == 2
+        said = capsys.readouterr()
+        assert refused in said.err
+        assert "Policy:" not in said.out
+    assert [path.name for path in tmp_path.iterdir() if path.suffix == ".zarr"] == ["a.zarr"]

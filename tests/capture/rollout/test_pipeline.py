@@ -353,7 +353,7 @@ def test_the_first_replan_of_a_batch_is_that_of_single_calls_but_for_rounding(
     [
         (["--num-envs", "0"], "Cannot use --num-envs 0; expected at least 1."),
         (["--policy-batch", "0"], "Cannot use --policy-batch 0; expected at least 1."),
-        (["--policy-batch", "2", "--knockout", "camera:base_0_rgb"], "with interventions on attention; leave it out"),
+        (["--policy-batch", "2", "--knockout", "camera:base_0_rgb"], "with interventions on attention, whose"),
     ],
 )
 def test_what_does_not_work_is_refused(scene, tmp_path, capsys, words, said):
