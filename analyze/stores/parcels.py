@@ -140,6 +140,11 @@ class _Packer(pickle.Pickler):
         values = [_from_anywhere(getattr(shown, one.name)) for one in fields(cast(Any, shown)) if one.init]
         return number, type(value), values
 
+    def reducer_override(self, value: object) -> Any:
+        # Without its cause, which may be anything, and not in the way that dask registers for all exceptions: that one
+        # cannot make errors anew which are two builtins at once.
+        return value.__reduce__() if isinstance(value, UserError) else NotImplemented
+
 
 class _Unpacker(pickle.Unpickler):
     """`known`: as of the packer."""

@@ -7,6 +7,7 @@ import signal
 from pathlib import Path
 
 from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 
@@ -46,3 +47,11 @@ def die_always(number: int) -> int:
     if number == 3:
         os.kill(os.getpid(), signal.SIGKILL)
     return number
+
+
+def refused(kind: type[UserError]) -> None:
+    """Raise an error for users, caused by one that cannot travel."""
+    try:
+        raise ValueError(lambda: None)
+    except ValueError as error:
+        raise kind("one sentence") from error

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import pickle
+import copyreg
 from dataclasses import replace
 from functools import partial
 
 import pytest
 
-from tests.kit.episode_work import damaged, defect, seen
+from tests.kit.episode_work import damaged, defect, refused, seen
 from tests.kit.questions import question_about
 from vla_attention.analyze.heads.head_study import _measure
 from vla_attention.analyze.measures.selected import resolve_all
@@ -83,11 +83,23 @@ def test_a_store_that_a_worker_does_not_see_is_named(question, tmp_path):
     assert parcels._check_visible.cache_info().misses
 
 
-def test_every_error_for_users_survives_the_way():
+@pytest.fixture
+def ways_of_pickling():
+    """What a test registers for pickling is gone after it. The dictionary stays the same: `pickle` keeps it."""
+    before = dict(copyreg.dispatch_table)
+    yield
+    copyreg.dispatch_table.clear()
+    copyreg.dispatch_table.update(before)
+
+
+@pytest.mark.parametrize("with_dask", [False, True])
+def test_every_error_for_users_survives_the_way(with_dask, ways_of_pickling):
+    if with_dask:  # it registers another way for every kind of exception that there is
+        pytest.importorskip("tblib.pickling_support").install()
     kinds = [errors.UserError]
     while kinds:
         kind = kinds.pop()
         kinds += kind.__subclasses__()
-        error = pickle.loads(pickle.dumps(kind("one sentence")))
-        assert type(error) is kind
-        assert str(error) == "one sentence"
+        with pytest.raises(kind, match=r"^one sentence$") as raised:
+            done(refused, kind)
+        assert type(raised.value) is kind
