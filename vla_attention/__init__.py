@@ -67,8 +67,8 @@ def open(stores: str | Path | Sequence[str | Path]) -> OpenStores:
 def workers(where: int | str) -> AbstractContextManager[None]:
     """Return a block within which episodes are worked on elsewhere; results are the same to the last bit.
 
-    `where`: a number of processes on this machine, or the address of a running dask scheduler (docs/cluster.md). In a
-    script, processes need `if __name__ == "__main__":` around it, as everywhere with Python's multiprocessing.
+    `where`: a number of processes on this machine, or the address of a running dask scheduler (docs/cluster.md). The
+    processes do not run a script again that has no `if __name__ == "__main__":`.
 
     >>> with va.workers(2):
     ...     elsewhere = va.open(store).ratios()

@@ -5,12 +5,15 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing.connection import wait
+from types import ModuleType
 from typing import Any
 
 from vla_attention.schemas.errors import BadArgument, UserError, listing
@@ -89,7 +92,8 @@ class WorkerProcesses:
             context = multiprocessing.get_context("spawn")
             self._executor = ProcessPoolExecutor(self._number, context, initializer=prepare_process)
         try:
-            return self._executor.submit(work, parcel.content, package_version())
+            with _main_module_hidden():  # here the executor starts processes
+                return self._executor.submit(work, parcel.content, package_version())
         except BrokenProcessPool as error:  # a process died between two submissions
             future: Future[bytes] = Future()
             future.set_exception(error)
@@ -102,6 +106,21 @@ class WorkerProcesses:
 
 
 _NONE = object()
+
+
+@contextmanager
+def _main_module_hidden() -> Iterator[None]:
+    """Processes that are started within the block do not run the user's script again.
+
+    `multiprocessing` runs `__main__` in every new process, for functions that are defined there. Episodes are handed to
+    functions of this package only, and a script without `if __name__ == "__main__"` would start workers of its own.
+    """
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def _done(future: Future[bytes]) -> bool:

@@ -152,6 +152,29 @@ if __name__ == "__main__":
     assert not [pid for pid in done.stdout.split() if runs(pid)]
 
 
+@pytest.mark.parametrize("stdin", [False, True])
+def test_a_script_needs_no_guard(store, tmp_path, stdin):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import vla_attention as va\n"
+        "with va.workers(2):\n"
+        f"    print(len(va.open({str(store)!r}).masses('episodes')))\n"
+        "print(__name__)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, *([] if stdin else [str(script)])],
+        input=script.read_text() if stdin else None,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    rows, name = done.stdout.split()
+    assert (int(rows), name) == (len(va.open(store).masses("episodes")), "__main__")
+
+
 def test_the_command_line_takes_a_number_of_workers(store, tmp_path, capsys):
     before = set(multiprocessing.active_children())
     for folder, options in (("a", []), ("b", ["--workers", "2"])):
