@@ -19,6 +19,8 @@ FOLDER_VARIABLE = "VLA_CACHE"
 SIZE_VARIABLE = "VLA_CACHE_SIZE"
 #: Values of VLA_CACHE with which there is no cache.
 _OFF = ("off", "0", "no", "false")
+#: Values with which it is where it is without the variable.
+_ON = ("on", "1", "yes", "true", "")
 _UNITS = {"": 1, "B": 1, "KB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}
 
 
@@ -41,7 +43,8 @@ def cache_place() -> CachePlace | None:
         return None
     size = os.environ.get(SIZE_VARIABLE, "").strip()
     # Absolute: the working directory may change while a store is open.
-    return CachePlace(Path(given or DEFAULT_FOLDER).absolute(), parse_size(size) if size else DEFAULT_BYTES)
+    folder = DEFAULT_FOLDER if given.casefold() in _ON else Path(given)
+    return CachePlace(folder.absolute(), parse_size(size) if size else DEFAULT_BYTES)
 
 
 @contextmanager

@@ -181,5 +181,5 @@ class _Keeper:
 
     def __exit__(self, *_: object) -> None:
         self._stop()
-        if self._finished:
-            make_room(self._place)
+        # Although nothing may have been written: the cache may hold what a larger VLA_CACHE_SIZE had room for.
+        make_room(self._place)

@@ -42,7 +42,7 @@ def build_parser() -> argparse.ArgumentParser:
         "vla-analyze overlay",
         "Attention laid over the stored pictures of one episode, right way round, with one scale for all "
         "of them: a "
-        "strip of some replans (PNG, PDF, and the numbers as CSV), and a video with the ratio's curve beside it.",
+        "strip of some replans (PNG, and the numbers as CSV), and a video with the ratio's curve beside it.",
         _EXAMPLES,
     )
     add_stores(parser)

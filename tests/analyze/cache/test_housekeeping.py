@@ -54,6 +54,14 @@ def test_a_question_larger_than_the_cache_stays_within_it(cache, store, tmp_path
     assert 0 < sum(one.size for one in kept_segments(cache)) <= all_of_it // 2
 
 
+def test_a_smaller_size_holds_although_nothing_is_new(cache, store, tmp_path, monkeypatch):
+    assert main([str(store), "--no-plots", "--output", str(tmp_path / "out")]) == 0
+    (kept,) = kept_segments(cache)
+    monkeypatch.setenv("VLA_CACHE_SIZE", str(kept.size - 1))
+    assert main([str(store), "--no-plots", "--output", str(tmp_path / "out")]) == 0
+    assert kept_segments(cache) == []
+
+
 def test_the_command_shows_and_removes(cache, store, tmp_path, capsys):
     assert main(["cache"]) == 0
     assert "nothing is kept yet" in capsys.readouterr().out
@@ -89,6 +97,9 @@ def test_the_cache_is_beside_the_results(tmp_path, monkeypatch):
     monkeypatch.delenv("VLA_CACHE")
     monkeypatch.chdir(tmp_path)
     assert cache_place() == CachePlace(tmp_path / "results/.cache")
+    for value in ("on", "1", " "):
+        monkeypatch.setenv("VLA_CACHE", value)
+        assert cache_place() == CachePlace(tmp_path / "results/.cache")
     monkeypatch.setenv("VLA_CACHE", "elsewhere")
     monkeypatch.setenv("VLA_CACHE_SIZE", "1.5 GB")
     assert cache_place() == CachePlace(tmp_path / "elsewhere", 1_500_000_000)

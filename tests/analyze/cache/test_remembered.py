@@ -348,8 +348,9 @@ import sys
 from vla_attention.analyze.cache import fingerprints
 fingerprints.SETTLED_SECONDS = 0.0
 import vla_attention as va
-sys.stdin.readline()
 run = va.open(sys.argv[1])
+print("ready", flush=True)
+sys.stdin.readline()
 run.ratios("steps", grouping="cameras").write_parquet(sys.argv[2])
 """
 
@@ -357,11 +358,18 @@ run.ratios("steps", grouping="cameras").write_parquet(sys.argv[2])
 def test_processes_that_fill_one_cache_at_the_same_time_agree(cache, stores, measured, tmp_path):
     outputs = [tmp_path / f"{i}.parquet" for i in range(3)]
     running = [
-        subprocess.Popen([sys.executable, "-c", CODE, str(stores[0]), str(output)], stdin=subprocess.PIPE)
+        subprocess.Popen(
+            [sys.executable, "-c", CODE, str(stores[0]), str(output)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
         for output in outputs
     ]
     for process in running:
-        process.communicate(b"\n", timeout=120)
+        assert process.stdout.readline() == b"ready\n"
+    for process in running:
+        process.stdin.write(b"\n")
+        process.stdin.flush()
+    for process in running:
+        process.communicate(timeout=120)
         assert process.returncode == 0
     found = [pl.read_parquet(output) for output in outputs]
     assert all(one.equals(found[0]) for one in found)
