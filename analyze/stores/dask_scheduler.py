@@ -41,6 +41,7 @@ class DaskScheduler:
     def __enter__(self) -> DaskScheduler:
         try:
             from distributed import Client
+            from distributed.comm.addressing import get_address_host_port
         except ImportError:
             raise MissingDependency(
                 "--scheduler needs dask.distributed, which is not installed: pip install 'vla-attention[dask]', on the "
@@ -50,6 +51,9 @@ class DaskScheduler:
         for name in ("distributed.client", "distributed.core", "distributed.comm", "distributed.batched"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
+            # A client made with what is no address waits half a minute at its end, and then prints a traceback.
+            check: Any = get_address_host_port
+            check(self._address)
             connect: Any = Client  # dask's own signature has no types
             self._client = connect(self._address, timeout=_ANSWER_WITHIN, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:

@@ -149,6 +149,16 @@ def test_an_address_without_a_scheduler_is_a_sentence(store, tmp_path, capsys, m
         pass
 
 
+@pytest.mark.parametrize("address", ["", "node", "no address", "http://127.0.0.1:1"])
+def test_no_client_is_made_with_what_is_no_address(monkeypatch, address):
+    def no_client(*_: object, **__: object) -> None:
+        raise AssertionError("it waits half a minute at its end, and then prints a traceback")
+
+    monkeypatch.setattr(distributed, "Client", no_client)
+    with pytest.raises(BadArgument, match=f"No scheduler answers at '{address}'"), workers(address):
+        pass
+
+
 def test_without_dask_a_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with (
