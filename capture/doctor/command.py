@@ -141,10 +141,11 @@ def _find_place(settings: RunSettings) -> Finding:
     """Return whether the store can be written where the run would write it, and the room there."""
 
     def look() -> str:
+        from vla_attention.capture.store.store_root import read_existing_root
         from vla_attention.capture.store.store_writer import refuse_existing
 
-        if settings.mode == "new" and settings.store.exists():
-            refuse_existing(settings.store)
+        if settings.store.exists():
+            refuse_existing(settings.store) if settings.mode == "new" else read_existing_root(settings.store)
         check_writable(settings.store.parent, "--store")
         return f"{format_bytes(_free(settings.store))} free for {settings.store}."
 
@@ -209,21 +210,23 @@ def _try(settings: RunSettings, policy: Policy, device: str, termination: Termin
 
 
 def _plan(settings: RunSettings, policy: Policy, device: str, termination: Termination) -> _PlannedRun:
-    """Plan the run as `run_capture` does, and try its first replans."""
+    """Plan the run as `run_capture` does, check that it can continue its store, and try its first replans."""
     from vla_attention.capture.budget import recordings_by_size
     from vla_attention.capture.capture_run import plan_changes, plan_protocol, plan_recording
     from vla_attention.capture.environments.base import EnvironmentSettings
     from vla_attention.capture.environments.suites import list_tasks
     from vla_attention.capture.provenance import describe_machine
     from vla_attention.capture.rollout.episode import check_protocol
+    from vla_attention.capture.store.store_root import check_same_run, read_existing_root
     from vla_attention.capture.trial import run_trial
-    from vla_attention.schemas.stores.store_format import FORMAT_NAME, FORMAT_VERSION, RootAttributes
+    from vla_attention.schemas.stores.store_format import FORMAT_NAME, FORMAT_VERSION, Recording, RootAttributes
 
     evaluation = settings.protocol or policy.default_protocol
     protocol = plan_protocol(settings, evaluation, policy)
     check_protocol(protocol, policy)
     tasks = list_tasks(settings.suite)
     wanted = tasks if settings.task_ids is None else tuple(tasks[number] for number in settings.task_ids)
+    changes = plan_changes(settings, policy, tasks)
     attributes = RootAttributes(
         format=FORMAT_NAME,
         format_version=FORMAT_VERSION,
@@ -232,12 +235,16 @@ def _plan(settings: RunSettings, policy: Policy, device: str, termination: Termi
         recording=plan_recording(settings.recording, policy)[0],
         sites=policy.sites,
         provenance=describe_machine(device),
+        interventions=changes.interventions,
     )
-    tried = attributes
+    candidates: tuple[Recording, ...] = (attributes.recording,)
     if settings.budget is not None:
-        largest = recordings_by_size(attributes.recording, policy.num_denoise_steps, settings.fixed)[0]
-        tried = replace(attributes, recording=largest)
-    changes = plan_changes(settings, policy, tasks)
+        candidates = recordings_by_size(attributes.recording, policy.num_denoise_steps, settings.fixed)
+    tried = replace(attributes, recording=candidates[0])
+    if settings.mode == "resume" and settings.store.exists():
+        existing = read_existing_root(settings.store)
+        same = existing.recording if existing.recording in candidates else attributes.recording
+        check_same_run(settings.store, existing, replace(attributes, recording=same))
     environment = EnvironmentSettings(evaluation, settings.libero_assets)
     trial = run_trial(policy, tried, wanted[0], environment, changes, termination.check)
     return _PlannedRun(attributes, len(wanted), trial)

@@ -9,6 +9,7 @@ import pytest
 
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.environments.libero_installation import ASSETS_VARIABLE
+from vla_attention.testing.stores import write_store
 
 pytestmark = pytest.mark.simulator
 
@@ -37,6 +38,17 @@ def test_the_run_of_the_policy_that_comes_along(tmp_path, capfd):
     assert re.match(r"At most [\d.]+ MB: 8 episodes, up to 10 replans each, [\d.]+ kB a replan", found["size"][1])
     assert said.endswith("Nothing is missing for the run.\n")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_store_that_the_run_cannot_continue_is_missing(tmp_path, capfd):
+    store = write_store(tmp_path / "a.zarr", tasks=(0,), episodes=1)
+    options = ["--checkpoint", "untrained-tiny", "--task-id", "0", "--num-episodes", "1", "--max-steps", "4"]
+    assert capture(["doctor", *options, "--store", str(store), "--resume"]) == 1
+    assert f"Cannot resume {store}: its " in lines_of(capfd.readouterr().out)["trial"][1]
+    (tmp_path / "b.zarr").mkdir()
+    for mode in ("--resume", "--overwrite"):
+        assert capture(["doctor", *options, "--no-trial", "--store", str(tmp_path / "b.zarr"), mode]) == 1
+        assert lines_of(capfd.readouterr().out)["disk"][0] == "MISSING"
 
 
 def test_what_a_run_needs_and_lacks_is_exit_code_1(tmp_path, capfd, monkeypatch):
