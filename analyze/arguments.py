@@ -102,12 +102,13 @@ def add_output(parser: argparse.ArgumentParser, default: str = "results/STORE/GR
     """--output, --no-plots and --pdf."""
     output = parser.add_argument_group("output")
     output.add_argument("--output", type=Path, metavar="PATH", help=f"folder (default: {default})")
-    output.add_argument("--no-plots", action="store_true", help="numbers only")
-    add_pdf(output)
+    pictures = output.add_mutually_exclusive_group()
+    pictures.add_argument("--no-plots", action="store_true", help="numbers only")
+    add_pdf(pictures)
     return output
 
 
-def add_pdf(output: argparse._ArgumentGroup) -> None:
+def add_pdf(output: argparse._ActionsContainer) -> None:
     """--pdf."""
     output.add_argument("--pdf", action="store_true", help="pictures as PDF too (takes twice the time)")
 

@@ -149,7 +149,7 @@ def _find_place(settings: RunSettings) -> Finding:
         check_writable(settings.store.parent, "--store")
         return f"{format_bytes(_free(settings.store))} free for {settings.store}."
 
-    return checked("disk", look)
+    return checked("store", look)
 
 
 def _free(path: Path) -> int:

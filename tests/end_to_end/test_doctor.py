@@ -27,7 +27,7 @@ def test_the_run_of_the_policy_that_comes_along(tmp_path, capfd):
     said = capfd.readouterr().out
     found = lines_of(said)
     assert list(found) == [
-        *("processor", "memory", "GPU", "drawing", "robosuite", "LIBERO", "disk", "checkpoint", "precision"),
+        *("processor", "memory", "GPU", "drawing", "robosuite", "LIBERO", "store", "checkpoint", "precision"),
         *("time", "size"),
     ]
     assert "The policy's process took up to" in found["memory"][1]
@@ -48,7 +48,7 @@ def test_a_store_that_the_run_cannot_continue_is_missing(tmp_path, capfd):
     (tmp_path / "b.zarr").mkdir()
     for mode in ("--resume", "--overwrite"):
         assert capture(["doctor", *options, "--no-trial", "--store", str(tmp_path / "b.zarr"), mode]) == 1
-        assert lines_of(capfd.readouterr().out)["disk"][0] == "MISSING"
+        assert lines_of(capfd.readouterr().out)["store"][0] == "MISSING"
 
 
 def test_what_a_run_needs_and_lacks_is_exit_code_1(tmp_path, capfd, monkeypatch):
