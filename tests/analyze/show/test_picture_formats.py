@@ -27,6 +27,14 @@ def test_the_command_line_chooses_the_formats(tmp_path, capsys, words, pdf):
     assert picture_formats() == ("png", "pdf")
 
 
+@pytest.mark.parametrize("command", ["ratios", "words", "compare", "effects"])
+def test_a_pdf_without_pictures_is_refused(capsys, command):
+    with pytest.raises(SystemExit) as stopped:
+        main([command, "a.zarr", "--no-plots", "--pdf"])
+    assert stopped.value.code == 2
+    assert "--pdf: not allowed with argument --no-plots" in capsys.readouterr().err
+
+
 def test_the_formats_are_back_after_an_error():
     def fail() -> None:
         with pictures_saved_as(["png"]):
