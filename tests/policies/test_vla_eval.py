@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -88,7 +89,7 @@ def folder(tmp_path_factory):
     with log.open("wb") as output:
         process = subprocess.Popen(
             ["vla-eval", "serve", "--config", "server.yaml", "--address", f"127.0.0.1:{port}"],
-            cwd=folder, env=environment(), stdout=output, stderr=subprocess.STDOUT,
+            cwd=folder, env=environment(), stdout=output, stderr=subprocess.STDOUT, start_new_session=True,
         )  # fmt: skip
     try:
         wait_for(port, process, log)
@@ -101,7 +102,8 @@ def folder(tmp_path_factory):
             )  # fmt: skip
             assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:] + log.read_text()[-3000:]
     finally:
-        process.terminate()
+        # It serves in a process of its own, which a signal to it alone would leave.
+        os.killpg(process.pid, signal.SIGTERM)
         process.wait(timeout=30)
     return folder
 
