@@ -18,7 +18,8 @@ heads: of the last denoise step of ten, of the first and the last (the default),
 from __future__ import annotations
 
 import argparse
-import statistics
+import functools
+import itertools
 import sys
 import tempfile
 import time
@@ -33,7 +34,9 @@ from torch import Tensor, nn
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
-import vla_attention as va  # noqa: E402 - a script, and not part of the package
+import measurement  # noqa: E402 - scripts, and not part of the package
+
+import vla_attention as va  # noqa: E402
 
 HEADS, STEPS, HORIZON = 8, 10, 10
 PATCHES, WORDS, CAMERAS = 256, 200, 3
@@ -133,52 +136,41 @@ def measure(
     act: makes one call of the policy. kinds: what `va.record` is given, by kind; `plain` is the call without it.
     """
 
-    def timed(call: Callable[[], object]) -> float:
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-        began = clock()
-        for _ in range(calls):
+    def recorded(episode: Any, kind: str) -> None:
+        with episode.replan(env_step=next(steps)):
+            actions = act()
+        assert "knockout" in kinds[kind] or torch.equal(actions, expected), kind
+
+    def waited_for(call: Callable[[], object]) -> Callable[[], object]:
+        def waiting() -> None:
             call()
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-        return (clock() - began) / calls
+            if torch.cuda.is_available():
+                torch.cuda.synchronize()
 
-    seconds: dict[str, list[float]] = {"plain": [], **{kind: [] for kind in kinds}}
+        return waiting
+
+    steps = itertools.count()
     with ExitStack() as stack:
-        episodes = {}
-        for kind, settings in kinds.items():
-            run = va.record(folder / f"{len(episodes)}.zarr", policy, layout=layout, durable=False, **settings)
+        turns: dict[str, Callable[[], object]] = {"plain": act}
+        for number, (kind, settings) in enumerate(kinds.items()):
+            run = va.record(folder / f"{number}.zarr", policy, layout=layout, durable=False, **settings)
             stack.enter_context(run)
-            episodes[kind] = stack.enter_context(run.episode(task_id=0, episode_index=0, instruction=""))
+            episode = stack.enter_context(run.episode(task_id=0, episode_index=0, instruction=""))
+            turns[kind] = functools.partial(recorded, episode, kind)
         expected = act()
-        step = 0
-        for number in range(rounds + 1):  # the first round is not counted
-            found = {"plain": timed(act)}
-            for kind, episode in episodes.items():
-
-                def recorded(episode: Any = episode, kind: str = kind) -> None:
-                    nonlocal step
-                    step += 1
-                    with episode.replan(env_step=step):
-                        actions = act()
-                    assert "knockout" in kinds[kind] or torch.equal(actions, expected), kind
-
-                found[kind] = timed(recorded)
-            if number:
-                for kind, value in found.items():
-                    seconds[kind].append(value)
-    return seconds
+        calls_of = {kind: waited_for(call) for kind, call in turns.items()}
+        return measurement.take_turns(calls_of, rounds, repeats=calls, clock=clock)
 
 
 def milliseconds(seconds: list[float]) -> str:
     """The median of the rounds."""
-    return f"{1000 * statistics.median(seconds):.1f}"
+    return f"{measurement.measured(seconds, factor=1000).median:.1f}"
 
 
 def times(seconds: list[float], plain: list[float]) -> str:
     """The median, lowest and highest of the ratios within the rounds."""
-    ratios = [value / base for value, base in zip(seconds, plain, strict=True)]
-    return f"{statistics.median(ratios):.3f} ({min(ratios):.3f}, {max(ratios):.3f})"
+    found = measurement.measured(measurement.ratios(seconds, plain))
+    return f"{found.median:.3f} ({found.lowest:.3f}, {found.highest:.3f})"
 
 
 def main() -> None:

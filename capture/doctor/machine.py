@@ -53,19 +53,13 @@ def find_processor(threads: Threads) -> Finding:
 
 def find_memory(meminfo: Path = Path("/proc/meminfo")) -> Finding:
     """Return the memory that is available."""
-    available = _available_memory(meminfo)
+    # Here, so that this module can be imported where torch is missing.
+    from vla_attention.capture.rollout.pipeline import available_memory
+
+    available = available_memory(meminfo)
     if available is None:
         return Finding("memory", "note", "This system does not say how much is available.")
     return Finding("memory", "ok", f"{format_bytes(available)} available.")
-
-
-def _available_memory(meminfo: Path) -> int | None:
-    try:
-        lines = meminfo.read_text(encoding="ascii").splitlines()
-    except OSError:
-        return None
-    values = [line.split()[1] for line in lines if line.startswith("MemAvailable:")]
-    return int(values[0]) * 1024 if values and values[0].isdecimal() else None
 
 
 def find_gpu(device: str, torch: Any, driver: Path = Path("/proc/driver/nvidia/version")) -> Finding:

@@ -79,14 +79,20 @@ def memory_left() -> float:
     Infinite where neither says.
     """
     left = [float("inf")]
-    available = re.search(r"^MemAvailable:\s+(\d+) kB", _text(Path("/proc/meminfo")), re.MULTILINE)
-    if available:
-        left.append(1024.0 * int(available[1]))
+    available = available_memory()
+    if available is not None:
+        left.append(available)
     of_job = os.environ.get("SLURM_MEM_PER_NODE", "")  # megabytes; 0 is the whole node
     own = re.search(r"^VmRSS:\s+(\d+) kB", _text(Path("/proc/self/status")), re.MULTILINE)
     if of_job.isdecimal() and int(of_job) and own:
         left.append(1024.0 * (1024 * int(of_job) - int(own[1])))
     return min(left)
+
+
+def available_memory(meminfo: Path = Path("/proc/meminfo")) -> float | None:
+    """Return the bytes of memory that the machine has left, None where it does not say."""
+    found = re.search(r"^MemAvailable:\s+(\d+) kB", _text(meminfo), re.MULTILINE)
+    return 1024.0 * int(found[1]) if found else None
 
 
 def _text(path: Path) -> str:

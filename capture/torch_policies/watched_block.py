@@ -154,9 +154,10 @@ class WatchedBlock:
     def _learn(self) -> None:
         """Remember what the softmaxes by hand of this block turned out to be."""
         known = self._found.softmaxes
-        for asked, count in self._began.items():
-            found = [shape for (before, shape), times in self._met_values.items() if before == asked and times == count]
-            known[asked] = found[0] if found and known.get(asked, found[0]) == found[0] else None
+        always = {asked: shape for (asked, shape), times in self._met_values.items() if times == self._began[asked]}
+        for asked in self._began:
+            shape = always.get(asked)
+            known[asked] = shape if known.get(asked, shape) == shape else None
 
     def saw(self, call: AttentionCall) -> None:
         """Tell the watcher about a call, and count it."""
