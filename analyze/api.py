@@ -22,6 +22,7 @@ from vla_attention.analyze.stores.selection import check_combinable
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.store_format import RootAttributes
+from vla_attention.schemas.stores.store_url import store_place
 
 if TYPE_CHECKING:
     import xarray
@@ -36,7 +37,7 @@ def open_stores(stores: str | Path | Sequence[str | Path]) -> OpenStores:
     paths = [stores] if isinstance(stores, (str, Path)) else list(stores)
     if not paths:
         raise BadArgument("No store was given; expected the path of a NAME.zarr, or several.")
-    opened = tuple(open_store(Path(path)) for path in paths)
+    opened = tuple(open_store(store_place(path)) for path in paths)
     check_combinable(opened)
     return OpenStores(opened)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_attention.schemas.safe_text import file_part
+from vla_attention.schemas.stores.store_url import store_place
 
 if TYPE_CHECKING:
     from vla_attention.analyze.measures.question_settings import AnalysisSettings
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 def add_stores(parser: argparse.ArgumentParser) -> None:
     """STORE ..., one or several, analysed as one."""
-    parser.add_argument("stores", nargs="+", type=Path, metavar="STORE", help="one or several NAME.zarr")
+    parser.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses")
 
 
 def stores_of(arguments: argparse.Namespace) -> list[Store]:

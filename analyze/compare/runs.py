@@ -16,6 +16,7 @@ from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.schemas.errors import BadArgument, UnknownName, UserError, did_you_mean, listing
 from vla_attention.schemas.stores.reader import Store, open_store
+from vla_attention.schemas.stores.store_url import StorePlace, store_place
 
 
 class MixedPolicies(UserError, ValueError):
@@ -31,7 +32,7 @@ class RunArgument:
     """One run as the user gives it: a name and the paths of its stores."""
 
     name: str
-    paths: tuple[Path, ...]
+    paths: tuple[StorePlace, ...]
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ def parse_runs(texts: Sequence[str]) -> list[RunArgument]:
     for text in texts:
         # A path may hold '=' too: what exists as it stands is a path.
         name, given, rest = ("", "", text) if Path(text).exists() else text.rpartition("=")
-        paths = tuple(Path(part) for part in rest.split(","))
+        paths = tuple(store_place(part) for part in rest.split(","))
         if (given and not name) or not all(rest.split(",")):
             raise BadArgument(f"Cannot read the run '{text}'; expected STORE or NAME=STORE[,STORE ...].")
         if not given and len(paths) > 1:
@@ -79,10 +80,10 @@ def parse_runs(texts: Sequence[str]) -> list[RunArgument]:
     return runs
 
 
-def _name_among(path: Path, others: Sequence[Path]) -> str:
+def _name_among(path: StorePlace, others: Sequence[StorePlace]) -> str:
     """The end of a store's path, without suffix, that no other one ends with; at least its file name."""
 
-    def end(of: Path, depth: int) -> str:
+    def end(of: StorePlace, depth: int) -> str:
         return "/".join(of.resolve().with_suffix("").parts[-depth:])
 
     depth = 1
@@ -93,7 +94,7 @@ def _name_among(path: Path, others: Sequence[Path]) -> str:
 
 
 def _refuse_twice(runs: Sequence[RunArgument]) -> None:
-    seen: dict[Path, str] = {}
+    seen: dict[StorePlace, str] = {}
     for run in runs:
         for path in run.paths:
             where = path.resolve()

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 from vla_attention.analyze.show.numbers import format_percent, plural
 from vla_attention.schemas.command_line import command_parser, format_bytes
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.stores.store_url import store_place
 
 if TYPE_CHECKING:
     from vla_attention.schemas.stores.reader import Store
@@ -18,6 +20,9 @@ _EXAMPLES = """examples:
   vla-analyze copy libero_10.zarr slim.zarr --without frames
   vla-analyze copy libero_10.zarr slim.zarr --without frames objects contributions
   vla-analyze copy libero_10.zarr slim.zarr --without frames    again: adds what was captured meanwhile
+  vla-analyze copy libero_10.zarr packed.zarr --packed          one file an episode
+  vla-analyze copy libero_10.zarr packed.zarr --packed --push hf://datasets/ORG/NAME/libero_10.zarr
+  vla-analyze copy hf://datasets/ORG/NAME/libero_10.zarr here.zarr
 
 frames: the cameras' pictures (overlays and reruns need them). objects: what each patch shows (object: groups need it).
 contributions: norms of what keys add. Rows, and everything else that groupings of keys, words, cameras and
@@ -29,13 +34,24 @@ def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-analyze copy STORE DEST`."""
     parser = command_parser(
         "vla-analyze copy",
-        "Copy a store, for instance without its pictures; without DEST, print how large each part is.",
+        "Copy a store, for instance without its pictures or packed into few files; without DEST, print how large each\n"
+        "part is.",
         _EXAMPLES,
     )
-    parser.add_argument("store", type=Path, metavar="STORE", help="NAME.zarr")
+    parser.add_argument("store", type=store_place, metavar="STORE", help="NAME.zarr, or its address")
     parser.add_argument("target", type=Path, nargs="?", metavar="DEST", help="where the copy goes, NAME.zarr")
     parser.add_argument(
         "--without", nargs="+", default=[], metavar="PART", help="frames, objects, contributions (default: copy all)"
+    )
+    parser.add_argument(
+        "--packed",
+        action="store_true",
+        help="one zip file an episode and an index of them; every command reads it in place, here and elsewhere",
+    )
+    parser.add_argument(
+        "--push",
+        metavar="hf://datasets/ORG/NAME/FILE.zarr",
+        help="upload the packed copy to the Hugging Face hub, with a card that says what it holds",
     )
     return parser
 
@@ -49,14 +65,27 @@ def run(arguments: argparse.Namespace) -> int:
     store = open_store(arguments.store)
     without = check_parts(arguments.without)
     if arguments.target is None:
+        if arguments.packed or arguments.push:
+            raise BadArgument("--packed and --push need a DEST: the packed copy is made here first; give DEST.zarr.")
         print(_sizes_text(store, without))
         return 0
+    if arguments.push and not arguments.packed:
+        raise BadArgument("--push uploads a packed copy: a hub takes few files only; add --packed.")
+    push = None
+    if arguments.push:
+        from vla_attention.analyze.copy.pushing import check_push
+
+        push = check_push(arguments.push)
     with progress_bar(len(store.episodes), "episodes") as advance:
-        copied = copy_store(store, arguments.target, without, advance)
+        copied = copy_store(store, arguments.target, without, advance, packed=arguments.packed)
     there = f" ({copied.present} were there already)" if copied.present else ""
     left = f", {format_bytes(copied.left_bytes)} left behind: {', '.join(without)}" if without else ""
     added = plural(copied.added, "episode")
     print(f"{arguments.target}: {added} added{there}, {format_bytes(copied.copied_bytes)}{left}.")
+    if push is not None:
+        from vla_attention.analyze.copy.pushing import push_store
+
+        print(push_store(arguments.target, push))
     return 0
 
 

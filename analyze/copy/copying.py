@@ -18,17 +18,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from vla_attention.schemas.errors import BadArgument, unknown_name
+from vla_attention.analyze.copy.packing import Packing
+from vla_attention.schemas.errors import BadArgument, UserError, unknown_name
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.stores.digest import run_digest
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
+from vla_attention.schemas.stores.remote_source import source_of
 from vla_attention.schemas.stores.root import episode_folders, group_attributes
-from vla_attention.schemas.stores.seal import seal_episode
+from vla_attention.schemas.stores.seal import SEAL_FILE, seal_episode
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
     FORMAT_VERSION,
     PARTIAL_SUFFIX,
-    SEAL_GROUP,
     STORE_SUFFIX,
     CorruptEpisode,
     RootAttributes,
@@ -64,11 +65,12 @@ class Copied:
 
 
 def part_sizes(store: Store) -> dict[str, int]:
-    """Bytes of each part of a store; `rest` is everything else."""
+    """Bytes of each part of a store, as the seals list them; `rest` is everything else."""
     sizes = dict.fromkeys((*PARTS, REST), 0)
     for episode in store.episodes:
-        for file in _files(episode.folder):
-            sizes[_part_of(file) or REST] += (episode.folder / file).stat().st_size
+        for file, record in episode.files.records.items():
+            sizes[_part_of(file) or REST] += record.size
+        sizes[REST] += len(episode.source.whole(SEAL_FILE))
     return sizes
 
 
@@ -81,9 +83,16 @@ def check_parts(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def copy_store(
-    store: Store, target: Path, without: Sequence[str], progress: Callable[[int], object] | None = None
+    store: Store,
+    target: Path,
+    without: Sequence[str],
+    progress: Callable[[int], object] | None = None,
+    *,
+    packed: bool = False,
 ) -> Copied:
     """Copy every episode of a store; `progress` is called with 1 after each. A copy that exists is brought up to date.
+
+    packed: one zip an episode and an index of them, see `packing.py`; otherwise a folder each, whatever the store has.
 
     Raises:
         BadArgument: the target cannot be written, or is the store itself.
@@ -93,33 +102,42 @@ def copy_store(
     without = check_parts(without)
     if target.suffix != STORE_SUFFIX:
         raise BadArgument(f"Cannot copy to {target}: expected a name that ends with '{STORE_SUFFIX}'.")
-    if target.resolve() == store.path.resolve():
+    if isinstance(store.path, Path) and target.resolve() == store.path.resolve():
         raise BadArgument(f"Cannot copy {store.path} to itself; give another name.")
     try:
-        return _copy(store, target, without, progress)
+        return _copy(store, target, without, progress, packed)
     except OSError as error:
-        if isinstance(error, (BadArgument, CorruptEpisode)) or error.errno is None:
+        if isinstance(error, UserError) or error.errno is None:
             raise
         raise BadArgument(f"Cannot copy to {target}: {error.strerror or error}; give another place.") from None
 
 
-def _copy(store: Store, target: Path, without: tuple[str, ...], progress: Callable[[int], object] | None) -> Copied:
+def _copy(
+    store: Store, target: Path, without: tuple[str, ...], progress: Callable[[int], object] | None, packed: bool
+) -> Copied:
     building = target.with_name(target.name + PARTIAL_SUFFIX) / f"copy-{os.getpid()}"
     root = _root_document(store, without)
     run = run_digest(group_attributes(root))
     building.mkdir(parents=True)
     try:
         _ensure_root(store, target, root, building)
-        present = {folder.name for folder in episode_folders(target)}
+        pack = Packing(target, run) if packed else None
+        present = {folder.name for folder in episode_folders(target)} if pack is None else pack.present()
         added = copied = left = 0
         for episode in store.episodes:
             if episode.name not in present:
                 folder = building / episode.name
                 sizes = _copy_episode(episode, folder, without, run)
                 copied, left, added = copied + sizes[0], left + sizes[1], added + 1
-                _rename_new(folder, target / EPISODES_GROUP / episode.name)
+                if pack is None:
+                    _rename_new(folder, target / EPISODES_GROUP / episode.name)
+                else:
+                    pack.add(episode.name, folder)
+                    shutil.rmtree(folder)
             if progress is not None:
                 progress(1)
+        if pack is not None:
+            pack.write_index()
     finally:
         shutil.rmtree(building, ignore_errors=True)
         _remove_if_empty(building.parent)
@@ -132,7 +150,8 @@ def _ensure_root(store: Store, target: Path, root: bytes, building: Path) -> Non
         empty = building / "root"
         (empty / EPISODES_GROUP).mkdir(parents=True)
         (empty / "zarr.json").write_bytes(root)
-        shutil.copyfile(store.path / EPISODES_GROUP / "zarr.json", empty / EPISODES_GROUP / "zarr.json")
+        group = source_of(store.path).whole(f"{EPISODES_GROUP}/zarr.json")
+        (empty / EPISODES_GROUP / "zarr.json").write_bytes(group)
         _rename_new(empty, target)
     if (target / "zarr.json").read_bytes() != root if (target / "zarr.json").is_file() else True:
         open_store(target)  # raises when it is no store
@@ -161,18 +180,18 @@ def _copy_episode(episode: StoredEpisode, folder: Path, without: tuple[str, ...]
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes(content)
         copied += len(content)
-    seal = folder / SEAL_GROUP / "zarr.json"
+    seal = folder / SEAL_FILE
     if without:
         seal_episode(folder, episode.name, run, copied_from=episode.seal.copied_from or episode.seal.digest)
     else:
         seal.parent.mkdir()
-        shutil.copyfile(episode.folder / SEAL_GROUP / "zarr.json", seal)
+        seal.write_bytes(episode.source.whole(SEAL_FILE))
     return copied + seal.stat().st_size, left
 
 
 def _root_document(store: Store, without: tuple[str, ...]) -> bytes:
     """The copy's `zarr.json`: that of the run, with the omitted parts."""
-    content = (store.path / "zarr.json").read_bytes()
+    content = source_of(store.path).whole("zarr.json")
     if not without:
         return content
     root = store.attributes
@@ -199,11 +218,6 @@ def _with_attributes(document: bytes, attributes: dict[str, Any]) -> bytes:
 def _part_of(path: str) -> str | None:
     """The part that an array, or a file of the episode, belongs to."""
     return next((name for name, part in PARTS.items() if re.search(part.pattern, path)), None)
-
-
-def _files(folder: Path) -> list[str]:
-    """Every file below an episode's folder, relative to it."""
-    return sorted(file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
 
 
 def _rename_new(source: Path, target: Path) -> None:

@@ -9,6 +9,7 @@ from vla_attention.analyze.arguments import add_grouping, add_intervals, add_out
 from vla_attention.analyze.show.output_files import write_csv, write_parquet
 from vla_attention.analyze.show.screen import fitted, write_whole
 from vla_attention.schemas.command_line import command_parser
+from vla_attention.schemas.stores.store_url import store_place
 
 _EXAMPLES = """examples:
   vla-analyze effects runs/cubes.zarr reruns/cubes
@@ -29,11 +30,11 @@ def build_parser() -> argparse.ArgumentParser:
         "its attention to that group in the same replans, another noise seed and random keys.",
         _EXAMPLES,
     )
-    parser.add_argument("base", type=Path, metavar="BASE", help="the store whose policy calls were run again")
+    parser.add_argument("base", type=store_place, metavar="BASE", help="the store whose policy calls were run again")
     parser.add_argument(
         "reruns",
         nargs="+",
-        type=Path,
+        type=store_place,
         metavar="RERUN",
         help="stores of vla-capture rerun BASE, rollouts with interventions, or folders of them",
     )

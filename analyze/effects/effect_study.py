@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -50,6 +49,7 @@ from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
+from vla_attention.schemas.stores.store_url import StorePlace
 
 _LIMITS = {"effect": POSITIVE, "effect_chunk": POSITIVE, "angle": POSITIVE, "gripper_flips": SHARE}
 _NAMES = ("condition", "kind", "group", "selector")
@@ -131,7 +131,7 @@ class EffectStudy:
 
 
 def study_effects(
-    base: Path, given: Sequence[Path], settings: AnalysisSettings, dimensions: Sequence[int] | None = None
+    base: StorePlace, given: Sequence[StorePlace], settings: AnalysisSettings, dimensions: Sequence[int] | None = None
 ) -> EffectStudy:
     """Open a base and its reruns (`reruns.open_reruns`) and measure every pair of replans.
 

@@ -11,6 +11,7 @@ from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX, StoreNotFound
+from vla_attention.schemas.stores.store_url import StorePlace
 
 #: So many digits of a run's digest tell runs apart in a message.
 _DIGITS = 12
@@ -33,7 +34,7 @@ class BaseAndReruns:
     notes: tuple[str, ...]
 
 
-def open_reruns(base: Store, given: Sequence[Path]) -> BaseAndReruns:
+def open_reruns(base: Store, given: Sequence[StorePlace]) -> BaseAndReruns:
     """Open what is compared with a base: stores, or folders of stores.
 
     Raises:
@@ -75,7 +76,7 @@ def open_reruns(base: Store, given: Sequence[Path]) -> BaseAndReruns:
     return BaseAndReruns(base, tuple(conditions[: len(reruns)]), tuple(conditions[len(reruns) :]), tuple(notes))
 
 
-def _what_fits(base: Path) -> str:
+def _what_fits(base: StorePlace) -> str:
     return f"make reruns with vla-capture rerun {base}, or roll out with its settings and an intervention"
 
 
@@ -108,11 +109,11 @@ def _short(value: object) -> str:
     return text if len(text) <= 2 * _DIGITS else text[:_DIGITS]
 
 
-def _paths(given: Sequence[Path]) -> list[tuple[Path, bool]]:
+def _paths(given: Sequence[StorePlace]) -> list[tuple[StorePlace, bool]]:
     """Paths of stores, and whether each was named itself; the others are in a folder that was given."""
-    found: list[tuple[Path, bool]] = []
+    found: list[tuple[StorePlace, bool]] = []
     for path in given:
-        if path.is_dir() and not (path / "zarr.json").exists():
+        if isinstance(path, Path) and path.is_dir() and not (path / "zarr.json").exists():
             inside = sorted(entry for entry in path.iterdir() if entry.suffix == STORE_SUFFIX and entry.is_dir())
             if not inside:
                 raise StoreNotFound(

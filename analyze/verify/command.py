@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from vla_attention.analyze.arguments import add_workers
 from vla_attention.analyze.show.numbers import plural
 from vla_attention.schemas.command_line import command_parser
+from vla_attention.schemas.stores.store_url import store_place
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -17,7 +17,7 @@ def build_parser() -> argparse.ArgumentParser:
         "Read everything back and check counts, missing chunks, digests and row sums. Exit code 1 if anything is "
         "wrong.",
     )
-    parser.add_argument("stores", nargs="+", type=Path, metavar="STORE", help="one or several NAME.zarr")
+    parser.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses")
     add_workers(parser)
     return parser
 

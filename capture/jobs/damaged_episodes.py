@@ -10,6 +10,7 @@ from vla_attention.schemas.errors import listing
 from vla_attention.schemas.stores.completeness import check_presence
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import StoreError
+from vla_attention.schemas.stores.store_url import local_path
 from vla_attention.schemas.stores.verify import episode_faults
 
 
@@ -35,7 +36,12 @@ class DamagedEpisode:
 
 def look_at(store: Store, episode: StoredEpisode, verify: bool = False) -> DamagedEpisode | None:
     """Return what is wrong with an episode, or None. `verify`: read all of it, as `vla-analyze verify` does."""
-    problems = check_presence(episode.folder, store.run)
+    if episode.place is not None:
+        raise StoreError(
+            f"{store.path} is packed, and captures add nothing to packed stores; vla-analyze verify {store.path} "
+            f"checks it, and vla-analyze copy {store.path} NAME.zarr makes a store of folders."
+        )
+    problems = check_presence(local_path(episode.folder), store.run)
     if verify and not problems:
         problems = [fault.problem for fault in episode_faults(store, episode)]
     return DamagedEpisode(episode.name, tuple(problems)) if problems else None

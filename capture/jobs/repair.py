@@ -18,6 +18,7 @@ from vla_attention.capture.store.durable_files import remove_if_empty
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.seal import read_seal
 from vla_attention.schemas.stores.store_format import StoreError
+from vla_attention.schemas.stores.store_url import local_path
 
 #: Ending of the folder beside the store with the episodes that were moved aside. It may be deleted at any time.
 QUARANTINE_SUFFIX = ".quarantine"
@@ -77,7 +78,7 @@ def _check_root(store: Store) -> None:
     runs = []
     for episode in store.episodes:
         try:
-            runs.append(read_seal(episode.folder).run)
+            runs.append(read_seal(episode.source).run)
         except (OSError, ValueError):
             continue
     if runs and store.run not in runs:
@@ -92,16 +93,16 @@ def _move(store: Store, episode: StoredEpisode, claims: Claims, verify: bool) ->
     """Move one episode aside; None if it is no longer there, or no longer damaged."""
     try:
         holder = claims.acquire(episode.name)
-        if not episode.folder.is_dir():
+        if not local_path(episode.folder).is_dir():
             return None
         # A new `StoredEpisode`: the old one keeps what it has read.
         damaged = look_at(store, StoredEpisode(episode.folder, episode.name, store.run), verify)
         if damaged is None or holder is not None:
             return None if damaged is None else Finding(damaged, holder=holder)
-        return Finding(damaged, moved_to=_quarantine(store.path, episode.folder, damaged))
+        return Finding(damaged, moved_to=_quarantine(local_path(store.path), local_path(episode.folder), damaged))
     except OSError as error:
         raise StoreError(
-            f"Cannot move {episode.name} of {store.path} into {quarantine_folder(store.path)}: "
+            f"Cannot move {episode.name} of {store.path} into {quarantine_folder(local_path(store.path))}: "
             f"{error.strerror or error}. Episodes before it were moved; remove the cause and run the command again."
         ) from None
     finally:

@@ -18,6 +18,7 @@ from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import parse_episode_name
+from vla_attention.schemas.stores.store_url import local_path
 
 
 @dataclass(frozen=True)
@@ -121,8 +122,8 @@ def store_status(path: Path, expected: int | None = None, verify: bool = False) 
                 task_id=task_id,
                 episode=index,
                 success=stored.attributes.success,
-                bytes=sum(file.stat().st_size for file in stored.folder.rglob("*") if file.is_file()),
-                at=at or _time_of(stored.folder),
+                bytes=sum(file.stat().st_size for file in local_path(stored.folder).rglob("*") if file.is_file()),
+                at=at or _time_of(local_path(stored.folder)),
                 by=worker.describe() if worker else "",
             )
         )

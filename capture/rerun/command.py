@@ -26,6 +26,7 @@ from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.reader import Store
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX
+from vla_attention.schemas.stores.store_url import local_path
 from vla_attention.schemas.threads import Threads
 
 
@@ -88,7 +89,7 @@ def _target(arguments: argparse.Namespace, base: Store, interventions: Intervent
     elif interventions.is_none:
         return None
     else:
-        target = base.path.with_name(f"{base.path.stem}_{file_part(interventions.name)}{STORE_SUFFIX}")
+        target = local_path(base.path).with_name(f"{base.path.stem}_{file_part(interventions.name)}{STORE_SUFFIX}")
     if target.resolve() == base.path.resolve():
         raise BadArgument(f"Cannot write the rerun of {base.path} into the store itself; give another --store.")
     return target

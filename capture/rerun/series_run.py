@@ -20,6 +20,7 @@ from vla_attention.schemas.interventions import Interventions, KeyKnockout
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.reader import Store
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX
+from vla_attention.schemas.stores.store_url import local_path
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class SeriesRun:
             objects=arguments.objects,
         )
         check_may_change(base, series.conditions[0].interventions)
-        folder = arguments.output_dir or base.path.with_name(f"{base.path.stem}_reruns")
+        folder = arguments.output_dir or local_path(base.path).with_name(f"{base.path.stem}_reruns")
         check_writable(folder, "--output-dir")
         return cls(base, series, folder)
 

@@ -10,7 +10,6 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -20,6 +19,9 @@ from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.jsonable import from_json
 from vla_attention.schemas.layout import prompt_at
+from vla_attention.schemas.stores.byte_source import ByteSource
+from vla_attention.schemas.stores.packed_index import INDEX_FILE, PackedEpisode, read_index
+from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
 from vla_attention.schemas.stores.root import episode_folders, group_attributes, read_run
 from vla_attention.schemas.stores.seal import identity_problem, read_seal
 from vla_attention.schemas.stores.sealed_files import SealedFiles
@@ -32,6 +34,8 @@ from vla_attention.schemas.stores.store_format import (
     episode_name,
     parse_episode_name,
 )
+from vla_attention.schemas.stores.store_url import StorePlace, store_place
+from vla_attention.schemas.stores.zip_members import DamagedZip, ZipMembers
 
 if TYPE_CHECKING:
     import zarr
@@ -45,14 +49,23 @@ class StoredEpisode:
     """One episode in its folder. It is read when it is needed, and nothing is read that its seal does not bind.
 
     Attributes:
-        folder: where it is.
+        folder: where it is; in a packed store its zip.
         name: the name of its group, which its seal must have.
         run: digest of the configuration of the run that it must belong to, see `run_digest`.
+        place: where its files are read; those in the folder unless it is given.
+        indexed: digest of its seal in the index of a packed store.
     """
 
-    folder: Path
+    folder: StorePlace
     name: str
     run: str
+    place: ByteSource | None = None
+    indexed: str = ""
+
+    @property
+    def source(self) -> ByteSource:
+        """The episode's files as they are found, not yet compared with the seal."""
+        return source_of(self.folder) if self.place is None else self.place
 
     @cached_property
     def attributes(self) -> EpisodeAttributes:
@@ -71,13 +84,19 @@ class StoredEpisode:
     def seal(self) -> EpisodeSeal:
         """What binds the episode's files to its name and run; `CorruptEpisode` when it is not that of this episode."""
         try:
-            seal = read_seal(self.folder)
+            seal = read_seal(self.source)
+        except (RemoteFailure, CorruptEpisode):
+            raise
+        except DamagedZip as error:
+            raise CorruptEpisode(f"Episode {self.name} cannot be read: {error}.") from None
         except OSError as error:
             lost = error.strerror or error
             raise CorruptEpisode(f"Episode {self.name} cannot be read: it has lost its seal ({lost}).") from None
         except ValueError as error:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: its seal is damaged ({error}).") from None
         problem = identity_problem(seal, self.name, self.run)
+        if problem is None and self.indexed not in ("", seal.digest):
+            problem = f"its zip holds another seal than the {INDEX_FILE} of the store lists: one of them was changed"
         if problem is not None:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: {problem}.")
         return seal
@@ -85,7 +104,7 @@ class StoredEpisode:
     @cached_property
     def files(self) -> SealedFiles:
         """The episode's files, as the seal lists them."""
-        return SealedFiles(self.folder, self.seal.files)
+        return SealedFiles(self.source.bound_to(self.seal.digest), self.seal.files)
 
     def sealed(self, file: str) -> bytes:
         """All bytes of one file of the episode; raises `CorruptEpisode` when they are not those that were sealed."""
@@ -254,7 +273,7 @@ class Store:
     `run` is the digest of the run's configuration.
     """
 
-    path: Path
+    path: StorePlace
     attributes: RootAttributes
     run: str
     episodes: tuple[StoredEpisode, ...]
@@ -270,20 +289,31 @@ class Store:
         return tuple(sorted({parse_episode_name(episode.name)[0] for episode in self.episodes}))
 
 
-def open_store(path: Path) -> Store:
-    """Open a store for reading; its episodes are in the order of task id and episode index.
+def open_store(path: str | StorePlace) -> Store:
+    """Open a store for reading, at a path or an address; its episodes are in the order of task id and episode index.
 
     Raises:
         StoreNotFound: nothing is there; the error lists the stores nearby.
         StoreError: something else is there, or its attributes cannot be read.
         FormatTooNew: a later version wrote it.
     """
+    path = store_place(path)
     root, run = read_run(path)
+    source = source_of(path)
+    index = read_index(source, path, run)
+    if index is not None:
+        in_order = sorted(index.episodes.items(), key=lambda item: parse_episode_name(item[0]))
+        return Store(path, root, run, tuple(_packed(path, source, run, *item) for item in in_order))
     try:
         folders = sorted(episode_folders(path), key=lambda folder: parse_episode_name(folder.name))
     except BadArgument as error:
         raise StoreError(f"The store {path} cannot be read: {error}") from None
     return Store(path, root, run, tuple(StoredEpisode(folder, folder.name, run) for folder in folders))
+
+
+def _packed(path: StorePlace, source: ByteSource, run: str, name: str, entry: PackedEpisode) -> StoredEpisode:
+    members = ZipMembers(source.bound_to(entry.seal), entry.file, entry.bytes, entry.tail)
+    return StoredEpisode(path / entry.file, name, run, members, entry.seal)
 
 
 def _lost_chunk(episode: StoredEpisode, name: str) -> CorruptEpisode:

@@ -9,6 +9,8 @@ from typing import Any
 from vla_attention.schemas.errors import did_you_mean, listing
 from vla_attention.schemas.jsonable import MalformedDocument, from_json
 from vla_attention.schemas.stores.digest import run_digest
+from vla_attention.schemas.stores.packed_index import INDEX_FILE
+from vla_attention.schemas.stores.remote_source import RemoteFailure, RemoteFolder, source_of
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
     FORMAT_NAME,
@@ -17,14 +19,15 @@ from vla_attention.schemas.stores.store_format import (
     StoreNotFound,
     check_format,
 )
+from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
 
 
-def read_root(path: Path) -> RootAttributes:
+def read_root(path: StorePlace) -> RootAttributes:
     """The attributes of the store at `path`; raises as `read_run` does."""
     return read_run(path)[0]
 
 
-def read_run(path: Path) -> tuple[RootAttributes, str]:
+def read_run(path: StorePlace) -> tuple[RootAttributes, str]:
     """The attributes of the store at `path`, and the digest of its run's configuration; episodes are bound to it.
 
     Raises:
@@ -32,19 +35,27 @@ def read_run(path: Path) -> tuple[RootAttributes, str]:
         StoreError: something else is there, or its attributes cannot be read.
         FormatTooNew: a later version wrote it.
     """
-    if not path.exists():
+    if isinstance(path, Path) and not path.exists():
         nearby = sorted(str(found) for found in path.parent.glob("*.zarr")) if path.parent.is_dir() else []
         raise StoreNotFound(
             f"There is no store at {path}.{did_you_mean(str(path), nearby)} "
             f"Stores in {path.parent}: {listing(nearby, 5)}. Make one with vla-capture."
         )
     try:
-        attributes = group_attributes((path / "zarr.json").read_bytes())
+        attributes = group_attributes(source_of(path).whole("zarr.json"))
+    except RemoteFailure:
+        raise
     except (FileNotFoundError, NotADirectoryError):
+        if isinstance(path, StoreUrl):
+            raise StoreNotFound(
+                f"There is no store at {path}: no zarr.json was found there. Give the address of the NAME.zarr itself; "
+                "private places need the credentials of their service in the environment."
+            ) from None
         raise StoreError(f"{path} is not a store: it has no zarr.json.") from None
     except (OSError, ValueError) as error:
         raise StoreError(f"The store {path} cannot be read: {error}.") from None
-    _refuse_inside(path, attributes)
+    if isinstance(path, Path):
+        _refuse_inside(path, attributes)
     check_format(attributes, path)
     try:
         return from_json(RootAttributes, attributes), run_digest(attributes)
@@ -65,8 +76,22 @@ def _refuse_inside(path: Path, attributes: dict[str, Any]) -> None:
             raise StoreError(f"{path} is a group inside of a store; give the folder above, {above}.")
 
 
-def episode_folders(path: Path) -> list[Path]:
-    """Folders of the complete episodes of the store at `path`, in no particular order."""
+def episode_folders(path: StorePlace) -> list[StorePlace]:
+    """Folders of the complete episodes of the store at `path`, in no particular order; none of them is packed."""
+    if isinstance(path, StoreUrl):
+        try:
+            names = RemoteFolder(path.url).names(EPISODES_GROUP)
+        except (OSError, NotImplementedError) as error:
+            raise StoreError(
+                f"The episodes of {path} cannot be listed ({error}), and it has no index; vla-analyze copy --packed "
+                "makes a store that is read without listing."
+            ) from None
+        return [path / EPISODES_GROUP / name for name in names if name != "zarr.json"]
+    if (path / INDEX_FILE).is_file():
+        raise StoreError(
+            f"{path} is packed: its episodes are zip files, and nothing is added to them or moved. vla-analyze copy "
+            f"{path} NAME.zarr makes a store of folders."
+        )
     try:
         return [entry for entry in (path / EPISODES_GROUP).iterdir() if entry.is_dir()]
     except OSError as error:

@@ -12,12 +12,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from vla_attention.schemas.jsonable import from_json, to_json
+from vla_attention.schemas.stores.byte_source import ByteSource, Folder
 from vla_attention.schemas.stores.digest import bytes_digest, seal_digest
 from vla_attention.schemas.stores.root import group_attributes
 from vla_attention.schemas.stores.shards import CHECKSUM_BYTES, chunks_of_a_shard, index_size, read_index
 from vla_attention.schemas.stores.store_format import SEAL_GROUP, EpisodeSeal, FileRecord
 
-_FILE = f"{SEAL_GROUP}/zarr.json"
+SEAL_FILE = f"{SEAL_GROUP}/zarr.json"
 
 
 def seal_episode(folder: Path, name: str, run: str, copied_from: str = "") -> EpisodeSeal:
@@ -29,7 +30,7 @@ def seal_episode(folder: Path, name: str, run: str, copied_from: str = "") -> Ep
         run: digest of the run's configuration, see `run_digest`.
         copied_from: digest of the seal under which the episode was captured, if this is a changed copy.
     """
-    (folder / _FILE).unlink(missing_ok=True)
+    (folder / SEAL_FILE).unlink(missing_ok=True)
     files = sorted(file for file in folder.rglob("*") if file.is_file())
     shards = {
         document.parent: chunks
@@ -44,18 +45,19 @@ def seal_episode(folder: Path, name: str, run: str, copied_from: str = "") -> Ep
     seal = replace(seal, digest=seal_digest(to_json(seal)))
     (folder / SEAL_GROUP).mkdir(exist_ok=True)
     group = {"zarr_format": 3, "node_type": "group", "attributes": to_json(seal)}
-    (folder / _FILE).write_text(json.dumps(group, separators=(",", ":")), encoding="utf-8")
+    (folder / SEAL_FILE).write_text(json.dumps(group, separators=(",", ":")), encoding="utf-8")
     return seal
 
 
-def read_seal(folder: Path) -> EpisodeSeal:
-    """Read the seal of the episode in `folder`.
+def read_seal(place: Path | ByteSource) -> EpisodeSeal:
+    """Read the seal of the episode whose files are there.
 
     Raises:
         OSError: it cannot be read.
         ValueError: it is no seal, or its own digest does not fit.
     """
-    attributes = group_attributes((folder / _FILE).read_bytes())
+    source = Folder(place) if isinstance(place, Path) else place
+    attributes = group_attributes(source.whole(SEAL_FILE))
     if attributes.get("digest") != seal_digest(attributes):
         raise ValueError("its own digest does not fit")
     return from_json(EpisodeSeal, attributes)

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
+from vla_attention.schemas.stores.byte_source import ByteSource
 from vla_attention.schemas.stores.digest import bytes_digest
+from vla_attention.schemas.stores.remote_source import RemoteFailure
 from vla_attention.schemas.stores.shards import SealedShard
 from vla_attention.schemas.stores.store_format import CorruptEpisode, FileRecord
+from vla_attention.schemas.stores.zip_members import DamagedZip
 
 
 @dataclass(frozen=True)
 class SealedFiles:
-    """The files in an episode's folder; `records` are those of its seal, by path."""
+    """The files of an episode, wherever they are; `records` are those of its seal, by path."""
 
-    folder: Path
+    source: ByteSource
     records: Mapping[str, FileRecord]
     _shards: dict[str, SealedShard] = field(default_factory=dict, repr=False, compare=False)
 
@@ -27,13 +28,17 @@ class SealedFiles:
             CorruptEpisode: the file is missing, not in the seal, or not the one that was sealed.
         """
         record = self._record(file)
-        try:
-            content = (self.folder / file).read_bytes()
-        except OSError as error:
-            raise CorruptEpisode(_lost(file, error)) from None
-        if len(content) != record.size or bytes_digest(content) != record.sha256:
-            raise CorruptEpisode(f"its {file} does not agree with its seal")
-        return content
+        # A cache may have kept damaged bytes: they are asked for anew once.
+        for fresh in (False, True) if self.source.remembers else (False,):
+            try:
+                content = self.source.whole(file, fresh=fresh)
+            except RemoteFailure:
+                raise
+            except OSError as error:
+                raise CorruptEpisode(_lost(file, error)) from None
+            if len(content) == record.size and bytes_digest(content) == record.sha256:
+                return content
+        raise CorruptEpisode(f"its {file} does not agree with its seal")
 
     def shard(self, file: str) -> SealedShard | None:
         """The shard in a file, of which single chunks can be read; None when the seal does not list its chunks."""
@@ -42,7 +47,9 @@ class SealedFiles:
             if not record.chunks:
                 return None
             try:
-                self._shards[file] = SealedShard.open(self.folder / file, file, record)
+                self._shards[file] = SealedShard.open(self.source, file, record)
+            except RemoteFailure:
+                raise
             except OSError as error:
                 raise CorruptEpisode(_lost(file, error)) from None
         return self._shards[file]
@@ -52,7 +59,9 @@ class SealedFiles:
         found = []
         for file, record in self.records.items():
             try:
-                size = os.stat(self.folder / file).st_size
+                size = self.source.size(file)
+            except RemoteFailure:
+                raise
             except OSError as error:
                 found.append(_lost(file, error))
                 continue
@@ -68,4 +77,6 @@ class SealedFiles:
 
 
 def _lost(file: str, error: OSError) -> str:
+    if isinstance(error, DamagedZip):
+        return str(error)
     return f"it has lost its {file} ({error.strerror or error})"

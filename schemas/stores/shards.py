@@ -13,18 +13,18 @@ was: bytes of the process, which would pass for attention.
 
 from __future__ import annotations
 
-import os
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.schemas.stores.byte_source import ByteSource
 from vla_attention.schemas.stores.digest import bytes_digest, crc32c
+from vla_attention.schemas.stores.remote_source import RemoteFailure
 from vla_attention.schemas.stores.store_format import CorruptEpisode, FileRecord
 
 CHECKSUM_BYTES = 4
@@ -86,33 +86,35 @@ class SealedShard:
     """One shard's file, whose size and index agree with the seal.
 
     Attributes:
-        path: the file.
-        file: its path in the episode, for messages.
+        source: where the episode's files are.
+        file: the shard's path there.
         index_bytes: the index as it is stored, with its checksum.
         index: offset and length of each chunk, shape (chunk, 2); (0, 0): not written.
         checksums: the last `CHECKSUM_BYTES` of each chunk, from the seal.
     """
 
-    path: Path
+    source: ByteSource
     file: str
     index_bytes: bytes
     index: NDArray[np.uint64]
     checksums: bytes
 
     @classmethod
-    def open(cls, path: Path, file: str, record: FileRecord) -> SealedShard:
+    def open(cls, source: ByteSource, file: str, record: FileRecord) -> SealedShard:
         """Read the index; raises `CorruptEpisode` unless it is the one in the seal, and `OSError` without the file."""
         checksums = bytes.fromhex(record.chunks)
         size = index_size(len(checksums) // CHECKSUM_BYTES)
-        with path.open("rb", buffering=0) as opened:
-            handle = opened.fileno()
-            if os.fstat(handle).st_size != record.size:
+        for fresh in (False, True) if source.remembers else (False,):
+            # One byte more: a file that has grown is not the one that was sealed.
+            stored, more = source.parts(file, max(0, record.size - size), (size, 1), fresh=fresh)
+            if len(stored) != size or more:
                 raise CorruptEpisode(f"its {file} does not agree with its seal: it has another size")
-            stored = os.pread(handle, size, max(0, record.size - size))
-        if bytes_digest(stored) != record.index:
+            if bytes_digest(stored) == record.index:
+                break
+        else:
             raise CorruptEpisode(f"its {file} does not agree with its seal: its index was changed")
         try:
-            return cls(path, file, stored, read_index(stored, record.size), checksums)
+            return cls(source, file, stored, read_index(stored, record.size), checksums)
         except CorruptEpisode as error:
             raise CorruptEpisode(f"its {file} cannot be read: {error}") from None
 
@@ -126,18 +128,21 @@ class SealedShard:
         if length <= CHECKSUM_BYTES:
             raise CorruptEpisode(f"its {self.file} lacks chunk {number}: it is missing")
         length -= CHECKSUM_BYTES
-        try:
-            with self.path.open("rb", buffering=0) as opened:
-                # Two reads: taking the checksum off the end of one would copy the chunk.
-                encoded = os.pread(opened.fileno(), length, offset)
-                checksum = os.pread(opened.fileno(), CHECKSUM_BYTES, offset + length)
-        except OSError as error:
-            raise CorruptEpisode(f"its {self.file} cannot be read: {error.strerror or error}") from None
-        if len(encoded) != length or checksum != self.checksum(number):
-            raise CorruptEpisode(f"chunk {number} of its {self.file} does not agree with its seal")
-        if crc32c(encoded) != int.from_bytes(checksum, "little"):
-            raise CorruptEpisode(f"the checksum of chunk {number} of its {self.file} does not fit")
-        return encoded
+        problem = ""
+        for fresh in (False, True) if self.source.remembers else (False,):
+            try:
+                encoded, checksum = self.source.parts(self.file, offset, (length, CHECKSUM_BYTES), fresh=fresh)
+            except RemoteFailure:
+                raise
+            except OSError as error:
+                raise CorruptEpisode(f"its {self.file} cannot be read: {error.strerror or error}") from None
+            if len(encoded) != length or checksum != self.checksum(number):
+                problem = f"chunk {number} of its {self.file} does not agree with its seal"
+            elif crc32c(encoded) != int.from_bytes(checksum, "little"):
+                problem = f"the checksum of chunk {number} of its {self.file} does not fit"
+            else:
+                return encoded
+        raise CorruptEpisode(problem)
 
     def checksum(self, number: int) -> bytes:
         """The checksum of one chunk, from the seal."""

@@ -1,0 +1,96 @@
+"""Packed stores: one zip file an episode, without compression, and an index of the episodes.
+
+zarr's `ZipStore` and tensorstore's `zip` read such a zip as they read a folder. Its order is for readers that are
+elsewhere: large files first, then the small ones and all metadata, the seal last, so that one request for the end opens
+the episode.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from pathlib import Path
+
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.stores.byte_source import Folder
+from vla_attention.schemas.stores.packed_index import (
+    INDEX_FILE,
+    INDEX_FORMAT,
+    INDEX_VERSION,
+    PackedEpisode,
+    PackedIndex,
+    packed_file,
+    read_index,
+)
+from vla_attention.schemas.stores.seal import SEAL_FILE, read_seal
+from vla_attention.schemas.stores.store_format import EPISODES_GROUP
+
+#: Files of at most so many bytes are in the tail, which is read when the episode is opened.
+SMALL_BYTES = 4096
+#: The first date that a zip can state: packing the same episode twice gives the same bytes.
+_DATE = (1980, 1, 1, 0, 0, 0)
+
+
+class Packing:
+    """A packed store that episodes are added to. The index is written last: it lists whole zips only."""
+
+    def __init__(self, target: Path, run: str) -> None:
+        """Continue what is at `target`; `run` is the digest of its configuration.
+
+        Raises:
+            BadArgument: its episodes are folders.
+            StoreError: its index is damaged or of another run.
+        """
+        self.target = target
+        self.run = run
+        if next((target / EPISODES_GROUP).glob("task*_episode*/zarr.json"), None) is not None:
+            raise BadArgument(f"Cannot pack into {target}: its episodes are folders; give another name.")
+        index = read_index(Folder(target), target, run)
+        self.episodes: dict[str, PackedEpisode] = {} if index is None else dict(index.episodes)
+
+    def present(self) -> set[str]:
+        """Names of the episodes whose zips are there, with the bytes that the index says."""
+        for name, entry in list(self.episodes.items()):
+            path = self.target / entry.file
+            if not path.is_file() or path.stat().st_size != entry.bytes:
+                del self.episodes[name]
+        return set(self.episodes)
+
+    def add(self, name: str, folder: Path) -> None:
+        """Pack a sealed episode from its folder."""
+        path = self.target / packed_file(name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        building = path.with_name(f"{path.name}.partial-{os.getpid()}")
+        try:
+            tail = write_zip(folder, building)
+            size = building.stat().st_size
+            building.replace(path)
+        finally:
+            building.unlink(missing_ok=True)
+        self.episodes[name] = PackedEpisode(packed_file(name), size, tail, read_seal(folder).digest)
+
+    def write_index(self) -> None:
+        """Write the index in one step."""
+        index = PackedIndex(INDEX_FORMAT, INDEX_VERSION, self.run, dict(sorted(self.episodes.items())))
+        building = self.target / f".{INDEX_FILE}.partial-{os.getpid()}"
+        building.write_bytes(index.document())
+        building.replace(self.target / INDEX_FILE)
+
+
+def write_zip(folder: Path, path: Path) -> int:
+    """Write the files of a folder into a zip; returns the offset from which on everything is small."""
+    files = [(file, file.relative_to(folder).as_posix()) for file in folder.rglob("*") if file.is_file()]
+    small = {name: name.endswith("zarr.json") or file.stat().st_size <= SMALL_BYTES for file, name in files}
+    # Arrays, then small arrays, then metadata, then the seal.
+    files.sort(key=lambda one: (small[one[1]], one[1].endswith("zarr.json"), one[1] == SEAL_FILE, one[1]))
+    tail = 0
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as packed:
+        for file, name in files:
+            if not small[name]:
+                tail = 0
+            elif not tail:
+                tail = packed.start_dir
+            packed.writestr(zipfile.ZipInfo(name, _DATE), file.read_bytes())
+        if not tail:
+            tail = packed.start_dir
+    return tail

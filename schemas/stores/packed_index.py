@@ -1,0 +1,95 @@
+"""The index of a packed store: its episodes, the zip of each, and the digests of their seals.
+
+`index.json` beside the root's `zarr.json` is what a reader needs where nothing can be listed (plain HTTP), and what
+spares one that can from listing thousands of files. An index that was damaged, or is of another run, is refused.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+
+from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
+from vla_attention.schemas.safe_text import check_inner_path
+from vla_attention.schemas.stores.byte_source import ByteSource
+from vla_attention.schemas.stores.digest import seal_digest
+from vla_attention.schemas.stores.store_format import EPISODES_GROUP, StoreError, parse_episode_name
+
+INDEX_FILE = "index.json"
+INDEX_FORMAT = "vla-attention-index"
+INDEX_VERSION = 1
+#: Episodes of one task in one folder: a hub takes at most 10,000 files in one.
+_IN_A_FOLDER = 1000
+
+
+@dataclass(frozen=True)
+class PackedEpisode:
+    """One episode's zip: its path in the store, its bytes, the offset of its tail, and the digest of its seal."""
+
+    file: str
+    bytes: int
+    tail: int
+    seal: str
+
+
+@dataclass(frozen=True)
+class PackedIndex:
+    """The episodes of a packed store by name; `run` is the digest of the run's configuration, `digest` of the rest."""
+
+    format: str
+    version: int
+    run: str
+    episodes: dict[str, PackedEpisode]
+    digest: str = ""
+
+    def __post_init__(self) -> None:
+        """Check names and paths."""
+        for name, episode in self.episodes.items():
+            parse_episode_name(name)
+            check_inner_path(episode.file)
+
+    def sealed(self) -> PackedIndex:
+        """The same index with its digest."""
+        return replace(self, digest=seal_digest(to_json(self)))
+
+    def document(self) -> bytes:
+        """The bytes of the file."""
+        return json.dumps(to_json(self.sealed()), separators=(",", ":"), sort_keys=True).encode()
+
+
+def packed_file(name: str) -> str:
+    """The path of an episode's zip in a packed store."""
+    task, index = parse_episode_name(name)
+    return f"{EPISODES_GROUP}/task{task:03d}_{index // _IN_A_FOLDER:03d}/{name}.zip"
+
+
+def read_index(source: ByteSource, store: object, run: str) -> PackedIndex | None:
+    """The index of a store whose run has this digest; None when it has none.
+
+    Raises:
+        StoreError: it cannot be read, was damaged, or belongs to another run.
+    """
+    try:
+        content = source.whole(INDEX_FILE)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    try:
+        document = json.loads(content)
+        if not isinstance(document, dict) or document.get("format") != INDEX_FORMAT:
+            raise ValueError(f"its 'format' is not '{INDEX_FORMAT}'")
+        if document.get("version") != INDEX_VERSION:
+            raise ValueError(f"its version is {document.get('version')!r}; this program reads {INDEX_VERSION}")
+        if document.get("digest") != seal_digest(document):
+            raise ValueError("its own digest does not fit")
+        index = from_json(PackedIndex, document)
+    except (MalformedDocument, ValueError) as error:
+        raise StoreError(
+            f"The store {store} cannot be read: its {INDEX_FILE} is damaged ({error}). vla-analyze copy --packed "
+            "writes it again."
+        ) from None
+    if index.run != run:
+        raise StoreError(
+            f"The store {store} cannot be read: its {INDEX_FILE} belongs to a run of another configuration than its "
+            "zarr.json states."
+        )
+    return index

@@ -1,0 +1,270 @@
+"""Files that are elsewhere, through fsspec (the extra `remote`), and the cache of what was fetched.
+
+Only the bytes that are asked for are fetched. `hf://datasets/ORG/NAME/PATH` is read by the addresses under which the
+hub serves files, so that a part of a file is one request; fsspec's own file system of the hub asks for a description of
+the file each time. What belongs to a sealed episode is kept in a folder of this machine, by the seal's digest: bytes of
+an episode that was changed are never taken for those of another. `VLA_REMOTE_CACHE` names the folder (`off`: keep
+nothing), `VLA_REMOTE_CACHE_SIZE` its most bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.stores.byte_source import ByteSource, Folder, split
+from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
+
+FOLDER_VARIABLE = "VLA_REMOTE_CACHE"
+SIZE_VARIABLE = "VLA_REMOTE_CACHE_SIZE"
+DEFAULT_BYTES = 10_000_000_000
+_OFF = ("off", "0", "no", "false")
+_DIGEST_BYTES = 32
+#: The cache is searched for what to remove after every so many bytes that were added to it.
+_LOOK_EVERY = 64_000_000
+
+
+class RemoteFailure(UserError, OSError):
+    """A place elsewhere that cannot be read: the network, a server's refusal, or a missing package."""
+
+
+def source_of(place: StorePlace) -> ByteSource:
+    """The files below a path or an address."""
+    return RemoteFolder(place.url) if isinstance(place, StoreUrl) else Folder(place)
+
+
+@dataclass(frozen=True)
+class RemoteFolder:
+    """A folder at an address that fsspec can read.
+
+    Attributes:
+        url: the address.
+        digest: that of the seal or the index to which the files belong; they are kept then.
+    """
+
+    url: str
+    digest: str = ""
+
+    @property
+    def remembers(self) -> bool:
+        """See `ByteSource`."""
+        return bool(self.digest) and kept_bytes() is not None
+
+    def whole(self, file: str, *, fresh: bool = False) -> bytes:
+        """See `ByteSource`."""
+        return self._get(file, None, None, fresh)
+
+    def parts(self, file: str, offset: int, lengths: Sequence[int], *, fresh: bool = False) -> list[bytes]:
+        """See `ByteSource`; one request."""
+        length = sum(lengths)
+        return split(self._get(file, offset, offset + length, fresh) if length else b"", lengths)
+
+    def size(self, file: str) -> int:
+        """See `ByteSource`."""
+        files, path = _file_system(self.url)
+        return int(_asked(self.url, lambda: files.size(f"{path}/{file}")) or 0)
+
+    def names(self, folder: str) -> list[str]:
+        """The names in a folder, where the server lists them."""
+        if self.url.startswith("hf://"):
+            files, path = _hub_listing(self.url)
+        else:
+            files, path = _file_system(self.url)
+        found = _asked(self.url, lambda: files.ls(f"{path}/{folder}", detail=False))
+        return sorted(str(name).rstrip("/").rpartition("/")[2] for name in found)
+
+    def bound_to(self, digest: str) -> RemoteFolder:
+        """See `ByteSource`."""
+        return RemoteFolder(self.url, digest)
+
+    def _get(self, file: str, start: int | None, end: int | None, fresh: bool) -> bytes:
+        kept = kept_bytes() if self.digest else None
+        key = f"{self.digest}\n{file}\n{start}\n{end}"
+        if kept is not None and not fresh:
+            found = kept.get(key)
+            if found is not None:
+                return found
+        content = self._fetch(file, start, end)
+        if kept is not None:
+            kept.put(key, content)
+        return content
+
+    def _fetch(self, file: str, start: int | None, end: int | None) -> bytes:
+        files, path = _file_system(self.url)
+        content: bytes = _asked(self.url, lambda: files.cat_file(f"{path}/{file}", start=start, end=end))
+        if start is not None and end is not None and len(content) > end - start:
+            raise RemoteFailure(
+                f"The server of {self.url} sends whole files where a part was asked for (no range requests), so that "
+                "every number would cost a whole episode; copy the store here, or use a server that has them."
+            )
+        return content
+
+
+@dataclass(frozen=True)
+class KeptBytes:
+    """A folder of bytes that were fetched; every file begins with the sha256 of the rest."""
+
+    folder: Path
+    most_bytes: int
+
+    def get(self, key: str) -> bytes | None:
+        """What was kept, or None; a damaged file is removed and is nothing."""
+        path = self._path(key)
+        try:
+            content = path.read_bytes()
+        except OSError:
+            return None
+        found = content[_DIGEST_BYTES:]
+        if hashlib.sha256(found).digest() != content[:_DIGEST_BYTES]:
+            path.unlink(missing_ok=True)
+            return None
+        with suppress(OSError):
+            os.utime(path)  # the least recently used is removed first
+        return found
+
+    def put(self, key: str, content: bytes) -> None:
+        """Keep bytes; a folder without room or rights keeps nothing."""
+        path = self._path(key)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            handle, name = tempfile.mkstemp(dir=path.parent, prefix=".new-")
+            try:
+                with os.fdopen(handle, "wb") as file:
+                    file.write(hashlib.sha256(content).digest() + content)
+                os.replace(name, path)
+            except BaseException:
+                Path(name).unlink(missing_ok=True)
+                raise
+        except OSError:
+            return
+        self._note(len(content))
+
+    def _path(self, key: str) -> Path:
+        digest = hashlib.sha256(key.encode()).hexdigest()
+        return self.folder / digest[:2] / digest[2:]
+
+    def _note(self, added: int) -> None:
+        seen = _ADDED.get(self.folder, _LOOK_EVERY) + added
+        _ADDED[self.folder] = 0 if seen >= min(_LOOK_EVERY, self.most_bytes) else seen
+        if not _ADDED[self.folder]:
+            self.prune()
+
+    def prune(self) -> None:
+        """Remove the files that were not used for longest, until the rest is small enough."""
+        files = []
+        for path in self.folder.glob("??/*"):
+            with suppress(OSError):
+                status = path.stat()
+                files.append((status.st_mtime_ns, status.st_size, path))
+        total = sum(size for _, size, _ in files)
+        for _, size, path in sorted(files):
+            if total <= self.most_bytes:
+                break
+            with suppress(OSError):
+                path.unlink()
+                total -= size
+
+
+#: Bytes added to each folder since it was last searched.
+_ADDED: dict[Path, int] = {}
+
+
+def kept_bytes() -> KeptBytes | None:
+    """The cache of this process, or None when it is switched off."""
+    given = os.environ.get(FOLDER_VARIABLE, "").strip()
+    if given.casefold() in _OFF:
+        return None
+    home = Path(os.environ.get("XDG_CACHE_HOME", "") or Path.home() / ".cache")
+    size = os.environ.get(SIZE_VARIABLE, "").strip()
+    try:
+        most = int(float(size)) if size else DEFAULT_BYTES
+    except ValueError:
+        raise BadArgument(
+            f"{SIZE_VARIABLE}={size} is no number of bytes; {FOLDER_VARIABLE}=off keeps nothing."
+        ) from None
+    return KeptBytes(Path(given).absolute() if given else home / "vla-attention" / "remote", most)
+
+
+@cache
+def _file_system(url: str) -> tuple[Any, str]:
+    """fsspec's file system of an address, and the path in it."""
+    try:
+        import fsspec
+        from fsspec.core import url_to_fs
+    except ImportError as error:
+        raise _missing(url, error) from None
+    try:
+        if url.startswith("hf://"):
+            endpoint, headers = _hub()
+            return fsspec.filesystem("https", client_kwargs={"headers": headers}), _hub_address(endpoint, url)
+        files, path = url_to_fs(url)
+    except ImportError as error:
+        raise _missing(url, error) from None
+    except ValueError as error:
+        raise BadArgument(f"The address {url} cannot be read: {error}.") from None
+    return files, path.rstrip("/")
+
+
+def _hub() -> tuple[str, dict[str, str]]:
+    """The hub's address, and the headers that say who asks."""
+    token = os.environ.get("HF_TOKEN", "")
+    if not token:
+        with suppress(ImportError):
+            from huggingface_hub import get_token
+
+            token = get_token() or ""
+    endpoint = os.environ.get("HF_ENDPOINT", "https://huggingface.co").rstrip("/")
+    return endpoint, {"authorization": f"Bearer {token}"} if token else {}
+
+
+def hub_parts(url: str) -> tuple[str, str, str, str]:
+    """Kind (`datasets` or `models`), repository, revision and path of a `hf://` address."""
+    parts = url.removeprefix("hf://").split("/")
+    kind = parts.pop(0) if parts[0] in ("datasets", "spaces") else "models"
+    name, _, revision = (parts[1] if len(parts) > 1 else "").partition("@")
+    if not parts[0] or not name:
+        raise BadArgument(f"{url} is no address on the hub; expected hf://datasets/ORG/NAME/PATH.")
+    return kind, f"{parts[0]}/{name}", revision or "main", "/".join(parts[2:])
+
+
+def _hub_address(endpoint: str, url: str) -> str:
+    kind, repository, revision, path = hub_parts(url)
+    prefix = "" if kind == "models" else f"{kind}/"
+    return f"{endpoint}/{prefix}{repository}/resolve/{revision.replace('/', '%2F')}/{path}".rstrip("/")
+
+
+def _hub_listing(url: str) -> tuple[Any, str]:
+    try:
+        from huggingface_hub import HfFileSystem
+    except ImportError as error:
+        raise _missing(url, error) from None
+    return HfFileSystem(), url.removeprefix("hf://")
+
+
+def _missing(url: str, error: ImportError) -> RemoteFailure:
+    return RemoteFailure(
+        f"Reading {url} needs a package that is not installed ({error.name or error}); "
+        "pip install 'vla-attention[remote]', or copy the store here."
+    )
+
+
+def _asked(url: str, ask: Any) -> Any:
+    """What a file system answers; what it raises in its own classes becomes an `OSError` with the address."""
+    try:
+        return ask()
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise RemoteFailure(f"{url} cannot be read: {error.strerror or error}.") from None
+    except Exception as error:  # aiohttp, botocore and others have classes of their own
+        if getattr(error, "status", None) == 416:  # a part beyond the file's end
+            return b""
+        raise RemoteFailure(f"{url} cannot be read: {type(error).__name__} {error}.".rstrip(". ") + ".") from None

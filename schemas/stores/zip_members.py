@@ -1,0 +1,169 @@
+"""The files of an episode in one zip file without compression, read in place.
+
+A store packed by `vla-analyze copy --packed` has a zip an episode. The small files and all metadata are at the zip's
+end, just before its directory, so that one request for the tail opens an episode that is elsewhere. A zip's directory
+is not believed more than any other bytes: it says where a file begins, and what is found there has to be what the
+episode's seal lists.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zipfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+from vla_attention.schemas.stores.byte_source import ByteSource, split
+
+#: Bytes of a local header before the file's name.
+LOCAL_HEADER_BYTES = 30
+_ENCRYPTED, _DESCRIPTOR = 0x1, 0x8
+
+
+class DamagedZip(OSError):
+    """A zip file that this program did not write, or that was changed since."""
+
+
+@dataclass(frozen=True)
+class ZipMembers:
+    """The files in a zip file.
+
+    Attributes:
+        source: where the zip is.
+        file: its path there.
+        length: how many bytes it has.
+        tail: the offset from which on it is read at once: small files, metadata and the directory.
+    """
+
+    source: ByteSource
+    file: str
+    length: int
+    tail: int
+
+    @property
+    def remembers(self) -> bool:
+        """See `ByteSource`."""
+        return self.source.remembers
+
+    def whole(self, file: str, *, fresh: bool = False) -> bytes:
+        """See `ByteSource`."""
+        return self.parts(file, 0, (self.size(file),), fresh=fresh)[0]
+
+    def parts(self, file: str, offset: int, lengths: Sequence[int], *, fresh: bool = False) -> list[bytes]:
+        """See `ByteSource`."""
+        first, size = self._member(file, fresh=fresh)
+        ends, at = [], offset
+        for length in lengths:
+            at = min(at + length, max(size, offset))
+            ends.append(at)
+        lengths = [end - start for start, end in pairwise([min(offset, size), *ends])]
+        tail = self._opened()[1]
+        if first + offset >= self.tail:
+            start = first + offset - self.tail
+            return split(tail[start : start + sum(lengths)], lengths)
+        return self.source.parts(self.file, first + offset, lengths, fresh=fresh)
+
+    def size(self, file: str) -> int:
+        """See `ByteSource`."""
+        return self._member(file)[1]
+
+    def bound_to(self, digest: str) -> ZipMembers:
+        """See `ByteSource`; the index of the store has bound the zip already."""
+        return self
+
+    def names(self) -> list[str]:
+        """The files in the zip."""
+        return list(self._opened()[0])
+
+    def _member(self, file: str, *, fresh: bool = False) -> tuple[int, int]:
+        try:
+            return self._opened(fresh=fresh)[0][file]
+        except KeyError:
+            raise FileNotFoundError(2, "No such file in its zip", file) from None
+
+    def _opened(self, *, fresh: bool = False) -> tuple[dict[str, tuple[int, int]], bytes]:
+        """Offset and size of the content of each file, and the bytes of the tail."""
+        kept: dict[str, Any] = self.__dict__
+        if "_kept" not in kept or fresh:
+            kept["_kept"] = self._open(fresh)
+        return kept["_kept"]  # type: ignore[no-any-return]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the bytes of the tail: another process reads them itself."""
+        return {name: value for name, value in self.__dict__.items() if name != "_kept"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+
+    def _open(self, fresh: bool) -> tuple[dict[str, tuple[int, int]], bytes]:
+        try:
+            return self._directory(fresh)
+        except DamagedZip:
+            if fresh or not self.remembers:
+                raise
+            return self._directory(True)
+
+    def _directory(self, fresh: bool) -> tuple[dict[str, tuple[int, int]], bytes]:
+        wanted = self.length - self.tail
+        if not 0 < wanted <= self.length:
+            raise DamagedZip(f"the index says that its zip has {self.length} bytes, the last ones from {self.tail} on")
+        # One byte more: a file that has grown is not the one in the index.
+        tail, more = self.source.parts(self.file, self.tail, (wanted, 0 if self.remembers else 1), fresh=fresh)
+        if len(tail) != wanted or more:
+            raise DamagedZip(f"its zip {self.file} has not the {self.length} bytes that the index says")
+        try:
+            with zipfile.ZipFile(_Tail(tail, self.tail)) as opened:
+                members, end = opened.infolist(), opened.start_dir
+        except (zipfile.BadZipFile, struct.error, ValueError, NotImplementedError, OverflowError, EOFError) as error:
+            raise DamagedZip(f"its zip {self.file} cannot be read: {error}") from None
+        return dict(self._places(members, end)), tail
+
+    def _places(self, members: Sequence[zipfile.ZipInfo], end: int) -> Iterator[tuple[str, tuple[int, int]]]:
+        """Where the content of each file is: it ends where the next file's header, or the directory, begins."""
+        ordered = sorted(members, key=lambda member: member.header_offset)
+        names = {member.filename for member in ordered}
+        if len(names) != len(ordered):
+            raise DamagedZip(f"its zip {self.file} names a file twice")
+        for member, until in zip(ordered, [*(later.header_offset for later in ordered[1:]), end], strict=True):
+            first = until - member.file_size
+            header = member.header_offset + LOCAL_HEADER_BYTES + len(member.orig_filename.encode())
+            plain = member.compress_type == zipfile.ZIP_STORED and member.file_size == member.compress_size
+            if not plain or member.flag_bits & (_ENCRYPTED | _DESCRIPTOR) or first < header or until > self.length:
+                raise DamagedZip(
+                    f"its zip {self.file} holds {member.filename!r} in another way than vla-analyze copy --packed "
+                    "writes it; pack the store again"
+                )
+            yield member.filename, (first, member.file_size)
+
+
+class _Tail(io.RawIOBase):
+    """The end of a file, for `zipfile`: positions are those of the whole file."""
+
+    def __init__(self, content: bytes, offset: int) -> None:
+        super().__init__()
+        self._content, self._offset, self._at = content, offset, 0
+
+    def seekable(self) -> bool:
+        return True
+
+    def readable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._at
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        size = self._offset + len(self._content)
+        self._at = max(0, {0: 0, 1: self._at, 2: size}[whence] + offset)
+        return self._at
+
+    def read(self, size: int = -1) -> bytes:
+        start = self._at - self._offset
+        if start < 0:
+            raise EOFError("its directory is not where the index says")
+        found = self._content[start:] if size < 0 else self._content[start : start + size]
+        self._at += len(found)
+        return found
