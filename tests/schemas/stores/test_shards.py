@@ -17,6 +17,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 from tests.kit.attacks import files_of, with_checksum
 from tests.kit.examples import examples
 from vla_attention.schemas.stores import shards
+from vla_attention.schemas.stores.byte_source import Folder
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.seal import seal_episode
 from vla_attention.schemas.stores.sealed_files import SealedFiles
@@ -45,7 +46,7 @@ def write_array(folder: Path, values: np.ndarray, block: int, **changes) -> zarr
 
 def reader_of(folder: Path) -> ShardedLayers | None:
     """The reader of the array `rows` in a folder, which is sealed here."""
-    files = SealedFiles(folder.parent, seal_episode(folder.parent, "made up", "a run").files)
+    files = SealedFiles(Folder(folder.parent), seal_episode(folder.parent, "made up", "a run").files)
 
     def shard(file: str) -> SealedShard:
         found = files.shard(f"rows/{file}")
