@@ -119,6 +119,7 @@ def _copy(
     root = _root_document(store, without)
     run = run_digest(group_attributes(root))
     building.mkdir(parents=True)
+    pack: Packing | None = None
     try:
         _ensure_root(store, target, root, building)
         pack = Packing(target, run) if packed else None
@@ -136,11 +137,13 @@ def _copy(
                     shutil.rmtree(folder)
             if progress is not None:
                 progress(1)
-        if pack is not None:
-            pack.write_index()
     finally:
-        shutil.rmtree(building, ignore_errors=True)
-        _remove_if_empty(building.parent)
+        try:
+            if pack is not None:
+                pack.write_index()
+        finally:
+            shutil.rmtree(building, ignore_errors=True)
+            _remove_if_empty(building.parent)
     return Copied(added, len(store.episodes) - added, copied, left)
 
 

@@ -27,12 +27,17 @@ from vla_attention.schemas.stores.store_format import EPISODES_GROUP
 
 #: Files of at most so many bytes are in the tail, which is read when the episode is opened.
 SMALL_BYTES = 4096
+#: The index is written after so many episodes: after a power cut, at most these are packed again.
+_INDEX_EVERY = 50
 #: The first date that a zip can state: packing the same episode twice gives the same bytes.
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
 class Packing:
-    """A packed store that episodes are added to. The index is written last: it lists whole zips only."""
+    """A packed store that episodes are added to. The index lists whole zips only, and is written now and then.
+
+    It is there before the first zip: a copy that ends early is a packed store of the episodes that it has.
+    """
 
     def __init__(self, target: Path, run: str) -> None:
         """Continue what is at `target`; `run` is the digest of its configuration.
@@ -47,6 +52,8 @@ class Packing:
             raise BadArgument(f"Cannot pack into {target}: its episodes are folders; give another name.")
         index = read_index(Folder(target), target, run)
         self.episodes: dict[str, PackedEpisode] = {} if index is None else dict(index.episodes)
+        if index is None:
+            self.write_index()
 
     def present(self) -> set[str]:
         """Names of the episodes whose zips are there, with the bytes that the index says."""
@@ -68,6 +75,8 @@ class Packing:
         finally:
             building.unlink(missing_ok=True)
         self.episodes[name] = PackedEpisode(packed_file(name), size, tail, read_seal(folder).digest)
+        if len(self.episodes) % _INDEX_EVERY == 0:
+            self.write_index()
 
     def write_index(self) -> None:
         """Write the index in one step."""

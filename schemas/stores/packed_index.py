@@ -20,6 +20,8 @@ INDEX_FORMAT = "vla-attention-index"
 INDEX_VERSION = 1
 #: Episodes of one task in one folder: a hub takes at most 10,000 files in one.
 _IN_A_FOLDER = 1000
+#: An episode's tail has some hundred kilobytes; an index that says more than this is not believed.
+_MOST_TAIL_BYTES = 256_000_000
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,11 @@ class PackedEpisode:
     bytes: int
     tail: int
     seal: str
+
+    def __post_init__(self) -> None:
+        """Check the numbers: the tail is read into memory."""
+        if not (0 <= self.tail < self.bytes < 2**53 and self.bytes - self.tail <= _MOST_TAIL_BYTES):
+            raise ValueError(f"a zip of {self.bytes} bytes cannot have its small files from {self.tail} on")
 
 
 @dataclass(frozen=True)
@@ -82,7 +89,7 @@ def read_index(source: ByteSource, store: object, run: str) -> PackedIndex | Non
         if document.get("digest") != seal_digest(document):
             raise ValueError("its own digest does not fit")
         index = from_json(PackedIndex, document)
-    except (MalformedDocument, ValueError) as error:
+    except (MalformedDocument, ValueError, RecursionError) as error:
         raise StoreError(
             f"The store {store} cannot be read: its {INDEX_FILE} is damaged ({error}). vla-analyze copy --packed "
             "writes it again."

@@ -102,7 +102,10 @@ def episode_folders(path: StorePlace) -> list[StorePlace]:
 
 def group_attributes(document: bytes) -> dict[str, Any]:
     """The attributes in the `zarr.json` of a Zarr v3 group; raises `ValueError` when the bytes are anything else."""
-    content = json.loads(document)
+    try:
+        content = json.loads(document)
+    except RecursionError:
+        raise ValueError("zarr.json is nested too deeply") from None
     if not isinstance(content, dict) or (content.get("zarr_format"), content.get("node_type")) != (3, "group"):
         raise ValueError("zarr.json does not describe a group of Zarr format 3")
     attributes = content.get("attributes", {})

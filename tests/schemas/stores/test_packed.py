@@ -1,0 +1,376 @@
+"""Damage to a packed store, by accident or on purpose, gives a sentence and never a number that was not recorded."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import struct
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.kit.examples import examples
+from tests.kit.slow import slow_except
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.analyze.copy.copying import copy_store
+from vla_attention.analyze.copy.packing import write_zip
+from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.jsonable import from_json
+from vla_attention.schemas.stores.digest import seal_digest
+from vla_attention.schemas.stores.packed_index import INDEX_FILE, PackedIndex
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.verify import verify_store
+from vla_attention.testing.stores import StoreSpec, write_store
+
+SPEC = StoreSpec(tasks=(0,), episodes=2, replans=2, layers=(0, 2), denoise_steps=(0, 9), heads=(0,))
+FIRST, SECOND = (f"episodes/task000_000/task000_episode00{i}.zip" for i in (0, 1))
+Values = dict[str, dict[str, np.ndarray]]
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory) -> tuple[Path, Path]:
+    """Two stores of one configuration with other numbers."""
+    made = tmp_path_factory.mktemp("folders")
+    plant = {"plant_rows": lambda task, episode, tokens, rows: rows[:, ::-1]}
+    return write_store(made / "a.zarr", spec=SPEC), write_store(made / "b.zarr", spec=SPEC, **plant)
+
+
+@pytest.fixture(scope="module")
+def originals(folders, tmp_path_factory) -> tuple[Path, Path]:
+    made = tmp_path_factory.mktemp("packed")
+    for folder in folders:
+        copy_store(open_store(folder), made / folder.name, (), packed=True)
+    return made / "a.zarr", made / "b.zarr"
+
+
+@pytest.fixture
+def path(originals, tmp_path) -> Path:
+    return Path(shutil.copytree(originals[0], tmp_path / "a.zarr"))
+
+
+@pytest.fixture
+def other(originals, tmp_path) -> Path:
+    return Path(shutil.copytree(originals[1], tmp_path / "b.zarr"))
+
+
+@pytest.fixture(scope="module")
+def recorded(folders) -> Values:
+    return {
+        one.name: {name: one.read(name) for name in one.attributes.arrays} for one in open_store(folders[0]).episodes
+    }
+
+
+def wrong_or_refused(path: Path, recorded: Values) -> list[str]:
+    """The sentences with which the store, its episodes and their arrays are refused; what is read must be recorded."""
+    said: list[str] = []
+
+    def reads(what: Callable[[], Any]) -> Any:
+        try:
+            return what()
+        except UserError as error:
+            said.append(str(error))
+            return None
+
+    store = reads(lambda: open_store(path))
+    for episode in () if store is None else store.episodes:
+        if reads(lambda episode=episode: episode.attributes) is None:
+            continue
+        for name in episode.attributes.arrays:
+            values = reads(lambda episode=episode, name=name: episode.read(name))
+            expected = recorded[episode.name][name]
+            assert values is None or np.array_equal(values, expected, equal_nan=True), (episode.name, name)
+            if name.endswith("/rows"):
+                layers = reads(lambda episode=episode, name=name: episode.read_layer(name, 1, 0))
+                assert layers is None or np.array_equal(layers, expected[:, 1, 0])
+    assert not any("\n" in sentence for sentence in said)
+    return said
+
+
+def check_refused(path: Path, recorded: Values, *, by_command: bool = True) -> list[str]:
+    """Nothing wrong is read, something is refused, and the commands say so; returns the sentences."""
+    said = wrong_or_refused(path, recorded)
+    assert said
+    if by_command:
+        assert analyze(["verify", str(path)]) in (1, 2)
+        assert analyze([str(path), "--no-plots", "--output", str(path.parent / "out")]) == 2
+        assert not list((path.parent / "out").rglob("*.json"))
+    return said
+
+
+def edit_index(path: Path, change: Callable[[dict[str, Any]], object], *, seal: bool = True) -> None:
+    """Change the index as its writer might have written it, with its digest, or leave the old one."""
+    document = json.loads((path / INDEX_FILE).read_text())
+    change(document)
+    if seal:
+        document = json.loads(from_json(PackedIndex, document).document())
+    (path / INDEX_FILE).write_text(json.dumps(document))
+
+
+def test_a_whole_store_is_read(path, recorded):
+    assert wrong_or_refused(path, recorded) == []
+
+
+@pytest.mark.parametrize("bits", slow_except((0x01,), (0x01, 0x80, 0xFF)))
+def test_a_byte_that_was_flipped_anywhere_gives_no_other_number(path, recorded, bits):
+    zip_file = path / FIRST
+    whole = zip_file.read_bytes()
+    tail = json.loads((path / INDEX_FILE).read_text())["episodes"]["task000_episode000"]["tail"]
+    generator = np.random.default_rng(bits)
+    places = {
+        *generator.integers(0, len(whole), examples(25)).tolist(),
+        *generator.integers(tail, len(whole), examples(25)).tolist(),
+        *range(len(whole) - 22, len(whole), 3),
+    }
+    refused = 0
+    for place in sorted(places):
+        zip_file.write_bytes(whole[:place] + bytes([whole[place] ^ bits]) + whole[place + 1 :])
+        refused += bool(wrong_or_refused(path, recorded))
+    # Names and dates before each file, which nothing is read by, are the rest.
+    assert refused > len(places) // 3
+
+
+def test_a_flipped_byte_of_a_file_is_named_by_verify(path, capsys):
+    with zipfile.ZipFile(path / FIRST) as found:
+        member = next(one for one in found.infolist() if "joint/rows/c" in one.filename)
+    content = bytearray((path / FIRST).read_bytes())
+    content[member.header_offset + 30 + len(member.filename) + 100] ^= 4
+    (path / FIRST).write_bytes(bytes(content))
+    assert analyze(["verify", str(path)]) == 1
+    said = capsys.readouterr().out
+    assert "task000_episode000" in said
+    assert "joint/rows" in said
+    assert "task000_episode001" not in said
+    (fault,) = {fault.episode for fault in verify_store(open_store(path))}
+    assert fault == "task000_episode000"
+
+
+def test_a_zip_that_was_cut_off_or_has_grown_is_refused(path, recorded):
+    zip_file = path / FIRST
+    whole = zip_file.read_bytes()
+    for length in (0, 1, 21, 22, len(whole) // 2, len(whole) - 1):
+        zip_file.write_bytes(whole[:length])
+        check_refused(path, recorded, by_command=length in (0, len(whole) - 1))
+    for more in (b"\0", whole):
+        zip_file.write_bytes(whole + more)
+        assert "has not the" in " ".join(check_refused(path, recorded, by_command=False))
+
+
+def test_a_missing_zip_is_refused(path, recorded):
+    (path / FIRST).unlink()
+    assert "No such file" in " ".join(check_refused(path, recorded))
+    (path / FIRST).mkdir()
+    check_refused(path, recorded)
+
+
+def packed_again(path: Path, zip_name: str, change: Callable[[Path], object]) -> None:
+    """Pack an episode again after its files were changed, with the index that its writer would write."""
+    folder = path.parent / "unpacked"
+    shutil.rmtree(folder, ignore_errors=True)
+    with zipfile.ZipFile(path / zip_name) as found:
+        found.extractall(folder)
+    change(folder)
+    tail = write_zip(folder, path / zip_name)
+
+    def say(index: dict[str, Any]) -> None:
+        index["episodes"][Path(zip_name).stem] |= {"bytes": (path / zip_name).stat().st_size, "tail": tail}
+
+    edit_index(path, say)
+
+
+def swap(folder: Path, one: str, other: str) -> None:
+    (folder / one).rename(folder / "aside")
+    (folder / other).rename(folder / one)
+    (folder / "aside").rename(folder / other)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda folder: swap(folder, "joint/row_sum/c", "joint/atoms/c"),
+        lambda folder: swap(folder, "frames/base_0_rgb", "frames/left_wrist_0_rgb"),
+        lambda folder: swap(folder, "env_step", "prompt_index"),
+        lambda folder: (folder / "joint/rows").rename(folder / "joint/other"),
+        lambda folder: shutil.rmtree(folder / "joint/rows/c"),
+        lambda folder: shutil.rmtree(folder / "seal"),
+        lambda folder: (folder / "zarr.json").unlink(),
+        lambda folder: (folder / "joint/rows/zarr.json").write_text("{}"),
+    ],
+    ids=["swapped", "pictures swapped", "small swapped", "renamed", "lost", "no seal", "no attributes", "metadata"],
+)
+def test_members_that_were_swapped_renamed_or_removed_are_refused(path, recorded, change):
+    packed_again(path, FIRST, change)
+    check_refused(path, recorded, by_command=False)
+    assert analyze(["verify", str(path)]) == 1
+
+
+def test_what_a_zip_holds_besides_is_never_read(path, recorded):
+    packed_again(path, FIRST, lambda folder: (folder / "joint/evil").write_text("more"))
+    assert wrong_or_refused(path, recorded) == []
+
+
+def rewritten(path: Path, write: Callable[[zipfile.ZipFile, zipfile.ZipFile], object]) -> None:
+    """Write the first zip anew by hand; its whole content passes for the tail."""
+    whole = path / FIRST
+    building = whole.with_suffix(".new")
+    with zipfile.ZipFile(whole) as old, zipfile.ZipFile(building, "w", zipfile.ZIP_STORED) as new:
+        write(old, new)
+    building.replace(whole)
+    size = whole.stat().st_size
+    edit_index(path, lambda index: index["episodes"]["task000_episode000"].update(bytes=size, tail=0))
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_two_files_of_one_name_are_refused(path, recorded):
+    def twice(old: zipfile.ZipFile, new: zipfile.ZipFile) -> None:
+        for member in old.infolist():
+            if "rows/c/0" in member.filename:
+                new.writestr(member.filename, b"\0" * member.file_size)
+            new.writestr(member.filename, old.read(member))
+
+    rewritten(path, twice)
+    assert "names a file twice" in " ".join(check_refused(path, recorded))
+
+
+@pytest.mark.parametrize("way", ["compressed", "encrypted", "descriptor"])
+def test_another_kind_of_zip_is_refused(path, recorded, way):
+    def write(old: zipfile.ZipFile, new: zipfile.ZipFile) -> None:
+        for member in old.infolist():
+            kind = zipfile.ZIP_DEFLATED if way == "compressed" else zipfile.ZIP_STORED
+            new.writestr(member.filename, old.read(member), kind)
+
+    rewritten(path, write)
+    if way != "compressed":
+        whole = bytearray((path / FIRST).read_bytes())
+        at = whole.find(b"PK\x01\x02")
+        while at >= 0:
+            (flags,) = struct.unpack_from("<H", whole, at + 8)
+            struct.pack_into("<H", whole, at + 8, flags | (1 if way == "encrypted" else 8))
+            at = whole.find(b"PK\x01\x02", at + 4)
+        (path / FIRST).write_bytes(bytes(whole))
+    assert "in another way than vla-analyze copy --packed" in " ".join(check_refused(path, recorded))
+
+
+def test_members_that_point_elsewhere_in_the_zip_are_refused(path, recorded):
+    """Directory entries whose offsets changed places, or lead beyond the zip: what is found there is not sealed."""
+    whole = (path / FIRST).read_bytes()
+    entries, at = [], whole.find(b"PK\x01\x02")
+    while at >= 0:
+        entries.append(at)
+        at = whole.find(b"PK\x01\x02", at + 4)
+    for one, two in ((0, 1), (1, 2), (len(entries) - 1, 0)):
+        changed = bytearray(whole)
+        offsets = [whole[entries[i] + 42 : entries[i] + 46] for i in (one, two)]
+        changed[entries[one] + 42 : entries[one] + 46] = offsets[1]
+        changed[entries[two] + 42 : entries[two] + 46] = offsets[0]
+        (path / FIRST).write_bytes(bytes(changed))
+        check_refused(path, recorded, by_command=False)
+    for offset in (0, 0x7FFFFFFF, 0xFFFFFFFF):
+        changed = bytearray(whole)
+        struct.pack_into("<I", changed, entries[1] + 42, offset)
+        (path / FIRST).write_bytes(bytes(changed))
+        check_refused(path, recorded, by_command=False)
+
+
+def test_zips_of_other_episodes_and_other_stores_are_refused(path, other, recorded):
+    whole = {name: (path / name).read_bytes() for name in (FIRST, SECOND)}
+    (path / FIRST).write_bytes(whole[SECOND])
+    check_refused(path, recorded)
+    (path / SECOND).write_bytes(whole[FIRST])  # both changed places
+    check_refused(path, recorded)
+    (path / SECOND).write_bytes(whole[SECOND])
+    (path / FIRST).write_bytes((other / FIRST).read_bytes())
+    check_refused(path, recorded)
+
+
+def test_an_index_that_gives_an_episode_the_zip_of_another_is_refused(path, recorded):
+    def exchange(index: dict[str, Any]) -> None:
+        one, two = index["episodes"].values()
+        index["episodes"] = dict(zip(index["episodes"], (two, one), strict=True))
+
+    edit_index(path, exchange)
+    assert "its seal is that of task000_episode001" in " ".join(check_refused(path, recorded))
+
+
+def test_an_index_of_another_store_of_the_same_run_is_refused(path, other, recorded):
+    """Equal configurations: the runs' digests agree, and the seals do not."""
+    assert open_store(path).run == open_store(other).run
+    shutil.copyfile(other / INDEX_FILE, path / INDEX_FILE)
+    check_refused(path, recorded)
+    # With the sizes of this store's zips it gets as far as the seals.
+    mine, theirs = (json.loads((store / INDEX_FILE).read_text())["episodes"] for store in (path, other))
+    sizes = {name: (path / entry["file"]).stat().st_size for name, entry in mine.items()}
+    assert set(mine) == set(theirs)
+    shutil.copytree(path, path.parent / "c.zarr")
+    copy_index = {name: {**theirs[name], "bytes": sizes[name], "tail": 0} for name in theirs}
+    edit_index(path.parent / "c.zarr", lambda index: index.update(episodes=copy_index))
+    said = check_refused(path.parent / "c.zarr", recorded)
+    assert "holds another seal than the index.json" in " ".join(said)
+
+
+def test_an_index_of_another_run_is_refused(path, tmp_path, recorded):
+    folder = write_store(tmp_path / "folder.zarr", spec=replace(SPEC, suite="another"))
+    copy_store(open_store(folder), tmp_path / "c.zarr", (), packed=True)
+    shutil.copyfile(tmp_path / "c.zarr" / INDEX_FILE, path / INDEX_FILE)
+    assert "belongs to a run of another configuration" in " ".join(check_refused(path, recorded))
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{}", b"[]", b"null", b"\xff\xfe", b'{"format": "vla-attention-index"}', b"[" * 9999]
+)
+def test_an_index_that_is_none_is_refused(path, recorded, content):
+    (path / INDEX_FILE).write_bytes(content)
+    assert "index.json" in " ".join(check_refused(path, recorded, by_command=False))
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"file": "../../secret.zip"},
+        {"file": "/etc/passwd"},
+        {"file": ""},
+        {"bytes": -1},
+        {"bytes": 2**70},
+        {"tail": -5},
+        {"tail": 2**62},
+        {"bytes": 2**50, "tail": 1},
+        {"bytes": 2**50, "tail": 2**50 - 100},
+        {"bytes": "7"},
+        {"seal": "0" * 64},
+    ],
+    ids=str,
+)
+def test_an_index_with_entries_that_cannot_be_is_refused(path, recorded, entry):
+    document = json.loads((path / INDEX_FILE).read_text())
+    document["episodes"]["task000_episode000"].update(entry)
+    (path / INDEX_FILE).write_text(json.dumps(document | {"digest": seal_digest(document)}))
+    check_refused(path, recorded, by_command=False)
+
+
+def test_a_root_nested_deeper_than_any_is_refused(path, recorded):
+    (path / "zarr.json").write_bytes(b'{"zarr_format": 3, "node_type": "group", "attributes": ' + b"[" * 9999)
+    assert "nested too deeply" in " ".join(check_refused(path, recorded))
+
+
+def test_a_changed_index_without_its_digest_is_refused(path, recorded):
+    edit_index(path, lambda index: index["episodes"].pop("task000_episode001"), seal=False)
+    assert "its own digest does not fit" in " ".join(check_refused(path, recorded))
+
+
+def test_without_its_index_a_packed_store_is_refused(path, recorded):
+    (path / INDEX_FILE).unlink()
+    check_refused(path, recorded)
+
+
+def test_a_copy_refuses_damage_and_packs_none_of_it(path, tmp_path, capsys):
+    content = bytearray((path / SECOND).read_bytes())
+    content[len(content) // 3] ^= 1
+    (path / SECOND).write_bytes(bytes(content))
+    assert analyze(["copy", str(path), str(tmp_path / "c.zarr"), "--packed"]) == 2
+    assert "task000_episode001 is damaged" in capsys.readouterr().err
+    assert [episode.name for episode in open_store(tmp_path / "c.zarr").episodes] == ["task000_episode000"]
+    assert verify_store(open_store(tmp_path / "c.zarr")) == []
