@@ -18,7 +18,7 @@ from vla_attention.schemas.threads import use_threads
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 use_threads()
 # What is tested is measured; tests of the cache switch it on in a folder of their own. Subprocesses inherit it.
-os.environ["VLA_CACHE"] = "off"
+os.environ["VLA_CACHE"] = os.environ["VLA_REMOTE_CACHE"] = "off"
 
 for _name, _count in PROFILES.items():
     settings.register_profile(_name, max_examples=_count, deadline=None)

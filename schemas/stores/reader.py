@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, cast
 
@@ -62,9 +62,11 @@ class StoredEpisode:
     place: ByteSource | None = None
     indexed: str = ""
 
-    @property
+    @cached_property
     def source(self) -> ByteSource:
         """The episode's files as they are found, not yet compared with the seal."""
+        if isinstance(self.place, ZipMembers):
+            return replace(self.place)  # what it keeps of the zip goes when this object goes
         return source_of(self.folder) if self.place is None else self.place
 
     @cached_property
@@ -84,7 +86,15 @@ class StoredEpisode:
     def seal(self) -> EpisodeSeal:
         """What binds the episode's files to its name and run; `CorruptEpisode` when it is not that of this episode."""
         try:
-            seal = read_seal(self.source)
+            return self._read_seal()
+        except CorruptEpisode:
+            if not self.source.remembers:
+                raise
+            return self._read_seal(fresh=True)  # a cache may have kept damaged bytes
+
+    def _read_seal(self, *, fresh: bool = False) -> EpisodeSeal:
+        try:
+            seal = read_seal(self.source, fresh=fresh)
         except (RemoteFailure, CorruptEpisode):
             raise
         except DamagedZip as error:
@@ -168,8 +178,8 @@ class StoredEpisode:
         stored: Any = self._single_chunk(name) or self.array(name)
         try:
             values = np.asarray(stored[index])
-        except IndexError:
-            raise  # the caller's mistake
+        except (IndexError, RemoteFailure):
+            raise  # the caller's mistake; a network that fails is no damage
         except Exception as error:  # damaged bytes can make codecs raise anything
             problem = str(error).rstrip(".")
             raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {problem}.") from error

@@ -193,9 +193,13 @@ def kept_bytes() -> KeptBytes | None:
     return KeptBytes(Path(given).absolute() if given else home / "vla-attention" / "remote", most)
 
 
-@cache
 def _file_system(url: str) -> tuple[Any, str]:
-    """fsspec's file system of an address, and the path in it."""
+    """fsspec's file system of an address, and the path in it; a forked process makes its own."""
+    return _file_system_of(url, os.getpid())
+
+
+@cache
+def _file_system_of(url: str, _process: int) -> tuple[Any, str]:
     try:
         import fsspec
         from fsspec.core import url_to_fs
