@@ -25,6 +25,8 @@ class Served:
         change: gets the path and the bytes of an answer, and gives those that are sent.
         announce: whether an answer states how long it is without `change`, so that one cut short breaks off.
         status: answers every request with this one.
+        redirect: a server to which every request is sent on.
+        authorizations: what requests gave to say who asks; "" for nothing.
     """
 
     url: str
@@ -34,6 +36,8 @@ class Served:
     change: Callable[[str, bytes], bytes] | None = None
     announce: bool = False
     status: int = 200
+    redirect: str = ""
+    authorizations: set[str] = field(default_factory=set)
 
     def forget(self) -> None:
         """Begin to count anew."""
@@ -56,6 +60,10 @@ def serve(folder: Path) -> Iterator[Served]:
             path = unquote(self.path.partition("?")[0]).lstrip("/")
             wanted = self.headers.get("Range") or ""
             served.requests.append((path, wanted))
+            served.authorizations.add(self.headers.get("Authorization") or "")
+            if served.redirect:
+                self.answer(302, b"", path, {"Location": f"{served.redirect}/{path}"})
+                return
             file = folder / path
             if served.status != 200 or not file.is_file():
                 self.answer(served.status if served.status != 200 else 404, b"")

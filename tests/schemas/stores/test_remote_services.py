@@ -1,0 +1,152 @@
+"""Stores in S3 (moto's server on the loopback), and on the hub, of which a web server with its addresses stands in."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.kit.http_ranges import Served, serve
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.analyze.copy.copying import copy_store
+from vla_attention.schemas.stores import remote_source
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.verify import verify_store
+from vla_attention.testing.stores import StoreSpec, write_store
+
+pytest.importorskip("aiohttp", reason="needs the extra remote: pip install 'vla-attention[remote]'")
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory) -> tuple[Path, Path]:
+    """A store of folders, and the same packed."""
+    made = tmp_path_factory.mktemp("stores")
+    folder = write_store(made / "folder.zarr", spec=StoreSpec(tasks=(0,), episodes=2, replans=2))
+    copy_store(open_store(folder), made / "packed.zarr", (), packed=True)
+    return folder, made / "packed.zarr"
+
+
+def csv_of(place: str, out: Path) -> dict[str, bytes]:
+    """The tables that the default command writes."""
+    assert analyze([place, "--no-plots", "--output", str(out)]) == 0
+    assert analyze(["groups", place, "--output", str(out / "groups")]) == 0
+    return {str(file.relative_to(out)): file.read_bytes() for file in sorted(out.rglob("*.parquet"))}
+
+
+@pytest.fixture
+def bucket(stores, monkeypatch) -> Iterator[str]:
+    """A bucket with both stores on a server of the loopback."""
+    pytest.importorskip("s3fs", reason="needs the extra remote")
+    moto = pytest.importorskip("moto.server", reason="needs moto[server]")
+    import boto3
+
+    for name, value in {
+        "AWS_ACCESS_KEY_ID": "made-up",
+        "AWS_SECRET_ACCESS_KEY": "made-up",
+        "AWS_DEFAULT_REGION": "us-east-1",
+    }.items():
+        monkeypatch.setenv(name, value)
+    server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    try:
+        host, port = server.get_host_and_port()
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+        client = boto3.client("s3", endpoint_url=f"http://{host}:{port}")
+        client.create_bucket(Bucket="stores")
+        for store in stores:
+            for file in store.rglob("*"):
+                if file.is_file():
+                    client.put_object(
+                        Bucket="stores", Key=file.relative_to(store.parent).as_posix(), Body=file.read_bytes()
+                    )
+        yield "s3://stores"
+    finally:
+        server.stop()
+
+
+def test_stores_in_s3_give_the_same_tables(bucket, stores, tmp_path, capsys):
+    expected = csv_of(str(stores[0]), tmp_path / "here")
+    assert expected
+    for name in ("packed", "folder"):  # S3 lists folders: a store need not be packed
+        assert csv_of(f"{bucket}/{name}.zarr", tmp_path / name).keys() == expected.keys()
+        assert verify_store(open_store(f"{bucket}/{name}.zarr")) == []
+        text = (tmp_path / name / "summary.txt").read_text()
+        assert text.replace(f"{bucket}/{name}.zarr", "S") == (tmp_path / "here" / "summary.txt").read_text().replace(
+            str(stores[0]), "S"
+        )
+    capsys.readouterr()
+    for wrong in (f"{bucket}/none.zarr", "s3://no-such-bucket/a.zarr"):
+        assert analyze([wrong, "--no-plots"]) == 2
+        said = capsys.readouterr().err
+        assert wrong in said
+        assert said.count("\n") == 1
+
+
+@pytest.fixture
+def hub(stores, tmp_path, monkeypatch) -> Iterator[Served]:
+    """A server with the addresses under which the hub serves files."""
+    shutil.copytree(stores[1], tmp_path / "hub/datasets/org/name/resolve/main/runs/a.zarr")
+    with serve(tmp_path / "hub") as served:
+        monkeypatch.setenv("HF_ENDPOINT", served.url)
+        monkeypatch.setenv("HF_TOKEN", "made-up")
+        yield served
+
+
+def test_a_store_on_the_hub_is_read_by_ranges(hub, stores, tmp_path, capsys):
+    url = "hf://datasets/org/name/runs/a.zarr"
+    assert csv_of(url, tmp_path / "there").keys() == csv_of(str(stores[1]), tmp_path / "here").keys()
+    for name in ("summary.txt",):
+        there, here = (tmp_path / "there" / name).read_text(), (tmp_path / "here" / name).read_text()
+        assert there.replace(url, "S") == here.replace(str(stores[1]), "S")
+    assert all(wanted for path, wanted in hub.requests if path.endswith(".zip"))
+    assert verify_store(open_store(url)) == []
+    capsys.readouterr()
+    for wrong, expected in (
+        ("hf://datasets/org/name/runs/b.zarr", "There is no store at"),
+        ("hf://datasets/org", "expected hf://datasets/ORG/NAME/PATH"),
+    ):
+        assert analyze([wrong, "--no-plots"]) == 2
+        said = capsys.readouterr().err
+        assert expected in said
+        assert said.count("\n") == 1
+
+
+def test_the_token_goes_to_the_hub_and_not_where_it_sends_readers(hub, stores, tmp_path):
+    """The hub keeps large files at another address, and answers with that."""
+    with serve(tmp_path / "hub") as elsewhere:
+        hub.redirect = elsewhere.url
+        episode = open_store("hf://datasets/org/name/runs/a.zarr").episodes[0]
+        assert np.array_equal(episode.read("joint/rows"), open_store(stores[1]).episodes[0].read("joint/rows"))
+        assert hub.authorizations == {"Bearer made-up"}
+        assert elsewhere.authorizations == {""}
+        assert elsewhere.of_episodes() > 0 == hub.of_episodes()
+
+
+@pytest.mark.parametrize("missing", ["fsspec", "aiohttp"])
+def test_a_missing_package_is_named(missing, monkeypatch, capsys):
+    from fsspec.registry import _registry
+
+    remote_source._file_system_of.cache_clear()
+    real = __import__
+
+    def refuse(name: str, *arguments: Any, **options: Any) -> Any:
+        if name.partition(".")[0] == missing:
+            raise ImportError(f"No module named '{missing}'", name=missing)
+        return real(name, *arguments, **options)
+
+    for name in list(sys.modules):
+        if name.partition(".")[0] == missing or name == "fsspec.implementations.http":
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delitem(_registry, "https", raising=False)  # classes that fsspec has imported already
+    monkeypatch.setattr("builtins.__import__", refuse)
+    assert analyze(["https://127.0.0.1:9/x.zarr", "--no-plots"]) == 2
+    monkeypatch.undo()
+    remote_source._file_system_of.cache_clear()
+    said = capsys.readouterr().err
+    assert "vla-attention[remote]" in said
+    assert said.count("\n") == 1
