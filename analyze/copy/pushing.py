@@ -176,8 +176,8 @@ def _client() -> Any:
 
 def _plain(text: str) -> str:
     """Text of a store in a table of Markdown: no markup, one line."""
-    signs = {sign: f"&#{ord(sign)};" if sign in "<>|&" else f"\\{sign}" for sign in "\\`*_{}[]<>#|$&!"}
-    return visible(text).translate(str.maketrans(signs))
+    signs = {ord(sign): f"&#{ord(sign)};" if sign in "<>|&" else f"\\{sign}" for sign in "\\`*_{}[]<>#|$&!"}
+    return visible(text).translate(signs)
 
 
 def _yaml(text: str) -> str:
