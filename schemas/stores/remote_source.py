@@ -194,12 +194,15 @@ def kept_bytes() -> KeptBytes | None:
 
 
 def _file_system(url: str) -> tuple[Any, str]:
-    """fsspec's file system of an address, and the path in it; a forked process makes its own."""
-    return _file_system_of(url, os.getpid())
+    """fsspec's file system of an address, and the path in it.
+
+    A forked process makes its own, and so does one whose hub or token is another one now.
+    """
+    return _file_system_of(url, os.getpid(), os.environ.get("HF_ENDPOINT"), os.environ.get("HF_TOKEN"))
 
 
 @cache
-def _file_system_of(url: str, _process: int) -> tuple[Any, str]:
+def _file_system_of(url: str, _process: int, *_hub_variables: str | None) -> tuple[Any, str]:
     try:
         import fsspec
         from fsspec.core import url_to_fs
