@@ -14,6 +14,7 @@ from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens
 from vla_attention.analyze.show.headings import run_header
 from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.checking import faults_of_each
+from vla_attention.analyze.stores.read_ahead import read_ahead
 from vla_attention.analyze.stores.selection import (
     Selection,
     check_combinable,
@@ -192,7 +193,12 @@ def _without_faulty(
 
 
 def _refuse_empty(chosen: Sequence[tuple[Store, StoredEpisode]]) -> None:
-    empty = [f"{episode.name} of {store.path}" for store, episode in chosen if not episode.attributes.num_replans]
+    opened = read_ahead(episode for _, episode in chosen)
+    empty = [
+        f"{episode.name} of {store.path}"
+        for (store, _), episode in zip(chosen, opened, strict=True)
+        if not episode.attributes.num_replans
+    ]
     if empty:
         raise StoreError(
             f"{listing(empty)} hold{'s' if len(empty) == 1 else ''} no replan, so there is no attention to measure; "

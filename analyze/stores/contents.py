@@ -10,6 +10,7 @@ import polars as pl
 
 from vla_attention.analyze.show.headings import wrap
 from vla_attention.analyze.show.numbers import of_tasks, plural, solved_text
+from vla_attention.analyze.stores.read_ahead import read_ahead
 from vla_attention.analyze.stores.selection import select_episodes
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS
@@ -53,7 +54,7 @@ def read_one_by_one(episodes: Iterable[StoredEpisode]) -> Iterator[StoredEpisode
 
     What an episode keeps when it was read (its seal lists every file) is 20 kB, of thousands of episodes too much.
     """
-    return (replace(episode) for episode in episodes)
+    return read_ahead(replace(episode) for episode in episodes)
 
 
 def one_line(stores: Sequence[Store]) -> str:

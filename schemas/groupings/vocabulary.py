@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.schemas.cached_property import cached_property
 from vla_attention.schemas.groupings.key_counts import key_counts
 from vla_attention.schemas.groupings.words import Word, words_of
 from vla_attention.schemas.layout import INVALID_ROLES, Prompt, Role, SiteLayout

@@ -9,12 +9,13 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.schemas.cached_property import cached_property
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.jsonable import from_json

@@ -16,12 +16,12 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.schemas.cached_property import cached_property
 from vla_attention.schemas.stores.byte_source import ByteSource
 from vla_attention.schemas.stores.digest import bytes_digest, crc32c
 from vla_attention.schemas.stores.remote_source import RemoteFailure

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from dataclasses import fields
 from pathlib import Path
 
 from vla_attention.analyze.measures.selected import SelectedEpisode
@@ -22,7 +23,8 @@ def process_of(number: int) -> int:
 
 def seen(item: SelectedEpisode) -> tuple[SelectedEpisode, StoredEpisode, int, int]:
     """The episode, a part of it, how many episodes its store has here, and how much of it was read already."""
-    return item, item.episode, len(item.store.episodes), len(vars(item.episode)) - 3
+    read = vars(item.episode).keys() - {one.name for one in fields(item.episode)}
+    return item, item.episode, len(item.store.episodes), len(read)
 
 
 def damaged(number: int) -> int:

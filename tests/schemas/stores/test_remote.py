@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -110,6 +111,27 @@ def test_commands_take_addresses(server, packed, tmp_path, capsys):
     assert analyze(["copy", url]) == 0
     assert analyze(["copy", url, str(tmp_path / "c.zarr")]) == 0
     assert verify_store(open_store(tmp_path / "c.zarr")) == []
+
+
+@pytest.mark.parametrize("words", [("--list",), ("--no-plots", "--no-cache")], ids=["list", "masses"])
+def test_several_episodes_are_opened_at_once(tmp_path, words):
+    made = write_store(tmp_path / "folder.zarr", spec=StoreSpec(tasks=(0,), episodes=3, replans=2))
+    copy_store(open_store(made), tmp_path / "served" / "a.zarr", (), packed=True)
+    both = threading.Barrier(2, timeout=20)
+    waited: set[str] = set()
+
+    def meet(path: str, content: bytes) -> bytes:
+        # The first episode may be looked at alone: the store's root is compared with its seal.
+        if path.endswith(("episode001.zip", "episode002.zip")) and path not in waited:
+            waited.add(path)
+            both.wait()  # breaks when the other episode is asked for only after the answer
+        return content
+
+    with serve(tmp_path / "served") as served:
+        served.change = meet
+        assert analyze([f"{served.url}/a.zarr", "--output", str(tmp_path / "out"), *words]) == 0
+    assert len(waited) == 2
+    assert not both.broken
 
 
 def test_workers_read_addresses(server, tmp_path, capsys):
