@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from vla_attention.schemas.stores.store_format import JOB_RECORDS
 
 
-def crc32c(content: bytes) -> int:
+def crc32c(content: bytes | NDArray[np.uint8]) -> int:
     """The checksum that Zarr's codec `crc32c` writes after a chunk; imports its library when first used."""
     import google_crc32c
 

@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 
     from vla_attention.schemas.stores.shards import ShardedLayers
     from vla_attention.schemas.stores.single_chunks import SingleChunk
+
+Read = TypeVar("Read")
 
 
 @dataclass(frozen=True)
@@ -216,12 +218,12 @@ class StoredEpisode:
         what is made of them, which has far fewer numbers.
         """
         layers = self._sharded(name)
-        buffer = None if layers is None else self._readable(name, layers.buffer)
+        memory = None if layers is None else self._readable(name, layers.memory)
         for layer, denoise in places:
             if layers is None:
                 yield self.read(name, (slice(None), layer, denoise))
             else:
-                yield self._readable(name, partial(layers.read, layer, denoise, buffer))
+                yield self._readable(name, partial(layers.read, layer, denoise, memory))
 
     def _sharded(self, name: str) -> ShardedLayers | None:
         if name not in self._layers:
@@ -231,7 +233,7 @@ class StoredEpisode:
             self._layers[name] = ShardedLayers.of(self._metadata(name), lambda file: files.shard(f"{name}/{file}"))
         return self._layers[name]
 
-    def _readable(self, name: str, read: Callable[[], NDArray[np.float32]]) -> NDArray[np.float32]:
+    def _readable(self, name: str, read: Callable[[], Read]) -> Read:
         try:
             return read()
         except CorruptEpisode as error:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from vla_attention.schemas.errors import BadArgument, UserError
-from vla_attention.schemas.stores.byte_source import ByteSource, Folder, split
+from vla_attention.schemas.stores.byte_source import ByteSource, Folder, Memory, copy_into, split
 from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
 
 FOLDER_VARIABLE = "VLA_REMOTE_CACHE"
@@ -66,6 +66,10 @@ class RemoteFolder:
         """See `ByteSource`; one request."""
         length = sum(lengths)
         return split(self._get(file, offset, offset + length, fresh) if length else b"", lengths)
+
+    def read_into(self, memory: Memory, file: str, offset: int, *, fresh: bool = False) -> int:
+        """See `ByteSource`; one request."""
+        return copy_into(memory, self.parts(file, offset, (len(memory),), fresh=fresh)[0])
 
     def size(self, file: str) -> int:
         """See `ByteSource`."""

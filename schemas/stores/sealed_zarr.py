@@ -67,7 +67,7 @@ class SealedArrayStore(Store):
             at = np.flatnonzero(shard.index[:, 0] == wanted.start)
             for number in at.tolist():
                 if shard.index[number].sum() == wanted.end:
-                    frame = shard.chunk(number)
+                    frame = shard.chunk(number).tobytes()
                     self._check_frame(frame, shard.file)
                     return frame + shard.checksum(number)
         return None

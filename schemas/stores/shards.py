@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.schemas.cached_property import cached_property
-from vla_attention.schemas.stores.byte_source import ByteSource
+from vla_attention.schemas.stores.byte_source import ByteSource, Memory
 from vla_attention.schemas.stores.digest import bytes_digest, crc32c
 from vla_attention.schemas.stores.remote_source import RemoteFailure
 from vla_attention.schemas.stores.store_format import CorruptEpisode, FileRecord
@@ -118,8 +118,15 @@ class SealedShard:
         except CorruptEpisode as error:
             raise CorruptEpisode(f"its {file} cannot be read: {error}") from None
 
-    def chunk(self, number: int) -> bytes:
+    def longest(self) -> int:
+        """Bytes of the longest chunk, with its checksum."""
+        return int(self.index[:, 1].max(initial=0))
+
+    def chunk(self, number: int, memory: Memory | None = None) -> Memory:
         """The encoded bytes of one chunk, without the checksum that follows them in the file.
+
+        memory: as much as the `longest` chunk takes, for the result; new memory without. To be given new memory for
+        half a megabyte takes longer than to read it from the system's cache.
 
         Raises:
             CorruptEpisode: the chunk is missing, its checksum is not the one in the seal, or not that of its bytes.
@@ -127,18 +134,19 @@ class SealedShard:
         offset, length = (int(value) for value in self.index[number])
         if length <= CHECKSUM_BYTES:
             raise CorruptEpisode(f"its {self.file} lacks chunk {number}: it is missing")
-        length -= CHECKSUM_BYTES
+        stored = np.empty(length, np.uint8) if memory is None else memory[:length]
+        encoded, checksum = stored[:-CHECKSUM_BYTES], stored[-CHECKSUM_BYTES:]
         problem = ""
         for fresh in (False, True) if self.source.remembers else (False,):
             try:
-                encoded, checksum = self.source.parts(self.file, offset, (length, CHECKSUM_BYTES), fresh=fresh)
+                found = self.source.read_into(stored, self.file, offset, fresh=fresh)
             except RemoteFailure:
                 raise
             except OSError as error:
                 raise CorruptEpisode(f"its {self.file} cannot be read: {error.strerror or error}") from None
-            if len(encoded) != length or checksum != self.checksum(number):
+            if found != length or checksum.tobytes() != self.checksum(number):
                 problem = f"chunk {number} of its {self.file} does not agree with its seal"
-            elif crc32c(encoded) != int.from_bytes(checksum, "little"):
+            elif crc32c(encoded) != int.from_bytes(self.checksum(number), "little"):
                 problem = f"the checksum of chunk {number} of its {self.file} does not fit"
             else:
                 return encoded
@@ -149,7 +157,7 @@ class SealedShard:
         return self.checksums[CHECKSUM_BYTES * number : CHECKSUM_BYTES * (number + 1)]
 
 
-def check_blosc_frame(frame: bytes, decoded_bytes: int, typesize: int) -> None:
+def check_blosc_frame(frame: bytes | memoryview, decoded_bytes: int, typesize: int) -> None:
     """Raise `CorruptEpisode` unless a Blosc frame says of itself what is known of it: its own size and the decoded one.
 
     c-blosc trusts the header: it reads and writes as many bytes as that says.
@@ -166,6 +174,19 @@ def check_blosc_frame(frame: bytes, decoded_bytes: int, typesize: int) -> None:
             raise CorruptEpisode(f"its header says {given} {what}; expected {expected}")
     if not 0 < blocksize <= max(decoded_bytes, typesize):
         raise CorruptEpisode(f"its header says blocks of {blocksize} bytes; expected 1 to {decoded_bytes}")
+
+
+@dataclass(frozen=True)
+class LayerMemory:
+    """Memory for `ShardedLayers.read`, used again for every layer and denoise step.
+
+    Attributes:
+        values: whole chunks of one layer and denoise step, (replans of all shards, ...).
+        chunk: bytes of a chunk as it is stored.
+    """
+
+    values: NDArray[np.float32]
+    chunk: Memory
 
 
 @dataclass(frozen=True)
@@ -216,15 +237,16 @@ class ShardedLayers:
             raise CorruptEpisode(f"the seal does not list the chunks of its {file}")
         return shard
 
-    def buffer(self) -> NDArray[np.float32]:
-        """Memory for `read`: whole chunks of one layer and denoise step, (replans of all shards, ...)."""
-        return np.empty((len(self._shards) * self.replans_per_shard, *self.shape[3:]), dtype="<f4")
+    def memory(self) -> LayerMemory:
+        """Memory for `read`."""
+        values = np.empty((len(self._shards) * self.replans_per_shard, *self.shape[3:]), dtype="<f4")
+        return LayerMemory(values, np.empty(max(shard.longest() for shard in self._shards), np.uint8))
 
-    def read(self, layer: int, denoise: int, into: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+    def read(self, layer: int, denoise: int, memory: LayerMemory | None = None) -> NDArray[np.float32]:
         """Values (replan, ...) of one layer and denoise step, both positions along their axes.
 
-        into: a `buffer`, of which the result is then a part; a new one without. Decoding every layer into the same
-        memory keeps it in the processor's cache, and no chunk is copied.
+        memory: of which the result is then a part; new memory without. Decoding every layer into the same memory keeps
+        it in the processor's cache, and no chunk is copied.
 
         Raises:
             CorruptEpisode: a chunk is missing, is not the one that was sealed, or decodes to another size.
@@ -234,12 +256,13 @@ class ShardedLayers:
         if not (0 <= layer < self.shape[1] and 0 <= denoise < self.shape[2]):
             raise IndexError(f"layer {layer} and denoise {denoise} of an array of shape {self.shape}")
         number = layer * self.shape[2] + denoise
-        values = self.buffer() if into is None else into
+        memory = memory or self.memory()
+        values = memory.values
         for i, shard in enumerate(self._shards):
-            frame = shard.chunk(number)
+            frame = shard.chunk(number, memory.chunk)
             chunk = values[i * self.replans_per_shard : (i + 1) * self.replans_per_shard]
             try:
-                check_blosc_frame(frame, chunk.nbytes, chunk.itemsize)
+                check_blosc_frame(frame.data, chunk.nbytes, chunk.itemsize)
                 blosc.decompress(frame, chunk)
             except (CorruptEpisode, RuntimeError, ValueError) as error:
                 raise CorruptEpisode(f"chunk {number} of its {shard.file} cannot be decoded: {error}") from None

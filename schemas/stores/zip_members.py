@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from vla_attention.schemas.stores.byte_source import ByteSource, split
+from vla_attention.schemas.stores.byte_source import ByteSource, Memory, copy_into, split
 
 #: Bytes of a local header before the file's name.
 LOCAL_HEADER_BYTES = 30
@@ -59,12 +59,20 @@ class ZipMembers:
         for length in lengths:
             at = min(at + length, max(size, offset))
             ends.append(at)
-        lengths = [end - start for start, end in pairwise([min(offset, size), *ends])]
+        lengths = [end - start for start, end in pairwise([offset, *ends])]
         tail = self._opened()[1]
         if first + offset >= self.tail:
             start = first + offset - self.tail
             return split(tail[start : start + sum(lengths)], lengths)
         return self.source.parts(self.file, first + offset, lengths, fresh=fresh)
+
+    def read_into(self, memory: Memory, file: str, offset: int, *, fresh: bool = False) -> int:
+        """See `ByteSource`."""
+        first, size = self._member(file, fresh=fresh)
+        if first + offset >= self.tail:
+            return copy_into(memory, self.parts(file, offset, (len(memory),), fresh=fresh)[0])
+        room = memory[: max(0, size - offset)]
+        return self.source.read_into(room, self.file, first + offset, fresh=fresh)
 
     def size(self, file: str) -> int:
         """See `ByteSource`."""

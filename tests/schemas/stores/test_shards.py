@@ -68,10 +68,14 @@ def test_equals_zarr_python(tmp_path_factory, shape, block, seed):
     array = write_array(folder, values, block)
     reader = reader_of(folder)
     assert reader is not None
+    memory = reader.memory()
     for layer in range(shape[1]):
         for denoise in range(shape[2]):
             read = reader.read(layer, denoise)
             np.testing.assert_array_equal(read, values[:, layer, denoise])
+            again = reader.read(layer, denoise, memory)
+            np.testing.assert_array_equal(again, read)
+            assert np.shares_memory(again, memory.values)
             np.testing.assert_array_equal(read, array[:, layer, denoise])
 
 
