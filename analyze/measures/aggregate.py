@@ -12,6 +12,7 @@ null for the average. Ratios that are not finite are never dropped silently: eve
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -55,7 +56,7 @@ from vla_attention.analyze.statistics.intervals import (
     named_interval,
     ratio_of_means_over_episodes,
 )
-from vla_attention.analyze.statistics.summaries import summarize
+from vla_attention.analyze.statistics.summaries import summarize_rows
 from vla_attention.schemas.groupings.grouping import Grouping
 
 #: The ratio that texts and pictures show first: with few episodes and strong spread, its interval alone covers the
@@ -170,34 +171,38 @@ def _columns_over_episodes(grouping: Grouping) -> tuple[str, ...]:
 def _scopes(cells: pl.DataFrame) -> Iterator[tuple[dict[str, object], list[dict[str, object]], NDArray[np.int64]]]:
     """The cells that belong together: what they share, what names each layer, and positions (layer, episode).
 
-    Layers of the same episodes come together.
+    Layers of the same episodes come together. `cells` are sorted by episode.
     """
-    several = cells["suite"].n_unique() > 1
-    indexed = cells.select(
-        *("suite", "task_id", "instruction", *LAYER_KEYS),
-        pl.int_range(pl.len()).alias("_position"),
-        pl.struct(EPISODE_ID).rank("dense").alias("_episode"),
+    by_rank = cells.select(LAYER_KEYS).unique("layer").sort("layer").rows(named=True)
+    layer, episode = (
+        cells.select(of.rank("dense").cast(pl.Int64)).to_series().to_numpy()
+        for of in (pl.col("layer"), pl.struct(EPISODE_ID))
     )
 
     def by_layer(
-        part: pl.DataFrame, scope: dict[str, object]
+        scope: dict[str, object], first: int, count: int
     ) -> Iterator[tuple[dict[str, object], list[dict[str, object]], NDArray[np.int64]]]:
         found: dict[bytes, tuple[list[dict[str, object]], list[NDArray[np.int64]]]] = {}
-        for of_layer in part.partition_by("layer", maintain_order=True):
-            names, positions = found.setdefault(of_layer["_episode"].to_numpy().tobytes(), ([], []))
-            names.append(of_layer.select(LAYER_KEYS).row(0, named=True))
-            positions.append(of_layer["_position"].to_numpy())
-        for names, positions in found.values():
-            yield scope, names, np.stack(positions)
+        positions = first + np.argsort(layer[first : first + count], kind="stable")
+        for of_layer in np.split(positions, np.flatnonzero(np.diff(layer[positions])) + 1):
+            names, members = found.setdefault(episode[of_layer].tobytes(), ([], []))
+            names.append(by_rank[layer[of_layer[0]] - 1])
+            members.append(of_layer)
+        for names, members in found.values():
+            yield scope, names, np.stack(members)
 
-    for of_suite in indexed.partition_by("suite", maintain_order=True):
-        suite = of_suite["suite"][0]
-        for part in of_suite.partition_by("task_id", maintain_order=True):
-            task, instruction = part["task_id"][0], part["instruction"][0]
-            yield from by_layer(part, {"scope": "task", "suite": suite, "task_id": task, "instruction": instruction})
-        yield from by_layer(of_suite, {"scope": "all", "suite": suite, "task_id": None, "instruction": None})
-    if several:
-        yield from by_layer(indexed, {"scope": "combined", "suite": None, "task_id": None, "instruction": None})
+    runs = cells.group_by("suite", "task_id", maintain_order=True).agg(pl.first("instruction"), pl.len())
+    first = 0
+    for of_suite in runs.partition_by("suite", maintain_order=True):
+        begin = first
+        for suite, task, instruction, count in of_suite.iter_rows():
+            task_scope = {"scope": "task", "suite": suite, "task_id": task, "instruction": instruction}
+            yield from by_layer(task_scope, first, count)
+            first += count
+        whole = {"scope": "all", "suite": of_suite["suite"][0], "task_id": None, "instruction": None}
+        yield from by_layer(whole, begin, first - begin)
+    if runs["suite"].n_unique() > 1:
+        yield from by_layer({"scope": "combined", "suite": None, "task_id": None, "instruction": None}, 0, first)
 
 
 def _task_rows(
@@ -212,54 +217,45 @@ def _task_rows(
     columns: (layer, episode) each; groups: (layer, episode, group) each.
     """
     tasks = columns[_TASK][0]
+    # Outcomes that are not known are NaN, and in no mean.
+    plain: dict[str, EpisodeStatistic] = {"success_rate": mean_over_episodes(columns["success"])}
+    bounded: dict[str, EpisodeStatistic] = {}
+    counts: dict[str, list[int]] = {"num_replans": columns["num_replans"].sum(axis=1).astype(int).tolist()}
+    if grouping.ratio:
+        plain |= {name: mean_over_episodes(columns[name]) for name in ("numerator_mass", "denominator_mass")}
+        # With the mean and the episodes of the headline, so that ratio / uniform ratio is the lift.
+        uniform = baseline_logs(columns["uniform_ratio"], columns["log_ratio_mean"])
+        plain["uniform_ratio"] = geometric_mean_over_episodes(uniform)
+        bounded = {
+            "ratio_mean": mean_over_episodes(columns["ratio_mean"], POSITIVE),
+            "ratio_of_means": ratio_of_means_over_episodes(columns["numerator_mass"], columns["denominator_mass"]),
+            "geometric_mean": geometric_mean_over_episodes(columns["log_ratio_mean"]),
+            "ratio_lift": geometric_mean_over_episodes(logs_of(columns["ratio_lift"])),
+        }
+        for name in ("num_nonfinite", "geometric_left_out", "nonfinite_layers"):
+            counts[name] = columns[name].sum(axis=1).astype(int).tolist()
+    shares = mean_over_episodes(groups["fraction"].swapaxes(1, 2), SHARE)
+    found = iter(estimates([*plain.values(), *bounded.values(), shares], tasks, estimand))
     layers = range(len(columns[_TASK]))
-    plain: list[dict[str, EpisodeStatistic]] = []
-    bounded: list[dict[str, EpisodeStatistic]] = []
-    for i in layers:
-        of_layer = {name: array[i] for name, array in columns.items()}
-        # Outcomes that are not known are NaN, and in no mean.
-        plain.append({"success_rate": mean_over_episodes(of_layer["success"])})
-        bounded.append({})
-        if grouping.ratio:
-            plain[i] |= {name: mean_over_episodes(of_layer[name]) for name in ("numerator_mass", "denominator_mass")}
-            # With the mean and the episodes of the headline, so that ratio / uniform ratio is the lift.
-            uniform = baseline_logs(of_layer["uniform_ratio"], of_layer["log_ratio_mean"])
-            plain[i]["uniform_ratio"] = geometric_mean_over_episodes(uniform)
-            sides = (of_layer["numerator_mass"], of_layer["denominator_mass"])
-            bounded[i] = {
-                "ratio_mean": mean_over_episodes(of_layer["ratio_mean"], POSITIVE),
-                "ratio_of_means": ratio_of_means_over_episodes(*sides),
-                "geometric_mean": geometric_mean_over_episodes(of_layer["log_ratio_mean"]),
-                "ratio_lift": geometric_mean_over_episodes(logs_of(of_layer["ratio_lift"])),
-            }
-    shares = [mean_over_episodes(column, SHARE) for i in layers for column in groups["fraction"][i].T]
-    statistics = [one for which in (plain, bounded) for of_layer in which for one in of_layer.values()]
-    found = iter(estimates([*statistics, *shares], tasks, estimand))
-    of_plain, of_bounded = (
-        [{name: next(found) for name in of_layer} for of_layer in which] for which in (plain, bounded)
-    )
-    means = {name: means_over_tasks(groups[name], tasks) for name in ("mass", "keys", "density", "lift")}
+    of_plain, of_bounded = ({name: [next(found) for _ in layers] for name in which} for which in (plain, bounded))
+    means = {name: means_over_tasks(groups[name], tasks).tolist() for name in ("mass", "keys", "density", "lift")}
+    spreads = summarize_rows(columns["ratio_mean"]) if grouping.ratio else []
+    num_tasks, num_episodes = len(np.unique(tasks)), len(tasks)
     rows, group_rows = [], []
     for i in layers:
-        row: dict[str, float | int | None] = {
-            "num_tasks": len(np.unique(tasks)),
-            "num_episodes": len(tasks),
-            "num_replans": int(columns["num_replans"][i].sum()),
-        }
+        row: dict[str, float | int | None] = {"num_tasks": num_tasks, "num_episodes": num_episodes}
+        row |= {name: count[i] for name, count in counts.items()}
         if grouping.ratio:
-            spread = summarize(columns["ratio_mean"][i])
-            row |= {f"ratio_{name}": getattr(spread, name) for name in ("std", "median", "min", "max")}
-            row["episodes_without_ratio"] = spread.num_nonfinite
-            counts = ("num_nonfinite", "geometric_left_out", "nonfinite_layers")
-            row |= {name: int(columns[name][i].sum()) for name in counts}
-        row |= {name: one.value for name, one in of_plain[i].items()}
-        for name, one in of_bounded[i].items():
-            row |= named_interval(name, one.value, one.interval(level))
+            row |= {f"ratio_{name}": getattr(spreads[i], name) for name in ("std", "median", "min", "max")}
+            row["episodes_without_ratio"] = spreads[i].num_nonfinite
+        row |= {name: of_layers[i].value for name, of_layers in of_plain.items()}
+        for name, of_layers in of_bounded.items():
+            row |= named_interval(name, of_layers[i].value, of_layers[i].interval(level))
         rows.append(row)
         of_groups = []
         for j, name in enumerate(grouping.names):
             share = next(found)
-            values = {measure: _none_for_nan(of[i, j]) for measure, of in means.items()}
+            values = {measure: _none_for_nan(of[i][j]) for measure, of in means.items()}
             of_groups.append(
                 {"group": name, **values, **named_interval("fraction", share.value, share.interval(level))}
             )
@@ -268,13 +264,13 @@ def _task_rows(
 
 
 def _none_for_nan(value: float) -> float | None:
-    return None if np.isnan(value) else float(value)
+    return None if math.isnan(value) else value
 
 
 def baseline_logs(uniform: NDArray[np.float64], log_ratios: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Logarithms of uniform ratios (episode,) of the episodes that have a ratio; of all where none has."""
+    """Logarithms of uniform ratios (..., episode) of the episodes that have a ratio; of all where none has."""
     having = np.isfinite(log_ratios)
-    return np.where(having | ~having.any(), logs_of(uniform), np.nan)
+    return np.where(having | ~having.any(axis=-1, keepdims=True), logs_of(uniform), np.nan)
 
 
 _NAMES: dict[str, type[pl.DataType]] = {

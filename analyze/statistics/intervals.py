@@ -70,10 +70,12 @@ class Interval:
 class EpisodeStatistic:
     """A statistic over episodes: g(mean of `numerator` / mean of `denominator`), both means over tasks of task means.
 
+    Or many of one kind over the same episodes, one for each place of the axes before that of the episodes.
+
     Attributes:
-        numerator: (episode,) float64.
-        denominator: (episode,) float64; 1 for a plain mean.
-        used: (episode,) bool, which episodes are used.
+        numerator: (..., episode) float64.
+        denominator: (..., episode) float64; 1 for a plain mean.
+        used: (..., episode) bool, which episodes are used.
         exponentiate: g is exp (geometric mean) instead of the identity.
         limits: natural limits of the quotient before g: `NO_LIMITS`, `POSITIVE`, `SHARE`.
     """
@@ -134,7 +136,7 @@ UNKNOWN = Estimate(None)
 
 
 def mean_over_episodes(values: ArrayLike, limits: tuple[float, float] = NO_LIMITS) -> EpisodeStatistic:
-    """Mean of one value per episode, shape (episode,); episodes whose value is not finite are left out and counted.
+    """Mean of one value per episode, shape (..., episode); episodes whose value is not finite are left out and counted.
 
     `limits`: `POSITIVE` for masses and ratios, `SHARE` for fractions; an interval never contains impossible values.
     """
@@ -164,14 +166,14 @@ def means_over_tasks(values: NDArray[np.float64], tasks: ArrayLike) -> NDArray[n
 
 
 def ratio_of_means_over_episodes(numerator: ArrayLike, denominator: ArrayLike) -> EpisodeStatistic:
-    """Mean numerator mass / mean denominator mass, both (episode,). It uses episodes with an infinite ratio."""
+    """Mean numerator mass / mean denominator mass, both (..., episode). It uses episodes with an infinite ratio."""
     above, below = np.asarray(numerator, dtype=np.float64), np.asarray(denominator, dtype=np.float64)
     used = np.isfinite(above) & np.isfinite(below)
     return EpisodeStatistic(np.where(used, above, 0.0), np.where(used, below, 0.0), used, limits=POSITIVE)
 
 
 def geometric_mean_over_episodes(log_means: ArrayLike) -> EpisodeStatistic:
-    """exp of the mean over episodes of each episode's mean log ratio (natural logarithm), shape (episode,)."""
+    """exp of the mean over episodes of each episode's mean log ratio (natural logarithm), (..., episode)."""
     mean = mean_over_episodes(log_means)
     return EpisodeStatistic(mean.numerator, mean.denominator, mean.used, exponentiate=True)
 
@@ -182,7 +184,7 @@ def estimates(
     """Values and standard errors of several statistics over the same episodes.
 
     Args:
-        statistics: over the same episodes.
+        statistics: over the same episodes; one of many of a kind gives as many estimates, in C order.
         tasks: (episode,) labels of the episodes' tasks.
         estimand: what the intervals are about. Each task counts with the episodes that the statistic uses; for
             `THESE_TASKS` every task needs two of them.
@@ -191,9 +193,11 @@ def estimates(
         return []
     task_of = np.unique(np.asarray(tasks), return_inverse=True)[1]
     member = (task_of[:, None] == np.arange(task_of.max() + 1)).astype(np.float64)  # (episode, task)
-    used = np.stack([statistic.used for statistic in statistics]).astype(np.float64)  # (statistic, episode)
-    above = np.stack([statistic.numerator for statistic in statistics]) * used
-    below = np.stack([statistic.denominator for statistic in statistics]) * used
+    used, above, below = (
+        np.concatenate([part.reshape(-1, len(task_of)) for part in parts]).astype(np.float64)  # (statistic, episode)
+        for parts in zip(*((one.used, one.numerator, one.denominator) for one in statistics), strict=True)
+    )
+    above, below = above * used, below * used
     size = used @ member  # (statistic, task)
     num_tasks = (size > 0).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -205,14 +209,13 @@ def estimates(
         by_task = (task_above - quotient[:, None] * task_below) / mean_below[:, None]
         between = (by_task**2 * (size > 0)).sum(axis=1) / (num_tasks - 1) / num_tasks
         squares = ((by_episode - by_task[:, task_of]) ** 2 * used) @ member
+        scale = np.where(mean_below == 0, 0.0, np.abs(above).max(axis=1, initial=0.0) / mean_below)
     in_strata, welch = strata_error(squares, size, num_tasks[:, None])
-    found = []
-    for i, statistic in enumerate(statistics):
-        clusters = estimand == Estimand.TASKS_LIKE_THESE and num_tasks[i] > 1
-        variance, degrees = (between[i], float(num_tasks[i] - 1)) if clusters else (in_strata[i], welch[i])
-        scale = float(np.abs(above[i]).max(initial=0.0) / mean_below[i]) if mean_below[i] else 0.0
-        found.append(_estimate(float(quotient[i]), float(variance), degrees, scale, statistic))
-    return found
+    clusters = (num_tasks > 1) & (estimand == Estimand.TASKS_LIKE_THESE)
+    variance, degrees = np.where(clusters, between, in_strata), np.where(clusters, num_tasks - 1, welch)
+    kinds = [statistic for statistic in statistics for _ in range(statistic.used.size // len(task_of))]
+    each = zip(*(part.tolist() for part in (quotient, variance, degrees, scale)), kinds, strict=True)
+    return [_estimate(*one) for one in each]
 
 
 def quotient_by_episode(numerator: ArrayLike, denominator: ArrayLike, tasks: ArrayLike) -> NDArray[np.float64]:

@@ -161,6 +161,20 @@ def test_ratio_of_means_without_any_denominator_is_infinite():
     assert estimate.interval() is None
 
 
+def test_many_of_a_kind_are_the_same_as_one_by_one():
+    rng = np.random.default_rng(1)
+    values, tasks = rng.lognormal(size=(2, 3, 12)), np.repeat(np.arange(3), 4)
+    values[0, 1, 5] = np.nan
+    for estimand in Estimand:
+        together = estimates([mean_over_episodes(values, POSITIVE), mean_over_episodes(tasks)], tasks, estimand)
+        alone = [estimates([mean_over_episodes(one, POSITIVE)], tasks, estimand)[0] for one in values.reshape(6, 12)]
+        for mine, theirs in zip(together[:-1], alone, strict=True):
+            assert mine.value == pytest.approx(theirs.value, rel=1e-14)
+            assert mine.error == pytest.approx(theirs.error, rel=1e-12)
+            assert (mine.degrees, mine.limits) == (theirs.degrees, theirs.limits)
+        assert together[-1].value == 1.0
+
+
 def test_several_statistics_at_once_are_the_same_as_one_by_one():
     statistics = [
         mean_over_episodes(SAMPLE),
