@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Unpack, cast, get_args
+from typing import TYPE_CHECKING, Any, Literal, Unpack, get_args
 
 import polars as pl
 
@@ -154,8 +154,7 @@ class OpenStores:
         """
         from vla_attention.analyze.export.tables import chosen_tables
 
-        table = chosen_tables(self.analysis(**settings), ["contributions"])["contributions"]
-        return cast(pl.DataFrame, table)
+        return chosen_tables(self.analysis(**settings), ["contributions"])["contributions"].whole
 
     def to_xarray(
         self, rows: bool = False, most_gigabytes: float = 4.0, **settings: Unpack[SettingKeywords]

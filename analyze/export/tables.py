@@ -5,25 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import polars as pl
-
 from vla_attention.analyze.measures.frames import TableInParts, Tables, named_parts
 from vla_attention.analyze.ratios.analysis import Analysis
 from vla_attention.analyze.show.output_files import write_csv, write_parquet
 from vla_attention.schemas.errors import BadArgument
 
 
-def chosen_tables(analysis: Analysis, names: Sequence[str]) -> dict[str, pl.DataFrame | TableInParts]:
+def chosen_tables(analysis: Analysis, names: Sequence[str]) -> dict[str, TableInParts]:
     """Tables of an analysis by the names of their files.
 
-    Steps, replans, episodes and tasks are two tables each, NAME and NAME_groups, which are written in parts.
+    Steps, replans, episodes and tasks are two tables each, NAME and NAME_groups.
 
     Raises:
         BadArgument: contributions are wanted and were not recorded.
     """
-    tables: dict[str, pl.DataFrame | TableInParts] = {}
+    tables: dict[str, TableInParts] = {}
     for name in names:
-        table: Tables | pl.DataFrame | None = getattr(analysis, name)
+        table: Tables | TableInParts | None = getattr(analysis, name)
         if table is None:
             raise BadArgument(
                 "These stores hold no contributions; record them with vla-capture "
@@ -33,7 +31,7 @@ def chosen_tables(analysis: Analysis, names: Sequence[str]) -> dict[str, pl.Data
     return tables
 
 
-def write_tables(folder: Path, tables: Mapping[str, pl.DataFrame | TableInParts], kinds: Sequence[str]) -> list[Path]:
+def write_tables(folder: Path, tables: Mapping[str, TableInParts], kinds: Sequence[str]) -> list[Path]:
     """Write tables in each of the kinds `csv` and `parquet`; returns the paths."""
     written = []
     if "csv" in kinds:

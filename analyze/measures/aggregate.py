@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -35,13 +36,13 @@ from vla_attention.analyze.measures.frames import (
     LayerAxis,
     Tables,
     concat_tables,
-    episode_id,
     float_values,
     long_table,
     replan_axis,
+    tables_of_each,
 )
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.steps import MeasuredEpisode, measure_episodes
+from vla_attention.analyze.measures.steps import MeasuredEpisode, in_order_of_episodes, measure_episodes
 from vla_attention.analyze.statistics.episode_intervals import task_number
 from vla_attention.analyze.statistics.intervals import (
     DEFAULT_LEVEL,
@@ -67,7 +68,7 @@ _TASK = "_task_of_suite"
 
 def replans_of(question: Question) -> Tables:
     """Measure a question's episodes and average them per replan; see `replan_tables`."""
-    return replan_tables(measure_episodes(question), question.grouping)
+    return concat_tables(replan_tables(measure_episodes(question), question.grouping).parts)
 
 
 def replan_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Tables:
@@ -87,15 +88,14 @@ def replan_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Ta
         groups: suite, task_id, episode_index, replan, env_step, layer, layer_number, block, group, mass, fraction,
             keys, density, lift.
     """
-    in_order = sorted(measured, key=lambda episode: episode_id(episode.item))
-    return concat_tables([_episode_replans(episode, grouping) for episode in in_order])
+    return tables_of_each(in_order_of_episodes(measured), partial(_episode_replans, grouping=grouping))
 
 
 def _episode_replans(measured: MeasuredEpisode, grouping: Grouping) -> Tables:
     item, values = measured.item, replan_values(measured, grouping)
     axes = [replan_axis(item), LayerAxis.of(measured.selection).columns]
     return Tables(
-        long_table(item, axes, values.cells, EPISODE_KEYS),
+        lambda: long_table(item, axes, values.cells, EPISODE_KEYS),
         lambda: long_table(item, [*axes, {"group": grouping.names}], values.groups()),
     )
 

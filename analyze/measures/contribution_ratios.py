@@ -16,6 +16,8 @@ much of one direction they are. Unlike masses, both may be given for sides at di
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
@@ -131,12 +133,13 @@ def _with_ratio_over_blocks(
 
 
 def contribution_rows(
-    table: pl.DataFrame, above: str, below: str, estimand: Estimand, level: float = DEFAULT_LEVEL
+    parts: Iterable[pl.DataFrame], above: str, below: str, estimand: Estimand, level: float = DEFAULT_LEVEL
 ) -> pl.DataFrame:
     """Norms and their ratio of every layer and over all of them ("layers_avg"), over episodes, with intervals.
 
     Args:
-        table: one row per (episode, replan, layer, denoise step), with the norms and `ratio_columns`.
+        parts: one row per (episode, replan, layer, denoise step), with the norms and `ratio_columns`; a part holds
+            whole episodes.
         above: the column of the numerator's norm.
         below: the column of the denominator's norm.
         estimand: what the intervals are about.
@@ -163,14 +166,18 @@ def contribution_rows(
             ("ratio_lift", "ratio_lift"),
         )
     }
-    episodes = episode_means(
-        table,
+    means = [
         pl.col(above, below).mean(),
         pl.col("contribution_ratio").filter(pl.col("contribution_ratio").is_finite()).mean().alias("ratio_mean"),
         *(log.filter(log.is_finite()).mean().alias(name) for name, log in logs.items()),
-    )
-    if f"{above}_of_uniform" in table.columns:
-        episodes = _with_ratio_over_blocks(episodes, table, above, below, logs)
+    ]
+    of_parts = []
+    for table in parts:
+        of_part = episode_means(table, *means)
+        if f"{above}_of_uniform" in table.columns:
+            of_part = _with_ratio_over_blocks(of_part, table, above, below, logs)
+        of_parts.append(of_part)
+    episodes = pl.concat(of_parts)
     values = dict.fromkeys((above, below, "ratio_mean"), POSITIVE) | dict.fromkeys(logs, NO_LIMITS)
     quotients = {"ratio_of_means": (above, below)}
     rows = means_with_intervals(episodes, ["layer"], values, estimand, level, quotients=quotients)

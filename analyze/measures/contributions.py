@@ -11,15 +11,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.contribution_ratios import joint_norm, ratio_columns, selected_gram, uniform_weights
-from vla_attention.analyze.measures.frames import denoise_axis, layer_axis, long_table, replan_axis
+from vla_attention.analyze.measures.frames import TableInParts, denoise_axis, layer_axis, long_table, replan_axis
+from vla_attention.analyze.measures.not_in_memory import ArraysOnDisk, MadeWhenAsked
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.stores.parallel import map_episodes
+from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.segments import Segment
 from vla_attention.schemas.stores.reader import StoredEpisode
@@ -32,7 +34,7 @@ LINGUISTIC_ROLES = ("bos", "template", "instruction", "text")
 
 def contribution_table(
     selected: Sequence[SelectedEpisode], selection: Selection, layers: Sequence[int] | None = None
-) -> pl.DataFrame | None:
+) -> TableInParts | None:
     """Norms of both sides for every (episode, replan, layer, denoise step); None without recorded contributions.
 
     Columns: suite, task_id, episode_index, replan, env_step, layer, block, denoise_step, visual_norm, linguistic_norm,
@@ -52,12 +54,21 @@ def contribution_table(
     if not all(item.store.attributes.recording.contributions for item in selected):
         return None
 
-    measure = partial(_episode_norms, selection=selection, layers=layers)
-    frames = [frame for frame in map_episodes(measure, selected) if frame is not None]
-    return pl.concat(frames) if len(frames) == len(selected) else None
+    norms = ArraysOnDisk(each_episode(partial(_episode_norms, selection=selection, layers=layers), selected))
+    if not all(norms[i] for i in range(len(norms))):
+        return None
+    return TableInParts(MadeWhenAsked(lambda i: _table(selected[i], selection, norms[i]), range(len(selected))))
 
 
-def _episode_norms(item: SelectedEpisode, selection: Selection, layers: Sequence[int] | None) -> pl.DataFrame | None:
+def _table(item: SelectedEpisode, selection: Selection, norms: dict[str, NDArray[Any]]) -> pl.DataFrame:
+    layer = {name: norms.pop(name) for name in ("layer", "block")}
+    return long_table(item, [replan_axis(item), layer, denoise_axis(selection)], norms)
+
+
+def _episode_norms(
+    item: SelectedEpisode, selection: Selection, layers: Sequence[int] | None
+) -> dict[str, NDArray[Any]]:
+    """The columns of one episode's norms (replan, layer, denoise), and the layers' labels; empty without a side."""
     root, episode = item.store.attributes, item.episode
     sides = [_parts_of_side(root, episode, roles) for roles in (VISUAL_ROLES, LINGUISTIC_ROLES)]
     if len({root.recording_of(side[0]).layers for side in sides if side}) > 1:
@@ -71,10 +82,10 @@ def _episode_norms(item: SelectedEpisode, selection: Selection, layers: Sequence
         if side is not None
     ]
     if len(norms) < len(sides):
-        return None
+        return {}
     visual, linguistic = norms
-    values = {"visual_norm": visual[0], "linguistic_norm": linguistic[0], **ratio_columns(visual, linguistic)}
-    return long_table(item, [replan_axis(item), layer_axis(selection), denoise_axis(selection)], values)
+    labels = {name: np.array(values) for name, values in layer_axis(selection).items()}
+    return {**labels, "visual_norm": visual[0], "linguistic_norm": linguistic[0], **ratio_columns(visual, linguistic)}
 
 
 def _of_different_blocks(
@@ -82,17 +93,17 @@ def _of_different_blocks(
     selection: Selection,
     layers: Sequence[int] | None,
     sides: Sequence[tuple[str, NDArray[np.bool_]]],
-) -> pl.DataFrame | None:
-    """The table where the sides are at sites in different blocks; None where no chosen block has one of the sides."""
+) -> dict[str, NDArray[Any]]:
+    """The same where the sides are at sites in different blocks; empty where no chosen block has one of the sides."""
     root = item.store.attributes
     blocks_of = {
         site: tuple(b for b in root.recording_of(site).layers if layers is None or b in layers) for site, _ in sides
     }
     if len(sides) < 2 or not all(blocks_of.values()):
-        return None
+        return {}
     union = sorted({block for blocks in blocks_of.values() for block in blocks})
     shape = (item.tokens.num_replans, len(union), len(selection.denoise))
-    values = {}
+    values: dict[str, NDArray[Any]] = {"layer": np.array(union), "block": np.array(union)}
     for name, (site, parts) in zip(("visual_norm", "linguistic_norm"), sides, strict=True):
         recorded = root.recording_of(site).layers
         own = replace(selection, layers=tuple(recorded.index(block) for block in blocks_of[site]))
@@ -101,8 +112,7 @@ def _of_different_blocks(
         for column, norm in ((name, joint_norm(gram, parts)), (f"{name}_of_uniform", joint_norm(gram, parts, uniform))):
             values[column] = np.full(shape, np.nan)
             values[column][:, at] = norm
-    values |= dict.fromkeys(("contribution_ratio", "uniform_ratio", "ratio_lift"), np.full(shape, np.nan))
-    return long_table(item, [replan_axis(item), {"layer": union, "block": union}, denoise_axis(selection)], values)
+    return values | dict.fromkeys(("contribution_ratio", "uniform_ratio", "ratio_lift"), np.full(shape, np.nan))
 
 
 def _parts_of_side(

@@ -6,7 +6,7 @@ and groups would be several times as large as the masses, and as slow.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +20,6 @@ from vla_attention.analyze.measures.frames import (
     LayerAxis,
     Tables,
     episode_columns,
-    episode_id,
     float_values,
 )
 from vla_attention.analyze.measures.masses import (
@@ -31,13 +30,13 @@ from vla_attention.analyze.measures.masses import (
     sides,
     uniform_ratio,
 )
-from vla_attention.analyze.measures.steps import MeasuredEpisode
+from vla_attention.analyze.measures.steps import MeasuredEpisode, in_order_of_episodes
 from vla_attention.schemas.groupings.grouping import Grouping
 
 Array = NDArray[np.float64]
 LAYER_KEYS = ("layer", "layer_number", "block")
-#: So many masses are reduced at once: a few arrays of 16 MB.
-_MASSES_AT_ONCE = 2_000_000
+#: So many masses are reduced at once: a few arrays of 4 MB.
+_MASSES_AT_ONCE = 500_000
 
 
 @dataclass(frozen=True)
@@ -110,11 +109,10 @@ def episode_tables(replans: Tables, grouping: Grouping) -> Tables:
 
 def episode_tables_of(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Tables:
     """`episode_tables` of the replans of measured episodes, without a table of their replans."""
-    in_order = sorted(measured, key=lambda episode: episode_id(episode.item))
-    return _joined([_of_episodes(batch, grouping) for batch in _batches([one for one in in_order if len(one.mass)])])
+    return _joined([_of_episodes(batch, grouping) for batch in _batches(in_order_of_episodes(measured))])
 
 
-def _batches(measured: Sequence[MeasuredEpisode]) -> Iterator[list[MeasuredEpisode]]:
+def _batches(measured: Iterable[MeasuredEpisode]) -> Iterator[list[MeasuredEpisode]]:
     batch: list[MeasuredEpisode] = []
     size = 0
     for one in measured:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.safe_text import visible
@@ -25,6 +26,8 @@ EPISODE_KEYS = ("suite", "task_id", "instruction", "episode_index", "success", "
 #: The layer that stands for the mean over all layers.
 LAYERS_AVG = "layers_avg"
 
+#: What tables are made of, one for each episode.
+Measured = TypeVar("Measured")
 #: One axis: the columns that label it, each with a value per position.
 Axis = Mapping[str, Sequence[Any] | NDArray[Any] | pl.Series]
 
@@ -173,8 +176,8 @@ class Tables:
     """Tables of one level: steps, replans, episodes or tasks.
 
     Attributes:
-        cells: one row per cell, with the measures of the whole row and of the ratio. Of steps it is made at every
-            access, and not kept.
+        cells: one row per cell, with the measures of the whole row and of the ratio. Of steps and replans it is made at
+            every access, and not kept.
         groups: one row per cell and group: cells in the same order as in `cells`, groups in that of the grouping;
             column `group`. Of steps and replans it is made at every access, and not kept: it is several times as large
             as the masses.
@@ -255,8 +258,9 @@ def concat_tables(parts: Sequence[Tables]) -> Tables:
     )
 
 
-def tables_in_parts(parts: Sequence[Tables]) -> Tables:
-    """The rows of all parts, each of which has cells, in order; both tables are made when they are asked for."""
+def tables_of_each(measured: Sequence[Measured], make: Callable[[Measured], Tables]) -> Tables:
+    """Tables with a part for each of `measured`, which `make` makes of it whenever it is asked for; all have cells."""
+    parts = MadeWhenAsked(lambda i: make(measured[i]), range(len(measured)))
     return Tables(
         lambda: pl.concat([part.cells for part in parts]), lambda: pl.concat([part.groups for part in parts]), parts
     )
@@ -264,20 +268,33 @@ def tables_in_parts(parts: Sequence[Tables]) -> Tables:
 
 @dataclass(frozen=True)
 class TableInParts:
-    """One table of `Tables` for `show.output_files`: its parts are made one after the other while it is written."""
+    """A table in parts of whole episodes with the same columns, each made whenever it is asked for."""
 
-    tables: Tables
-    of_groups: bool = False
+    parts: Sequence[pl.DataFrame]
 
     def __iter__(self) -> Iterator[pl.DataFrame]:
         """The parts, in order."""
-        for part in self.tables.parts:
-            yield part.groups if self.of_groups else part.cells
+        return iter(self.parts)
+
+    @property
+    def whole(self) -> pl.DataFrame:
+        """The rows of all parts."""
+        return pl.concat(self.parts)
+
+
+def cells_in_parts(level: Tables) -> TableInParts:
+    """The cells of a level."""
+    return TableInParts(MadeWhenAsked(lambda i: level.parts[i].cells, range(len(level.parts))))
+
+
+def groups_in_parts(level: Tables) -> TableInParts:
+    """The groups of a level."""
+    return TableInParts(MadeWhenAsked(lambda i: level.parts[i].groups, range(len(level.parts))))
 
 
 def named_parts(name: str, level: Tables) -> dict[str, TableInParts]:
     """The two tables of a level as `named_tables` has them, to be written in parts."""
-    return {name: TableInParts(level), f"{name}_groups": TableInParts(level, of_groups=True)}
+    return {name: cells_in_parts(level), f"{name}_groups": groups_in_parts(level)}
 
 
 def named_tables(name: str, level: Tables) -> dict[str, pl.DataFrame]:

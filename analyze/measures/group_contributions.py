@@ -25,16 +25,18 @@ from vla_attention.analyze.measures.contribution_ratios import (
 )
 from vla_attention.analyze.measures.frames import (
     Tables,
-    concat_tables,
+    cells_in_parts,
     denoise_axis,
     layer_axis,
     long_table,
     replan_axis,
+    tables_of_each,
 )
+from vla_attention.analyze.measures.not_in_memory import ArraysOnDisk, MadeWhenAsked
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_episode
 from vla_attention.analyze.statistics.intervals import Estimand
-from vla_attention.analyze.stores.parallel import map_episodes
+from vla_attention.analyze.stores.parallel import each_episode, map_episodes
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
@@ -76,20 +78,16 @@ def group_contribution_tables(question: Question, resolved: Sequence[ResolvedGro
         return None
     known = [None] * len(question.selected) if resolved is None else resolved
     take = partial(_segments_of_groups, site=question.site, grouping=question.grouping)
-    chosen = map_episodes(take, [(item, one) for item, one in zip(question.selected, known, strict=True)])
+    chosen = map_episodes(take, list(zip(question.selected, known, strict=True)))
     # A group that cannot be measured in one episode would be a mean over the others only.
     names = [name for name in question.grouping.names if all(name in parts for parts in chosen)]
     if not names:
         return None
     measure = partial(_episode_norms, selection=question.selection, site=question.site, grouping=question.grouping)
     measurable = [{name: parts[name] for name in names} for parts in chosen]
-    measured = map_episodes(measure, list(zip(question.selected, measurable, strict=True)))
-    return concat_tables(
-        [
-            _norm_tables(item, *one, names, question.selection)
-            for item, one in zip(question.selected, measured, strict=True)
-        ]
-    )
+    kept = ArraysOnDisk(each_episode(measure, list(zip(question.selected, measurable, strict=True))))
+    norms = MadeWhenAsked(lambda i: (question.selected[i], kept[i]), range(len(question.selected)))
+    return tables_of_each(norms, lambda one: _norm_tables(*one, names, question.selection))
 
 
 def _segments_of_groups(
@@ -101,12 +99,11 @@ def _segments_of_groups(
 
 def _episode_norms(
     pair: tuple[SelectedEpisode, Mapping[str, NDArray[np.bool_]]], selection: Selection, site: str, grouping: Grouping
-) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64]]:
-    """The measures of both sides, (replan, layer, denoise) each, and norms (replan, layer, denoise, group)."""
+) -> dict[str, NDArray[np.float64]]:
+    """`norm` (replan, layer, denoise, group), and the measures of both sides (replan, layer, denoise)."""
     item, parts = pair
     gram = selected_gram(item, site, selection)
-    norms = np.stack([joint_norm(gram, taken) for taken in parts.values()], axis=-1)
-    sides: dict[str, NDArray[np.float64]] = {}
+    found = {"norm": np.stack([joint_norm(gram, taken) for taken in parts.values()], axis=-1)}
     if grouping.ratio is not None and {*grouping.ratio.numerator, *grouping.ratio.denominator} <= parts.keys():
         uniform = uniform_weights(item, site, selection)
         above, below = (
@@ -114,20 +111,18 @@ def _episode_norms(
             for side in (grouping.ratio.numerator, grouping.ratio.denominator)
             for taken in [np.any([parts[name] for name in side], axis=0)]
         )
-        sides = {"numerator_norm": above[0], "denominator_norm": below[0], **ratio_columns(above, below)}
-    return sides, norms
+        found |= {"numerator_norm": above[0], "denominator_norm": below[0], **ratio_columns(above, below)}
+    return found
 
 
 def _norm_tables(
-    item: SelectedEpisode,
-    sides: Mapping[str, NDArray[np.float64]],
-    norms: NDArray[np.float64],
-    names: Sequence[str],
-    selection: Selection,
+    item: SelectedEpisode, values: Mapping[str, NDArray[np.float64]], names: Sequence[str], selection: Selection
 ) -> Tables:
     axes = [replan_axis(item), layer_axis(selection), denoise_axis(selection)]
+    cells = {name: array for name, array in values.items() if name != "norm"}
     return Tables(
-        long_table(item, axes, sides), lambda: long_table(item, [*axes, {"group": list(names)}], {"norm": norms})
+        lambda: long_table(item, axes, cells),
+        lambda: long_table(item, [*axes, {"group": list(names)}], {"norm": values["norm"]}),
     )
 
 
@@ -138,9 +133,14 @@ def norms_by_layer(tables: Tables) -> dict[tuple[str, str], float]:
     return {(layer, group): norm for layer, group, norm in means.iter_rows()}
 
 
-def ratios_by_layer(cells: pl.DataFrame, estimand: Estimand) -> dict[str, dict[str, Any]]:
+def have_ratio(tables: Tables) -> bool:
+    """Whether the grouping has a ratio whose sides can be measured."""
+    return "contribution_ratio" in tables.parts[0].cells.columns
+
+
+def ratios_by_layer(tables: Tables, estimand: Estimand) -> dict[str, dict[str, Any]]:
     """By layer the rows of `contribution_ratios.contribution_rows`; empty without a ratio."""
-    if "contribution_ratio" not in cells.columns:
+    if not have_ratio(tables):
         return {}
-    rows = contribution_rows(cells, "numerator_norm", "denominator_norm", estimand)
+    rows = contribution_rows(cells_in_parts(tables), "numerator_norm", "denominator_norm", estimand)
     return {row["layer"]: row for row in rows.iter_rows(named=True)}

@@ -16,11 +16,12 @@ from vla_attention.analyze.measures.frames import (
     Axis,
     Tables,
     denoise_axis,
+    episode_id,
     head_axis,
     layer_axis,
     long_table,
     replan_axis,
-    tables_in_parts,
+    tables_of_each,
 )
 from vla_attention.analyze.measures.kept import digest_of_weights, measured_once
 from vla_attention.analyze.measures.masses import (
@@ -31,6 +32,7 @@ from vla_attention.analyze.measures.masses import (
     sides,
     uniform_ratio,
 )
+from vla_attention.analyze.measures.not_in_memory import ArraysOnDisk, MadeWhenAsked
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import (
     SelectedEpisode,
@@ -136,8 +138,10 @@ def measure_episodes(
     resolved: Sequence[ResolvedGrouping] | None = None,
     progress: Callable[[int], object] | None = None,
     per_head: bool | None = None,
-) -> list[MeasuredEpisode]:
+) -> Sequence[MeasuredEpisode]:
     """Masses of every selected episode of a question. Shows progress at a terminal unless `progress` is given.
+
+    They are kept on disk: each episode's are read when they are asked for.
 
     Args:
         question: stores, selection and grouping.
@@ -158,7 +162,7 @@ def _measured_or_kept(
     selection: Selection,
     resolved: Sequence[ResolvedGrouping] | None,
     progress: Callable[[int], object],
-) -> list[MeasuredEpisode]:
+) -> Sequence[MeasuredEpisode]:
     """`measure_episodes`: from the cache what it holds. The grouping is resolved on the other episodes only."""
     grouping, selected = question.grouping, question.selected
     # Whether a group is empty is decided with its sinks.
@@ -174,25 +178,37 @@ def _measured_or_kept(
         each = partial(_measured_arrays, grouping=grouping, selection=selection, site=question.site)
         return each_episode(each, pairs, progress)
 
-    arrays = list(
-        measured_once(
-            "masses",
-            f"masses of grouping {grouping.name}",
-            selected,
-            selection,
-            question.site,
-            measure,
-            {
-                "groups": [[name, list(selectors)] for name, selectors in grouping.groups.items()],
-                "overlap": grouping.overlap,
-            },
-            None if resolved is None else [digest_of_weights(one) for one in resolved],
-            progress,
-        )
+    measured = measured_once(
+        "masses",
+        f"masses of grouping {grouping.name}",
+        selected,
+        selection,
+        question.site,
+        measure,
+        {
+            "groups": [[name, list(selectors)] for name, selectors in grouping.groups.items()],
+            "overlap": grouping.overlap,
+        },
+        None if resolved is None else [digest_of_weights(one) for one in resolved],
+        progress,
     )
+    num_keys: list[NDArray[np.float64]] = []
+
+    def noting_keys() -> Iterator[dict[str, NDArray[Any]]]:
+        for arrays in measured:
+            num_keys.append(arrays["num_keys"].max(axis=0, keepdims=True))
+            yield arrays
+
+    kept = ArraysOnDisk(noting_keys())
     if resolved is None:
-        check_not_empty(grouping, [one["num_keys"] for one in arrays])
-    return [MeasuredEpisode(item, selection, **one) for item, one in zip(selected, arrays, strict=True)]
+        check_not_empty(grouping, num_keys)
+    return MadeWhenAsked(lambda i: MeasuredEpisode(selected[i], selection, **kept[i]), range(len(selected)))
+
+
+def in_order_of_episodes(measured: Sequence[MeasuredEpisode]) -> Sequence[MeasuredEpisode]:
+    """The episodes that have replans, by suite, task and number."""
+    ids = {i: episode_id(one.item) for i, one in enumerate(measured) if len(one.mass)}
+    return MadeWhenAsked(measured.__getitem__, sorted(ids, key=ids.__getitem__))
 
 
 def _measured_arrays(
@@ -214,7 +230,7 @@ def step_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Tabl
         groups: suite, task_id, episode_index, replan, layer, block, denoise_step, head, group, mass, fraction, keys,
             density, lift (see `masses.group_measures`).
     """
-    return tables_in_parts([_episode_steps(episode, grouping) for episode in measured])
+    return tables_of_each(measured, partial(_episode_steps, grouping=grouping))
 
 
 def _episode_steps(measured: MeasuredEpisode, grouping: Grouping) -> Tables:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.frames import EPISODE_KEYS, LAYERS_AVG, Tables
 from vla_attention.analyze.measures.masses import sides
@@ -26,14 +29,19 @@ _COUNTS = ("total_mass", *_KEYS)
 
 
 def episode_documents(
-    replans: Tables, grouping: Grouping, denoise_steps: Sequence[int], proxy: FrameProxy | None = None
-) -> Iterator[dict[str, Any]]:
-    """Episodes of one or more suites from `aggregate.replan_tables`, in their order, as JSON documents.
+    replans: Tables,
+    grouping: Grouping,
+    denoise_steps: Sequence[int],
+    proxy: FrameProxy | None = None,
+    num_keys: Iterable[NDArray[np.float64]] | None = None,
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Episodes of one or more suites from `aggregate.replan_tables`, in their order: suite and JSON document.
 
     visual is the sum of the ratio's numerator groups, linguistic that of its denominator groups; the fraction of either
     is its mass / sum of all groups' masses. `denoise_steps` are those that the masses are means over. With a `proxy`
     the numbers are those of the published Cosmos scripts instead: masses are sums over the queries (ours are means),
-    and fractions are of visual + linguistic only.
+    and fractions are of visual + linguistic only. `num_keys` (..., group) are the groups' numbers of keys in all
+    episodes, taken from the tables unless they are given.
 
     The documents follow `vla_attention.schemas.results.EpisodeResult`. They are plain dictionaries, because a suite has
     a hundred thousand steps.
@@ -46,11 +54,12 @@ def episode_documents(
     sides = [*_SIDES, _ACTION] if _ACTION in grouping.names and proxy is None else list(_SIDES)
     kinds = [f"{side}_{kind}" for side in sides for kind in ("mass", "fraction")]
     columns = ("layer", "replan", "step", _RATIO, *kinds, *_COUNTS)
-    # A few episodes at a time: tables of groups, and the documents, are several times as large as the cells.
-    tables = [_with_sides(part, grouping, proxy).select(*EPISODE_KEYS, *columns) for part in replans.parts]
     # Numbers of keys are whole numbers in all episodes or in none.
-    whole = [name for name in _KEYS if all((table[name] == table[name].floor()).all() for table in tables)]
+    counts = (part.values("keys") for part in replans.parts) if num_keys is None else num_keys
+    whole = _whole(counts, grouping)
     extra = {} if proxy is None else proxy.fields()
+    # A few episodes at a time: tables of groups, and the documents, are several times as large as the cells.
+    tables = (_with_sides(part, grouping, proxy).select(*EPISODE_KEYS, *columns) for part in replans.parts)
     counted = (table.with_columns(pl.col(whole).cast(pl.Int64)) for table in tables)
     of_episodes = (table.partition_by("suite", "task_id", "episode_index", maintain_order=True) for table in counted)
     for part in itertools.chain.from_iterable(of_episodes):
@@ -59,33 +68,43 @@ def episode_documents(
         in_time = part.sort("replan", maintain_order=True).drop(*EPISODE_KEYS, "replan")
         layers = in_time.partition_by("layer", as_dict=True, maintain_order=True, include_key=False)
         steps = {str(layer): rows for (layer,), rows in layers.items()}
-        yield {
-            "task_id": identity["task_id"],
-            "episode_idx": identity["episode_index"],
-            "task_description": identity["instruction"],
-            "success": identity["success"],
-            # The first replan comes after the last waiting step.
-            "num_steps": loop_counter(int(part["step"].to_numpy().min()), identity["num_steps"], identity["success"]),
-            "num_steps_definition": "loop_counter",
-            "grouping": grouping.name,
-            "grouping_description": grouping.description,
-            "denoise_steps": list(denoise_steps),
-            "summary": {_field_of_layer(layer): _summary_document(summaries[layer], kinds) for layer in steps},
-            "per_step_ratios": {
-                _field_of_layer(layer): [step | extra for step in rows.to_dicts()] if extra else rows.to_dicts()
-                for layer, rows in steps.items()
+        yield (
+            identity["suite"],
+            {
+                "task_id": identity["task_id"],
+                "episode_idx": identity["episode_index"],
+                "task_description": identity["instruction"],
+                "success": identity["success"],
+                # The first replan comes after the last waiting step.
+                "num_steps": loop_counter(
+                    int(part["step"].to_numpy().min()), identity["num_steps"], identity["success"]
+                ),
+                "num_steps_definition": "loop_counter",
+                "grouping": grouping.name,
+                "grouping_description": grouping.description,
+                "denoise_steps": list(denoise_steps),
+                "summary": {_field_of_layer(layer): _summary_document(summaries[layer], kinds) for layer in steps},
+                "per_step_ratios": {
+                    _field_of_layer(layer): [step | extra for step in rows.to_dicts()] if extra else rows.to_dicts()
+                    for layer, rows in steps.items()
+                },
             },
-        }
+        )
 
 
-def write_results(path: Path, episodes: Iterable[dict[str, Any]]) -> None:
-    """Write a results file atomically, as strict JSON with one episode per line."""
+def _whole(num_keys: Iterable[NDArray[np.float64]], grouping: Grouping) -> list[str]:
+    """Of which sides all numbers of keys are whole."""
+    of_sides = zip(_KEYS, zip(*(sides(keys, grouping) for keys in num_keys), strict=True), strict=True)
+    return [name for name, arrays in of_sides if all((array == np.floor(array)).all() for array in arrays)]
+
+
+@contextmanager
+def results_file(path: Path) -> Iterator[Callable[[dict[str, Any]], object]]:
+    """Yield a function that adds an episode to a results file: strict JSON, an episode a line, written atomically."""
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
-        separator = "[\n"
-        for episode in episodes:
-            file.write(separator + json.dumps(episode, allow_nan=False, ensure_ascii=False))
-            separator = ",\n"
-        file.write("\n]\n" if separator == ",\n" else "[]\n")
+        separators = itertools.chain(["[\n"], itertools.repeat(",\n"))
+        yield lambda episode: file.write(next(separators) + json.dumps(episode, allow_nan=False, ensure_ascii=False))
+        file.write("\n]\n" if next(separators) == ",\n" else "[]\n")
 
 
 def write_results_of_suites(
@@ -94,16 +113,19 @@ def write_results_of_suites(
     grouping: Grouping,
     denoise_steps: Sequence[int],
     proxy: FrameProxy | None = None,
+    num_keys: Iterable[NDArray[np.float64]] | None = None,
 ) -> list[Path]:
-    """Write `attention_ratio_results_<suite>.json` for every suite of the tables and return the paths."""
-    paths = []
-    suites = replans.cells["suite"].unique(maintain_order=True)
-    for suite in suites:
-        path = folder / results_file_name(suite)
-        of_suite = replans if len(suites) == 1 else replans.filter(pl.col("suite") == suite)
-        write_results(path, episode_documents(of_suite, grouping, denoise_steps, proxy))
-        paths.append(path)
-    return paths
+    """Write `attention_ratio_results_<suite>.json` for every suite of the tables and return the paths.
+
+    The arguments are those of `episode_documents`; `folder` is where the files go.
+    """
+    files: dict[str, Callable[[dict[str, Any]], object]] = {}
+    with ExitStack() as opened:
+        for suite, document in episode_documents(replans, grouping, denoise_steps, proxy, num_keys):
+            if suite not in files:
+                files[suite] = opened.enter_context(results_file(folder / results_file_name(suite)))
+            files[suite](document)
+    return [folder / results_file_name(suite) for suite in files]
 
 
 def _with_sides(replans: Tables, grouping: Grouping, proxy: FrameProxy | None) -> pl.DataFrame:

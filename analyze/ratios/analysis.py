@@ -19,8 +19,16 @@ from vla_attention.analyze.measures.aggregate import (
 )
 from vla_attention.analyze.measures.contribution_ratios import contribution_rows
 from vla_attention.analyze.measures.contributions import contribution_table
-from vla_attention.analyze.measures.frames import TableInParts, Tables, layer_name, named_parts, named_tables
-from vla_attention.analyze.measures.group_contributions import group_contribution_tables
+from vla_attention.analyze.measures.frames import (
+    TableInParts,
+    Tables,
+    cells_in_parts,
+    groups_in_parts,
+    layer_name,
+    named_parts,
+    named_tables,
+)
+from vla_attention.analyze.measures.group_contributions import group_contribution_tables, have_ratio
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.analyze.measures.sinks import SinkRule, search_sinks
@@ -114,7 +122,7 @@ class Analysis:
         return step_tables(self.measured, self.grouping)
 
     @cached_property
-    def contributions(self) -> pl.DataFrame | None:
+    def contributions(self) -> TableInParts | None:
         """See `measures.contributions.contribution_table`; None when they were not recorded."""
         return contribution_table(self.question.selected, self.question.selection, self.question.settings.layers)
 
@@ -188,8 +196,9 @@ class Analysis:
         parts = [summary_text(_described(self), self.grouping, self.episodes, self.tasks)]
         if all(store.attributes.recording.contributions for store in question.stores):
             tables, estimand = self.group_contributions, question.settings.intervals
-            if self.contributions is not None and not same_sides(self.contributions, tables):
-                parts.append(contributions_section(self.contributions, estimand))
+            rows = self.contribution_rows
+            if self.contributions is not None and rows is not None and not same_sides(self.contributions, tables):
+                parts.append(contributions_section(rows))
             first = len(parts) == 1
             parts.append(group_contributions_section(tables, self.grouping, question.site, estimand, first))
         return "\n".join(parts)
@@ -242,20 +251,21 @@ def write_tables(analysis: Analysis, folder: Path) -> list[Path]:
     written += write_parquet(folder, about, **named_parts("steps", analysis.steps))
     for name in ("episodes", "tasks"):
         written += write_parquet(folder, about, **named_tables(name, getattr(analysis, name)))
-    recorded: dict[str, pl.DataFrame | TableInParts] = {}
+    recorded: dict[str, TableInParts] = {}
     if analysis.contributions is not None:
         recorded["contributions"] = analysis.contributions
     if analysis.group_contributions is not None:
-        recorded["group_contributions"] = TableInParts(analysis.group_contributions, of_groups=True)
-        if "contribution_ratio" in analysis.group_contributions.cells.columns:
-            recorded["group_contribution_ratios"] = analysis.group_contributions.cells
+        recorded["group_contributions"] = groups_in_parts(analysis.group_contributions)
+        if have_ratio(analysis.group_contributions):
+            recorded["group_contribution_ratios"] = cells_in_parts(analysis.group_contributions)
     written += write_parquet(folder, about, **recorded)
     with writing("results", folder):
         if grouping.ratio is not None and not analysis.without_known_end:
             question = analysis.question
             proxy = frame_proxy(question.stores[0].attributes, question.selected[0].tokens.layout, grouping)
             steps = question.selection.denoise_steps
-            written += write_results_of_suites(folder, analysis.replans, grouping, steps, proxy)
+            num_keys = (one.num_keys for one in analysis.measured)
+            written += write_results_of_suites(folder, analysis.replans, grouping, steps, proxy, num_keys)
         write_text(folder / "summary.txt", analysis.summary)
     written.append(folder / "summary.txt")
     if analysis.sinks is not None:

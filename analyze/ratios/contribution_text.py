@@ -7,9 +7,8 @@ from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.measures.contribution_ratios import contribution_rows
-from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables
-from vla_attention.analyze.measures.group_contributions import norms_by_layer, ratios_by_layer
+from vla_attention.analyze.measures.frames import LAYERS_AVG, TableInParts, Tables, cells_in_parts
+from vla_attention.analyze.measures.group_contributions import have_ratio, norms_by_layer, ratios_by_layer
 from vla_attention.analyze.show.headings import WIDTH, heading, wrap
 from vla_attention.analyze.show.numbers import format_number, interval_name, row_interval
 from vla_attention.analyze.show.text_table import text_table
@@ -29,18 +28,19 @@ _HOW = (
 )
 
 
-def same_sides(contributions: pl.DataFrame, tables: Tables | None) -> bool:
+def same_sides(contributions: TableInParts, tables: Tables | None) -> bool:
     """Whether the ratio of a grouping's groups is that of `contribution_table` at every replan, layer and step."""
-    if tables is None or "contribution_ratio" not in tables.cells.columns:
+    if tables is None or not have_ratio(tables):
         return False
-    return tables.cells["contribution_ratio"].equals(contributions["contribution_ratio"])
+    ratio = "contribution_ratio"
+    return all(a[ratio].equals(b[ratio]) for a, b in zip(cells_in_parts(tables), contributions, strict=True))
 
 
-def contributions_section(table: pl.DataFrame, estimand: Estimand) -> str:
+def contributions_section(contributions: pl.DataFrame) -> str:
     """The summary's section: `contribution_rows` of both sides as text."""
     rows = [
         [row["layer"], format_number(row["visual_norm"]), format_number(row["linguistic_norm"]), *_ratio_cells(row)]
-        for row in contribution_rows(table, "visual_norm", "linguistic_norm", estimand).iter_rows(named=True)
+        for row in contributions.iter_rows(named=True)
     ]
     title = "CONTRIBUTIONS  |visual| / |linguistic|, norms of what the keys add to the residual stream"
     note = f"{_HOW} Norms of different sites may be divided; masses may not. {_RATIO_NOTE}"
@@ -75,9 +75,9 @@ def group_contributions_section(
     if first:
         note = f"{_HOW} {note}".strip()
     norms = norms_by_layer(tables)
-    ratios = ratios_by_layer(tables.cells, estimand)
+    ratios = ratios_by_layer(tables, estimand)
     layers, of_norms, of_ratios = [], [], []
-    for layer in (*tables.cells["layer"].unique(maintain_order=True).cast(pl.String), LAYERS_AVG):
+    for layer in (*tables.parts[0].cells["layer"].unique(maintain_order=True).cast(pl.String), LAYERS_AVG):
         layers.append(layer)
         of_norms.append([format_number(norms[layer, name]) for name in shown])
         of_ratios.append(_ratio_cells(ratios[layer]) if layer in ratios else [])

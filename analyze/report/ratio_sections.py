@@ -10,7 +10,6 @@ import polars as pl
 from vla_attention.analyze.heads.layer_time import layer_time_table
 from vla_attention.analyze.heads.plot_layer_time import plot_layer_time
 from vla_attention.analyze.measures.aggregate import layer_order, overall_rows
-from vla_attention.analyze.measures.contribution_ratios import contribution_rows
 from vla_attention.analyze.measures.frames import layer_name
 from vla_attention.analyze.ratios.analysis import Analysis
 from vla_attention.analyze.ratios.plot_attention_fractions import plot_attention_fractions
@@ -170,7 +169,7 @@ def _layer_tables(analysis: Analysis) -> list[Table]:
 
 def contribution_section(analysis: Analysis) -> Section | None:
     """What the image keys and the text keys add to the residual stream; None when it was not recorded."""
-    if analysis.contributions is None:
+    if analysis.contribution_rows is None:
         return None
     note = (
         "A mass is how much attention keys get; a norm is the length of the vector that they add to the residual "
@@ -189,9 +188,7 @@ def contribution_section(analysis: Analysis) -> Section | None:
             interval_cell(row["ratio_lift_low"], row["ratio_lift_high"]),
             *(number_cell(row[name]) for name in ("ratio_of_means", "ratio_mean")),
         ]
-        for row in contribution_rows(
-            analysis.contributions, "visual_norm", "linguistic_norm", analysis.question.settings.intervals
-        ).iter_rows(named=True)
+        for row in analysis.contribution_rows.iter_rows(named=True)
     ]
     caption = (
         "Norms of contributions. Ratio, uniform, lift: geometric means. Uniform: the ratio that the same values would "

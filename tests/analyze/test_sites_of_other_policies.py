@@ -99,7 +99,7 @@ def test_masses_of_a_site_are_those_of_its_own_rows(stores):
 
 def test_contributions_of_sites_in_different_blocks(stores):
     question = question_about(stores["split"])
-    table = contribution_table(question.selected, question.selection)
+    table = contribution_table(question.selected, question.selection).whole
     assert table["block"].unique().sort().to_list() == [0, 1, 2, 3]
     assert table["contribution_ratio"].is_null().all()
     of_image = table.filter(pl.col("block").is_in([1, 3]))

@@ -37,8 +37,9 @@ def test_both_sides_and_their_ratio_equal_a_direct_computation(tmp_path):
     store = open_store(write_store(tmp_path / "a.zarr", spec=SPEC))
     assert verify_store(store) == []
     selected = load_tokens([(store, episode) for episode in store.episodes], "joint")
-    table = contribution_table(selected, select(store.attributes, layers=[2]))
-    assert table is not None
+    parts = contribution_table(selected, select(store.attributes, layers=[2]))
+    assert parts is not None
+    table = parts.whole
     assert table.height == 4 * SPEC.replans * len(SPEC.denoise_steps)
     for row in table.iter_rows(named=True):
         seed = [SPEC.seed, row["task_id"], row["episode_index"]]
@@ -74,20 +75,22 @@ def uniform_over_valid(task, episode, tokens, rows):
 def test_uniform_attention_has_a_lift_of_one_whatever_the_values_are(tmp_path):
     spec = replace(SPEC, plant_rows=uniform_over_valid)
     store = open_store(write_store(tmp_path / "a.zarr", spec=spec))
-    table = contribution_table(
+    parts = contribution_table(
         load_tokens([(store, episode) for episode in store.episodes], "joint"), select(store.attributes)
     )
-    assert table is not None
+    assert parts is not None
+    table = parts.whole
     assert table["contribution_ratio"].std() > 0.1
     np.testing.assert_allclose(table["ratio_lift"], 1.0, rtol=1e-3)
 
 
 def test_the_baseline_needs_all_heads(tmp_path):
     store = open_store(write_store(tmp_path / "a.zarr", spec=replace(SPEC, heads=(1,))))
-    table = contribution_table(
+    parts = contribution_table(
         load_tokens([(store, episode) for episode in store.episodes], "joint"), select(store.attributes)
     )
-    assert table is not None
+    assert parts is not None
+    table = parts.whole
     assert table["contribution_ratio"].is_not_null().all()
     assert table["uniform_ratio"].is_null().all()
 
@@ -95,9 +98,10 @@ def test_the_baseline_needs_all_heads(tmp_path):
 def test_rows_over_episodes_have_the_three_means_and_what_each_is_of(tmp_path):
     store = open_store(write_store(tmp_path / "a.zarr", spec=SPEC))
     selected = load_tokens([(store, episode) for episode in store.episodes], "joint")
-    table = contribution_table(selected, select(store.attributes))
-    assert table is not None
-    rows = contribution_rows(table, "visual_norm", "linguistic_norm", Estimand.TASKS_LIKE_THESE)
+    parts = contribution_table(selected, select(store.attributes))
+    assert parts is not None
+    table = parts.whole
+    rows = contribution_rows(parts, "visual_norm", "linguistic_norm", Estimand.TASKS_LIKE_THESE)
     assert rows["layer"].to_list() == ["0", "2", "layers_avg"]
     wanted = (pl.col("layer") == 0, pl.col("layer") == 2, pl.lit(True))
     for layer, row in zip(wanted, rows.iter_rows(named=True), strict=True):

@@ -14,6 +14,7 @@ from tests.kit.made_up_steps import default_grouping, make_steps, measured_of
 from vla_attention.analyze.measures import episodes
 from vla_attention.analyze.measures.aggregate import replan_tables
 from vla_attention.analyze.measures.episodes import _Parts, episode_tables, episode_tables_of
+from vla_attention.analyze.measures.frames import episode_id
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.testing.stores import write_store
 
@@ -46,7 +47,7 @@ def test_masses_give_what_the_table_of_replans_gives(missing, at_once, with_rati
                 getattr(episode_tables_of(given, grouping), part), getattr(table, part), rel_tol=1e-12, abs_tol=0
             )
     for one, alone in zip(cut, (episode_tables_of([one], grouping) for one in cut), strict=True):
-        key = dict(zip(("suite", "task_id", "episode_index"), episodes.episode_id(one.item), strict=True))
+        key = dict(zip(("suite", "task_id", "episode_index"), episode_id(one.item), strict=True))
         together = episode_tables_of(cut, grouping)
         assert_frame_equal(together.cells.filter(**key), alone.cells, rel_tol=1e-12, abs_tol=0)
         assert_frame_equal(together.groups.filter(**key), alone.groups, rel_tol=1e-12, abs_tol=0)

@@ -10,7 +10,7 @@ from tests.kit import made_up_steps
 from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, flat, make_steps
 from vla_attention.analyze.published.results_writer import (
     episode_documents,
-    write_results,
+    results_file,
     write_results_of_suites,
 )
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
@@ -31,8 +31,18 @@ def replans_of(steps, grouping=GROUPING):
     return made_up_steps.replans_of(steps, grouping)
 
 
+def documents_of(replans, grouping) -> list[dict]:
+    return [document for _, document in episode_documents(replans, grouping, DENOISE_STEPS)]
+
+
+def write(path, documents) -> None:
+    with results_file(path) as add:
+        for document in documents:
+            add(document)
+
+
 def episode_results(replans, grouping):
-    return from_json(list[EpisodeResult], list(episode_documents(replans, grouping, DENOISE_STEPS)))
+    return from_json(list[EpisodeResult], documents_of(replans, grouping))
 
 
 def read_results(path):
@@ -140,7 +150,7 @@ def test_reading_gives_back_what_was_written(tmp_path, with_action):
     replans = replans_of(make_steps(grouping, keys, no_denominator=0.3), grouping)
     results = episode_results(replans, grouping)
     path = tmp_path / "results" / results_file_name("libero_10")
-    write_results(path, episode_documents(replans, grouping, DENOISE_STEPS))
+    write(path, documents_of(replans, grouping))
     assert read_results(path) == results
     assert ("action_mass" in path.read_text(encoding="utf-8")) == with_action
     assert [file.name for file in path.parent.iterdir()] == [path.name]  # nothing temporary stays
@@ -188,14 +198,14 @@ def test_every_suite_has_its_own_file(tmp_path):
 
 
 def test_no_episodes_are_an_empty_list(tmp_path):
-    write_results(tmp_path / "results.json", [])
+    write(tmp_path / "results.json", [])
     assert read_results(tmp_path / "results.json") == []
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "results.json"
-    documents = list(episode_documents(replans_of(make_steps()), GROUPING, DENOISE_STEPS))
-    write_results(path, documents)
+    documents = documents_of(replans_of(make_steps()), GROUPING)
+    write(path, documents)
     results = read_results(path)
 
     def broken():
@@ -203,7 +213,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_results(path, broken())
+        write(path, broken())
     assert read_results(path) == results
     assert list(tmp_path.iterdir()) == [path]
 

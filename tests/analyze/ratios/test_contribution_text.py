@@ -41,8 +41,8 @@ def tables_of(question: Question) -> Tables | None:
 
 def test_the_summary_has_a_line_per_layer_and_an_interval(store):
     analysis = analyse(question_about(store, "objects"))  # cut segments, and have no norms
-    assert analysis.contributions is not None
-    section = contributions_section(analysis.contributions, estimand=Estimand.TASKS_LIKE_THESE)
+    assert analysis.contribution_rows is not None
+    section = contributions_section(analysis.contribution_rows)
     assert section in analysis.summary
     assert analysis.summary.count("CONTRIBUTIONS") == 1
     lines = [line.split() for line in section.splitlines()]
