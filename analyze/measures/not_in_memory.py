@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Generic, TypeVar, overload
 
@@ -58,7 +59,8 @@ class ArraysOnDisk:
             BadArgument: there is no room for them.
         """
         self._ends = [0]
-        self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  closed when this object goes
+        self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115
+        weakref.finalize(self, self._file.close)
         for arrays in episodes:
             self._append(arrays_to_bytes(arrays))
 
