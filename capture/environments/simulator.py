@@ -131,8 +131,11 @@ class SimulatedEnvironment:
 
     def _construct(self, environment_class: Any, *arguments: Any, **options: Any) -> Any:
         """Create an instance of a robosuite environment class whose cameras obey the gate."""
+        from vla_attention.capture.environments.drawing_context import KeptContext
+
         simulator = environment_class.__new__(environment_class)
         self._gate.attach(simulator)
+        self._kept_context = KeptContext(simulator)
         simulator.__init__(*arguments, **options)
         return simulator
 
@@ -180,7 +183,7 @@ class SimulatedEnvironment:
         return 0
 
     def _reset_once(self, can_draw: bool = True) -> None:
-        """Reset the simulator. Without `can_draw`, it gets no drawing context, whose making takes most of the time."""
+        """Reset the simulator. Without `can_draw`, it gets no drawing context, which may take half of the time."""
         from robosuite.utils.errors import RandomizationError
 
         self._simulator.has_offscreen_renderer = can_draw
@@ -279,6 +282,7 @@ class SimulatedEnvironment:
         atexit.unregister(self.close)
         self._make_context_current()
         self._simulator.close()
+        self._kept_context.free()
         self._moment = None
 
     def _robot_bodies(self) -> list[str]:
