@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -52,6 +53,11 @@ from vla_attention.schemas.threads import available_cores
 MOST_RESTARTS = 2
 #: Seconds between two looks whether SIGTERM came, while no simulator answers.
 _LOOK_EVERY_S = 0.5
+#: A simulator that gives no answer is ended after so many times the slowest answer of this run so far, but not before
+#: so many seconds: after actions, and while it begins an episode, for which it may read a scene from a slow disk.
+NO_ANSWER_TIMES = 10
+NO_ANSWER_S = 120.0
+NO_BEGINNING_S = 1200.0
 
 
 #: The largest number of simulators that is taken without being asked for: one policy keeps few more busy.
@@ -124,6 +130,13 @@ class Simulator:
     begun_times: int = 1
     recording: EpisodeRecording | None = None
     writer: EpisodeInBackground | None = None
+    #: When it was asked for the answer that it owes, or gave the last part of it; None if it owes none.
+    asked_at: float | None = None
+
+    @property
+    def begins(self) -> bool:
+        """Whether it is at the beginning of the episode, which ends with the first picture."""
+        return self.recording is None or not self.recording.num_replans
 
     @property
     def name(self) -> str:
@@ -159,6 +172,8 @@ class PipelinedLoop(EpisodeLoop):
     #: What simulators of each task know of its resets, for the others.
     _resets: dict[int, Sequence[object]] = field(default_factory=dict, init=False)
     _told_of_resets: set[int] = field(default_factory=set, init=False)
+    #: Seconds of the slowest answer so far, at beginnings (True) and after actions (False).
+    _slowest: dict[bool, float] = field(default_factory=lambda: {True: 0.0, False: 0.0}, init=False)
 
     @contextmanager
     def simulators(self) -> Iterator[None]:
@@ -197,7 +212,11 @@ class PipelinedLoop(EpisodeLoop):
         """Give an episode to every simulator without one; takes from `left`, adds to `elsewhere`."""
         while left and len(self._running) < self.num_envs:
             process, task_id = self._idle.pop() if self._idle else (None, None)
-            task, episode = left.pop(self._choose(left, task_id))
+            place = self._choose(left, task_id)
+            if process is not None and self._would_repeat_resets(task_id, *left[place]):
+                self._idle.append((process, task_id))
+                return
+            task, episode = left.pop(place)
             claimed = self.claim(task, episode)
             if claimed is True:
                 process = process or self._start_simulator()
@@ -230,8 +249,15 @@ class PipelinedLoop(EpisodeLoop):
 
         return min(range(len(left)), key=preference)
 
+    def _would_repeat_resets(self, task_id: int | None, task: Task, episode: int) -> bool:
+        """Tell whether a simulator with a scene of the task would make a reset that another one is making now."""
+        known = self._resets.get(task.task_id)
+        resetting = any(other.task.task_id == task.task_id and other.recording is None for other in self._running)
+        return task_id == task.task_id and bool(known) and len(known or ()) <= episode and resetting
+
     def _begin(self, simulator: Simulator) -> None:
         self.positions[simulator.name] = 0
+        simulator.asked_at = time.monotonic()
         title = episode_title(self.run.store, simulator.task, simulator.episode_index)
         task_id = simulator.task.task_id
         simulator.process.begin(BeginEpisode(task_id, simulator.episode_index, title, self._resets.get(task_id)))
@@ -240,7 +266,9 @@ class PipelinedLoop(EpisodeLoop):
         """Take what the simulators have answered; waits for an answer unless the policy has something to do."""
         by_connection = {simulator.process.connection: simulator for simulator in self._running}
         timeout = 0.0 if self._ready else _LOOK_EVERY_S
-        for connection in wait([*by_connection, self._woken], timeout):
+        answered = wait([*by_connection, self._woken], timeout)
+        self._end_what_hangs([by_connection[each] for each in by_connection if each not in answered])
+        for connection in answered:
             if connection is self._woken:
                 self._woken.recv_bytes()
                 continue
@@ -248,9 +276,26 @@ class PipelinedLoop(EpisodeLoop):
             try:
                 answer = simulator.process.connection.recv()
             except (EOFError, OSError):  # OSError: it ended inside of an answer
-                self._begin_again(simulator)
+                self._begin_again(simulator, simulator.process.how_it_ended())
             else:
+                self._note_answer(simulator)
                 self._take(simulator, answer)
+
+    def _note_answer(self, simulator: Simulator) -> None:
+        now = time.monotonic()
+        if simulator.asked_at is not None:
+            seconds = now - simulator.asked_at
+            self._slowest[simulator.begins] = max(seconds, self._slowest[simulator.begins])
+            simulator.asked_at = now  # `_advanced` takes it back: nothing more is to come
+
+    def _end_what_hangs(self, silent: Sequence[Simulator]) -> None:
+        """End simulators of `silent` that have owed an answer for too long, and begin their episodes again."""
+        now = time.monotonic()
+        for simulator in silent:
+            least = NO_BEGINNING_S if simulator.begins else NO_ANSWER_S
+            limit = max(least, NO_ANSWER_TIMES * self._slowest[simulator.begins])
+            if simulator.asked_at is not None and now - simulator.asked_at > limit:
+                self._begin_again(simulator, f"killed after {now - simulator.asked_at:.0f} s without an answer")
 
     def _take(self, simulator: Simulator, answer: object) -> None:
         match answer:
@@ -281,6 +326,7 @@ class PipelinedLoop(EpisodeLoop):
                 )
 
     def _advanced(self, simulator: Simulator, result: Advanced) -> None:
+        simulator.asked_at = None
         recording, writer = simulator.in_episode
         recording.advanced(result)
         if recording.num_replans:
@@ -304,14 +350,14 @@ class PipelinedLoop(EpisodeLoop):
         prepared = [simulator.in_episode[0].prepare(seen) for simulator, seen in batch]
         calls = record_calls(self.run.policy, prepared, self.run.store.attributes.recording)
         for (simulator, _), call in zip(batch, calls, strict=True):
+            simulator.asked_at = time.monotonic()
             simulator.process.execute(Execute(*simulator.in_episode[0].next_actions(call)))
         for (simulator, _), before, call in zip(batch, prepared, calls, strict=True):
             recording, writer = simulator.in_episode
             recording.keep(before, call, writer)
 
-    def _begin_again(self, simulator: Simulator) -> None:
-        """Begin the episode of a simulator that has died in a new one."""
-        how = simulator.process.how_it_ended()
+    def _begin_again(self, simulator: Simulator, how: str) -> None:
+        """Begin the episode of a simulator that has died or hangs in a new one; how: in what way, for messages."""
         simulator.process.close()
         self._ready = deque(entry for entry in self._ready if entry[0] is not simulator)
         if simulator.writer is not None:

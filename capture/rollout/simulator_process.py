@@ -7,6 +7,7 @@ OpenGL context does not survive a fork. Every process draws with a context and o
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import subprocess
 import sys
@@ -28,6 +29,8 @@ from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.store_format import Protocol
 from vla_attention.schemas.threads import OTHER_LIBRARIES
 
+#: How far simulators stand back where there are more processes than cores: all of them wait for the policy's process.
+_NICENESS = 5
 #: Seconds that a process gets to end by itself.
 _END_WITHIN_S = 2.0
 #: The paths of modules are those of the first process, which may have got some while it ran.
@@ -136,10 +139,11 @@ class SimulatorProcess:
         return f"killed by signal {-code}" if code < 0 else f"exit code {code}"
 
     def close(self) -> None:
-        """End the process."""
+        """End the process. One that the operating system cannot end yet, on a disk that hangs, is not waited for."""
         self.connection.close()
         self._process.kill()
-        self._process.wait()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_END_WITHIN_S)
 
 
 def _has_descriptor(stream: Any) -> bool:
@@ -186,16 +190,20 @@ class _Server:
     def _environment_of(self, task_id: int) -> Environment:
         if self.environment is None or self.task_id != task_id:
             if self.environment is not None:
+                gc.unfreeze()
                 self.environment.close()
                 self.environment = None
             self.environment = make_environment(self.setup.suite, task_id, self.setup.settings)
             self.task_id = task_id
+            # Every reset of robosuite collects garbage; what lives as long as the scene need not be looked at again.
+            gc.freeze()
         return self.environment
 
 
 def main(descriptor: int) -> None:
     """Simulate for the process at the other end of a connection, until that end closes."""
     connection = Connection(descriptor)
+    os.nice(_NICENESS)
     try:
         server = _Server(connection, connection.recv())
         try:
