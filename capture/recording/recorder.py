@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vla_attention.capture.recording.attention import PieceSink, RowCollector, RowSink, UpdateSink
-from vla_attention.capture.recording.call_contributions import CallContributions, Cell, KeyFacts
+from vla_attention.capture.recording.call_contributions import CallContributions, Cell
 from vla_attention.capture.recording.contributions import Projection
+from vla_attention.capture.recording.shared_contributions import KeyFacts
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import SiteLayout
@@ -179,22 +180,21 @@ class AttentionRecorder(RowCollector):
     def _take(self, cell: Cell, rows: Tensor, action_queries: slice) -> None:
         if rows.shape != self._shape:
             self._check_shape(rows)
-        of_actions = _of_queries(rows, 2, action_queries)
+        chosen = _of_queries(rows, 2, action_queries)
         if self.parts is not None:
-            self._awaited = of_actions
-        chosen = of_actions[0]
+            self._awaited = chosen
         if self._buffer is None:
             self._buffer = self._allocate(chosen)
-            self._slots = self._buffer.unbind()
+            self._slots = torch.split(self._buffer, 1)
         slot = self._slots[self._cells[cell]]
         self._rows_seen[cell] += 1
         if self._heads is not None:
-            chosen = chosen.index_select(0, self._heads)
+            chosen = chosen.index_select(1, self._heads)
         if self.plan.queries == "mean":
             if slot.device == chosen.device:
-                torch.sum(chosen, dim=1, keepdim=True, out=slot)  # `on_device` divides all at once
+                torch.sum(chosen, dim=2, keepdim=True, out=slot)  # `on_device` divides all at once
             else:
-                slot.copy_(chosen.sum(dim=1, keepdim=True))
+                slot.copy_(chosen.sum(dim=2, keepdim=True))
         elif self._pools is not None:
             slot.copy_(torch.matmul(self._pools, chosen))
         else:
@@ -223,9 +223,9 @@ class AttentionRecorder(RowCollector):
     def _allocate(self, of_actions: Tensor) -> Tensor:
         """Return the buffer (cell, head, query, key).
 
-        of_actions: (head, action query, key), the first rows that were taken.
+        of_actions: (1, head, action query, key), the first rows that were taken.
         """
-        heads, queries, _ = of_actions.shape
+        _, heads, queries, _ = of_actions.shape
         self._num_queries = queries
         device = of_actions.device
         if self._prepared_for != device:
