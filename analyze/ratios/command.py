@@ -33,6 +33,10 @@ _EXAMPLES = """examples:
 """
 
 
+#: What the process that draws imports while this one scans.
+_DRAWING = ("vla_attention.analyze.ratios.default_plots", "matplotlib.figure", "matplotlib.backends.backend_agg")
+
+
 def build_parser(prog: str = "vla-analyze") -> argparse.ArgumentParser:
     """The parser of `vla-analyze STORE ...` and `vla-analyze ratios STORE ...`."""
     parser = command_parser(
@@ -68,6 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     from vla_attention.analyze.measures.sinks import SinkRule
     from vla_attention.analyze.ratios.analysis import analyse, write_tables
     from vla_attention.analyze.ratios.screen_text import screen_text
+    from vla_attention.analyze.stores.second_process import SecondProcess
     from vla_attention.schemas.errors import BadArgument
 
     stores = stores_of(arguments)
@@ -79,12 +84,18 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.without_sinks and sink_rule(arguments) != SinkRule():
         raise BadArgument("--sink-factor and its like define a sink for --without-sinks; give --without-sinks too.")
     rule = sink_rule(arguments) if arguments.without_sinks else None
-    analysis = analyse(ask(stores, settings_of(arguments)), without_sinks=rule)
-    folder = output_folder(arguments, analysis.grouping.name)
-    written = write_tables(analysis, folder)
-    if not arguments.no_plots:
-        from vla_attention.analyze.ratios.default_plots import write_plots
+    question = ask(stores, settings_of(arguments))
+    with SecondProcess(() if arguments.no_plots else _DRAWING) as second:
+        analysis = analyse(question, without_sinks=rule)
+        folder = output_folder(arguments, analysis.grouping.name)
+        if arguments.no_plots:
+            written = write_tables(analysis, folder)
+        else:
+            from vla_attention.analyze.ratios.default_plots import PlottedTables, write_plots, write_plots_of_episodes
 
-        written += write_plots(analysis, folder, arguments.save_viz)
+            pictures = second.begin(write_plots, PlottedTables.of(analysis), folder)
+            written = write_tables(analysis, folder) + pictures()
+            if arguments.save_viz:
+                written += write_plots_of_episodes(analysis, folder)
     print(screen_text(analysis, folder, files_lines(folder, written)))
     return 0

@@ -31,6 +31,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 STEM = "ratio_distribution"
+#: The columns of `aggregate.replan_tables` that are drawn.
+COLUMNS = (
+    *("suite", "task_id", "episode_index", "replan", "env_step", "layer", "layer_number"),
+    *("ratio", "uniform_ratio"),
+)
 _BASELINE_RANGE_COLOR = "#E6E6E6"
 _MEDIAN_COLOR, _BOX_COLOR, _DOT_COLOR = "#D55E00", "#CFE3F1", "#333333"
 
@@ -48,7 +53,7 @@ def plot_ratio_distribution(
     """Draw the ratios of all replans; returns the paths of png, pdf and csv.
 
     Args:
-        replans: the cells of `aggregate.replan_tables`.
+        replans: `COLUMNS` of the cells of `aggregate.replan_tables`.
         grouping: its groups and ratio.
         folder: where the files go.
         stem: name of the files, without ending.

@@ -92,7 +92,7 @@ class WorkerProcesses:
             context = multiprocessing.get_context("spawn")
             self._executor = ProcessPoolExecutor(self._number, context, initializer=prepare_process)
         try:
-            with _main_module_hidden():  # here the executor starts processes
+            with main_module_hidden():  # here the executor starts processes
                 return self._executor.submit(work, parcel.content, package_version())
         except BrokenProcessPool as error:  # a process died between two submissions
             future: Future[bytes] = Future()
@@ -109,7 +109,7 @@ _NONE = object()
 
 
 @contextmanager
-def _main_module_hidden() -> Iterator[None]:
+def main_module_hidden() -> Iterator[None]:
     """Processes that are started within the block do not run the user's script again.
 
     `multiprocessing` runs `__main__` in every new process, for functions that are defined there. Episodes are handed to
