@@ -4,6 +4,7 @@
 #   make analyze     masses, ratios, tables and pictures from a store (installs the laptop's small set only)
 #   make test        formatting, types, all tests, and the package as others install it
 #   make test-policies   policies of transformers 5 and LeRobot, in environments of their own (.venv-transformers, .venv-lerobot)
+#   make test-remote stores in S3, on moto's server on this machine, in an environment of its own (.venv-remote)
 #   make test-slurm  an array job on the SLURM that sbatch reaches from here (opt-in; installs nothing)
 #   make setup       the whole environment        make setup-analyze   the laptop's part of it
 #
@@ -35,7 +36,7 @@ WORKERS ?= 2
 # An empty PYTHONDONTWRITEBYTECODE: where it is set, both processes compile all tests anew at every run.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: capture analyze test test-policies test-slurm test-thorough check unit package setup setup-analyze schemas clean
+.PHONY: capture analyze test test-policies test-remote test-slurm test-thorough check unit package setup setup-analyze schemas clean
 
 capture: .venv/capture-installed
 	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --store $(STORE) \
@@ -69,6 +70,10 @@ package: .venv/capture-installed
 test-policies: .venv-transformers/installed .venv-lerobot/installed
 	.venv-transformers/bin/pytest tests/policies $(ARGS)
 	.venv-lerobot/bin/pytest tests/policies $(ARGS)
+
+# moto brings fifty packages, and nothing else needs them.
+test-remote: .venv-remote/installed
+	.venv-remote/bin/pytest tests/schemas/stores/test_remote.py tests/schemas/stores/test_remote_services.py $(ARGS)
 
 # Takes about ten minutes, most of it waiting: SLURM holds a requeued job back for two. Works with any environment that is active.
 test-slurm:
@@ -114,5 +119,11 @@ setup-analyze: .venv/analyze-installed
 	.venv-lerobot/bin/python -m pip install --quiet --disable-pip-version-check --no-deps lerobot==0.4.4 av==15.0.0 openpi-client==0.1.2 openpi-server==0.1.0
 	@touch $@
 
+.venv-remote/installed: pyproject.toml constraints.txt
+	@echo "Installing s3fs and moto's server into .venv-remote ..."
+	$(PYTHON) -m venv .venv-remote
+	.venv-remote/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[remote]' 'moto[server]>=5' pytest hypothesis
+	@touch $@
+
 clean:
-	rm -rf .venv .venv-transformers .venv-lerobot build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-transformers .venv-lerobot .venv-remote build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

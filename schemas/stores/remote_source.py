@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
@@ -37,8 +38,20 @@ class RemoteFailure(UserError, OSError):
 
 
 def source_of(place: StorePlace) -> ByteSource:
-    """The files below a path or an address."""
-    return RemoteFolder(place.url) if isinstance(place, StoreUrl) else Folder(place)
+    """The files below a path or an address.
+
+    Raises:
+        BadArgument: an address with a query or a fragment, which is one file's and not a folder's.
+    """
+    if not isinstance(place, StoreUrl):
+        return Folder(place)
+    without = re.split("[?#]", place.url, maxsplit=1)[0]
+    if without != place.url and place.protocol in ("http", "https"):
+        raise BadArgument(
+            f"The address {without} was given with a query (a signed link), which is for one file; a store is a folder "
+            "of files. Give an address that is read without one, or copy the store here."
+        )
+    return RemoteFolder(place.url)
 
 
 @dataclass(frozen=True)

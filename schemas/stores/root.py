@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from vla_attention.schemas.errors import did_you_mean, listing
+from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
 from vla_attention.schemas.jsonable import MalformedDocument, from_json
 from vla_attention.schemas.stores.digest import run_digest
 from vla_attention.schemas.stores.packed_index import INDEX_FILE
@@ -43,7 +43,7 @@ def read_run(path: StorePlace) -> tuple[RootAttributes, str]:
         )
     try:
         attributes = group_attributes(source_of(path).whole("zarr.json"))
-    except RemoteFailure:
+    except (RemoteFailure, BadArgument):
         raise
     except (FileNotFoundError, NotADirectoryError):
         if isinstance(path, StoreUrl):

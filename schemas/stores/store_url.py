@@ -28,7 +28,7 @@ class StoreUrl:
 
     @property
     def _path(self) -> PurePosixPath:
-        return PurePosixPath(self.url.partition("://")[2].partition("?")[0])
+        return PurePosixPath(self.url.partition("://")[2])
 
     @property
     def name(self) -> str:

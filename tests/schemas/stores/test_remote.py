@@ -351,3 +351,19 @@ def test_a_hostile_index_asks_for_nothing_outside(server, tmp_path):
 )
 def test_addresses(given, expected):
     assert store_place(given) == expected
+
+
+@pytest.mark.parametrize("link", ["https://host/x/a.zarr?signature=secret", "https://host/a.zarr#secret"])
+def test_a_signed_link_is_refused_and_not_repeated(link, capsys):
+    assert analyze([link, "--list"]) == 2
+    said = capsys.readouterr().err
+    assert "query" in said
+    assert "secret" not in said
+    assert said.count("\n") == 1
+
+
+def test_an_unknown_kind_of_address_is_named_once(capsys):
+    assert analyze(["foo://host/a.zarr", "--list"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("foo://host/a.zarr") == 1
+    assert said.count("\n") == 1
