@@ -15,6 +15,7 @@ from vla_attention.analyze.stores.selection import select_episodes
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Names
+from vla_attention.schemas.groupings.words import words_of
 from vla_attention.schemas.layers import block_of_labels
 from vla_attention.schemas.layout import Role, Span
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, mass_error_bound
@@ -143,7 +144,7 @@ class _Found:
         tasks: instruction and objects of interest of each task's first episode.
         num_episodes: by task.
         first: the first episode's tokens, by site.
-        names: all names, by site.
+        names: all words and objects, by site.
     """
 
     success: list[bool | None] = field(default_factory=list)
@@ -163,9 +164,13 @@ class _Found:
                 interest = listing([thing.name for thing in attributes.objects if thing.of_interest])
                 found.tasks[attributes.task_id] = visible(attributes.instruction), interest
             for site in root.sites:
-                tokens = episode.tokens(root, site.name)
-                found.first.setdefault(site.name, tokens)
-                found.names[site.name].add(tokens)
+                if site.name not in found.first:
+                    found.first[site.name] = episode.tokens(root, site.name)
+                # Words and objects are in the attributes: no array of the other episodes is read.
+                names = found.names[site.name]
+                names.add_words(words_of(prompt) for prompt in episode.prompts(root, site.name))
+                if episode.coverage(root, site.name):
+                    names.add_objects(attributes.objects)
         return found
 
 

@@ -144,14 +144,22 @@ class Names:
             if (tokens.static_roles[:, span.start : span.stop] != Role.MASKED_IMAGE).any():
                 self._cameras[span.camera] = None
         self._roles.update({Role(code).label: None for code in np.unique(tokens.static_roles)})
-        for line in tokens.words:
+        self.add_words(tokens.words)
+        if tokens.coverage:
+            self.add_objects(tokens.objects)
+
+    def add_words(self, lines: Iterable[tuple[Word, ...]]) -> None:
+        """Add the words of prompts."""
+        for line in lines:
             if not any(word.keys for word in line):
                 continue  # a text that was captured without its tokenizer
             sentence = tuple(word.text.casefold() for word in line)
             self._sentences[sentence] = None
             self._words.update(dict.fromkeys(sentence))
-        if tokens.coverage:
-            self._objects.update({thing.name: None for thing in tokens.objects})
+
+    def add_objects(self, objects: Iterable[SceneObject]) -> None:
+        """Add the objects of a scene that have coverage."""
+        self._objects.update({thing.name: None for thing in objects})
 
     def vocabulary(self) -> Vocabulary:
         """The union of what was added, in order of appearance."""

@@ -19,7 +19,7 @@ from vla_attention.schemas.cached_property import cached_property
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.jsonable import from_json
-from vla_attention.schemas.layout import prompt_at
+from vla_attention.schemas.layout import Prompt, prompt_at
 from vla_attention.schemas.stores.byte_source import ByteSource
 from vla_attention.schemas.stores.packed_index import INDEX_FILE, PackedEpisode, read_index
 from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
@@ -247,19 +247,27 @@ class StoredEpisode:
     def tokens(self, root: RootAttributes, site: str) -> EpisodeTokens:
         """What every key of a site is in this episode."""
         layout = root.site(site)
-        stored = [name.removeprefix("objects/") for name in self.attributes.arrays if name.startswith("objects/")]
-        cameras = [camera for camera in stored if camera in layout.cameras]
-        # A prompt's pieces are keys of the site that reads it; elsewhere (Cosmos's self-attention) there are no words.
-        reads = any(span.kind == "text" for span in layout.spans)
         return EpisodeTokens(
             layout=layout,
             key_role=self.read(f"{site}/key_role"),
-            prompts=tuple(prompt_at(root.sites, layout, prompt) for prompt in self.attributes.prompts) if reads else (),
+            prompts=self.prompts(root, site),
             prompt_index=self.read("prompt_index"),
             objects=self.attributes.objects,
-            coverage=_StoredCoverage(self, cameras),
+            coverage=self.coverage(root, site),
             num_queries=root.recording.of_site(layout).num_action_queries,
         )
+
+    def prompts(self, root: RootAttributes, site: str) -> tuple[Prompt, ...]:
+        """The different prompts of the episode, as the keys of a site; none where the site reads no text."""
+        layout = root.site(site)
+        # A prompt's pieces are keys of the site that reads it; elsewhere (Cosmos's self-attention) there are no words.
+        reads = any(span.kind == "text" for span in layout.spans)
+        return tuple(prompt_at(root.sites, layout, prompt) for prompt in self.attributes.prompts) if reads else ()
+
+    def coverage(self, root: RootAttributes, site: str) -> Mapping[str, NDArray[np.float32]]:
+        """Object coverage (replan, patch, object) by camera of a site; of each camera read when it is asked for."""
+        stored = [name.removeprefix("objects/") for name in self.attributes.arrays if name.startswith("objects/")]
+        return _StoredCoverage(self, [camera for camera in stored if camera in root.site(site).cameras])
 
 
 class _StoredCoverage(Mapping[str, NDArray[np.float32]]):
