@@ -79,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
     question = ask([open_store(path) for path in arguments.stores], settings_of(arguments))
     study = study_heads(question, options)
     folder = output_folder(arguments, "heads")
-    files = write_parquet(folder, **study.tables())
+    files = write_parquet(folder, **study.files())
     text = heads_text(study, arguments.top)
     files.append(write_whole(folder, text))
     if not arguments.no_plots:

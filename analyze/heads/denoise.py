@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import polars as pl
@@ -15,6 +16,7 @@ from vla_attention.analyze.measures.aggregate import (
     task_tables,
 )
 from vla_attention.analyze.measures.frames import Tables, concat_tables
+from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked
 from vla_attention.analyze.measures.steps import MeasuredEpisode
 from vla_attention.analyze.statistics.intervals import Estimand
 from vla_attention.schemas.groupings.grouping import Grouping
@@ -32,7 +34,8 @@ def denoise_tables(
     selection = measured[0].selection
     parts = []
     for position in np.argsort(selection.denoise_steps, kind="stable").tolist():
-        episodes = episode_tables(replan_tables([one.at_denoise(position) for one in measured], grouping), grouping)
+        of_step = MadeWhenAsked(partial(_at_denoise, measured, position), range(len(measured)))
+        episodes = episode_tables(replan_tables(of_step, grouping), grouping)
         layer = overall_layer(episodes.cells)
         whole = overall_rows(task_tables(episodes.filter(pl.col("layer") == layer), grouping, estimand=estimand))
         times = [one.item.episode.read("denoise_time")[selection.denoise[position]] for one in measured]
@@ -41,3 +44,7 @@ def denoise_tables(
         cells, groups = (table.select(number, time, pl.all()) for table in (whole.cells, whole.groups))
         parts.append(Tables(cells, groups))
     return concat_tables(parts)
+
+
+def _at_denoise(measured: Sequence[MeasuredEpisode], position: int, episode: int) -> MeasuredEpisode:
+    return measured[episode].at_denoise(position)

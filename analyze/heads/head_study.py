@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -12,22 +15,30 @@ from numpy.typing import NDArray
 from vla_attention.analyze.heads.denoise import denoise_tables
 from vla_attention.analyze.heads.depth import contribution_norms, depth_table
 from vla_attention.analyze.heads.head_measures import dispersion_table, episode_heads, heads_tables
-from vla_attention.analyze.heads.row_metrics import RowOptions, groups_with_valid_keys, measure_all_rows, row_tables
+from vla_attention.analyze.heads.row_metrics import (
+    RowMeasures,
+    RowOptions,
+    groups_with_valid_keys,
+    measure_all_rows,
+    row_tables,
+)
 from vla_attention.analyze.measures.aggregate import episode_tables, replan_tables, task_tables
-from vla_attention.analyze.measures.frames import Tables, concat_tables, named_tables
+from vla_attention.analyze.measures.frames import TableInParts, Tables, concat_tables, named_parts, named_tables
+from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
-from vla_attention.analyze.measures.sinks import SinkSearch, search_of
+from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_each
+from vla_attention.analyze.measures.sinks import KeyShares, SinkSearch, search_of
 from vla_attention.analyze.measures.steps import (
     MeasuredEpisode,
     measure_episode,
     measured_from,
+    measured_on_disk,
     row_sums,
     segment_weights,
     with_valid,
 )
 from vla_attention.analyze.show.progress import progress_bar
-from vla_attention.analyze.stores.parallel import map_episodes
+from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 
@@ -61,13 +72,17 @@ class HeadStudy:
     search: SinkSearch | None
 
     def tables(self) -> dict[str, pl.DataFrame]:
-        """The tables that are written to files, by the files' names."""
+        """The tables of heads, layers and denoise steps by the names of their files."""
         tables = named_tables("heads", self.heads) | {"dispersion": self.dispersion, "depth": self.depth}
-        tables |= named_tables("denoise", self.denoise)
+        return tables | named_tables("denoise", self.denoise)
+
+    def files(self) -> dict[str, pl.DataFrame | TableInParts]:
+        """All tables by the names of their files."""
+        files: dict[str, pl.DataFrame | TableInParts] = {**self.tables()}
         if self.rows is not None and self.search is not None:
-            tables |= named_tables("row_metrics", self.rows)
-            tables |= {"sinks": self.search.sinks, "sink_heads": self.search.heads}
-        return tables
+            files |= named_parts("row_metrics", self.rows)
+            files |= {"sinks": self.search.sinks, "sink_heads": self.search.heads}
+        return files
 
 
 def _measure(
@@ -80,13 +95,17 @@ def _measure(
     return measured_from(item, groups, apart, mass.astype(np.float64), row_sums(item, apart, site))
 
 
+def _shares(measures: Sequence[RowMeasures], episode: int) -> KeyShares:
+    return measures[episode].shares
+
+
 def study_heads(question: Question, options: RowOptions | None = None) -> HeadStudy:
     """Measure heads, layers, denoise steps and, with `options`, rows. Rows are read at most once.
 
     Without `options` rows are only read when a group cuts a stored segment (a word, an object).
     """
     grouping, estimand, selection = question.grouping, question.settings.intervals, question.selection
-    resolved = resolve_all(grouping, question.selected, question.vocabulary)
+    resolved = resolve_each(grouping, question.selected, question.vocabulary)
     shown = groups_with_valid_keys(question.selected, resolved)
     measures = None
     if options is not None:
@@ -98,21 +117,29 @@ def study_heads(question: Question, options: RowOptions | None = None) -> HeadSt
         measures = measure_all_rows(question, resolved, options, shown, with_masses=any(cut))
 
     known = (
-        [None] * len(resolved)
+        itertools.repeat(None, len(resolved))
         if measures is None
-        else [of_episode.mass if is_cut else None for of_episode, is_cut in zip(measures, cut, strict=True)]
+        else (of_episode.mass if is_cut else None for of_episode, is_cut in zip(measures, cut, strict=True))
     )
     measure = partial(_measure, apart=replace(selection, per_head=True), site=question.site)
-    with progress_bar(len(resolved), "episodes") as advance:
-        measured = map_episodes(measure, list(zip(question.selected, resolved, known, strict=True)), advance)
-    heads = concat_tables([episode_heads(episode, grouping) for episode in measured])
-    over_heads = [episode.over_heads() for episode in measured]
+    of_heads: list[Tables] = []
+
+    def arrays_over_heads() -> Iterator[dict[str, NDArray[Any]]]:
+        given = zip(question.selected, resolved, known, strict=True)
+        with progress_bar(len(resolved), "episodes") as advance:
+            for measured in each_episode(measure, given, advance):
+                of_heads.append(episode_heads(measured, grouping))
+                yield measured.over_heads().arrays()
+
+    over_heads = measured_on_disk(question.selected, replace(selection, per_head=False), arrays_over_heads())
+    heads = concat_tables(of_heads)
     replans = replan_tables(over_heads, grouping)
     episodes = episode_tables(replans, grouping)
     rows = search = None
     if options is not None and measures is not None:
         rows = row_tables(question.selected, measures, shown, selection, options)
-        search = search_of(question, [of_episode.shares for of_episode in measures], options.rule)
+        shares = MadeWhenAsked(partial(_shares, measures), range(len(measures)))
+        search = search_of(question, shares, options.rule)
     return HeadStudy(
         question=question,
         options=options,

@@ -12,9 +12,18 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.heads.entropy import effective_keys, entropies, top_mass
-from vla_attention.analyze.measures.frames import EPISODE_ID, Tables, denoise_axis, head_axis, layer_axis, long_table
+from vla_attention.analyze.measures.frames import (
+    EPISODE_ID,
+    Tables,
+    denoise_axis,
+    head_axis,
+    layer_axis,
+    long_table,
+    tables_of_each,
+)
 from vla_attention.analyze.measures.kept import digest_of_weights, measured_once
 from vla_attention.analyze.measures.masses import masses
+from vla_attention.analyze.measures.not_in_memory import ArraysOnDisk, MadeWhenAsked
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
 from vla_attention.analyze.measures.sinks import KeyShares, SinkRule
@@ -71,39 +80,29 @@ class RowMeasures:
             found["mass"] = self.mass
         return {name: np.ascontiguousarray(array) for name, array in found.items()}
 
-    def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Copy the `arrays` of the same measures of the same episode."""
-        self.entropy[:] = arrays["entropy"]
-        self.top[:] = arrays["top"]
-        if self.mass is not None:
-            self.mass[:] = arrays["mass"]
-        self.shares.above[:] = arrays["above"]
-        self.shares.held[:] = arrays["held"]
+    @classmethod
+    def of(cls, arrays: Mapping[str, NDArray[Any]]) -> RowMeasures:
+        """The measures with these `arrays`."""
+        shares = KeyShares(arrays["above"], arrays["held"])
+        return cls(arrays["entropy"], arrays["top"], arrays.get("mass"), shares)
 
-
-def empty_measures(
-    items: Sequence[SelectedEpisode],
-    selection: Selection,
-    options: RowOptions,
-    num_entropies: int,
-    num_masses: int | None = None,
-) -> list[RowMeasures]:
-    """Arrays for every episode's measures, which `measure_rows` fills: parts of a few large arrays.
-
-    They are allocated before anything is read. Small results that stay between the large temporary arrays of reading
-    would fragment the heap, and the process would take twice the memory.
-    """
-    cells = (len(selection.layers), len(selection.denoise), len(selection.heads))
-    ends = np.cumsum([item.tokens.num_replans for item in items])
-    entropy = np.empty((ends[-1], *cells, num_entropies), dtype=np.float32)
-    top = np.empty((ends[-1], *cells, len(options.top)), dtype=np.float32)
-    mass = None if num_masses is None else np.empty((ends[-1], *cells, num_masses), dtype=np.float32)
-    shares = [KeyShares.empty(selection, item.tokens.layout.num_keys) for item in items]
-    parts = [slice(end - item.tokens.num_replans, end) for item, end in zip(items, ends, strict=True)]
-    return [
-        RowMeasures(entropy[part], top[part], None if mass is None else mass[part], share)
-        for part, share in zip(parts, shares, strict=True)
-    ]
+    @classmethod
+    def empty(
+        cls,
+        item: SelectedEpisode,
+        selection: Selection,
+        options: RowOptions,
+        num_entropies: int,
+        num_masses: int | None = None,
+    ) -> RowMeasures:
+        """Arrays that `measure_rows` fills."""
+        cells = (item.tokens.num_replans, len(selection.layers), len(selection.denoise), len(selection.heads))
+        return cls(
+            np.empty((*cells, num_entropies), np.float32),
+            np.empty((*cells, len(options.top)), np.float32),
+            None if num_masses is None else np.empty((*cells, num_masses), np.float32),
+            KeyShares.empty(selection, item.tokens.layout.num_keys),
+        )
 
 
 def measure_rows(
@@ -160,51 +159,56 @@ def row_tables(
             mass or no such key. There are millions of them: they name their cell by its number alone.
     """
     axes_of = replace(selection, per_head=True)
-    cells = []
-    for item, measured in zip(items, measures, strict=True):
+    of_replan = len(selection.layers) * len(selection.denoise) * len(selection.heads)
+    ends = np.cumsum([0, *(item.tokens.num_replans * of_replan for item in items)]).tolist()
+
+    def part(i: int) -> Tables:
+        measured, first, end = measures[i], ends[i], ends[i + 1]
+        return Tables(lambda: cells(items[i], measured, first), lambda: groups(measured, first, end))
+
+    def cells(item: SelectedEpisode, measured: RowMeasures, first: int) -> pl.DataFrame:
         entropy = measured.entropy[..., len(shown)]
         values = {"entropy": entropy, "effective_keys": effective_keys(entropy)}
         values |= {f"top{k}_mass": measured.top[..., j] for j, k in enumerate(options.top)}
         axes = [{"replan": range(len(entropy))}, layer_axis(axes_of), denoise_axis(axes_of), head_axis(axes_of)]
-        cells.append(long_table(item, axes, values))
-    table = pl.concat(cells).with_row_index("row")
-    of_groups = np.concatenate([measured.entropy[..., : len(shown)].ravel() for measured in measures])
-    groups = pl.DataFrame(
-        {
-            "row": np.repeat(np.arange(table.height, dtype=np.uint32), len(shown)),
-            "group": pl.Series(shown, dtype=pl.Enum(shown)).gather(np.tile(np.arange(len(shown)), table.height)),
-            "entropy": of_groups,
-            "effective_keys": effective_keys(of_groups),
-        }
-    )
-    return Tables(table, groups.with_columns(pl.col(pl.Float32).fill_nan(None)))
+        return long_table(item, axes, values).with_row_index("row", first)
+
+    def groups(measured: RowMeasures, first: int, end: int) -> pl.DataFrame:
+        entropy = measured.entropy[..., : len(shown)].ravel()
+        table = pl.DataFrame(
+            {
+                "row": np.repeat(np.arange(first, end, dtype=np.uint32), len(shown)),
+                "group": pl.Series(shown, dtype=pl.Enum(shown)).gather(np.tile(np.arange(len(shown)), end - first)),
+                "entropy": entropy,
+                "effective_keys": effective_keys(entropy),
+            }
+        )
+        return table.with_columns(pl.col(pl.Float32).fill_nan(None))
+
+    return tables_of_each(range(len(items)), part)
 
 
-def episode_layer_means(rows: Tables, items: Sequence[SelectedEpisode]) -> Tables:
-    """Means of `row_tables` (of these episodes) over replans, denoise steps and heads, float64.
+def episode_layer_means(rows: Tables) -> Tables:
+    """Means of `row_tables` over replans, denoise steps and heads, float64.
 
     Returns:
         cells: suite, task_id, episode_index, layer, block and the measures; groups: the same names, group, entropy,
             effective_keys.
     """
     keys = (*EPISODE_ID, "layer", "block")
-    names = rows.groups["group"].unique(maintain_order=True).cast(pl.String).to_list()
-    per_replan, start = rows.cells.height // sum(item.tokens.num_replans for item in items), 0
+    names = rows.group_names()
     cells, groups = [], []
 
     def means(part: pl.DataFrame) -> pl.DataFrame:
         measured = pl.col(pl.Float32).mean().cast(pl.Float64)
         return part.group_by(keys, maintain_order=True).agg(measured)
 
-    # Grouping a million rows at once would double the memory of the process.
-    for item in items:
-        part = rows.cells.slice(start, item.tokens.num_replans * per_replan)
+    for tables in rows.parts:
+        part, of_part = tables.cells, tables.groups
         cells.append(means(part))
-        of_part = rows.groups.slice(start * len(names), part.height * len(names))
         for i, name in enumerate(names):
             own = of_part.gather_every(len(names), i).select("entropy", "effective_keys")
             groups.append(means(part.select(keys).hstack(own)).with_columns(pl.lit(name).alias("group")))
-        start += part.height
     empty = pl.DataFrame(schema={**cells[0].select(keys).schema, "group": pl.String})
     return Tables(
         pl.concat(cells).sort(EPISODE_ID, maintain_order=True),
@@ -228,10 +232,9 @@ def measure_all_rows(
     options: RowOptions,
     shown: Sequence[str],
     with_masses: bool = False,
-) -> list[RowMeasures]:
-    """`measure_rows` of every episode, a few at a time; shows progress."""
+) -> Sequence[RowMeasures]:
+    """`measure_rows` of every episode, kept on disk; shows progress."""
     num_masses = len(question.grouping.names) + 1 if with_masses else None
-    room = empty_measures(question.selected, question.selection, options, len(shown) + 1, num_masses)
     scan = partial(
         _episode_measures,
         selection=question.selection,
@@ -240,10 +243,10 @@ def measure_all_rows(
         shown=shown,
         num_masses=num_masses,
     )
-    with progress_bar(len(room), "episodes' rows") as advance:
+    with progress_bar(len(question.selected), "episodes' rows") as advance:
 
         def measure(positions: Sequence[int]) -> Iterator[dict[str, NDArray[Any]]]:
-            return each_episode(scan, [(question.selected[i], resolved[i]) for i in positions], advance)
+            return each_episode(scan, ((question.selected[i], resolved[i]) for i in positions), advance)
 
         measured = measured_once(
             "rows",
@@ -262,9 +265,8 @@ def measure_all_rows(
             [digest_of_weights(groups) for groups in resolved],
             advance,
         )
-        for kept, arrays in zip(room, measured, strict=True):
-            kept.take(arrays)
-    return room
+        kept = ArraysOnDisk(measured)
+    return MadeWhenAsked(lambda i: RowMeasures.of(kept[i]), range(len(kept)))
 
 
 def _episode_measures(
@@ -276,7 +278,7 @@ def _episode_measures(
     num_masses: int | None,
 ) -> dict[str, NDArray[Any]]:
     """The arrays of `measure_rows` of one episode."""
-    (out,) = empty_measures([pair[0]], selection, options, len(shown) + 1, num_masses)
+    out = RowMeasures.empty(pair[0], selection, options, len(shown) + 1, num_masses)
     measure_rows(*pair, selection, site, options, shown, out)
     return out.arrays()
 

@@ -43,7 +43,7 @@ def heads_text(study: HeadStudy, top: int) -> str:
 def row_summary(study: HeadStudy) -> Tables:
     """Every layer: means over episodes of the columns of `rows`, with intervals."""
     assert study.rows is not None
-    episodes = episode_layer_means(study.rows, study.question.selected)
+    episodes = episode_layer_means(study.rows)
     order = study.tasks.cells.filter(pl.col("layer") != LAYERS_AVG)["layer_number"].unique().sort().to_list()
     position = pl.col("layer").replace_strict({layer: i for i, layer in enumerate(order)}, return_dtype=pl.Int64)
     return Tables(

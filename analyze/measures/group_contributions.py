@@ -78,14 +78,14 @@ def group_contribution_tables(question: Question, resolved: Sequence[ResolvedGro
         return None
     known = [None] * len(question.selected) if resolved is None else resolved
     take = partial(_segments_of_groups, site=question.site, grouping=question.grouping)
-    chosen = map_episodes(take, list(zip(question.selected, known, strict=True)))
+    chosen = map_episodes(take, zip(question.selected, known, strict=True))
     # A group that cannot be measured in one episode would be a mean over the others only.
     names = [name for name in question.grouping.names if all(name in parts for parts in chosen)]
     if not names:
         return None
     measure = partial(_episode_norms, selection=question.selection, site=question.site, grouping=question.grouping)
     measurable = [{name: parts[name] for name in names} for parts in chosen]
-    kept = ArraysOnDisk(each_episode(measure, list(zip(question.selected, measurable, strict=True))))
+    kept = ArraysOnDisk(each_episode(measure, zip(question.selected, measurable, strict=True)))
     norms = MadeWhenAsked(lambda i: (question.selected[i], kept[i]), range(len(question.selected)))
     return tables_of_each(norms, lambda one: _norm_tables(*one, names, question.selection))
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.key_counts import num_valid_keys
@@ -103,6 +104,16 @@ def resolve_all(
     return [
         _without(weights, item) if item.without else weights for item, weights in zip(selected, resolved, strict=True)
     ]
+
+
+def resolve_each(
+    grouping: Grouping, selected: Sequence[SelectedEpisode], vocabulary: Vocabulary
+) -> Sequence[ResolvedGrouping]:
+    """`resolve_all`, but that an episode is resolved whenever it is asked for: weights of objects are megabytes."""
+    check_names(grouping, vocabulary, selected[0].tokens.layout)
+    num_keys = [resolve(grouping, item.tokens).num_keys.max(axis=0, keepdims=True) for item in selected]
+    check_not_empty(grouping, num_keys)
+    return MadeWhenAsked(lambda i: resolve_episode(grouping, selected[i]), range(len(selected)))
 
 
 def resolve_episode(grouping: Grouping, item: SelectedEpisode) -> ResolvedGrouping:

@@ -33,6 +33,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.kept import measured_once
+from vla_attention.analyze.measures.not_in_memory import ArraysOnDisk, MadeWhenAsked
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.measures.sink_kinds import value_ratios
@@ -208,10 +209,13 @@ def search_of(question: Question, shares: Sequence[KeyShares], rule: SinkRule) -
     frames, heads = [], []
     for (suite, task), positions in _tasks(question).items():
         items = [question.selected[i] for i in positions]
-        above, held = (
-            np.stack([getattr(shares[i], name) for i in positions]).mean(axis=0, dtype=np.float64)
-            for name in ("above", "held")
-        )
+        above, held = np.zeros((2, *shares[positions[0]].held.shape))
+        for i in positions:
+            of_episode = shares[i]
+            above += of_episode.above
+            held += of_episode.held
+        above /= len(items)
+        held /= len(items)
         valid = [item.valid for item in items]
         num_valid = float(np.mean([item.num_valid.mean() for item in items]))
         counted = _mean_counts(items, valid)
@@ -271,8 +275,8 @@ def search_sinks(question: Question, rule: SinkRule | None = None) -> SinkSearch
 
         about, arguments = "shares of keys", {"factor": rule.factor}
         arrays = measured_once("shares", about, selected, selection, site, measure, arguments, progress=advance)
-        shares = [KeyShares(**one) for one in arrays]
-    return search_of(question, shares, rule)
+        kept = ArraysOnDisk(arrays)
+    return search_of(question, MadeWhenAsked(lambda i: KeyShares(**kept[i]), range(len(kept))), rule)
 
 
 def _share_arrays(item: SelectedEpisode, selection: Selection, site: str, rule: SinkRule) -> dict[str, NDArray[Any]]:

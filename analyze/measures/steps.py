@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -85,6 +85,10 @@ class MeasuredEpisode:
             valid_mass=self.valid_mass.mean(axis=3, keepdims=True),
             row_sum=self.row_sum.mean(axis=3, keepdims=True),
         )
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """`MEASURED_ARRAYS` by name, in C order."""
+        return {name: np.ascontiguousarray(getattr(self, name)) for name in MEASURED_ARRAYS}
 
     def at_denoise(self, position: int) -> MeasuredEpisode:
         """One denoise step alone, by its position in the selection."""
@@ -199,10 +203,18 @@ def _measured_or_kept(
             num_keys.append(arrays["num_keys"].max(axis=0, keepdims=True))
             yield arrays
 
-    kept = ArraysOnDisk(noting_keys())
+    kept = measured_on_disk(selected, selection, noting_keys())
     if resolved is None:
         check_not_empty(grouping, num_keys)
-    return MadeWhenAsked(lambda i: MeasuredEpisode(selected[i], selection, **kept[i]), range(len(selected)))
+    return kept
+
+
+def measured_on_disk(
+    selected: Sequence[SelectedEpisode], selection: Selection, arrays: Iterable[Mapping[str, NDArray[Any]]]
+) -> Sequence[MeasuredEpisode]:
+    """The episodes with their `arrays`, which are written to disk now and read when an episode is asked for."""
+    kept = ArraysOnDisk(arrays)
+    return MadeWhenAsked(lambda i: MeasuredEpisode(selected[i], selection, **kept[i]), range(len(kept)))
 
 
 def in_order_of_episodes(measured: Sequence[MeasuredEpisode]) -> Sequence[MeasuredEpisode]:
@@ -216,8 +228,7 @@ def _measured_arrays(
 ) -> dict[str, NDArray[Any]]:
     # Resolved here, one episode at a time: weights of objects are megabytes an episode.
     item, resolved = pair
-    measured = measure_episode(item, resolved or resolve_episode(grouping, item), selection, site)
-    return {name: np.ascontiguousarray(getattr(measured, name)) for name in MEASURED_ARRAYS}
+    return measure_episode(item, resolved or resolve_episode(grouping, item), selection, site).arrays()
 
 
 def step_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Tables:
