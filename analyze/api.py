@@ -275,7 +275,7 @@ class OpenStores:
         _check_name("table", table, ("objects", "summary", "times", "pointing", "iou"))
         options = ObjectSettings(spatial=table in ("pointing", "iou"))
         study = study_objects(self.stores, settings_from_keywords(**settings), options)
-        return study.summary if table == "summary" else _frame(study.tables, table)
+        return study.summary if table == "summary" else getattr(study.tables, table).whole
 
     def time(
         self,

@@ -23,7 +23,7 @@ from vla_attention.analyze.measures.frames import (
 )
 from vla_attention.analyze.measures.kept import digest_of_weights, measured_once
 from vla_attention.analyze.measures.masses import masses
-from vla_attention.analyze.measures.not_in_memory import ArraysOnDisk, MadeWhenAsked
+from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
 from vla_attention.analyze.measures.sinks import KeyShares, SinkRule
@@ -265,7 +265,7 @@ def measure_all_rows(
             [digest_of_weights(groups) for groups in resolved],
             advance,
         )
-        kept = ArraysOnDisk(measured)
+        kept = OnDisk(measured)
     return MadeWhenAsked(lambda i: RowMeasures.of(kept[i]), range(len(kept)))
 
 

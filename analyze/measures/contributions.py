@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.contribution_ratios import joint_norm, ratio_columns, selected_gram, uniform_weights
 from vla_attention.analyze.measures.frames import TableInParts, denoise_axis, layer_axis, long_table, replan_axis
-from vla_attention.analyze.measures.not_in_memory import ArraysOnDisk, MadeWhenAsked
+from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.selection import Selection
@@ -54,7 +54,7 @@ def contribution_table(
     if not all(item.store.attributes.recording.contributions for item in selected):
         return None
 
-    norms = ArraysOnDisk(each_episode(partial(_episode_norms, selection=selection, layers=layers), selected))
+    norms = OnDisk(each_episode(partial(_episode_norms, selection=selection, layers=layers), selected))
     if not all(norms[i] for i in range(len(norms))):
         return None
     return TableInParts(MadeWhenAsked(lambda i: _table(selected[i], selection, norms[i]), range(len(selected))))

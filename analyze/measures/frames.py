@@ -86,7 +86,7 @@ def _labels(name: str, labels: Sequence[Any] | NDArray[Any] | pl.Series) -> pl.S
     return pl.Series(name, given, dtype=kinds[type(known)])
 
 
-def rows_of_episode(table: pl.DataFrame, item: SelectedEpisode) -> pl.DataFrame:
+def rows_of_episode(table: pl.DataFrame | TableInParts, item: SelectedEpisode) -> pl.DataFrame:
     """The rows of one episode."""
     return table.filter(**dict(zip(EPISODE_ID, episode_id(item), strict=True)))
 
@@ -280,6 +280,10 @@ class TableInParts:
     def whole(self) -> pl.DataFrame:
         """The rows of all parts."""
         return pl.concat(self.parts)
+
+    def filter(self, *conditions: pl.Expr, **values: Any) -> pl.DataFrame:
+        """The rows of all parts for which conditions hold and columns have these values."""
+        return pl.concat([part.filter(*conditions, **values) for part in self.parts])
 
 
 def cells_in_parts(level: Tables) -> TableInParts:

@@ -32,7 +32,7 @@ from vla_attention.analyze.measures.frames import (
     replan_axis,
     tables_of_each,
 )
-from vla_attention.analyze.measures.not_in_memory import ArraysOnDisk, MadeWhenAsked
+from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_episode
 from vla_attention.analyze.statistics.intervals import Estimand
@@ -85,7 +85,7 @@ def group_contribution_tables(question: Question, resolved: Sequence[ResolvedGro
         return None
     measure = partial(_episode_norms, selection=question.selection, site=question.site, grouping=question.grouping)
     measurable = [{name: parts[name] for name in names} for parts in chosen]
-    kept = ArraysOnDisk(each_episode(measure, zip(question.selected, measurable, strict=True)))
+    kept = OnDisk(each_episode(measure, zip(question.selected, measurable, strict=True)))
     norms = MadeWhenAsked(lambda i: (question.selected[i], kept[i]), range(len(question.selected)))
     return tables_of_each(norms, lambda one: _norm_tables(*one, names, question.selection))
 

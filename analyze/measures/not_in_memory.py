@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import os
+import pickle
 import tempfile
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, Generic, TypeVar, overload
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Generic, TypeVar, overload
 
-from numpy.typing import NDArray
-
-from vla_attention.analyze.cache.array_bytes import arrays_from_bytes, arrays_to_bytes
 from vla_attention.schemas.errors import BadArgument
 
 Member = TypeVar("Member")
@@ -45,26 +43,28 @@ class MadeWhenAsked(Sequence[Member], Generic[Member]):
         return map(self._make, self._positions)
 
 
-class ArraysOnDisk:
-    """Named arrays of one episode after the other in a temporary file: `self[i]` reads those of episode i.
+class OnDisk(Sequence[Member], Generic[Member]):
+    """A sequence whose members are written to a temporary file when they are appended, and read at every access.
 
     The file has no name, and its space is free again when this object is gone. It lies where temporary files do
     (`TMPDIR`).
     """
 
-    def __init__(self, episodes: Iterable[Mapping[str, NDArray[Any]]]) -> None:
-        """Write the arrays of every episode as soon as they are there.
-
-        Raises:
-            BadArgument: there is no room for them.
-        """
+    def __init__(self, members: Iterable[Member] = ()) -> None:
+        """Append the members, each as soon as it is there."""
         self._ends = [0]
         self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115
         weakref.finalize(self, self._file.close)
-        for arrays in episodes:
-            self._append(arrays_to_bytes(arrays))
+        for member in members:
+            self.append(member)
 
-    def _append(self, content: bytes) -> None:
+    def append(self, member: Member) -> None:
+        """Write one more member.
+
+        Raises:
+            BadArgument: there is no room for it.
+        """
+        content = pickle.dumps(member, protocol=pickle.HIGHEST_PROTOCOL)
         rest = memoryview(content)
         try:
             while rest:
@@ -77,11 +77,26 @@ class ArraysOnDisk:
         self._ends.append(self._ends[-1] + len(content))
 
     def __len__(self) -> int:
-        """Number of episodes."""
+        """Number of members."""
         return len(self._ends) - 1
 
-    def __getitem__(self, episode: int) -> dict[str, NDArray[Any]]:
-        """The arrays of one episode, read-only."""
-        start, end = self._ends[episode], self._ends[episode + 1]
+    @overload
+    def __getitem__(self, index: int) -> Member: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> MadeWhenAsked[Member]: ...
+
+    def __getitem__(self, index: int | slice) -> Member | MadeWhenAsked[Member]:
+        """One member, read now, or a part of the sequence."""
+        positions = range(len(self))[index]
+        return self._read(positions) if isinstance(positions, int) else MadeWhenAsked(self._read, positions)
+
+    def __iter__(self) -> Iterator[Member]:
+        """The members, one after the other."""
+        return map(self._read, range(len(self)))
+
+    def _read(self, position: int) -> Member:
+        start, end = self._ends[position], self._ends[position + 1]
         # With its place, and not from where the last reading ended: several threads may read.
-        return arrays_from_bytes(os.pread(self._file.fileno(), end - start, start))
+        member: Member = pickle.loads(os.pread(self._file.fileno(), end - start, start))
+        return member

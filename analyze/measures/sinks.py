@@ -33,7 +33,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.kept import measured_once
-from vla_attention.analyze.measures.not_in_memory import ArraysOnDisk, MadeWhenAsked
+from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.measures.sink_kinds import value_ratios
@@ -275,7 +275,7 @@ def search_sinks(question: Question, rule: SinkRule | None = None) -> SinkSearch
 
         about, arguments = "shares of keys", {"factor": rule.factor}
         arrays = measured_once("shares", about, selected, selection, site, measure, arguments, progress=advance)
-        kept = ArraysOnDisk(arrays)
+        kept = OnDisk(arrays)
     return search_of(question, MadeWhenAsked(lambda i: KeyShares(**kept[i]), range(len(kept))), rule)
 
 

@@ -32,7 +32,7 @@ from vla_attention.analyze.measures.masses import (
     sides,
     uniform_ratio,
 )
-from vla_attention.analyze.measures.not_in_memory import ArraysOnDisk, MadeWhenAsked
+from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import (
     SelectedEpisode,
@@ -213,7 +213,7 @@ def measured_on_disk(
     selected: Sequence[SelectedEpisode], selection: Selection, arrays: Iterable[Mapping[str, NDArray[Any]]]
 ) -> Sequence[MeasuredEpisode]:
     """The episodes with their `arrays`, which are written to disk now and read when an episode is asked for."""
-    kept = ArraysOnDisk(arrays)
+    kept = OnDisk(arrays)
     return MadeWhenAsked(lambda i: MeasuredEpisode(selected[i], selection, **kept[i]), range(len(kept)))
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import partial
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -15,6 +16,7 @@ from vla_attention.analyze.measures.frames import (
     EPISODE_KEYS,
     Axis,
     LayerAxis,
+    TableInParts,
     denoise_axis,
     head_axis,
     layer_axis,
@@ -22,6 +24,7 @@ from vla_attention.analyze.measures.frames import (
     replan_axis,
 )
 from vla_attention.analyze.measures.masses import finite_mean
+from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.objects.control_columns import ControlParts, control_columns, task_of
@@ -47,7 +50,7 @@ from vla_attention.analyze.objects.pointing_and_iou import (
     shifted_masks,
 )
 from vla_attention.analyze.show.progress import progress_bar
-from vla_attention.analyze.stores.parallel import map_episodes
+from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import BadArgument
@@ -62,12 +65,12 @@ _MAPS_TOGETHER = 36
 class ObjectTables:
     """Tables of objects, see `object_tables`; `pointing` and `iou` are None without `ObjectSettings.spatial`."""
 
-    objects: pl.DataFrame
-    times: pl.DataFrame
-    pointing: pl.DataFrame | None = None
-    iou: pl.DataFrame | None = None
-    steps: pl.DataFrame | None = None
-    iou_steps: pl.DataFrame | None = None
+    objects: TableInParts
+    times: TableInParts
+    pointing: TableInParts | None = None
+    iou: TableInParts | None = None
+    steps: TableInParts | None = None
+    iou_steps: TableInParts | None = None
 
 
 def object_tables(question: Question, settings: ObjectSettings | None = None, keep_steps: bool = False) -> ObjectTables:
@@ -122,18 +125,64 @@ def object_tables(question: Question, settings: ObjectSettings | None = None, ke
         keep_steps=keep_steps,
         episodes_of=episodes_of,
     )
+    tables: dict[str, OnDisk[pl.DataFrame]] = defaultdict(OnDisk)
+    controls: OnDisk[ControlParts] = OnDisk()
+    steps: OnDisk[_Steps] = OnDisk()
     with progress_bar(len(showing), "episodes") as advance:
-        measured = map_episodes(measure, showing, advance)
-    columns = control_columns([of_control for _, of_control in measured])
-    parts = [
-        replace(part, objects=part.objects.hstack(control))
-        for (part, _), control in zip(measured, columns, strict=True)
-    ]
-    tables = {}
-    for one in fields(ObjectTables):
-        frames: list[pl.DataFrame] = [frame for part in parts if (frame := getattr(part, one.name)) is not None]
-        tables[one.name] = pl.concat(frames) if frames else None
-    return ObjectTables(**tables)  # type: ignore[arg-type]  # objects and times are never None
+        for of_episode, control, of_steps in each_episode(measure, showing, advance):
+            for name, table in of_episode.items():
+                tables[name].append(table)
+            controls.append(control)
+            if of_steps is not None:
+                steps.append(of_steps)
+    columns, objects = control_columns(showing, controls), tables["objects"]
+    return ObjectTables(
+        objects=TableInParts(MadeWhenAsked(lambda i: objects[i].hstack(columns[i]), range(len(showing)))),
+        times=TableInParts(tables["times"]),
+        pointing=TableInParts(tables["pointing"]) if settings.spatial else None,
+        iou=TableInParts(tables["iou"]) if settings.spatial else None,
+        steps=_step_tables(showing, steps, question.selection) if keep_steps else None,
+        iou_steps=_step_tables(showing, steps, question.selection, settings.thresholds)
+        if keep_steps and settings.spatial
+        else None,
+    )
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """The columns of one episode's tables of steps, which are far larger.
+
+    Attributes:
+        items: labels of the axis of items.
+        columns: camera -> column of `steps` -> (replan or 1, layer or 1, denoise or 1, head or 1, item or 1).
+        iou_columns: camera -> column of `iou_steps` -> (replan, layer, denoise, head, threshold, item).
+    """
+
+    items: Axis
+    columns: Mapping[str, Mapping[str, NDArray[Any]]]
+    iou_columns: Mapping[str, Mapping[str, NDArray[Any]]]
+
+
+def _step_tables(
+    items: Sequence[SelectedEpisode],
+    steps: Sequence[_Steps],
+    selection: Selection,
+    thresholds: Sequence[str] | None = None,
+) -> TableInParts:
+    """`steps`, or with `thresholds` `iou_steps`, a part for each episode and camera."""
+    parts = [(i, camera) for i, item in enumerate(items) for camera in cameras_of(item)]
+
+    def part(number: int) -> pl.DataFrame:
+        i, camera = parts[number]
+        item, found = items[i], steps[i]
+        axes = [{"camera": (camera,)}, replan_axis(item), layer_axis(selection), denoise_axis(selection)]
+        axes.append(head_axis(selection))
+        if thresholds is not None:
+            axes.append({"threshold": thresholds})
+        values = (found.columns if thresholds is None else found.iou_columns)[camera]
+        return long_table(item, [*axes, found.items], values, EPISODE_KEYS)
+
+    return TableInParts(MadeWhenAsked(part, range(len(parts))))
 
 
 @dataclass
@@ -173,7 +222,8 @@ def _measure_episode(
     settings: ObjectSettings,
     keep_steps: bool,
     episodes_of: Mapping[tuple[str, int], int],
-) -> tuple[ObjectTables, ControlParts]:
+) -> tuple[dict[str, pl.DataFrame], ControlParts, _Steps | None]:
+    """The tables of one episode without their control, what the control needs, and with `keep_steps` the steps."""
     names, members = items_of(item)
     views = views_of(item, members, settings)
     measured = {view.camera: _Measured() for view in views}
@@ -210,14 +260,9 @@ def _measure_episode(
     layers = LayerAxis.of(selection, average_one=False)
     averaged = {camera: layers.with_average(values) for camera, values in maps.items()}
     episode = _Episode(item, selection, settings, views, measured, layers, items)
-    tables = ObjectTables(
-        objects=_objects_part(episode),
-        times=_times_part(episode),
-        pointing=_pointing_part(episode) if settings.spatial else None,
-        iou=_iou_part(episode) if settings.spatial else None,
-        steps=_steps_part(episode) if keep_steps else None,
-        iou_steps=_iou_steps_part(episode) if keep_steps and settings.spatial else None,
-    )
+    tables = {"objects": _objects_part(episode), "times": _times_part(episode)}
+    if settings.spatial:
+        tables |= {"pointing": _pointing_part(episode), "iou": _iou_part(episode)}
     pictures = {ALL_CAMERAS: views, **{view.camera: [view] for view in views}}
     sources = {
         name: control_source(
@@ -228,7 +273,7 @@ def _measure_episode(
         for name, seen in pictures.items()
     }
     axes = [layers.columns, head_axis(selection), items]
-    return tables, ControlParts(item, sources, axes, names)
+    return tables, ControlParts(sources, axes, names), _steps(episode) if keep_steps else None
 
 
 def _put(
@@ -369,26 +414,14 @@ def _centres(view: View, measured: _Measured) -> dict[str, Array]:
     }
 
 
-def _step_axes(episode: _Episode) -> list[Axis]:
-    selection = episode.selection
-    return [replan_axis(episode.item), layer_axis(selection), denoise_axis(selection), head_axis(selection)]
-
-
-def _steps_part(episode: _Episode) -> pl.DataFrame:
-    parts = []
+def _steps(episode: _Episode) -> _Steps:
+    columns = {}
     for view in episode.views:
         measured = episode.measured[view.camera]
-        values = {
+        columns[view.camera] = {
             "area_share": view.area.mean(axis=1)[:, None, None, None, :],
             **measured.by_item,
             **{name: array[..., None] for name, array in measured.by_map.items()},
         }
-        parts.append(episode.table(view.camera, _step_axes(episode), values))
-    return pl.concat(parts)
-
-
-def _iou_steps_part(episode: _Episode) -> pl.DataFrame:
-    axes = [*_step_axes(episode), {"threshold": episode.settings.thresholds}]
-    return pl.concat(
-        [episode.table(view.camera, axes, episode.measured[view.camera].by_threshold) for view in episode.views]
-    )
+    by_threshold = {view.camera: episode.measured[view.camera].by_threshold for view in episode.views}
+    return _Steps(episode.items, columns, by_threshold)

@@ -10,7 +10,7 @@ from typing import Any
 import polars as pl
 
 from vla_attention.analyze.measures.aggregate import overall_layer
-from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
+from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, TableInParts
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, find_episode
@@ -48,40 +48,48 @@ class ObjectStudy:
     @property
     def layer(self) -> str:
         """The layer that the summaries are of."""
-        return overall_layer(self.tables.objects)
+        return overall_layer(self.tables.objects.parts[0])
+
+    def _of_layer(self, table: TableInParts) -> pl.DataFrame:
+        return table.filter(pl.col("layer") == self.layer)
 
     @cached_property
     def summary(self) -> pl.DataFrame:
         """Shares, enrichment and control; see `objects_summary`."""
-        return objects_summary(self.tables.objects, self.question.settings.intervals)
+        return objects_summary(self._of_layer(self.tables.objects), self.question.settings.intervals)
 
     @cached_property
     def pointing_summary(self) -> pl.DataFrame | None:
         """Pointing game and distances; see `pointing_summary`."""
         if self.tables.pointing is None:
             return None
-        return pointing_summary(self.tables.pointing, self.question.settings.intervals)
+        return pointing_summary(self._of_layer(self.tables.pointing), self.question.settings.intervals)
 
     @cached_property
     def iou_summary(self) -> pl.DataFrame | None:
         """IoU by threshold; see `iou_summary`."""
-        return None if self.tables.iou is None else iou_summary(self.tables.iou, self.question.settings.intervals)
+        if self.tables.iou is None:
+            return None
+        return iou_summary(self._of_layer(self.tables.iou), self.question.settings.intervals)
 
     @property
     def followed(self) -> list[tuple[dict[str, Any], Leader]]:
         """Which object is followed more than the others; see `followed_objects`."""
-        return followed_objects(self.tables.objects, self.question.settings.intervals)
+        together = self.tables.objects.filter(pl.col("kind") == "object", pl.col("camera") == ALL_CAMERAS)
+        return followed_objects(together, self.question.settings.intervals)
 
     @property
     def finder(self) -> tuple[dict[str, Any], Leader] | None:
         """The layer and head that find the objects of interest; see `leading_finder`."""
         if self.tables.iou is None:
             return None
-        return leading_finder(self.tables.iou, self.settings.shown_threshold, self.question.settings.intervals)
+        threshold = self.settings.shown_threshold
+        classes = self.tables.iou.filter(pl.col("kind") == "class", pl.col("threshold") == threshold)
+        return leading_finder(classes, threshold, self.question.settings.intervals)
 
-    def files(self) -> dict[str, pl.DataFrame]:
+    def files(self) -> dict[str, pl.DataFrame | TableInParts]:
         """All tables by the names of their files."""
-        tables = {
+        tables: dict[str, pl.DataFrame | TableInParts | None] = {
             "objects": self.tables.objects,
             "object_times": self.tables.times,
             "objects_summary": self.summary,

@@ -51,9 +51,10 @@ def plot_object_shares(study: ObjectStudy, folder: Path) -> list[Path]:
     dotted: the control, the enrichment of the same maps on masks of other episodes, where it can tell.
     """
     example = study.example
-    whole = study.tables.times.filter(pl.col("camera") == ALL_CAMERAS)
+    together = pl.col("camera") == ALL_CAMERAS
+    whole = study.tables.times.filter(together, pl.col("kind") == "class")
     attributes = example.episode.attributes
-    own = rows_of_episode(whole, example)
+    own = rows_of_episode(study.tables.times, example).filter(together)
     figure = new_figure(14.5, 4.7)
     num_episodes = whole.select(EPISODE_ID).unique().height
     num_tasks = whole.select(EPISODE_ID[:2]).unique().height

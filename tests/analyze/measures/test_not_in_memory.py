@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vla_attention.analyze.measures.not_in_memory import ArraysOnDisk, MadeWhenAsked
+from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
 from vla_attention.schemas.errors import BadArgument
 
 
 def test_arrays_are_read_as_they_were_written_in_any_order_and_by_threads():
     rng = np.random.default_rng(0)
     given = [{"mass": rng.random((i % 3, 4)), "keys": np.arange(i), "valid": np.array([True, i > 3])} for i in range(9)]
-    kept = ArraysOnDisk(iter(given))
+    kept = OnDisk(iter(given))
     assert len(kept) == 9
     with ThreadPoolExecutor(4) as threads:
         found = list(threads.map(kept.__getitem__, [*reversed(range(9))] * 5))
@@ -30,7 +30,7 @@ def test_arrays_are_read_as_they_were_written_in_any_order_and_by_threads():
 
 def test_no_file_is_left_behind(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    kept = ArraysOnDisk([{"a": np.zeros(1000)}])
+    kept = OnDisk([{"a": np.zeros(1000)}])
     assert list(tmp_path.iterdir()) == []
     number = kept._file.fileno()
     del kept
@@ -42,7 +42,7 @@ def test_no_file_is_left_behind(tmp_path, monkeypatch):
 def test_a_full_disk_is_one_sentence(monkeypatch):
     monkeypatch.setattr(tempfile, "TemporaryFile", lambda buffering: open("/dev/full", "wb", buffering=0))  # noqa: SIM115
     with pytest.raises(BadArgument, match=r"No space left on device; set TMPDIR to a folder with room"):
-        ArraysOnDisk([{"a": np.zeros(1000)}])
+        OnDisk([{"a": np.zeros(1000)}])
 
 
 def test_members_are_made_at_every_access():

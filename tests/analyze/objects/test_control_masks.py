@@ -93,7 +93,7 @@ def stored(path: Path, **changes) -> Path:
 def bowl_of(path: Path) -> dict:
     tables = object_tables(question_about(path), ObjectSettings(spatial=False))
     of_bowl = (pl.col("camera") == "all") & (pl.col("item") == "akita_black_bowl_1")
-    return objects_summary(tables.objects).filter(of_bowl).row(0, named=True)
+    return objects_summary(tables.objects.whole).filter(of_bowl).row(0, named=True)
 
 
 def test_attention_to_the_middle_has_enrichment_but_none_over_the_control(tmp_path):
@@ -120,7 +120,7 @@ def test_of_an_object_that_does_not_move_the_control_cannot_tell(tmp_path, capsy
     (line, *_) = [line for line in printed.splitlines() if line.lstrip().startswith("[of interest]")]
     assert "cannot tell" in line
     tables = object_tables(question_about(path), ObjectSettings(spatial=False))
-    assert followed_objects(tables.objects) == []
+    assert followed_objects(tables.objects.whole) == []
 
 
 def raw(path: Path, task: int, episode: int, camera: str) -> tuple[np.ndarray, np.ndarray]:
@@ -135,7 +135,7 @@ def raw(path: Path, task: int, episode: int, camera: str) -> tuple[np.ndarray, n
 @pytest.mark.parametrize("episodes", [1, 2, 3])
 def test_the_control_is_that_of_loops_over_raw_arrays(tmp_path, episodes):
     path = stored(tmp_path / "a.zarr", episodes=episodes, tasks=(0, 1), layers=(0, 2), denoise_steps=(0, 9))
-    table = object_tables(question_about(path, per_head=True), ObjectSettings(spatial=False)).objects
+    table = object_tables(question_about(path, per_head=True), ObjectSettings(spatial=False)).objects.whole
     number = [thing.name for thing in OBJECTS].index("akita_black_bowl_1")
     for camera in CAMERAS:
         read = {e: raw(path, 1, e, camera) for e in range(episodes)}

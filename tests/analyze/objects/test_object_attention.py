@@ -6,6 +6,7 @@ import math
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import polars as pl
@@ -40,8 +41,13 @@ QUICK = settings(
 CLASS_OF = {"akita_black_bowl_1": "of interest", "plate_1": "of interest", "wooden_cabinet_1": "other objects"}
 
 
-def measured(path: Path, wanted: ObjectSettings | None = None, keep_steps: bool = False, **selected) -> ObjectTables:
-    return object_tables(question_about(path, **selected), wanted, keep_steps)
+def measured(path: Path, wanted: ObjectSettings | None = None, keep_steps: bool = False, **selected) -> SimpleNamespace:
+    return whole(object_tables(question_about(path, **selected), wanted, keep_steps))
+
+
+def whole(tables: ObjectTables) -> SimpleNamespace:
+    """The tables as frames."""
+    return SimpleNamespace(**{name: part and part.whole for name, part in vars(tables).items()})
 
 
 def follow_bowl(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
@@ -273,7 +279,7 @@ def test_a_block_that_has_two_numbers_counts_once_in_the_average(follower_store)
         layer_labels=(*chosen.layer_labels, 20),
         blocks=(*chosen.blocks, chosen.blocks[1]),
     )
-    once, doubled = object_tables(question), object_tables(replace(question, selection=twice))
+    once, doubled = whole(object_tables(question)), whole(object_tables(replace(question, selection=twice)))
     for name in ("objects", "pointing", "iou"):
         averages = [getattr(tables, name).filter(pl.col("layer") == "layers_avg") for tables in (once, doubled)]
         assert_frame_equal(*averages)
