@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from vla_attention.capture.doctor.findings import Finding
+from vla_attention.capture.memory import memory_limits
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.threads import Threads
@@ -51,15 +52,12 @@ def find_processor(threads: Threads) -> Finding:
     return Finding("processor", "ok", text)
 
 
-def find_memory(meminfo: Path = Path("/proc/meminfo")) -> Finding:
-    """Return the memory that is available."""
-    # Here, so that this module can be imported where torch is missing.
-    from vla_attention.capture.rollout.pipeline import available_memory
-
-    available = available_memory(meminfo)
-    if available is None:
+def find_memory(root: Path = Path("/")) -> Finding:
+    """Return the memory that this process may still take. root: as in `memory_limits`."""
+    least = min(memory_limits(root), key=lambda limit: limit.bytes, default=None)
+    if least is None:
         return Finding("memory", "note", "This system does not say how much is available.")
-    return Finding("memory", "ok", f"{format_bytes(available)} available.")
+    return Finding("memory", "ok", f"{format_bytes(least.bytes)} available, by what {least.by} leaves.")
 
 
 def find_gpu(device: str, torch: Any, driver: Path = Path("/proc/driver/nvidia/version")) -> Finding:

@@ -8,8 +8,6 @@ last bits of what the policy computes. A thread writes (`background_writing.py`)
 from __future__ import annotations
 
 import contextlib
-import os
-import re
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -18,10 +16,10 @@ from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
-from pathlib import Path
 
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.claims import Holder
+from vla_attention.capture.memory import memory_left
 from vla_attention.capture.rollout.background_writing import BackgroundWriting, Committed, EpisodeInBackground
 from vla_attention.capture.rollout.episode import (
     EpisodeRecording,
@@ -77,35 +75,6 @@ def default_policy_batch(device: str) -> int | None:
 def default_num_envs() -> int:
     """Return the number of simulators without `--num-envs`: as many as there are cores, and as fit into memory."""
     return max(1, int(min(available_cores(), MOST_BY_DEFAULT, memory_left() / SIMULATOR_BYTES)))
-
-
-def memory_left() -> float:
-    """Return the bytes of memory that the machine, and the SLURM job of this process, have left.
-
-    Infinite where neither says.
-    """
-    left = [float("inf")]
-    available = available_memory()
-    if available is not None:
-        left.append(available)
-    of_job = os.environ.get("SLURM_MEM_PER_NODE", "")  # megabytes; 0 is the whole node
-    own = re.search(r"^VmRSS:\s+(\d+) kB", _text(Path("/proc/self/status")), re.MULTILINE)
-    if of_job.isdecimal() and int(of_job) and own:
-        left.append(1024.0 * (1024 * int(of_job) - int(own[1])))
-    return min(left)
-
-
-def available_memory(meminfo: Path = Path("/proc/meminfo")) -> float | None:
-    """Return the bytes of memory that the machine has left, None where it does not say."""
-    found = re.search(r"^MemAvailable:\s+(\d+) kB", _text(meminfo), re.MULTILINE)
-    return 1024.0 * int(found[1]) if found else None
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError:
-        return ""
 
 
 _WHY_KILLED = "Signal 9 mostly means that the memory was full. "

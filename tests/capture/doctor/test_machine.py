@@ -56,9 +56,10 @@ def test_more_threads_than_processors_is_a_note():
 
 
 def test_memory(tmp_path: Path):
-    meminfo = tmp_path / "meminfo"
+    meminfo = tmp_path / "proc" / "meminfo"
+    meminfo.parent.mkdir()
     meminfo.write_text("MemTotal:  9 kB\nMemAvailable:    2000000 kB\n", encoding="ascii")
-    assert find_memory(meminfo).describe() == "ok       memory      2.05 GB available."
+    assert find_memory(tmp_path).describe() == "ok       memory      2.05 GB available, by what the machine leaves."
     assert find_memory(tmp_path / "none").status == "note"
 
 
