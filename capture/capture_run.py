@@ -27,7 +27,7 @@ from vla_attention.capture.jobs.worker_records import (
 )
 from vla_attention.capture.policies.identity import announcement
 from vla_attention.capture.policies.policy import BatchPolicy, Policy, is_compiled, stored_picture_sizes
-from vla_attention.capture.provenance import describe_machine
+from vla_attention.capture.provenance import POLICY_BATCH, describe_machine
 from vla_attention.capture.rollout.episode import EpisodeResult, EpisodeRun, check_protocol, max_replans
 from vla_attention.capture.rollout.episode_loop import EpisodeLoop
 from vla_attention.capture.rollout.pipeline import PipelinedLoop, default_num_envs, default_policy_batch
@@ -197,6 +197,9 @@ def _record_missing(
     worker = this_worker()
     record = RecordWriter(store.path, worker, plan, torch.get_num_threads())
     num_envs = min(settings.num_envs or default_num_envs(), len(todo))
+    batch = num_envs if largest_batch is None else min(largest_batch, num_envs)
+    if batch > 1:  # calls of a batch round differently, and which share one depends on the simulators' speed
+        machine = {**machine, POLICY_BATCH: str(batch)}
     parts: dict[str, Any] = {
         "suite": settings.suite,
         "environment_settings": environment_settings,
@@ -205,7 +208,6 @@ def _record_missing(
         "record": record,
         "termination": termination,
     }
-    batch = num_envs if largest_batch is None else min(largest_batch, num_envs)
     if num_envs > 1:
         batches = f" Policy calls in batches of at most {batch}; --policy-batch N changes it." if batch > 1 else ""
         say(f"Simulators: {num_envs} processes; --num-envs N changes it.{batches}")

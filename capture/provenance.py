@@ -10,6 +10,9 @@ from pathlib import Path
 #: Packages whose versions can change numbers or pictures.
 _LIBRARIES = ("torch", "numpy", "mujoco", "robosuite", "hf-libero", "zarr", "numcodecs", "sentencepiece")
 
+#: The fact that says of how many policy calls a batch had at most, where that was more than one.
+POLICY_BATCH = "policy_batch"
+
 
 def describe_machine(device: str) -> dict[str, str]:
     """Return versions of code and libraries, processor, GPU and threads; nothing that identifies a person or a host."""

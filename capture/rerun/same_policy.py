@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from vla_attention.capture.provenance import POLICY_BATCH
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.stores.reader import Store
@@ -55,5 +56,7 @@ def _first_difference(old: object, new: object, where: str) -> tuple[str, object
 
 def machine_differences(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
     """Return what differs between the machine of an episode and this one, as `torch 2.9 then, 2.10 now`."""
+    single = {POLICY_BATCH: "1"}
+    then, now = single | dict(then), single | dict(now)
     facts = [name for name in then if name in now and then[name] != now[name]]
     return [f"{name} {then[name]} then, {now[name]} now" for name in facts]

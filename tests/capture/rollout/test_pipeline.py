@@ -27,10 +27,12 @@ from vla_attention.capture.jobs.claims import Claims, holders
 from vla_attention.capture.jobs.status import store_status
 from vla_attention.capture.jobs.termination import EXIT_TERMINATED
 from vla_attention.capture.jobs.worker import Worker
+from vla_attention.capture.rerun.same_policy import machine_differences
 from vla_attention.capture.rollout import pipeline, simulator_process
 from vla_attention.capture.rollout.policy_call import record_calls
 from vla_attention.capture.rollout.simulation import Advanced
 from vla_attention.schemas.errors import MissingDependency
+from vla_attention.schemas.stores.reader import open_store
 
 NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2")
 TINY = ["pi", "--checkpoint", "untrained-tiny", "--replan-steps", "4", "--max-steps", "8"]
@@ -424,6 +426,10 @@ def test_the_first_replan_of_a_batch_is_that_of_single_calls_but_for_rounding(
     assert "Policy calls in batches of at most 3; --policy-batch N changes it." in capsys.readouterr().out
     assert sizes[0] == 3
     assert sum(sizes) == 8
+    given = {kind: open_store(tmp_path / f"{kind}.zarr").episodes[0].attributes.provenance for kind in ("one", "four")}
+    assert "policy_batch" not in given["one"]
+    assert given["four"] == {**given["one"], "policy_batch": "3"}
+    assert machine_differences(given["four"], given["one"]) == ["policy_batch 3 then, 1 now"]
     for name in [f"task00{task}_episode00{episode}" for task in (0, 2) for episode in (0, 1)]:
         one, four = (zarr.open_group(tmp_path / f"{kind}.zarr/episodes/{name}", mode="r") for kind in ("one", "four"))
         for path in ["actions", "joint/row_sum", "joint/atoms", *(["joint/contribution"] if contributions else [])]:
@@ -581,19 +587,3 @@ def test_simulators_fit_into_the_memory(left, expected, monkeypatch):
     monkeypatch.setattr(pipeline, "available_cores", lambda: 64)
     monkeypatch.setattr(pipeline, "memory_left", lambda: left)
     assert pipeline.default_num_envs() == expected
-
-
-def test_memory_is_that_of_the_job_where_it_has_less_than_the_machine(monkeypatch):
-    texts = {
-        "/proc/meminfo": "MemTotal: 99 kB\nMemAvailable:   16000000 kB\n",
-        "/proc/self/status": "VmRSS:\t 1024 kB\n",
-    }
-    monkeypatch.setattr(pipeline, "_text", lambda path: texts[str(path)])
-    monkeypatch.delenv("SLURM_MEM_PER_NODE", raising=False)
-    assert pipeline.memory_left() == 1024 * 16_000_000
-    monkeypatch.setenv("SLURM_MEM_PER_NODE", "4001")
-    assert pipeline.memory_left() == 4000 * 2**20
-    monkeypatch.setenv("SLURM_MEM_PER_NODE", "0")
-    assert pipeline.memory_left() == 1024 * 16_000_000
-    monkeypatch.setattr(pipeline, "_text", lambda path: "")
-    assert pipeline.memory_left() == float("inf")
