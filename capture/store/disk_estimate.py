@@ -24,6 +24,8 @@ _SEGMENTS_OF_SPAN = {"text": 6, "latent": 2}
 _BYTES_PER_PIECE = 150
 #: Object coverage of one patch, compressed: most patches show one object or two.
 _COVERAGE_BYTES_PER_PATCH = 8
+#: What episodes of so many replans take, as shares of the bound: in `benchmarks/disk_estimate.py` 0.20 to 0.50.
+_USUAL = (0.2, 0.5)
 #: State, actions and numbers of a replan.
 _SMALL_PER_REPLAN = 8_000
 #: Metadata and small arrays of one episode: some seventy files and folders, each at least one block of the file system.
@@ -81,12 +83,15 @@ def describe(estimate: DiskEstimate, path: Path) -> str:
     """The line printed before a run, with a warning when the disk has less room than that."""
     existing = next(folder for folder in (path, *path.parents) if folder.exists())
     free = shutil.disk_usage(existing).free
-    measured = f", measured, + {format_bytes(estimate.episode_overhead)} each" if estimate.measured else ""
+    total = estimate.total_bytes
+    measured, usual = f", measured, + {format_bytes(estimate.episode_overhead)} each", ""
+    if not estimate.measured:
+        measured, usual = "", f"; mostly {format_bytes(total * _USUAL[0])} to {format_bytes(total * _USUAL[1])}"
     line = (
-        f"Disk: at most {format_bytes(estimate.total_bytes)} "
+        f"Disk: at most {format_bytes(total)} "
         f"({estimate.num_episodes} episodes x up to {estimate.max_replans} replans "
-        f"x {format_bytes(estimate.bytes_per_replan)}{measured}); {format_bytes(free)} free."
+        f"x {format_bytes(estimate.bytes_per_replan)}{measured}){usual}; {format_bytes(free)} free."
     )
-    if estimate.total_bytes > free:
+    if total > free:
         line += " WARNING: that is more than the disk has room for; record fewer layers, denoise steps or episodes."
     return line

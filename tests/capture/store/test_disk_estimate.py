@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -130,7 +131,9 @@ def test_the_line_before_a_run(tmp_path, monkeypatch):
     estimate = DiskEstimate(1_000_000, 50, 20)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=2e9))
     line = describe(estimate, tmp_path / "not" / "yet" / "a.zarr")
-    assert line == "Disk: at most 1.01 GB (20 episodes x up to 50 replans x 1 MB); 2 GB free."
+    assert line == "Disk: at most 1.01 GB (20 episodes x up to 50 replans x 1 MB); mostly 201 MB to 503 MB; 2 GB free."
+    exact = describe(dataclasses.replace(estimate, measured=True), tmp_path / "a.zarr")
+    assert exact == "Disk: at most 1.01 GB (20 episodes x up to 50 replans x 1 MB, measured, + 300 kB each); 2 GB free."
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=5e8))
     assert "500 MB free. WARNING: that is more than the disk has room for" in describe(estimate, tmp_path)
 
