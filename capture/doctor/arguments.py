@@ -41,8 +41,8 @@ def add_doctor_arguments(
     group.add_argument(
         "--accept",
         metavar="CHECKPOINT",
-        help="run this checkpoint on ten episodes and hold its success against the published rate; exit code 1 when it "
-        "solves too few",
+        help="run this checkpoint on ten episodes, or --num-episodes of each of as many tasks, and hold its success "
+        "against the published rate; exit code 1 when it solves too few",
     )
     group.add_argument(
         "--published-rate",
@@ -52,8 +52,14 @@ def add_doctor_arguments(
     )
     group.add_argument("--no-trial", action="store_true", help="load no policy and run no simulator: look only")
     add_capture_arguments(parser, family)
-    # A suite that nobody typed is that of the published rate.
-    parser.set_defaults(command=_run, family=family, task_suite=None)
+    # A suite that nobody typed is that of the published rate, and with --accept there are ten episodes.
+    parser.set_defaults(
+        command=_run,
+        family=family,
+        task_suite=None,
+        num_episodes=None,
+        episodes_of_a_run=parser.get_default("num_episodes"),
+    )
 
 
 def _run(arguments: argparse.Namespace, termination: Termination) -> int:

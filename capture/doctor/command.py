@@ -6,7 +6,7 @@ import argparse
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +24,8 @@ from vla_attention.capture.doctor.machine import (
     find_processor,
 )
 from vla_attention.capture.doctor.simulators import find_simulator
+from vla_attention.capture.environments.suites import find_suite
+from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.run_settings import RecordingSettings, RunSettings, run_settings
 from vla_attention.schemas.command_line import format_bytes
@@ -47,6 +49,8 @@ def run_doctor(arguments: argparse.Namespace, termination: Termination) -> int:
         raise BadArgument("Cannot use --published-rate without --accept CHECKPOINT.")
     if arguments.task_suite is None:
         arguments.task_suite = arguments.family.default_suite
+    if arguments.num_episodes is None:
+        arguments.num_episodes = arguments.episodes_of_a_run
     settings = run_settings(arguments)
     findings = []
     for finding in _findings(arguments, settings, termination):
@@ -161,13 +165,14 @@ def _free(path: Path) -> int:
 class _PlannedRun:
     attributes: RootAttributes
     num_tasks: int
-    trial: Trial
+    trials: Sequence[Trial]
 
 
 def _try(settings: RunSettings, policy: Policy, device: str, termination: Termination) -> Iterator[Finding]:
-    """Run the first replans; yield time and size of the run that is described."""
+    """Run the first replans of a task, or with a budget of as many as the run; yield time and size of that run."""
     from vla_attention.capture.budget import choose_recording, recordings_by_size
     from vla_attention.capture.rollout.episode import max_replans
+    from vla_attention.capture.store.measured_size import mean_size
     from vla_attention.schemas.stores.store_format import Recording
 
     try:
@@ -175,10 +180,10 @@ def _try(settings: RunSettings, policy: Policy, device: str, termination: Termin
     except UserError as error:
         yield Finding("trial", "missing", str(error))
         return
-    trial, attributes = planned.trial, planned.attributes
+    trials, attributes = planned.trials, planned.attributes
     protocol, episodes = attributes.protocol, planned.num_tasks * settings.num_episodes
     replans = max_replans(protocol)
-    yield _time(settings, trial, replans, protocol.replan_steps, episodes)
+    yield _time(settings, trials[0], replans, protocol.replan_steps, episodes)
     yield _memory_taken(device)
     candidates: tuple[Recording, ...] = (attributes.recording,)
     if settings.budget is not None:
@@ -188,7 +193,7 @@ def _try(settings: RunSettings, policy: Policy, device: str, termination: Termin
         choice = choose_recording(
             candidates,
             budget,
-            lambda recording: trial.sample.size(recording).estimate(replans, episodes),
+            lambda recording: mean_size([trial.sample.size(recording) for trial in trials]).estimate(replans, episodes),
             policy.num_denoise_steps,
         )
     except UserError as error:
@@ -198,7 +203,8 @@ def _try(settings: RunSettings, policy: Policy, device: str, termination: Termin
     text = (
         f"At most {format_bytes(estimate.total_bytes)}: {episodes} episodes, up to {replans} replans each, "
         f"{format_bytes(estimate.bytes_per_replan)} a replan and {format_bytes(estimate.episode_overhead)} an episode; "
-        f"measured on {len(trial.sample.records)} replans."
+        f"measured on {sum(len(trial.sample.records) for trial in trials)} replans of "
+        f"{'one task' if len(trials) == 1 else f'{len(trials)} tasks'}."
     )
     if settings.budget is not None:
         text = " ".join([text, *choice.lines])
@@ -212,13 +218,14 @@ def _try(settings: RunSettings, policy: Policy, device: str, termination: Termin
 def _plan(settings: RunSettings, policy: Policy, device: str, termination: Termination) -> _PlannedRun:
     """Plan the run as `run_capture` does, check that it can continue its store, and try its first replans."""
     from vla_attention.capture.budget import recordings_by_size
+    from vla_attention.capture.budgeted_recording import TRIED_TASKS
     from vla_attention.capture.capture_run import plan_changes, plan_protocol, plan_recording
     from vla_attention.capture.environments.base import EnvironmentSettings
     from vla_attention.capture.environments.suites import list_tasks
     from vla_attention.capture.provenance import describe_machine
     from vla_attention.capture.rollout.episode import check_protocol
     from vla_attention.capture.store.store_root import check_same_run, read_existing_root
-    from vla_attention.capture.trial import run_trial
+    from vla_attention.capture.trial import run_trial, spread
     from vla_attention.schemas.stores.store_format import FORMAT_NAME, FORMAT_VERSION, Recording, RootAttributes
 
     evaluation = settings.protocol or policy.default_protocol
@@ -246,8 +253,11 @@ def _plan(settings: RunSettings, policy: Policy, device: str, termination: Termi
         same = existing.recording if existing.recording in candidates else attributes.recording
         check_same_run(settings.store, existing, replace(attributes, recording=same))
     environment = EnvironmentSettings(evaluation, settings.libero_assets)
-    trial = run_trial(policy, tried, wanted[0], environment, changes, termination.check)
-    return _PlannedRun(attributes, len(wanted), trial)
+    trials = [
+        run_trial(policy, tried, task, environment, changes, termination.check)
+        for task in spread(wanted, TRIED_TASKS if settings.budget is not None else 1)
+    ]
+    return _PlannedRun(attributes, len(wanted), trials)
 
 
 def _time(settings: RunSettings, trial: Trial, replans: int, replan_steps: int, episodes: int) -> Finding:
@@ -295,21 +305,25 @@ def _accept(arguments: argparse.Namespace, termination: Termination) -> int:
     """Run ten episodes of the checkpoint, and print how its success stands to the published rate."""
     if arguments.task_id is not None or arguments.no_trial or arguments.budget is not None or arguments.resume:
         raise BadArgument("Cannot use --task-id, --budget, --resume or --no-trial with --accept: it runs ten episodes.")
+    if not read_interventions(arguments).is_none:
+        raise BadArgument("Cannot use interventions with --accept: the published rate is of the policy as it is.")
     published = find_published_rate(arguments.accept, arguments.task_suite, arguments.family, arguments.published_rate)
     arguments.checkpoint, arguments.task_suite = arguments.accept, published.suite
     threads = use_threads(arguments.threads)
+    tasks, episodes = share_of_tasks(find_suite(arguments.task_suite).num_tasks)
+    if arguments.num_episodes is None:
+        arguments.num_episodes = episodes
     settings = run_settings(arguments)
 
     from vla_attention.capture.capture_run import run_capture
     from vla_attention.capture.device import load_torch
     from vla_attention.capture.trial import spread
 
-    tasks, episodes = share_of_tasks(settings.suite.num_tasks)
     chosen = spread(range(settings.suite.num_tasks), tasks)
     device = load_torch(arguments.device, threads.number)
     policy = arguments.family.build(arguments, device)
     with ExitStack() as stack:
-        settings = replace(settings, task_ids=tuple(chosen), num_episodes=episodes)
+        settings = replace(settings, task_ids=tuple(chosen))
         if arguments.store is None:
             # Success is all that is asked: the least is recorded, and nothing of it is kept.
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="vla-accept-")))

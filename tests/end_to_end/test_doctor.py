@@ -78,11 +78,13 @@ def test_a_disk_that_is_too_small_and_a_budget(tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(command, "_free", lambda path: 10**7)
     assert capture(run) == 1
     status, text = lines_of(capfd.readouterr().out)["size"]
+    assert "measured on 8 replans of one task." in text
     assert (status, "10 MB are free: give --budget, fewer episodes" in text) == ("MISSING", True)
     monkeypatch.setattr(command, "_free", lambda path: 10**9)
     assert capture([*run, "--budget", "400MB"]) == 0
     status, text = lines_of(capfd.readouterr().out)["size"]
     assert (status, "Budget 400 MB: recording " in text) == ("ok", True)
+    assert "measured on 24 replans of 3 tasks." in text  # as many tasks as the run tries
 
 
 def test_a_policy_that_fails_is_not_accepted(tmp_path, capfd):
@@ -93,6 +95,12 @@ def test_a_policy_that_fails_is_not_accepted(tmp_path, capfd):
     assert "Published: 99.0% of 500 episodes (97.7% to 99.7%), --published-rate." in said
     assert "Not solved: task 0 episode 0, task 2 episode 0" in said
     assert "NOT accepted" in said
+
+
+def test_the_number_of_episodes_can_be_given(tmp_path, capfd):
+    options = ["--published-rate", "0.99", "--task-suite", "cubes", "--max-steps", "5", "--num-envs", "1"]
+    assert capture(["doctor", "--accept", "untrained-tiny", *options, "--num-episodes", "2"]) == 1
+    assert "Solved 0 of 20 episodes of cubes" in capfd.readouterr().out
 
 
 @pytest.mark.slow
@@ -112,6 +120,8 @@ def test_the_policy_that_comes_along_is_accepted(tmp_path, capfd):
         (["--accept", "my/own"], "No success rate of the checkpoint 'my/own' is known; there are rates of pi05_cubes"),
         (["--published-rate", "0.9"], "Cannot use --published-rate without --accept CHECKPOINT."),
         (["--accept", "pi05_cubes", "--task-id", "0"], "Cannot use --task-id, --budget, --resume or --no-trial with"),
+        (["--accept", "pi05_cubes", "--keep", "camera:base_0_rgb"], "Cannot use interventions with --accept: the"),
+        (["--accept", "pi05_cubes", "--num-episodes", "0"], "Cannot use --num-episodes 0; expected at least 1."),
         (["--task-suite", "cube"], "Unknown task suite 'cube'. Did you mean 'cubes'?"),
     ],
 )
