@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, DataSetFrame
 from vla_attention.capture.replay.robot_policy import RobotPolicy
-from vla_attention.capture.rollout.policy_call import record_call
-from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
+from vla_attention.capture.rollout.policy_call import record_call, replan_record
+from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter
 from vla_attention.capture.store.store_writer import RunStore
 
 #: The column that says of every frame whether the task is solved, where a data set has it.
@@ -97,16 +97,12 @@ def _append_call(
     where = f"replan {len(writer.records)} (frame {frame.index}) of {writer.what}"
     call = record_call(policy, policy_input, seed, recording, where)
     writer.append(
-        ReplanRecord(
+        replan_record(
+            policy_input,
+            call,
+            recording,
             env_step=frame.index,
             noise_seed=seed,
-            rows=call.rows,
-            key_role=policy_input.key_role,
-            prompt=policy_input.prompt,
-            state=policy_input.state,
-            actions=call.actions,
-            frames=policy_input.frames if recording.frames else {},
-            camera_frames=policy_input.camera_frames if recording.frames else {},
             dataset_actions=None if actions is None else actions[frame.index : frame.index + policy.action_horizon],
         )
     )

@@ -12,7 +12,8 @@ from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.rerun.calls import Repeater
 from vla_attention.capture.rerun.progress import RerunProgress
 from vla_attention.capture.rerun.stored_calls import StoredCalls, read_calls
-from vla_attention.capture.store.episode_writer import EpisodeStart, ReplanRecord
+from vla_attention.capture.rollout.policy_call import replan_record
+from vla_attention.capture.store.episode_writer import EpisodeStart
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.store_format import StoreExists, parse_episode_name
@@ -76,16 +77,12 @@ def rerun_episode(
             policy_input = repeater.prepare(calls, replan)
             call = repeater.call(calls, replan, policy_input)
             writer.append(
-                ReplanRecord(
+                replan_record(
+                    policy_input,
+                    call,
+                    recording,
                     env_step=int(calls.env_step[replan]),
                     noise_seed=repeater.noise_seed(calls, replan),
-                    rows=call.rows,
-                    key_role=policy_input.key_role,
-                    prompt=policy_input.prompt,
-                    state=policy_input.state,
-                    actions=call.actions,
-                    frames=policy_input.frames if recording.frames else {},
-                    camera_frames=policy_input.camera_frames if recording.frames else {},
                     coverage=calls.coverage_of(replan),
                     dataset_actions=calls.dataset_actions_of(replan),
                 )

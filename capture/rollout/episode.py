@@ -18,7 +18,7 @@ from vla_attention.capture.environments.base import Environment, Task
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.policies.policy import Policy, camera_grid
-from vla_attention.capture.rollout.policy_call import PreparedCall, RecordedCall, record_calls
+from vla_attention.capture.rollout.policy_call import PreparedCall, RecordedCall, record_calls, replan_record
 from vla_attention.capture.rollout.simulation import Advanced, Begun, CameraPatches, Seen, Simulation, StopCheck
 from vla_attention.capture.store.episode_writer import EpisodeStart, ReplanRecord
 from vla_attention.capture.store.store_writer import RunStore
@@ -160,19 +160,15 @@ class EpisodeRecording:
 
     def keep(self, prepared: PreparedCall, call: RecordedCall, writer: ReplanWriter) -> None:
         """Store a policy call that has been made."""
-        frames, given = self.run.store.attributes.recording.frames, prepared.policy_input
+        recording = self.run.store.attributes.recording
         self.num_replans += 1
         writer.append(
-            ReplanRecord(
+            replan_record(
+                prepared.policy_input,
+                call,
+                recording,
                 env_step=prepared.env_step,
                 noise_seed=prepared.noise_seed,
-                rows=call.rows,
-                key_role=given.key_role,
-                prompt=given.prompt,
-                state=given.state,
-                actions=call.actions,
-                frames=given.frames if frames else {},
-                camera_frames=given.camera_frames if frames else {},
                 coverage=prepared.coverage,
             )
         )

@@ -13,6 +13,7 @@ from vla_attention.capture.policies.policy import BatchPolicy, Policy, PolicyInp
 from vla_attention.capture.recording.attention import AttentionEditor
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite, all_finite, describe_origin
 from vla_attention.capture.recording.recorder import make_recorders
+from vla_attention.capture.store.episode_writer import ReplanRecord
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.stores.store_format import Recording
@@ -48,6 +49,32 @@ def record_call(
     if not all_finite(actions, rows):
         raise _not_finite(policy, policy_input, noise_seed, where, editors)
     return RecordedCall(actions, rows)
+
+
+def replan_record(
+    policy_input: PolicyInput,
+    call: RecordedCall,
+    recording: Recording,
+    *,
+    env_step: int,
+    noise_seed: int,
+    coverage: Mapping[str, NDArray[np.float32]] | None = None,
+    dataset_actions: NDArray[np.float64] | None = None,
+) -> ReplanRecord:
+    """Return what is stored of a policy call; see `ReplanRecord`."""
+    return ReplanRecord(
+        env_step=env_step,
+        noise_seed=noise_seed,
+        rows=call.rows,
+        key_role=policy_input.key_role,
+        prompt=policy_input.prompt,
+        state=policy_input.state,
+        actions=call.actions,
+        frames=policy_input.frames if recording.frames else {},
+        camera_frames=policy_input.camera_frames if recording.frames else {},
+        coverage=coverage or {},
+        dataset_actions=dataset_actions,
+    )
 
 
 @dataclass(frozen=True)
