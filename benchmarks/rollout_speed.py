@@ -1,13 +1,14 @@
 """Episodes a minute: one simulator in the policy's process, several in processes of their own, and without writing.
 
-Usage: OMP_NUM_THREADS=1 python benchmarks/rollout_speed.py [--suite libero_10] [--episodes 6] [--max-steps 40]
-           [--rounds 3] [--num-envs 2] [--checkpoint untrained]
+Usage: OMP_NUM_THREADS=1 python benchmarks/rollout_speed.py [--suite libero_10] [--episodes 8] [--max-steps 30]
+           [--rounds 3] [--num-envs 2 3] [--checkpoint untrained]
 
 Every policy and every renderer has one thread. All episodes have the same length, as random weights solve nothing. The
 rate of a run counts from the commits of its first `num_envs` episodes to the last commit, so that starting processes
-and building scenes is left out. The core-seconds of an episode are those of the run with one simulator, by part; the
-bound is the largest of their sum shared by the cores, the policy (one process calls it) and the simulation shared by
-the simulators. "without writing" drops every replan instead of giving it to the thread.
+and building scenes is left out. The core-seconds of an episode are those of the same round's run with one simulator, by
+part; the bound is the largest of their sum shared by the cores, the policy (one process calls it) and the simulation
+shared by the simulators. Beside it stand the core-seconds that each run took, counted like its rate, which say what
+beside waiting keeps it from the bound. "without writing" drops every replan instead of giving it to the thread.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,13 +43,10 @@ from vla_attention.schemas.threads import use_threads  # noqa: E402
 
 
 class Parts:
-    """The processor time of parts of the run with one simulator, in seconds."""
+    """The processor time of parts of a run with one simulator, in seconds."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {"simulation": 0.0, "policy": 0.0, "writing": 0.0}
-        self.num_episodes = 0
-        #: The largest memory of each process that simulated.
-        self.peak_mb: list[float] = []
 
     def timed(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
         def timed_call(*given: Any, **options: Any) -> Any:
@@ -58,6 +57,22 @@ class Parts:
                 self.seconds[part] += time.process_time() - began
 
         return timed_call
+
+
+@dataclass(frozen=True)
+class Run:
+    """Episodes a minute, core-seconds of an episode of all processes, and those of its parts (one simulator)."""
+
+    rate: float
+    core_seconds: float
+    parts: dict[str, float]
+
+
+def processor_seconds() -> float:
+    """Return the processor time of this process and the simulators that live."""
+    children = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+    stats = [Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split() for child in children]
+    return time.process_time() + sum(int(stat[11]) + int(stat[12]) for stat in stats) / os.sysconf("SC_CLK_TCK")
 
 
 class NotWritten(background_writing.EpisodeInBackground):
@@ -74,25 +89,26 @@ class NotWritten(background_writing.EpisodeInBackground):
         self.writing.put(lambda: self.writing.done(committed), 0)
 
 
-def rate(policy: Policy, arguments: argparse.Namespace, num_envs: int, written: bool, parts: Parts) -> float:
-    """Run the episodes, and return how many a minute."""
+def measure(policy: Policy, arguments: argparse.Namespace, num_envs: int, written: bool, peak_mb: list[float]) -> Run:
+    """Run the episodes; peak_mb: gets the largest memory of each process that simulated."""
+    parts = Parts()
     with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
         words = ["pi", "--checkpoint", arguments.checkpoint, "--task-suite", arguments.suite, "--task-id", "0"]
         words += ["--num-episodes", str(arguments.episodes), "--max-steps", str(arguments.max_steps)]
         words += ["--store", str(Path(folder) / "run.zarr"), "--num-envs", str(num_envs)]
         settings = run_settings(build_parser().parse_args(words))
-        commits: list[float] = []
+        commits: list[tuple[float, float]] = []
         note, made = episode_loop.EpisodeLoop.note_commit, pipeline.BackgroundWriting.episode
 
         def note_commit(loop: Any, result: Any) -> None:
-            commits.append(time.monotonic())
+            commits.append((time.monotonic(), processor_seconds()))
             note(loop, result)
 
         close = pipeline.SimulatorProcess.close
 
         def close_measured(process: Any) -> None:
             status = Path(f"/proc/{process.number}/status").read_text()
-            parts.peak_mb.append(float(status.partition("VmHWM:")[2].split()[0]) / 1024)
+            peak_mb.append(float(status.partition("VmHWM:")[2].split()[0]) / 1024)
             close(process)
 
         episode_loop.EpisodeLoop.note_commit = note_commit  # type: ignore[method-assign]
@@ -117,19 +133,20 @@ def rate(policy: Policy, arguments: argparse.Namespace, num_envs: int, written: 
             for (kind, name), method in own.items():
                 setattr(kind, name, method)
             episode.record_calls, episode.EpisodeRecording.prepare = call, prepare  # type: ignore[method-assign]
-        if num_envs == 1:
-            parts.num_episodes += len(commits)
-    return 60 * (len(commits) - num_envs) / (commits[-1] - commits[num_envs - 1])
+    num_counted = len(commits) - num_envs
+    seconds, core_seconds = (last - first for first, last in zip(commits[num_envs - 1], commits[-1], strict=True))
+    shares = {part: each / len(commits) for part, each in parts.seconds.items()}
+    return Run(60 * num_counted / seconds, core_seconds / num_counted, shares)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--suite", default="libero_10")
     parser.add_argument("--checkpoint", default="untrained")
-    parser.add_argument("--episodes", type=int, default=6)
-    parser.add_argument("--max-steps", type=int, default=40)
+    parser.add_argument("--episodes", type=int, default=8)
+    parser.add_argument("--max-steps", type=int, default=30)
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--num-envs", type=int, default=2)
+    parser.add_argument("--num-envs", type=int, nargs="+", default=[2, 3])
     parser.add_argument("--folder", help="where the stores are written (default: the folder for temporary files)")
     arguments = parser.parse_args()
     use_threads(1)
@@ -137,43 +154,57 @@ def main() -> None:
     words = ["pi", "--checkpoint", arguments.checkpoint]
     given = build_parser().parse_args(words)
     policy = given.family.build(given, "cpu")
-    parts, cores, num = Parts(), len(os.sched_getaffinity(0)), arguments.num_envs
-    several, unwritten = f"{num} simulators", f"{num} simulators, without writing"
-    rates = in_turn(
-        {
-            "one simulator": lambda: rate(policy, arguments, 1, True, parts),
-            several: lambda: rate(policy, arguments, num, True, parts),
-            unwritten: lambda: rate(policy, arguments, num, False, parts),
-        },
-        arguments.rounds,
-        warm_up=0,
-    )
-    shares = {part: seconds / parts.num_episodes for part, seconds in parts.seconds.items()}
-    total = sum(shares.values())
-    # No process but this one calls the policy, and a simulator is in one episode at a time.
-    least = max(total / cores, shares["policy"], shares["simulation"] / num)
-    bound = 60 / least
+    cores, peak_mb = len(os.sched_getaffinity(0)), list[float]()
+    kinds = {"one simulator": (1, True)} | {f"{num} simulators": (num, True) for num in arguments.num_envs}
+    several = f"{arguments.num_envs[0]} simulators"
+    unwritten = f"{several}, without writing"
+    kinds[unwritten] = (arguments.num_envs[0], False)
+    runs: dict[str, list[Run]] = {name: [] for name in kinds}
+
+    def measurer(name: str) -> Callable[[], float]:
+        def rate() -> float:
+            runs[name].append(measure(policy, arguments, *kinds[name], peak_mb))
+            return runs[name][-1].rate
+
+        return rate
+
+    rates = in_turn({name: measurer(name) for name in kinds}, arguments.rounds, warm_up=0)
+    serial = [run.parts for run in runs["one simulator"]]
+
+    def bounds(num_envs: int) -> list[float]:
+        # No process but this one calls the policy, and a simulator is in one episode at a time.
+        return [
+            60 / max(sum(parts.values()) / cores, parts["policy"], parts["simulation"] / num_envs) for parts in serial
+        ]
+
     rows: list[dict[str, Any]] = [
         {
             "run": name,
             "rate": measured(values),
             "times": measured(ratios(values, rates["one simulator"])),
-            "of_bound": measured([value / bound for value in values]) if name != "one simulator" else None,
+            "of_bound": measured(ratios(values, bounds(kinds[name][0]))) if name != "one simulator" else None,
+            "core_seconds": measured([run.core_seconds for run in runs[name]]),
         }
         for name, values in rates.items()
     ]
     written = measured(ratios(rates[several], rates[unwritten]))
+    bound = measured(bounds(arguments.num_envs[0]))
     what = f"{arguments.checkpoint}, {arguments.suite} task 0, {arguments.max_steps} steps an episode"
     note = (
-        f"{what}. Bound: {least:.2f} s an episode on {cores} cores = {bound:.1f} episodes a minute. With writing "
-        f"{written.median:.3f} ({written.lowest:.3f} to {written.highest:.3f}) of the rate without. A "
-        f"simulator's process took {max(parts.peak_mb):.0f} MB."
+        f"{what}. Bound: {bound.median:.1f} episodes a minute on {cores} cores. With writing {written.median:.3f} "
+        f"({written.lowest:.3f} to {written.highest:.3f}) of the rate without. A simulator's process took "
+        f"{max(peak_mb):.0f} MB."
     )
-    columns = {"run": "run", "rate": "episodes a minute", "times": "times one simulator", "of_bound": "of the bound"}
-    costs = [
-        {"part": part, "seconds": round(seconds, 3), "share": round(seconds / total, 3)}
-        for part, seconds in shares.items()
-    ]
+    columns = {
+        "run": "run",
+        "rate": "episodes a minute",
+        "times": "times one simulator",
+        "of_bound": "of the bound",
+        "core_seconds": "core-seconds an episode",
+    }
+    shares = {part: measured([parts[part] for parts in serial]) for part in serial[0]}
+    total = sum(share.median for share in shares.values())
+    costs = [{"part": part, "seconds": each, "share": round(each.median / total, 3)} for part, each in shares.items()]
     tables = {
         f"{arguments.suite}": Table(columns, rows, note),
         f"{arguments.suite}-parts": Table(
