@@ -89,7 +89,7 @@ def decode_only(store: Path, threads: int) -> Callable[[], None]:
     from vla_attention.schemas.stores.digest import crc32c
 
     def positions(episode: StoredEpisode) -> tuple[Path, list[tuple[int, int]], int]:
-        name = "joint/rows/c/0/0/0/0/0/0"
+        name = next(file for file in episode.files.records if file.startswith("joint/rows/c"))
         shard = episode.files.shard(name)
         assert shard is not None
         replans, *_, heads, queries, keys = episode.shape_of("joint/rows")

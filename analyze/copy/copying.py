@@ -14,13 +14,11 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from vla_attention.analyze.copy.packing import Packing
 from vla_attention.schemas.errors import BadArgument, UserError, unknown_name
-from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.stores.digest import run_digest
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.remote_source import source_of
@@ -28,11 +26,9 @@ from vla_attention.schemas.stores.root import episode_folders, group_attributes
 from vla_attention.schemas.stores.seal import SEAL_FILE, seal_episode
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
-    FORMAT_VERSION,
     PARTIAL_SUFFIX,
     STORE_SUFFIX,
     CorruptEpisode,
-    RootAttributes,
     RunMismatch,
 )
 
@@ -166,10 +162,8 @@ def _ensure_root(store: Store, target: Path, root: bytes, building: Path) -> Non
 
 def _copy_episode(episode: StoredEpisode, folder: Path, without: tuple[str, ...], run: str) -> tuple[int, int]:
     """Write the copy of one episode; returns (bytes copied, bytes omitted)."""
-    attributes = episode.attributes
-    kept = {name: record for name, record in attributes.arrays.items() if _part_of(name) not in without}
-    for name in kept:
-        if f"{name}/zarr.json" not in episode.files.records:
+    for name in episode.attributes.arrays:
+        if _part_of(name) not in without and f"{name}/zarr.json" not in episode.files.records:
             raise CorruptEpisode(f"Episode {episode.name} lacks the array {name}: its files are gone.")
     copied = left = 0
     for file, record in episode.files.records.items():
@@ -178,7 +172,7 @@ def _copy_episode(episode: StoredEpisode, folder: Path, without: tuple[str, ...]
             continue
         content = episode.sealed(file)  # raises when it differs from what was written
         if file == "zarr.json" and without:
-            content = _with_attributes(content, to_json(replace(attributes, arrays=kept)))
+            content = _without_arrays(content, without)
         place = folder / file
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes(content)
@@ -193,29 +187,26 @@ def _copy_episode(episode: StoredEpisode, folder: Path, without: tuple[str, ...]
 
 
 def _root_document(store: Store, without: tuple[str, ...]) -> bytes:
-    """The copy's `zarr.json`: that of the run, with the omitted parts."""
+    """The copy's `zarr.json`: that of the run, in the version that it has, with the omitted parts."""
     content = source_of(store.path).whole("zarr.json")
     if not without:
         return content
-    root = store.attributes
-    recording = replace(
-        root.recording,
-        frames=root.recording.frames and "frames" not in without,
-        contributions=root.recording.contributions and "contributions" not in without,
-    )
-    before = root.provenance.get("copied_without", "")
-    everything = [name for name in PARTS if name in without or name in before.split(", ")]
-    provenance = dict(root.provenance) | {"copied_without": ", ".join(everything)}
+    document = json.loads(content)
+    recording, provenance = (document["attributes"][field] for field in ("recording", "provenance"))
+    recording.update({name: False for name in without if name in recording})
+    before = provenance.get("copied_without", "").split(", ")
+    provenance["copied_without"] = ", ".join(name for name in PARTS if name in without or name in before)
     # A copy of a copy names the store that was captured, not the copy.
     provenance.setdefault("copied_from", store.run)
-    # It is written with this version's fields.
-    changed: RootAttributes = replace(root, format_version=FORMAT_VERSION, recording=recording, provenance=provenance)
-    return _with_attributes(content, to_json(changed))
+    return json.dumps(document, indent=2).encode()
 
 
-def _with_attributes(document: bytes, attributes: dict[str, Any]) -> bytes:
-    """A group's `zarr.json` with other attributes."""
-    return json.dumps(json.loads(document) | {"attributes": attributes}, indent=2).encode()
+def _without_arrays(document: bytes, without: tuple[str, ...]) -> bytes:
+    """An episode's `zarr.json` that does not list the arrays of these parts."""
+    changed = json.loads(document)
+    arrays = changed["attributes"]["arrays"]
+    changed["attributes"]["arrays"] = {name: arrays[name] for name in arrays if _part_of(name) not in without}
+    return json.dumps(changed, indent=2).encode()
 
 
 def _part_of(path: str) -> str | None:

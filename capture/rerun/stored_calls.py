@@ -101,7 +101,7 @@ def read_calls(episode: StoredEpisode) -> StoredCalls:
         prompt_index=episode.read("prompt_index"),
         actions=episode.read("actions"),
         dataset_actions=(episode.read("dataset_actions"), episode.read("dataset_action_count"))
-        if "dataset_actions" in episode.attributes.arrays
+        if episode.has("dataset_actions")
         else None,
     )
 
@@ -112,7 +112,7 @@ def check_has_inputs(store: Store, policy: Policy) -> None:
     changed = {change.camera for change in store.attributes.interventions.images}
     for episode in store.episodes:
         arrays = episode.attributes.arrays
-        unknown = [name for name in ("state", "noise_seed", "actions") if name not in arrays]
+        unknown = [name for name in ("state", "noise_seed", "actions") if not episode.has(name)]
         if unknown:
             raise StoreWithoutInputs(
                 f"Cannot rerun {store.path}: episode {episode.name} does not hold {listing(unknown)} of its policy "

@@ -2,7 +2,7 @@
 
 Only core codecs of Zarr v3 are used (bytes, blosc, crc32c, sharding_indexed), so that any Zarr v3 reader opens the
 store, and every chunk has a checksum. `docs/store.md` gives the reasons and measurements. Without zarr,
-`schemas/stores/shards.py` reads the layout of `create_blocked` and `schemas/stores/single_chunks.py` that of
+`schemas/stores/shards.py` reads the layout of `create_rows` and `schemas/stores/single_chunks.py` that of
 `write_whole`; after a change here they must know the new layout, or zarr reads it, more slowly.
 """
 
@@ -14,11 +14,17 @@ from typing import Any
 
 import numpy as np
 import zarr
+from numcodecs import Blosc
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 #: Decoded size of a chunk, about: large enough for the codec, small enough to read one layer quickly.
 TARGET_CHUNK_BYTES = 2 << 20
+
+#: Chunks are named `c.0.0`: with the separator `/`, every axis would be a folder of its own.
+CHUNK_KEYS: dict[str, Any] = {"name": "default", "configuration": {"separator": "."}}
+
+_ROWS = BloscCodec(cname="lz4", clevel=5, shuffle="bitshuffle", typesize=4)
 
 #: Fill values, which zarr gives for a missing chunk, by kind of number. No stored float or signed integer has this
 #: value. A stored byte may, so readers of pictures must check that the chunk's file exists.
@@ -35,15 +41,14 @@ def replans_per_block(bytes_per_replan: int, max_replans: int) -> int:
     return step * math.ceil(wanted / step)
 
 
-def create_blocked(
+def create_rows(
     group: zarr.Group, name: str, shape: tuple[int, ...], block: int, axes: Sequence[str]
 ) -> zarr.Array[Any]:
-    """Create a float32 array (replan, layer, denoise, ...) that grows along replans by whole shards of `block` replans.
+    """Create a float32 array (replan, layer, denoise, ...) of one shard, whose file is written by `ShardWriter`.
 
-    A chunk holds one layer and one denoise step, so that an analysis of three layers does not read the others. A
-    missing chunk reads as NaN, never as zeros that look like data.
+    A chunk holds `block` replans of one layer and one denoise step, so that an analysis of three layers does not read
+    the others. A missing chunk reads as NaN, never as zeros that look like data.
     """
-    shard = (block, *shape[1:])
     chunk = (block, 1, 1, *shape[3:])
     if math.prod(chunk) % 8:
         raise AssertionError(f"chunk {chunk} is not a multiple of 8 elements: bit shuffle would be skipped")
@@ -52,12 +57,18 @@ def create_blocked(
         shape=shape,
         dtype="float32",
         chunks=chunk,
-        shards=shard,
-        compressors=(BloscCodec(cname="lz4", clevel=5, shuffle="bitshuffle", typesize=4), Crc32cCodec()),
+        shards=(block * math.ceil(shape[0] / block), *shape[1:]),
+        compressors=(_ROWS, Crc32cCodec()),
         fill_value=float("nan"),
+        chunk_key_encoding=CHUNK_KEYS,
         dimension_names=list(axes),
-        config={"write_empty_chunks": True},
     )
+
+
+def encode_row_chunk(values: NDArray[np.float32]) -> bytes:
+    """A chunk of rows as the Blosc codec of `create_rows` encodes it, without the checksum that follows it."""
+    encoded: bytes = Blosc(_ROWS.cname.value, _ROWS.clevel, Blosc.BITSHUFFLE).encode(values)
+    return encoded
 
 
 def write_whole(group: zarr.Group, name: str, values: NDArray[np.generic], axes: Sequence[str]) -> zarr.Array[Any]:
@@ -78,6 +89,7 @@ def write_whole(group: zarr.Group, name: str, values: NDArray[np.generic], axes:
             Crc32cCodec(),
         ),
         fill_value=MISSING[values.dtype.kind],
+        chunk_key_encoding=CHUNK_KEYS,
         dimension_names=list(axes),
         # A chunk in which every number is the fill value is data, too.
         config={"write_empty_chunks": True},

@@ -28,7 +28,7 @@ _COVERAGE_BYTES_PER_PATCH = 8
 _USUAL = (0.2, 0.5)
 #: State, actions and numbers of a replan.
 _SMALL_PER_REPLAN = 8_000
-#: Metadata and small arrays of one episode: some seventy files and folders, each at least one block of the file system.
+#: Metadata and small arrays of one episode: some fifty files and folders, each at least one block of the file system.
 EPISODE_OVERHEAD = 300_000
 
 

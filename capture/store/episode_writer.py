@@ -110,7 +110,7 @@ class EpisodeWriter:
         self.group = zarr.create_group(folder, zarr_format=3)
         self.digests: dict[str, ArrayRecord] = {}
         self.sites = {
-            site.name: SiteWriter(self.group, self.write, site, run.recording.of_site(site), max_replans)
+            site.name: SiteWriter(self.group, folder, self.write, site, run.recording.of_site(site), max_replans)
             for site in run.sites
         }
         self.prompts: dict[Prompt, int] = {}
@@ -204,14 +204,20 @@ class EpisodeWriter:
             return self._publish()
 
     def _attributes(self, success: bool | None, num_steps: int) -> EpisodeAttributes:
+        records = self.records
         return EpisodeAttributes(
             **vars(self.start),
             success=success,
             num_steps=num_steps,
-            num_replans=len(self.records),
+            num_replans=len(records),
             prompts=tuple(self.prompts),
             segments={name: site.segments for name, site in self.sites.items()},
             arrays=dict(sorted(self.digests.items())),
+            env_step=tuple(int(record.env_step) for record in records),
+            prompt_index=tuple(self.prompts[record.prompt] for record in records),
+            noise_seed=tuple(int(record.noise_seed) for record in records if record.noise_seed is not None),
+            dataset_action_count=tuple(len(r.dataset_actions) for r in records if r.dataset_actions is not None),
+            denoise_time=tuple(float(time) for time in self.denoise_times),
         )
 
     def _check_store(self) -> None:
@@ -240,13 +246,6 @@ class EpisodeWriter:
 
     def _write_side_arrays(self) -> None:
         records = self.records
-        self.write("env_step", np.array([record.env_step for record in records], dtype=np.int32), ("replan",))
-        seeds = [record.noise_seed for record in records if record.noise_seed is not None]
-        if seeds:
-            self.write("noise_seed", np.array(seeds, dtype=np.int64), ("replan",))
-        index = np.array([self.prompts[record.prompt] for record in records], dtype=np.int32)
-        self.write("prompt_index", index, ("replan",))
-        self.write("denoise_time", np.asarray(self.denoise_times, dtype=np.float32), ("denoise",))
         states = [record.state for record in records if record.state is not None]
         if states:
             self.write("state", np.stack(states), ("replan", "state_dim"))
@@ -267,12 +266,10 @@ class EpisodeWriter:
     def _write_dataset_actions(self, actions: Sequence[NDArray[np.float64]]) -> None:
         if not actions:
             return
-        counts = np.array([len(steps) for steps in actions], dtype=np.int32)
-        stacked = np.zeros((len(actions), counts.max(), actions[0].shape[1]))
+        stacked = np.zeros((len(actions), max(map(len, actions)), actions[0].shape[1]))
         for replan, steps in enumerate(actions):
             stacked[replan, : len(steps)] = steps
         self.write("dataset_actions", stacked, ("replan", "horizon", "action_dim"))
-        self.write("dataset_action_count", counts, ("replan",))
 
     def _read_back(self, run: str) -> None:
         """Read everything back from disk, with the checks of `vla-analyze verify`."""

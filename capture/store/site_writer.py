@@ -1,16 +1,19 @@
-"""Writing rows, row sums, atoms and contributions of one site of one episode; rows are written in whole shards."""
+"""Writing rows, row sums, atoms and contributions of one site of one episode; rows are written block by block."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import zarr
 from numpy.typing import DTypeLike, NDArray
 
-from vla_attention.capture.store.codecs import create_blocked, replans_per_block
+from vla_attention.capture.store.codecs import create_rows, replans_per_block
 from vla_attention.capture.store.recorded_rows import RecordedRows
+from vla_attention.capture.store.shard_writer import ShardWriter
+from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import ROLE_DTYPE, SiteLayout
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, round_mantissa
 from vla_attention.schemas.segments import Segment, merge_segments, segment_masses, segment_members, segments_of
@@ -22,7 +25,13 @@ from vla_attention.schemas.stores.content_rules import (
     row_sum_problems,
 )
 from vla_attention.schemas.stores.digest import ArrayDigest
-from vla_attention.schemas.stores.store_format import ATOM_AXES, CONTRIBUTION_AXES, ROW_AXES, ArrayRecord, Recording
+from vla_attention.schemas.stores.store_format import (
+    ATOM_AXES,
+    CONTRIBUTION_AXES,
+    ROW_AXES,
+    ArrayRecord,
+    Recording,
+)
 
 #: Writes one complete array of the episode: name, values, axes.
 WriteArray = Callable[[str, NDArray[np.generic], tuple[str, ...]], None]
@@ -32,9 +41,17 @@ class SiteWriter:
     """Collects one site's replans; has at most one block of rows in memory."""
 
     def __init__(
-        self, group: zarr.Group, write: WriteArray, layout: SiteLayout, recording: Recording, max_replans: int
+        self,
+        group: zarr.Group,
+        folder: Path,
+        write: WriteArray,
+        layout: SiteLayout,
+        recording: Recording,
+        max_replans: int,
     ) -> None:
+        """Begin the site's group in the episode's `group`, whose folder it is; `recording` is what is of the site."""
         self.group = group
+        self.folder = folder
         self.write = write
         self.layout = layout
         self.recording = recording
@@ -42,16 +59,15 @@ class SiteWriter:
         self.shape = (len(recording.layers), len(recording.denoise_steps), len(recording.heads), recording.num_queries)
         self.bytes_per_replan = 4 * self.shape[2] * self.shape[3] * layout.num_keys
         self.block = replans_per_block(self.bytes_per_replan, max_replans)
-        self.rows_array: zarr.Array[Any] | None = None
+        self.rows: ShardWriter | None = None
         self.rows_digest = ArrayDigest()
         self.pending: list[NDArray[np.float32]] = []
-        self.num_written = 0
         self.row_sums: list[NDArray[np.float32]] = []
         self.roles: list[NDArray[np.uint8]] = []
         self.masses: list[tuple[tuple[Segment, ...], NDArray[np.float32]]] = []
         self.contributions: list[NDArray[np.float32]] = []
         self.segments: tuple[Segment, ...] = ()
-        group.create_group(layout.name)
+        group.create_group(layout.name, attributes=to_json(recording.axis_numbers))
 
     def problems(self, recorded: RecordedRows, key_role: NDArray[np.uint8], replan: int) -> Iterator[str]:
         """What forbids adding a replan (its number, for the sentences): shapes, types, and the rules of `verify`."""
@@ -97,27 +113,24 @@ class SiteWriter:
     def _flush(self) -> None:
         rows = np.stack(self.pending)
         self.pending.clear()
-        total = self.num_written + len(rows)
-        if self.rows_array is None:
+        if self.rows is None:
             block = replans_per_block(self.bytes_per_replan, min(len(rows), self.block))
-            shape = (total, *rows.shape[1:])
-            self.rows_array = create_blocked(self.group, f"{self.layout.name}/rows", shape, block, ROW_AXES)
-        else:
-            self.rows_array.resize((total, *rows.shape[1:]))
-        self.rows_array[self.num_written : total] = rows
+            self.rows = ShardWriter(self.folder / self.layout.name / "rows", rows.shape[1:], block)
+        self.rows.append(rows)
         self.rows_digest.update(rows)
-        self.num_written = total
 
     def finish(self) -> ArrayRecord:
         """Write the last rows and all other arrays of the site; returns shape and digest of the rows."""
         if self.pending:
             self._flush()
-        if self.rows_array is None:
+        if self.rows is None:
             raise ValueError("an episode without replans cannot be committed")
-        name = self.layout.name
+        self.rows.finish()
+        name, rows = self.layout.name, self.rows
+        create_rows(self.group, f"{name}/rows", rows.shape, rows.block, ROW_AXES)
         self.segments = merge_segments(self.layout, (segments for segments, _ in self.masses))
         column = {segment: i for i, segment in enumerate(self.segments)}
-        atoms = np.zeros((self.num_written, *self.shape, len(self.segments)), dtype=np.float32)
+        atoms = np.zeros((rows.num_replans, *self.shape, len(self.segments)), dtype=np.float32)
         for replan, (segments, masses) in enumerate(self.masses):
             atoms[replan][..., [column[segment] for segment in segments]] = masses
         self.write(f"{name}/atoms", atoms, ATOM_AXES)
@@ -125,18 +138,11 @@ class SiteWriter:
             self._write_contributions(column)
         self.write(f"{name}/row_sum", np.stack(self.row_sums), ROW_AXES[:-1])
         self.write(f"{name}/key_role", np.stack(self.roles), ("replan", "key"))
-        recording = self.recording
-        for axis, numbers in (
-            ("layer", recording.layers),
-            ("denoise", recording.denoise_steps),
-            ("head", recording.heads),
-        ):
-            self.write(f"{name}/{axis}", np.array(numbers, dtype=np.int32), (axis,))
-        return ArrayRecord(tuple(self.rows_array.shape), self.rows_digest.hexdigest())
+        return ArrayRecord(rows.shape, self.rows_digest.hexdigest())
 
     def _write_contributions(self, column: dict[Segment, int]) -> None:
         size = len(column) + 1
-        grams = np.zeros((self.num_written, *self.shape[:2], size, size), dtype=np.float32)
+        grams = np.zeros((len(self.masses), *self.shape[:2], size, size), dtype=np.float32)
         for replan, ((segments, _), gram) in enumerate(zip(self.masses, self.contributions, strict=True)):
             # A segment that a replan lacks contributes nothing there; the last part is the whole attention update.
             at = [*(column[segment] for segment in segments), size - 1]

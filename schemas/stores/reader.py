@@ -27,6 +27,7 @@ from vla_attention.schemas.stores.root import episode_folders, group_attributes,
 from vla_attention.schemas.stores.seal import identity_problem, read_seal
 from vla_attention.schemas.stores.sealed_files import SealedFiles
 from vla_attention.schemas.stores.store_format import (
+    NUMBERS,
     CorruptEpisode,
     EpisodeAttributes,
     EpisodeSeal,
@@ -140,8 +141,8 @@ class StoredEpisode:
         return {}
 
     def has(self, name: str) -> bool:
-        """Whether the episode has an array of that name."""
-        return name in self.attributes.arrays
+        """Whether the episode has an array of that name, or numbers of that name in its attributes."""
+        return name in self.attributes.arrays or bool(self._numbers_of(name))
 
     def array(self, name: str) -> zarr.Array[Any]:
         """Open one array with zarr-python, which gets the array's files through the seal.
@@ -177,8 +178,14 @@ class StoredEpisode:
         return document
 
     def read(self, name: str, index: Any = ...) -> NDArray[Any]:
-        """Values of one array; a chunk that is missing or not the one that was sealed raises `CorruptEpisode`."""
-        stored: Any = self._single_chunk(name) or self.array(name)
+        """Values of one array, or numbers of the attributes (`NUMBERS`) as one.
+
+        Raises:
+            CorruptEpisode: it is not there, or a chunk of it is missing or not the one that was sealed.
+        """
+        stored = self._numbers(name)
+        if stored is None:
+            stored = self._single_chunk(name) or self.array(name)
         try:
             values = np.asarray(stored[index])
         except (IndexError, RemoteFailure):
@@ -190,6 +197,17 @@ class StoredEpisode:
             raise _lost_chunk(self, name)
         self.refuse_missing(name, values)
         return values
+
+    def _numbers_of(self, name: str) -> tuple[float, ...]:
+        return getattr(self.attributes, name) if name in NUMBERS else ()
+
+    def _numbers(self, name: str) -> Any:
+        """The numbers of that name in the attributes, None without any."""
+        numbers = self._numbers_of(name)
+        try:
+            return np.array(numbers, dtype=NUMBERS[name]) if numbers else None
+        except OverflowError as error:
+            raise CorruptEpisode(f"Episode {self.name} cannot be read: its {name} is damaged ({error}).") from None
 
     def _single_chunk(self, name: str) -> SingleChunk | None:
         if name not in self._single_chunks:

@@ -14,7 +14,7 @@ was: bytes of the process, which would pass for attention.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,6 +53,18 @@ def chunks_of_a_shard(metadata: dict[str, Any]) -> int | None:
     )
     counts = (extent // chunk for extent, chunk in zip(shard, inner["chunk_shape"], strict=True))
     return int(np.prod(list(counts))) if bound else None
+
+
+def chunk_file(keys: Mapping[str, Any], place: Sequence[int]) -> str:
+    """The path of a chunk, or shard, in its array's folder, from its place in the grid and the array's chunk keys.
+
+    Raises:
+        ValueError: the `chunk_key_encoding` of the array is another one than Zarr's default.
+    """
+    separator = keys.get("configuration", {}).get("separator", "/")
+    if keys.get("name") != "default" or separator not in ("/", "."):
+        raise ValueError(f"the chunk keys {dict(keys)} are not known")
+    return str(separator).join(("c", *map(str, place)))
 
 
 def index_size(chunks: int) -> int:
@@ -181,7 +193,7 @@ class LayerMemory:
     """Memory for `ShardedLayers.read`, used again for every layer and denoise step.
 
     Attributes:
-        values: whole chunks of one layer and denoise step, (replans of all shards, ...).
+        values: whole chunks of one layer and denoise step, (replans of all chunks, ...).
         chunk: bytes of a chunk as it is stored.
     """
 
@@ -195,12 +207,16 @@ class ShardedLayers:
 
     Attributes:
         shape: shape of the array.
-        replans_per_shard: extent of shards and chunks along the replans.
+        block: extent of a chunk along the replans.
+        blocks_per_shard: how many of them a file has; up to version 4 of the format one.
+        keys: the array's `chunk_key_encoding`.
         shard: gives the shard in a file of the array, by its path in the array; None when the seal lists no chunks.
     """
 
     shape: tuple[int, ...]
-    replans_per_shard: int
+    block: int
+    blocks_per_shard: int
+    keys: Mapping[str, Any]
     shard: Callable[[str], SealedShard | None]
 
     @classmethod
@@ -212,24 +228,31 @@ class ShardedLayers:
             if len(shape) < 4 or chunks_of_a_shard(metadata) is None:
                 return None
             inner = metadata["codecs"][0]["configuration"]
+            block = inner["chunk_shape"][0]
+            chunk_file(metadata["chunk_key_encoding"], ())
             known = (
                 metadata["data_type"] == "float32"
-                and metadata["chunk_key_encoding"] == {"name": "default", "configuration": {"separator": "/"}}
                 and not metadata.get("storage_transformers")
                 and shard[1:] == shape[1:]
-                and tuple(inner["chunk_shape"]) == (shard[0], 1, 1, *shape[3:])
+                and shard[0] % block == 0
+                and tuple(inner["chunk_shape"]) == (block, 1, 1, *shape[3:])
                 and [codec["name"] for codec in inner["codecs"]] == ["bytes", "blosc", "crc32c"]
                 and inner["codecs"][0]["configuration"]["endian"] == "little"
             )
-        except (AttributeError, KeyError, TypeError):
+        except (AttributeError, KeyError, TypeError, ValueError, ZeroDivisionError):
             return None  # zarr says what is wrong with them
-        return cls(shape, shard[0], shard_in) if known else None
+        return cls(shape, block, shard[0] // block, metadata["chunk_key_encoding"], shard_in) if known else None
+
+    @property
+    def num_blocks(self) -> int:
+        """How many chunks a layer and denoise step has."""
+        return -(-self.shape[0] // self.block)
 
     @cached_property
     def _shards(self) -> tuple[SealedShard, ...]:
-        count = -(-self.shape[0] // self.replans_per_shard)
-        rest = "/".join("0" for _ in self.shape[1:])
-        return tuple(self._open(f"c/{i}/{rest}") for i in range(count))
+        rest = (0,) * (len(self.shape) - 1)
+        count = -(-self.num_blocks // self.blocks_per_shard)
+        return tuple(self._open(chunk_file(self.keys, (i, *rest))) for i in range(count))
 
     def _open(self, file: str) -> SealedShard:
         shard = self.shard(file)
@@ -239,7 +262,7 @@ class ShardedLayers:
 
     def memory(self) -> LayerMemory:
         """Memory for `read`."""
-        values = np.empty((len(self._shards) * self.replans_per_shard, *self.shape[3:]), dtype="<f4")
+        values = np.empty((self.num_blocks * self.block, *self.shape[3:]), dtype="<f4")
         return LayerMemory(values, np.empty(max(shard.longest() for shard in self._shards), np.uint8))
 
     def read(self, layer: int, denoise: int, memory: LayerMemory | None = None) -> NDArray[np.float32]:
@@ -255,12 +278,13 @@ class ShardedLayers:
 
         if not (0 <= layer < self.shape[1] and 0 <= denoise < self.shape[2]):
             raise IndexError(f"layer {layer} and denoise {denoise} of an array of shape {self.shape}")
-        number = layer * self.shape[2] + denoise
         memory = memory or self.memory()
         values = memory.values
-        for i, shard in enumerate(self._shards):
+        for i in range(self.num_blocks):
+            shard, place = self._shards[i // self.blocks_per_shard], i % self.blocks_per_shard
+            number = (place * self.shape[1] + layer) * self.shape[2] + denoise
             frame = shard.chunk(number, memory.chunk)
-            chunk = values[i * self.replans_per_shard : (i + 1) * self.replans_per_shard]
+            chunk = values[i * self.block : (i + 1) * self.block]
             try:
                 check_blosc_frame(frame.data, chunk.nbytes, chunk.itemsize)
                 blosc.decompress(frame, chunk)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from vla_attention.schemas.stores.digest import crc32c
 from vla_attention.schemas.stores.sealed_files import SealedFiles
-from vla_attention.schemas.stores.shards import CHECKSUM_BYTES, check_blosc_frame
+from vla_attention.schemas.stores.shards import CHECKSUM_BYTES, check_blosc_frame, chunk_file
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 
 _TYPES = ("uint8", "int32", "int64", "float32", "float64")
@@ -48,7 +48,6 @@ class SingleChunk:
             known = (
                 metadata["data_type"] in _TYPES
                 and tuple(metadata["chunk_grid"]["configuration"]["chunk_shape"]) == shape
-                and metadata["chunk_key_encoding"] == {"name": "default", "configuration": {"separator": "/"}}
                 and not metadata.get("storage_transformers")
                 and [codec["name"] for codec in codecs] == ["bytes", "blosc", "crc32c"]
                 and codecs[0].get("configuration", {}).get("endian", "little") == "little"
@@ -56,10 +55,11 @@ class SingleChunk:
             if not known:
                 return None
             typesize = codecs[1]["configuration"]["typesize"]
-        except (AttributeError, KeyError, TypeError):
+            file = chunk_file(metadata["chunk_key_encoding"], (0,) * len(shape))
+        except (AttributeError, KeyError, TypeError, ValueError):
             return None  # zarr says what is wrong with them
         dtype = np.dtype(metadata["data_type"]).newbyteorder("<")
-        return cls(files, "/".join((name, "c", *("0" for _ in shape))), shape, dtype, typesize)
+        return cls(files, f"{name}/{file}", shape, dtype, typesize)
 
     def __getitem__(self, index: Any) -> NDArray[Any]:
         """Values at a numpy index; raises `CorruptEpisode` for other bytes than were sealed, and for other sizes."""

@@ -6,17 +6,14 @@ vla_attention.schemas.json_files`) and describe the version in `docs/store.md`.
 
 NAME.zarr/                            attributes: `RootAttributes`
   episodes/task003_episode007/        attributes: `EpisodeAttributes`; listed = complete
+    joint/                            attributes: the numbers of its recorded layers, denoise steps and heads
     joint/rows                        (replan, layer, denoise, head, query, key) float32
     joint/row_sum                     (replan, layer, denoise, head, query) float32
     joint/atoms                       (replan, layer, denoise, head, query, segment) float32
     joint/key_role                    (replan, key) uint8
-    joint/layer, denoise, head        the numbers of the recorded layers, denoise steps and heads (coordinates)
-    env_step, noise_seed, prompt_index  (replan,)
-    denoise_time                      (denoise,)
     state                             (replan, state_dim); only where it is known
     actions                           (replan, horizon, action_dim), as given to the environment; only where known
     dataset_actions                   (replan, horizon, action_dim), those of the data set; only where there are some
-    dataset_action_count              (replan,): how many of them there are at this replan; the rest is 0
     frames/<camera>                   (replan, row, column, channel) uint8, as the model sees it
     camera_frames/<camera>            the same, as the camera gave it; only where `frames` is a rounded model input
     objects/<camera>                  (replan, patch, object) float32
@@ -38,7 +35,7 @@ from vla_attention.schemas.segments import Segment
 
 FORMAT_NAME = "vla-attention"
 #: A whole number. A reader accepts versions from `OLDEST_VERSION` to its own.
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 #: Seals of version 1 bind metadata only: files that were exchanged between episodes would be read without an error.
 OLDEST_VERSION = 2
 STORE_SUFFIX = ".zarr"
@@ -50,6 +47,17 @@ ROW_AXES = ("replan", "layer", "denoise", "head", "query", "key")
 ATOM_AXES = (*ROW_AXES[:-1], "segment")
 #: Parts are the episode's segments in order, then the block's whole attention update.
 CONTRIBUTION_AXES = ("replan", "layer", "denoise", "part", "other_part")
+
+#: The version from which on numbers along one axis are attributes of their group. Before it they are small arrays.
+NUMBERS_VERSION = 5
+#: Fields of `EpisodeAttributes` that are numbers of each replan or denoise step, and their types.
+NUMBERS = {
+    "env_step": "int32",
+    "prompt_index": "int32",
+    "noise_seed": "int64",
+    "dataset_action_count": "int32",
+    "denoise_time": "float32",
+}
 
 #: The group of an episode whose attributes are an `EpisodeSeal`.
 SEAL_GROUP = "seal"
@@ -107,6 +115,11 @@ class Recording:
     def num_queries(self) -> int:
         """Length of the query axis."""
         return {"mean": 1, "steps": self.num_pools, "all": self.num_action_queries}[self.queries]
+
+    @property
+    def axis_numbers(self) -> dict[str, tuple[int, ...]]:
+        """What the indices of the axes layer, denoise and head stand for: the attributes of a site's group."""
+        return {"layer": self.layers, "denoise": self.denoise_steps, "head": self.heads}
 
     def of_site(self, site: SiteLayout) -> Recording:
         """What is recorded of one site: the layers and heads that it has, and its own number of action queries.
@@ -349,6 +362,10 @@ class EpisodeAttributes:
     `success` is None where nobody knows it. `num_steps` is the number of actions executed after the waiting steps, with
     the one that solved the task; 0 where it is not known. The instruction and the prompts are any text; what is shown
     of them is made `safe_text.visible`.
+
+    The last five fields are numbers of each replan, and the noise level or flow time of each recorded denoise step;
+    `env_step` counts the waiting steps too, `prompt_index` is the number of a prompt, `dataset_action_count` how many
+    of `dataset_actions` there are. Empty where they are not known, and up to version 4, in which they are arrays.
     """
 
     task_id: int
@@ -365,6 +382,11 @@ class EpisodeAttributes:
     objects: tuple[SceneObject, ...]
     provenance: dict[str, str]
     arrays: dict[str, ArrayRecord]
+    env_step: tuple[int, ...] = ()
+    prompt_index: tuple[int, ...] = ()
+    noise_seed: tuple[int, ...] = ()
+    dataset_action_count: tuple[int, ...] = ()
+    denoise_time: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         """Check the task's name, and the names of arrays, which are paths."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import prompt_at
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
 from vla_attention.schemas.stores.content_rules import (
@@ -29,7 +30,10 @@ from vla_attention.schemas.stores.content_rules import (
 )
 from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
+from vla_attention.schemas.stores.root import group_attributes
 from vla_attention.schemas.stores.store_format import (
+    NUMBERS,
+    NUMBERS_VERSION,
     CorruptEpisode,
     EpisodeAttributes,
     RootAttributes,
@@ -79,15 +83,17 @@ def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[s
         if file.endswith("zarr.json"):
             yield from _guarded(_metadata_problems(episode, file))
     shapes = _expected_shapes(root, attributes)
-    for name in sorted(set(shapes) - set(attributes.arrays)):
-        yield f"the array {name} is not in the episode"
-    for name, record in attributes.arrays.items():
+    numbers = {name: (len(given),) for name in NUMBERS if (given := getattr(attributes, name))}
+    listed = {name: record.shape for name, record in attributes.arrays.items()} | numbers
+    for name in sorted(set(shapes) - set(listed)):
+        yield f"{name} is not in the episode"
+    for name, shape in listed.items():
         expected = shapes.get(name, (attributes.num_replans,))
-        if record.shape[: len(expected)] != expected:
-            yield f"the array {name} has the shape {record.shape}; expected {expected}"
-            continue
-        yield from _guarded(_array_problems(root, episode, name, record.sha256))
-    for check in (_token_problems, _camera_problems, _counter_problems):
+        if shape[: len(expected)] != expected:
+            yield f"{name} has the shape {shape}; expected {expected}"
+        elif name not in numbers:
+            yield from _guarded(_array_problems(root, episode, name, attributes.arrays[name].sha256))
+    for check in (_axis_problems, _token_problems, _camera_problems, _counter_problems):
         yield from _guarded(check(root, episode))
 
 
@@ -124,9 +130,8 @@ def _expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dic
         if recording.contributions:
             parts = len(attributes.segments.get(site.name, ())) + 1
             shapes[f"{site.name}/contribution"] = (*cells[:3], parts, parts)
-        shapes[f"{site.name}/layer"] = (len(recording.layers),)
-        shapes[f"{site.name}/denoise"] = (len(recording.denoise_steps),)
-        shapes[f"{site.name}/head"] = (len(recording.heads),)
+        if root.format_version < NUMBERS_VERSION:
+            shapes |= {f"{site.name}/{axis}": (len(given),) for axis, given in recording.axis_numbers.items()}
     return shapes
 
 
@@ -173,6 +178,17 @@ def _row_sums(episode: StoredEpisode, name: str, shape: tuple[int, ...]) -> NDAr
     return sums if sums.shape == shape else None
 
 
+def _axis_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
+    """The numbers of layers, denoise steps and heads in the attributes of every site are those of the run."""
+    if root.format_version < NUMBERS_VERSION:
+        return  # they are arrays
+    for site in root.sites:
+        given = group_attributes(episode.sealed(f"{site.name}/zarr.json"))
+        expected = to_json(root.recording.of_site(site).axis_numbers)
+        if given != expected:
+            yield f"the attributes of {site.name} are {given}; expected {expected}"
+
+
 def _token_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
     prompts = episode.attributes.prompts
     for prompt in prompts:
@@ -204,11 +220,10 @@ def _camera_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[s
 
 
 def _counter_problems(_root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
-    arrays = episode.attributes.arrays
-    seeds = episode.read("noise_seed") if "noise_seed" in arrays else np.zeros(0, dtype=np.int64)
+    seeds = episode.read("noise_seed") if episode.has("noise_seed") else np.zeros(0, dtype=np.int64)
     yield from counter_problems(episode.read("env_step"), seeds)
-    if "dataset_actions" in arrays and "dataset_action_count" in arrays:
-        horizon = arrays["dataset_actions"].shape[1]
+    if episode.has("dataset_actions") and episode.has("dataset_action_count"):
+        horizon = episode.shape_of("dataset_actions")[1]
         counts = episode.read("dataset_action_count")
         if not ((counts >= 1) & (counts <= horizon)).all():
             yield f"dataset_action_count is {counts.min()} to {counts.max()}; expected 1 to {horizon}"

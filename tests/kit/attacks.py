@@ -6,7 +6,6 @@ Every attack leaves files that can be read by themselves. They use nothing of th
 from __future__ import annotations
 
 import json
-import math
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -43,7 +42,7 @@ def arrays_of(episode: Path) -> list[str]:
 
 def files_of(episode: Path, array: str) -> list[Path]:
     """The files of an array's chunks."""
-    return sorted(file for file in (episode / array / "c").rglob("*") if file.is_file())
+    return sorted(file for file in (episode / array).rglob("*") if file.is_file() and file.name != "zarr.json")
 
 
 def exchange_index_entries(shard: Path, one: int, other: int, chunks: int) -> None:
@@ -131,16 +130,17 @@ def attacks(arrays: list[str]) -> dict[str, Attack]:
             *(store / "episodes" / FIRST / array for store in (path, other))
         )
         found[f"{array} encoded again"] = lambda path, other, array=array: encode_again(first(path), array)
-    for one, two_ in (("frames/base_0_rgb", "frames/left_wrist_0_rgb"), ("env_step", "prompt_index")):
+    for one, two_ in (("frames/base_0_rgb", "frames/left_wrist_0_rgb"), ("joint/row_sum", "joint/atoms")):
         found[f"{one} exchanged with {two_}"] = lambda path, other, pair=(one, two_): exchange(
             *(files_of(first(path), array)[0] for array in pair)
         )
-    rows = "joint/rows"
-    found["index of rows: layers exchanged"] = lambda path, other: exchange_index_entries(shard(path), 0, 2, 4)
-    found["index of rows: denoise steps exchanged"] = lambda path, other: exchange_index_entries(shard(path), 0, 1, 4)
-    found["chunks of rows: layers exchanged"] = lambda path, other: permute_chunks(shard(path), [2, 3, 0, 1])
-    found["chunks of rows: denoise steps exchanged"] = lambda path, other: permute_chunks(shard(path), [1, 0, 3, 2])
-    found["shards of rows exchanged"] = lambda path, other: exchange(*files_of(first(path), rows)[:2])
+    for what, one_, other_ in (("layers", 0, 2), ("denoise steps", 0, 1), ("replans", 0, 4)):
+        order = list(range(12))
+        order[one_], order[other_] = other_, one_
+        found[f"index of rows: {what} exchanged"] = lambda path, other, pair=(one_, other_): exchange_index_entries(
+            shard(path), *pair, 12
+        )
+        found[f"chunks of rows: {what} exchanged"] = lambda path, other, order=order: permute_chunks(shard(path), order)
     found["attributes exchanged"] = lambda path, other: exchange(*(episode / "zarr.json" for episode in two(path)))
     found["seals exchanged"] = lambda path, other: exchange(*(episode / "seal" for episode in two(path)))
     found["seals and attributes exchanged"] = lambda path, other: [
@@ -170,9 +170,8 @@ def renamed(path: Path) -> Path:
 
 
 def shard(path: Path) -> Path:
-    """The first shard of the first episode's rows: two layers of two denoise steps."""
-    file = files_of(first(path), "joint/rows")[0]
-    index = np.frombuffer(file.read_bytes()[-68:-4], dtype="<u8")
-    assert len(index) == 8
-    assert math.isclose(index[1::2].sum() + 68, file.stat().st_size)
+    """The file of the first episode's rows: three blocks of replans, two layers, two denoise steps."""
+    (file,) = files_of(first(path), "joint/rows")
+    index = np.frombuffer(file.read_bytes()[-196:-4], dtype="<u8")
+    assert index[1::2].sum() + 196 == file.stat().st_size
     return file

@@ -283,7 +283,7 @@ def episodes_of_store(
         if not name.startswith("task"):
             continue
         stored = zarr.open_group(store / "episodes" / name, mode="r")
-        replans = stored["env_step"].shape[0]
+        replans = stored.attrs["num_replans"]
         length = (replans - 1) * every + 1
         images = {}
         for camera, column in columns.items():

@@ -104,5 +104,5 @@ def test_smolvla_is_replayed_over_it(tmp_path, capsys):
     assert episode["actions"].shape == (3, 5, models.ACTION_DIM)
     np.testing.assert_array_equal(episode["state"][:], numbers["observation.state"][2][::4])
     np.testing.assert_array_equal(episode["dataset_actions"][0], numbers["action"][2][:5])
-    assert episode["dataset_action_count"][:].tolist() == [5, 5, 1]
+    assert episode.attrs["dataset_action_count"] == [5, 5, 1]
     assert episode.attrs["prompts"][0]["text"].split()[:6] == TASKS[0].split()

@@ -56,7 +56,7 @@ def test_usual_names_are_accepted():
     for name in ("libero_10", "akita_black_bowl_1", "left wrist", "größe", "<b>", "$x$", "a..b"):
         check_name("suite", name)
     check_text("checkpoint", "gs://openpi-assets/checkpoints/pi05_libero")
-    check_inner_path("joint/rows/c/0/0")
+    check_inner_path("joint/rows/c.0.0")
 
 
 @pytest.mark.parametrize("path", ["", "/etc/x", "../x", "a/../../x", "a//b", "a/./b", "a\\..\\b", "a\x1b"])

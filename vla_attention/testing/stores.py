@@ -258,8 +258,8 @@ def episode_records(spec: StoreSpec, task: int, episode: int) -> tuple[EpisodeSt
 def expected_arrays(spec: StoreSpec, task: int, episode: int) -> dict[str, NDArray[Any]]:
     """Name to values of the arrays that a reader must find in one episode, to the bit.
 
-    Left out is `joint/contribution`. Rows are rounded to the spec's mantissa bits; `joint/atoms` has the segments of
-    `segments_of` on its last axis.
+    Among them are numbers that are attributes of the episode, such as `env_step`. Left out is `joint/contribution`.
+    Rows are rounded to the spec's mantissa bits; `joint/atoms` has the segments of `segments_of` on its last axis.
     """
     _, records = episode_records(spec, task, episode)
     rows = np.stack([record.rows["joint"].rows for record in records])
@@ -276,9 +276,6 @@ def expected_arrays(spec: StoreSpec, task: int, episode: int) -> dict[str, NDArr
             ]
         ),
         "joint/key_role": roles,
-        "joint/layer": np.array(spec.layers, dtype=np.int32),
-        "joint/denoise": np.array(spec.denoise_steps, dtype=np.int32),
-        "joint/head": np.array(spec.heads, dtype=np.int32),
         "env_step": np.array([record.env_step for record in records], dtype=np.int32),
         "noise_seed": np.array([record.noise_seed for record in records], dtype=np.int64),
         "prompt_index": np.array([prompts.index(record.prompt) for record in records], dtype=np.int32),

@@ -33,9 +33,9 @@ from vla_attention.testing.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=9, contributions=True, prompts="same")
 ARRAYS = (
-    *(f"joint/{name}" for name in ("atoms", "contribution", "denoise", "head", "key_role", "layer", "row_sum", "rows")),
+    *(f"joint/{name}" for name in ("atoms", "contribution", "key_role", "row_sum", "rows")),
     *(f"{kind}/{camera}" for kind in ("frames", "objects") for camera in ("base_0_rgb", "left_wrist_0_rgb")),
-    *("actions", "denoise_time", "env_step", "noise_seed", "prompt_index", "state"),
+    *("actions", "state"),
 )
 #: A grouping of spans, which is answered from atoms, and one of words, which needs the rows.
 SPANS: dict[str, object] = {"grouping": "cameras"}
@@ -44,7 +44,7 @@ WORDS: dict[str, object] = {"groups": {"image": "role:image", "bowl": "word:bowl
 
 @pytest.fixture(scope="module")
 def originals(tmp_path_factory) -> tuple[Path, Path]:
-    """Two stores of other seeds, with equal shapes; rows are in two shards."""
+    """Two stores of other seeds, with equal shapes; rows are in three blocks."""
     folder = tmp_path_factory.mktemp("originals")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(store_codecs, "TARGET_CHUNK_BYTES", 1)

@@ -69,7 +69,7 @@ def test_other_readers_open_an_episode(original, packed):
     episode = open_store(original).episodes[0]
     store = zarr.storage.ZipStore(packed / FIRST, mode="r")
     group = zarr.open_group(store, mode="r")
-    kinds = ("joint/rows", "joint/key_role", "env_step", "frames/base_0_rgb", "actions")
+    kinds = ("joint/rows", "joint/key_role", "state", "frames/base_0_rgb", "actions")
     for name in kinds:
         expected = episode.read(name)
         assert np.array_equal(group[name][...], expected), name

@@ -25,8 +25,10 @@ def store(tmp_path_factory) -> Path:
 def raw(store: Path) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Episode -> (actions, the data set's, how many of these there are)."""
     group = zarr.open_group(store, mode="r")["episodes"]
-    names = ("actions", "dataset_actions", "dataset_action_count")
-    return {name: tuple(episode[array][:] for array in names) for name, episode in group.groups()}
+    return {
+        name: (episode["actions"][:], episode["dataset_actions"][:], np.array(episode.attrs["dataset_action_count"]))
+        for name, episode in group.groups()
+    }
 
 
 def spread_of(episodes: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:

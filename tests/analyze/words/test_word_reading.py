@@ -40,7 +40,7 @@ def raw_measures(path: Path, name: str, layer: int) -> dict[tuple[str, int], tup
     """
     episode = zarr.open_group(path / "episodes" / name, mode="r")
     rows = episode["joint/rows"][:].astype(np.float64).mean(axis=(2, 3, 4))  # (replan, layer, key)
-    roles, index = episode["joint/key_role"][:], episode["prompt_index"][:]
+    roles, index = episode["joint/key_role"][:], episode.attrs["prompt_index"]
     collected: dict[tuple[str, int], list[tuple[float, float, float, float]]] = {}
     for replan, row in enumerate(rows[:, layer]):
         prompt = episode.attrs["prompts"][int(index[replan])]

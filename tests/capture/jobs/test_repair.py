@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.kit.attacks import files_of
 from tests.kit.crashes import before_call, die, run_child
 from tests.kit.slow import slow_except
 from tests.kit.still_scene import capture_without_simulator
@@ -35,7 +36,7 @@ NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2", 0)
 
 
 def chunk(episode: Path, array: str) -> Path:
-    return next(file for file in (episode / array / "c").rglob("*") if file.is_file())
+    return next(iter(files_of(episode, array)))
 
 
 def empty(episode: Path) -> None:
@@ -51,8 +52,8 @@ def other_name(episode: Path) -> None:
 #: What happens to an episode, and what a cheap look says about it.
 DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "emptied": (empty, f"Episode {DAMAGED} cannot be read: it has lost its seal (No such file or directory)"),
-    "lacks atoms": (lambda episode: shutil.rmtree(episode / "joint/atoms"), "it has lost its joint/atoms/c/0"),
-    "lacks a chunk": (lambda episode: chunk(episode, "joint/rows").unlink(), "it has lost its joint/rows/c/0"),
+    "lacks atoms": (lambda episode: shutil.rmtree(episode / "joint/atoms"), "it has lost its joint/atoms/c.0"),
+    "lacks a chunk": (lambda episode: chunk(episode, "joint/rows").unlink(), "it has lost its joint/rows/c.0"),
     "cut off": (lambda episode: os.truncate(chunk(episode, "joint/rows"), 20), "has 20 bytes; its seal says"),
     "no attributes": (lambda episode: (episode / "zarr.json").unlink(), "it has lost its zarr.json"),
     "edited attributes": (
@@ -303,7 +304,7 @@ def test_resuming_records_what_is_missing_and_says_what_is_damaged(tmp_path, mon
         assert said.err.count("\n") == 1
         assert (store / "episodes/task000_episode002").is_dir()
     assert not store_status(store).complete
-    with (store / "episodes/task000_episode002/actions/c/0/0/0").open("r+b") as file:
+    with (store / "episodes/task000_episode002/actions/c.0.0.0").open("r+b") as file:
         file.seek(30)
         file.write(b"??")
     assert main([*given, "--resume", "--verify"]) == 2

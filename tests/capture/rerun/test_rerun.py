@@ -150,7 +150,7 @@ def test_a_damaged_episode_is_refused(pi_store, tmp_path, capsys):
     assert "task001_episode000" in said
     assert "vla-capture repair" in said
     # Bytes that were changed are found when they are read.
-    frame = next((damaged / "episodes/task000_episode000/frames").rglob("c/*"))
+    frame = next((damaged / "episodes/task000_episode000/frames").rglob("c.*"))
     while frame.is_dir():
         frame = next(frame.iterdir())
     content = bytearray(frame.read_bytes())

@@ -147,12 +147,12 @@ def test_bytes_that_come_back_changed_are_never_published(tmp_path, monkeypatch)
 
     async def spoiled(self, key, value, **keywords):
         await original(self, key, value, **keywords)
-        if "rows/c/" in key:
+        if "atoms/c." in key:
             file = Path(self.root) / key
             file.write_bytes(file.read_bytes()[:20] + b"\x55" + file.read_bytes()[21:])
 
     monkeypatch.setattr(LocalStore, "set", spoiled)
-    with pytest.raises(StoreError, match="joint/rows"):
+    with pytest.raises(StoreError, match="joint/atoms"):
         write_episode(store, SPEC, 0, 0)
     assert names(store.path) == []
 
@@ -216,7 +216,7 @@ def test_a_crash_while_overwriting_leaves_no_half_store(tmp_path, monkeypatch, u
     path = write_store(tmp_path / "a.zarr", spec=replace(SPEC, seed=5))
 
     def die_in_the_middle(folder: Path, **_: object) -> None:
-        next(file for file in Path(folder).rglob("0") if file.is_file()).unlink()
+        next(file for file in Path(folder).rglob("c.*")).unlink()
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:

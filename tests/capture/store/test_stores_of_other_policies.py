@@ -133,7 +133,7 @@ def test_a_run_of_our_own_loop_needs_them(tmp_path):
     with store.episode(start, np.array([1.0, 0.5]), len(records)) as writer:
         for record in records:
             writer.append(record)
-        with pytest.raises(CorruptEpisode, match="the array actions is not in the episode"):
+        with pytest.raises(CorruptEpisode, match="actions is not in the episode"):
             writer.commit(success=True, num_steps=5)
 
 

@@ -12,7 +12,7 @@ from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0,), episodes=2, replans=2, layers=(0,), heads=(0,), contributions=True)
-ROWS = "joint/rows/c/0/0/0/0/0/0"
+ROWS = "joint/rows/c.0.0.0.0.0.0"
 
 
 @pytest.fixture(scope="module")

@@ -60,12 +60,15 @@ def reader_of(folder: Path) -> ShardedLayers | None:
 @given(
     shape=st.tuples(*(st.integers(1, high) for high in (9, 3, 2, 2, 2, 17))),
     block=st.integers(1, 10),
+    blocks=st.integers(1, 3),
+    separator=st.sampled_from(["/", "."]),
     seed=st.integers(0, 99),
 )
-def test_equals_zarr_python(tmp_path_factory, shape, block, seed):
+def test_equals_zarr_python(tmp_path_factory, shape, block, blocks, separator, seed):
     folder = tmp_path_factory.mktemp("array") / "rows"
     values = np.random.default_rng(seed).random(shape, dtype=np.float32)
-    array = write_array(folder, values, block)
+    keys = {"name": "default", "separator": separator}
+    array = write_array(folder, values, block, shards=(block * blocks, *shape[1:]), chunk_key_encoding=keys)
     reader = reader_of(folder)
     assert reader is not None
     memory = reader.memory()
@@ -85,10 +88,11 @@ def test_equals_zarr_python(tmp_path_factory, shape, block, seed):
         {"compressors": (BloscCodec(typesize=4),)},
         {"shards": None},
         {"chunks": (4, 2, 1, 2, 1, 8)},
-        {"chunks": (2, 1, 1, 2, 1, 8)},
+        {"shards": (4, 1, 2, 2, 1, 8)},
+        {"chunk_key_encoding": {"name": "v2", "separator": "."}},
         {"compressors": None},
     ],
-    ids=["no checksum", "no shards", "two layers a chunk", "smaller chunks", "plain"],
+    ids=["no checksum", "no shards", "two layers a chunk", "a shard for each layer", "other names", "plain"],
 )
 def test_other_layouts_are_not_claimed(tmp_path, changes):
     values = np.random.default_rng(0).random((8, 2, 2, 2, 1, 8), dtype=np.float32)
@@ -221,7 +225,7 @@ def test_positions_that_cannot_be_are_refused(tmp_path, entries, problem):
     file.write_bytes(content[:-68] + changed)
     change_seal(
         episode,
-        lambda files: files["joint/rows/c/0/0/0/0/0/0"].update(
+        lambda files: files["joint/rows/c.0.0.0.0.0.0"].update(
             index=hashlib.sha256(changed).hexdigest(), sha256=hashlib.sha256(content[:-68] + changed).hexdigest()
         ),
     )

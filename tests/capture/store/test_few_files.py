@@ -1,0 +1,102 @@
+"""How many files and folders captured episodes have: clusters and hubs count them.
+
+Not here, because they need packages of their own: policies of LeRobot and GR00T (`tests/policies`). Each site takes 9
+files, 11 with contributions, as the sites here do.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.kit.attacks import files_of
+from tests.kit.lerobot_data_sets import episodes_of_store, write_data_set
+from tests.kit.pi_golden import GOLDEN
+from tests.kit.small_tokenizer import train_small_tokenizer
+from tests.kit.still_scene import capture_without_simulator
+from vla_attention.analyze.copy.copying import copy_store
+from vla_attention.capture.__main__ import main as capture
+from vla_attention.capture.store import codecs as store_codecs
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.testing.site_stores import write_site_store
+from vla_attention.testing.stores import write_store
+
+MOST_FILES = 45
+WHERE = ("--task-suite", "robosuite", "--task-id", "0", "--num-episodes", "1", "--max-steps", "30")
+TINY = ("--checkpoint", "untrained-tiny")
+CAMERAS = {"base_0_rgb": "image", "left_wrist_0_rgb": "wrist_image"}
+
+
+def run(*arguments: object) -> None:
+    assert capture([str(argument) for argument in arguments]) == 0
+
+
+def check_few(store: Path, most: int = MOST_FILES) -> int:
+    """Fail unless every array of every episode is one file; returns the most files that an episode has."""
+    found = []
+    for episode in open_store(store).episodes:
+        folder = Path(str(episode.folder))
+        for name in episode.attributes.arrays:
+            assert len(files_of(folder, name)) == 1, name
+        kinds = {file.parent: json.loads(file.read_text())["node_type"] for file in folder.rglob("zarr.json")}
+        folders = {folder, *(path for path in folder.rglob("*") if path.is_dir())}
+        assert folders == set(kinds), "a folder that is neither a group nor an array"
+        found.append(sum(path.is_file() for path in folder.rglob("*")))
+        assert found[-1] == len(kinds) + len(episode.attributes.arrays)
+    assert max(found) <= most
+    return max(found)
+
+
+@pytest.fixture
+def still_scene(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Captures in a scene in which nothing moves, with a block of rows for as few replans as there can be."""
+    capture_without_simulator(monkeypatch)
+    monkeypatch.setattr(store_codecs, "TARGET_CHUNK_BYTES", 1)
+
+
+@pytest.mark.usefixtures("still_scene")
+def test_pi_its_reruns_and_replays(tmp_path):
+    store = tmp_path / "run.zarr"
+    run("pi", *WHERE, *TINY, "--queries", "all", "--denoise-steps", "all", "--contributions", "--store", store)
+    assert check_few(store, 27) == 27
+    run("rerun", store, "--knockout", "camera:base_0_rgb", "--store", tmp_path / "without.zarr")
+    check_few(tmp_path / "without.zarr")
+    data = write_data_set(tmp_path / "data", "v3.0", episodes_of_store(store, CAMERAS))
+    run("replay", data, *TINY, "--contributions", "--store", tmp_path / "replay.zarr")
+    check_few(tmp_path / "replay.zarr")
+
+
+@pytest.mark.usefixtures("still_scene")
+@pytest.mark.parametrize("case", ["pi05_batch2", "pi0_batch2"])
+def test_policies_of_lerobot_which_keep_two_pictures_of_each_camera(tmp_path, case):
+    tokenizer = train_small_tokenizer(tmp_path / "small.model")
+    model = ("--checkpoint", GOLDEN / case / "checkpoint_lerobot", "--tokenizer", tokenizer, "--contributions")
+    run("pi", *WHERE, *model, "--store", tmp_path / "run.zarr")
+    assert any(
+        name.startswith("camera_frames/") for name in open_store(tmp_path / "run.zarr").episodes[0].attributes.arrays
+    )
+    check_few(tmp_path / "run.zarr")
+
+
+@pytest.mark.usefixtures("still_scene")
+def test_cosmos_with_two_sites(tmp_path):
+    run("cosmos", *WHERE, "--ckpt-path", "untrained-tiny", "--contributions", "--store", tmp_path / "run.zarr")
+    assert [site.name for site in open_store(tmp_path / "run.zarr").attributes.sites] == ["self", "cross"]
+    check_few(tmp_path / "run.zarr")
+
+
+@pytest.mark.parametrize("kind", ["alternating", "split", "growing"])
+def test_sites_of_other_policies_with_what_a_data_set_has(tmp_path, monkeypatch, kind):
+    monkeypatch.setattr(store_codecs, "TARGET_CHUNK_BYTES", 1)
+    store = write_site_store(tmp_path / "a.zarr", kind=kind, protocol="dataset", dataset_actions=0.5, replans=20)
+    check_few(store)
+
+
+def test_an_episode_of_any_length_has_the_same_files(tmp_path, monkeypatch):
+    monkeypatch.setattr(store_codecs, "TARGET_CHUNK_BYTES", 1)
+    counts = {replans: check_few(write_store(tmp_path / f"{replans}.zarr", replans=replans)) for replans in (1, 60)}
+    assert counts[1] == counts[60]
+    copy_store(open_store(tmp_path / "60.zarr"), tmp_path / "copy.zarr", ("frames",))
+    assert check_few(tmp_path / "copy.zarr") < counts[60]
