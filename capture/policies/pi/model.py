@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 class Prefix:
     """Result of the prefix pass for the suffix passes: one cache entry per block, and which keys are valid.
 
-    cache: per block, keys and values (batch, kv_head, prefix key, dim). valid: (batch, prefix key) bool.
+    cache: per block, keys and values (batch, kv_head, prefix key, dim). valid: (batch, prefix key) bool, where the
+    masks are.
     """
 
     cache: tuple[KeysValues, ...]
@@ -180,16 +181,18 @@ class PiModel(nn.Module):
         does not change use torch's fused attention. tokens: the keys that the embedded tokens are, (prefix key,); None
         counts them from 0.
         """
+        device = embedded.device
         if embedded.shape[0] == 1 and not bool(valid.all()):
             real = valid[0].nonzero()[:, 0]
-            dense = self.encode_prefix(embedded[:, real], valid[:, real], editor, real)
-            return Prefix(tuple(entry.spread(real, valid.shape[1]) for entry in dense.cache), valid)
-        rotation = Rotation.at(valid.cumsum(dim=1) - 1, self.config.paligemma.head_dim)
-        mask = None if embedded.shape[0] == 1 else valid[:, None, :]
+            places = real.to(device)
+            dense = self.encode_prefix(embedded[:, places], valid[:, real], editor, real)
+            return Prefix(tuple(entry.spread(places, valid.shape[1]) for entry in dense.cache), valid)
+        rotation = Rotation.at((valid.cumsum(dim=1) - 1).to(device), self.config.paligemma.head_dim)
+        mask = None if embedded.shape[0] == 1 else valid[:, None, :].to(device)
         x = embedded
         cache = []
         *earlier, last = self._vlm.blocks
-        keys = torch.arange(embedded.shape[1], device=embedded.device) if tokens is None else tokens
+        keys = torch.arange(embedded.shape[1]) if tokens is None else tokens
         for layer, block in enumerate(earlier):
             change = editor.prefix_change(layer, keys) if editor is not None else None
             x, own = block(x, mask, rotation, calls=None if change is None else AttentionCalls(change=change))
@@ -237,7 +240,8 @@ class PiModel(nn.Module):
         Args:
             images: per camera (batch, 3, height, width) float32 in [-1, 1].
             image_masks: per camera (batch,) bool.
-            tokens: (batch, text) int. token_mask: (batch, text) bool.
+            tokens: (batch, text) int. token_mask: (batch, text) bool. On a GPU, masks are best in the processor's
+                memory: shapes depend on them, and the processor would wait for the GPU to read them there.
             state: (batch, action dim) float32, normalised and padded; pi0.5 does not read it.
             noise: (batch, horizon, action dim) float32, the actions at t = 1.
             num_steps: number of denoise steps; None takes the configuration's.
@@ -252,16 +256,17 @@ class PiModel(nn.Module):
         through_compiled = compiled is not None and compiled.takes(noise, recorder, editor)
         prefix = self.encode_prefix(*self.embed_prefix(images, image_masks, tokens, token_mask), editor)
         suffix_positions = torch.arange(config.suffix_len, device=noise.device)
-        positions = prefix.valid.sum(dim=1, keepdim=True) + suffix_positions
+        valid = prefix.valid.to(noise.device)
+        positions = valid.sum(dim=1, keepdim=True) + suffix_positions
         denoising = Denoising(
             state,
             Rotation.at(positions, config.action_expert.head_dim),
-            self._suffix_mask(prefix.valid),
+            self._suffix_mask(valid),
             prefix.cache,
-            pieces_of_keys(config, prefix.valid),
+            pieces_of_keys(config, prefix.valid, noise.device),
         )
         if recorder is not None:
-            lasting = slice(0, prefix.valid.shape[1])
+            lasting = slice(0, valid.shape[1])
             recorder.begin_call(denoising.mask[0].any(dim=0), lasting, denoising.pieces)
 
         steps = config.num_denoise_steps if num_steps is None else num_steps

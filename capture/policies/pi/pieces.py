@@ -8,17 +8,18 @@ costs its start.
 from __future__ import annotations
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from vla_attention.capture.policies.pi.config import PiConfig
 
 
-def pieces_of_keys(config: PiConfig, prefix_valid: Tensor) -> tuple[slice, ...] | None:
+def pieces_of_keys(config: PiConfig, prefix_valid: Tensor, device: torch.device) -> tuple[slice, ...] | None:
     """Return the pieces of the keys of a denoise step, or None where the product is made at once.
 
-    prefix_valid: (batch, prefix key) bool. Pieces are for a batch of one on a processor.
+    prefix_valid: (batch, prefix key) bool. device: of the model. Pieces are for a batch of one on a processor.
     """
-    if prefix_valid.shape[0] != 1 or prefix_valid.device.type != "cpu":
+    if prefix_valid.shape[0] != 1 or device.type != "cpu":
         return None
     valid = prefix_valid[0].numpy()
     lengths = [*[config.siglip.num_tokens] * len(config.cameras), config.max_token_len]

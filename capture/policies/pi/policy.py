@@ -197,14 +197,15 @@ class PiPolicy:
         key_role[prompt_span.start : prompt_span.stop] = tokenized.roles
 
         black = torch.full((1, 3, size, size), -1.0)
+        # Masks stay in the processor's memory, as `PiModel.sample_actions` wants them.
         tensors: dict[str, Tensor] = {
             "tokens": torch.from_numpy(tokenized.ids)[None].to(device),
-            "token_mask": torch.from_numpy(tokenized.mask)[None].to(device),
+            "token_mask": torch.from_numpy(tokenized.mask)[None],
             "state": torch.from_numpy(pad_to(normalised, config.action_dim)).float()[None].to(device),
         }
         for camera in config.cameras:
             tensors[f"image:{camera}"] = (pictures[camera][1] if camera in pictures else black).to(device)
-            tensors[f"image_mask:{camera}"] = torch.tensor([camera in pictures], device=device)
+            tensors[f"image_mask:{camera}"] = torch.tensor([camera in pictures])
         frames = {slot: frame for slot, (frame, _) in pictures.items()}
         return PolicyInput(
             frames=frames,

@@ -1,8 +1,8 @@
-"""A recorded call asks nothing of a GPU inside its denoise steps, and moves what it recorded in one copy.
+"""A recorded call never waits for a GPU, from its pictures to its actions, and moves what it recorded in one copy.
 
 The device is torch's meta device, whose tensors have shapes and no numbers: an operation that needs a number
 (`.item()`, `.cpu()`, a choice by value) is an error there, as it would be a wait on a GPU. Copies to the device are
-collected.
+collected; there is none inside of the denoise steps.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG
+from tests.kit.policy_inputs import make_observation
+from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, dummy_policy
 from vla_attention.capture.policies.pi.gemma import KeysValues, Rotation
 from vla_attention.capture.policies.pi.model import Denoising, PiModel
 from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
@@ -85,6 +86,56 @@ def test_nothing_waits_for_the_gpu_in_the_denoise_steps(queries, dtype):
     assert {tensor.device for tensor in recorded} == {GPU}
     length = {"mean": 1, "steps": 2, "all": 4}[queries]
     assert [tuple(tensor.shape) for tensor in recorded] == [(9, 2, length, CONFIG.key_len), (9, 4, 4)]
+
+
+def whole_call(recorder: AttentionRecorder, masks: torch.device) -> tuple[list[str], list[int]]:
+    """Make a policy call on the fake GPU; return its transfers, and how many there were when each block began."""
+    with GPU:
+        model = PiModel(CONFIG)
+    begun: list[int] = []
+
+    class Noting(type(recorder)):
+        def begin_block(self, layer, denoise_step):
+            begun.append(len(inside.found))
+
+    noting = Noting(recorder.plan, recorder.num_keys, recorder.parts, recorder.pools)
+    size = CONFIG.siglip.image_size
+    first, *others = CONFIG.cameras
+    words = torch.arange(CONFIG.max_token_len)[None] < 9
+    with Transfers() as inside:
+        model.sample_actions(
+            images={camera: torch.empty(1, 3, size, size, device=GPU) for camera in CONFIG.cameras},
+            image_masks={first: torch.tensor([True], device=masks)}
+            | {camera: torch.tensor([False], device=masks) for camera in others},
+            tokens=torch.empty(1, CONFIG.max_token_len, dtype=torch.int64, device=GPU),
+            token_mask=words.to(masks),
+            state=torch.empty(1, CONFIG.action_dim, device=GPU),
+            noise=torch.empty(1, CONFIG.action_horizon, CONFIG.action_dim, device=GPU),
+            recorder=noting,
+        )
+        assert {tensor.device for tensor in noting.on_device()} == {GPU}
+    return inside.found, begun
+
+
+@pytest.mark.parametrize("queries", ["mean", "steps", "all"])
+def test_nothing_waits_for_the_gpu_in_the_whole_policy_call(queries):
+    """Masks and times go there before the first block. Nothing comes back: on this device that would be an error."""
+    found, begun = whole_call(recorder_of(queries), torch.device("cpu"))
+    assert len(begun) == 3 * CONFIG.action_expert.depth
+    assert begun == [len(found)] * len(begun)
+
+
+def test_masks_on_the_gpu_would_be_waited_for():
+    with pytest.raises((RuntimeError, NotImplementedError), match="meta"):
+        whole_call(recorder_of("mean"), GPU)
+
+
+def test_the_policy_keeps_its_masks_in_the_memory_of_the_processor():
+    policy = dummy_policy()
+    policy.model.to(GPU)
+    given = policy.prepare(make_observation(1), "put the red cube on the plate")
+    there = {name for name, tensor in given.tensors.items() if tensor.device == GPU}
+    assert there == {name for name in given.tensors if "mask" not in name}
 
 
 @pytest.mark.parametrize(
