@@ -22,7 +22,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
+from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, in_larger_parts
 from vla_attention.analyze.measures.masses import ratio
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
@@ -172,7 +172,7 @@ def contribution_rows(
         *(log.filter(log.is_finite()).mean().alias(name) for name, log in logs.items()),
     ]
     of_parts = []
-    for table in parts:
+    for table in in_larger_parts(parts):
         of_part = episode_means(table, *means)
         if f"{above}_of_uniform" in table.columns:
             of_part = _with_ratio_over_blocks(of_part, table, above, below, logs)

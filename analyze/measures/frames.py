@@ -6,7 +6,7 @@ is null in a table; infinite ratios stay infinite.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -28,6 +28,8 @@ LAYERS_AVG = "layers_avg"
 
 #: What tables are made of, one for each episode.
 Measured = TypeVar("Measured")
+#: A few megabytes.
+_ROWS_OF_LARGER_PARTS = 20_000
 #: One axis: the columns that label it, each with a value per position.
 Axis = Mapping[str, Sequence[Any] | NDArray[Any] | pl.Series]
 
@@ -284,6 +286,18 @@ class TableInParts:
     def filter(self, *conditions: pl.Expr, **values: Any) -> pl.DataFrame:
         """The rows of all parts for which conditions hold and columns have these values."""
         return pl.concat([part.filter(*conditions, **values) for part in self.parts])
+
+
+def in_larger_parts(parts: Iterable[pl.DataFrame]) -> Iterator[pl.DataFrame]:
+    """The same rows in fewer parts: whatever polars is asked takes a millisecond, of an episode as of a dozen."""
+    batch: list[pl.DataFrame] = []
+    for part in parts:
+        batch.append(part)
+        if sum(table.height for table in batch) >= _ROWS_OF_LARGER_PARTS:
+            yield pl.concat(batch)
+            batch = []
+    if batch:
+        yield pl.concat(batch)
 
 
 def cells_in_parts(level: Tables) -> TableInParts:

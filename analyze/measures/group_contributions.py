@@ -27,6 +27,8 @@ from vla_attention.analyze.measures.frames import (
     Tables,
     cells_in_parts,
     denoise_axis,
+    groups_in_parts,
+    in_larger_parts,
     layer_axis,
     long_table,
     replan_axis,
@@ -128,7 +130,8 @@ def _norm_tables(
 
 def norms_by_layer(tables: Tables) -> dict[tuple[str, str], float]:
     """By (layer, group): mean over episodes of the mean norm."""
-    episodes = pl.concat([episode_means(part.groups, pl.col("norm").mean(), by=("group",)) for part in tables.parts])
+    parts = in_larger_parts(groups_in_parts(tables))
+    episodes = pl.concat([episode_means(part, pl.col("norm").mean(), by=("group",)) for part in parts])
     means = episodes.group_by("layer", "group", maintain_order=True).agg(pl.col("norm").mean())
     return {(layer, group): norm for layer, group, norm in means.iter_rows()}
 

@@ -196,9 +196,9 @@ class Analysis:
         parts = [summary_text(_described(self), self.grouping, self.episodes, self.tasks)]
         if all(store.attributes.recording.contributions for store in question.stores):
             tables, estimand = self.group_contributions, question.settings.intervals
-            rows = self.contribution_rows
-            if self.contributions is not None and rows is not None and not same_sides(self.contributions, tables):
-                parts.append(contributions_section(rows))
+            if self.contributions is not None and not same_sides(self.contributions, tables):
+                assert self.contribution_rows is not None
+                parts.append(contributions_section(self.contribution_rows))
             first = len(parts) == 1
             parts.append(group_contributions_section(tables, self.grouping, question.site, estimand, first))
         return "\n".join(parts)
