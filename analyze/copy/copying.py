@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import errno
 import json
-import os
 import re
 import shutil
 from collections.abc import Callable, Sequence
@@ -20,13 +19,19 @@ from pathlib import Path
 from vla_attention.analyze.copy.packing import Packing
 from vla_attention.schemas.errors import BadArgument, UserError, unknown_name
 from vla_attention.schemas.stores.digest import run_digest
+from vla_attention.schemas.stores.partial_folders import (
+    make_partial,
+    partial_folder,
+    process_tag,
+    remove_dead_partials,
+    remove_if_empty,
+)
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.remote_source import source_of
 from vla_attention.schemas.stores.root import episode_folders, group_attributes
 from vla_attention.schemas.stores.seal import SEAL_FILE, seal_episode
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
-    PARTIAL_SUFFIX,
     STORE_SUFFIX,
     CorruptEpisode,
     RunMismatch,
@@ -111,14 +116,16 @@ def copy_store(
 def _copy(
     store: Store, target: Path, without: tuple[str, ...], progress: Callable[[int], object] | None, packed: bool
 ) -> Copied:
-    building = target.with_name(target.name + PARTIAL_SUFFIX) / f"copy-{os.getpid()}"
     root = _root_document(store, without)
     run = run_digest(group_attributes(root))
-    building.mkdir(parents=True)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    remove_dead_partials(target)
+    building = partial_folder(target) / f"copy-{process_tag()}"
+    make_partial(building)
     pack: Packing | None = None
     try:
         _ensure_root(store, target, root, building)
-        pack = Packing(target, run) if packed else None
+        pack = Packing(target, run, building) if packed else None
         present = {folder.name for folder in episode_folders(target)} if pack is None else pack.present()
         added = copied = left = 0
         for episode in store.episodes:
@@ -136,10 +143,10 @@ def _copy(
     finally:
         try:
             if pack is not None:
-                pack.write_index()
+                pack.close()
         finally:
             shutil.rmtree(building, ignore_errors=True)
-            _remove_if_empty(building.parent)
+            remove_if_empty(building.parent)
     return Copied(added, len(store.episodes) - added, copied, left)
 
 
@@ -221,10 +228,3 @@ def _rename_new(source: Path, target: Path) -> None:
     except OSError as error:
         if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
             raise
-
-
-def _remove_if_empty(folder: Path) -> None:
-    try:
-        folder.rmdir()
-    except OSError:
-        return

@@ -7,6 +7,8 @@ the episode.
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import os
 import zipfile
 from pathlib import Path
@@ -36,24 +38,36 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 class Packing:
     """A packed store that episodes are added to. The index lists whole zips only, and is written now and then.
 
-    It is there before the first zip: a copy that ends early is a packed store of the episodes that it has.
+    It is there before the first zip: a copy that ends early is a packed store of the episodes that it has. One process
+    at a time packs into a store, because the index that is written last would lack the zips of the other.
     """
 
-    def __init__(self, target: Path, run: str) -> None:
-        """Continue what is at `target`; `run` is the digest of its configuration.
+    def __init__(self, target: Path, run: str, building: Path) -> None:
+        """Continue what is at `target`, until `close`.
+
+        Args:
+            target: the store.
+            run: digest of its configuration.
+            building: a folder beside the store, in which files are written.
 
         Raises:
-            BadArgument: its episodes are folders.
+            BadArgument: its episodes are folders, or another copy is packing into it.
             StoreError: its index is damaged or of another run.
         """
         self.target = target
         self.run = run
+        self.building = building
         if next((target / EPISODES_GROUP).glob("task*_episode*/zarr.json"), None) is not None:
             raise BadArgument(f"Cannot pack into {target}: its episodes are folders; give another name.")
-        index = read_index(Folder(target), target, run)
-        self.episodes: dict[str, PackedEpisode] = {} if index is None else dict(index.episodes)
-        if index is None:
-            self.write_index()
+        self._lock = _locked(target)
+        try:
+            index = read_index(Folder(target), target, run)
+            self.episodes: dict[str, PackedEpisode] = {} if index is None else dict(index.episodes)
+            if index is None:
+                self.write_index()
+        except BaseException:
+            os.close(self._lock)
+            raise
 
     def present(self) -> set[str]:
         """Names of the episodes whose zips are there, with the bytes that the index says."""
@@ -67,13 +81,10 @@ class Packing:
         """Pack a sealed episode from its folder."""
         path = self.target / packed_file(name)
         path.parent.mkdir(parents=True, exist_ok=True)
-        building = path.with_name(f"{path.name}.partial-{os.getpid()}")
-        try:
-            tail = write_zip(folder, building)
-            size = building.stat().st_size
-            building.replace(path)
-        finally:
-            building.unlink(missing_ok=True)
+        building = self.building / path.name
+        tail = write_zip(folder, building)
+        size = building.stat().st_size
+        building.replace(path)
         self.episodes[name] = PackedEpisode(packed_file(name), size, tail, read_seal(folder).digest)
         if len(self.episodes) % _INDEX_EVERY == 0:
             self.write_index()
@@ -81,9 +92,32 @@ class Packing:
     def write_index(self) -> None:
         """Write the index in one step."""
         index = PackedIndex(INDEX_FORMAT, INDEX_VERSION, self.run, dict(sorted(self.episodes.items())))
-        building = self.target / f".{INDEX_FILE}.partial-{os.getpid()}"
+        building = self.building / INDEX_FILE
         building.write_bytes(index.document())
         building.replace(self.target / INDEX_FILE)
+
+    def close(self) -> None:
+        """Write the index a last time, and let others pack."""
+        try:
+            self.write_index()
+        finally:
+            os.close(self._lock)
+
+
+def _locked(target: Path) -> int:
+    """The root's `zarr.json`, opened and locked; the lock ends with the process, whatever ends that."""
+    handle = os.open(target / "zarr.json", os.O_RDWR | os.O_CLOEXEC)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno in (errno.EAGAIN, errno.EACCES):
+            os.close(handle)
+            raise BadArgument(
+                f"Cannot pack into {target}: another copy is packing into it; run the same command again when that has "
+                "ended, or give another name."
+            ) from None
+        # A file system without locks: there, nothing but the user keeps two copies apart.
+    return handle
 
 
 def write_zip(folder: Path, path: Path) -> int:

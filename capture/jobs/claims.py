@@ -32,8 +32,8 @@ from pathlib import Path
 from types import TracebackType
 
 from vla_attention.capture.jobs.worker import Worker, is_known_dead
-from vla_attention.capture.store.durable_files import make_partial, partial_folder, remove_if_empty
 from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
+from vla_attention.schemas.stores.partial_folders import make_partial, partial_folder, remove_if_empty
 
 #: Ending of the folder beside the store that holds claims and records. No reader needs it, and it may be deleted while
 #: no capture runs.

@@ -14,7 +14,7 @@ from pathlib import Path
 from vla_attention.capture.jobs.claims import Claims, Holder, jobs_folder
 from vla_attention.capture.jobs.damaged_episodes import DamagedEpisode, look_at
 from vla_attention.capture.jobs.worker import this_worker
-from vla_attention.capture.store.durable_files import remove_if_empty
+from vla_attention.schemas.stores.partial_folders import remove_if_empty
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.seal import read_seal
 from vla_attention.schemas.stores.store_format import StoreError

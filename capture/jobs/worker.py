@@ -12,7 +12,7 @@ import socket
 from dataclasses import dataclass
 from pathlib import Path
 
-from vla_attention.capture.store.durable_files import process_tag
+from vla_attention.schemas.stores.partial_folders import process_tag
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,10 @@ from pathlib import Path
 
 import zarr
 
-from vla_attention.capture.store.durable_files import (
-    make_partial,
-    partial_folder,
-    process_tag,
-    publish,
-    remove_if_empty,
-)
+from vla_attention.capture.store.durable_files import publish
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.stores.digest import run_configuration
+from vla_attention.schemas.stores.partial_folders import make_partial, partial_folder, process_tag, remove_if_empty
 from vla_attention.schemas.stores.root import read_root
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,

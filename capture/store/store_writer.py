@@ -15,17 +15,17 @@ from typing import Literal, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.store.durable_files import (
+from vla_attention.capture.store.durable_files import naming_the_failure
+from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter
+from vla_attention.capture.store.store_root import check_same_run, create_root, delete_store, read_existing_root
+from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.stores.partial_folders import (
     make_partial,
-    naming_the_failure,
     partial_folder,
     process_tag,
     remove_dead_partials,
     remove_if_empty,
 )
-from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter
-from vla_attention.capture.store.store_root import check_same_run, create_root, delete_store, read_existing_root
-from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stores.root import episode_folders
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,

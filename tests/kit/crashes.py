@@ -19,8 +19,11 @@ PROCESSES.set_forkserver_preload(["vla_attention.testing.stores"])
 
 @contextmanager
 def before_call(kind: str, number: int, action: Callable[[], None]):
-    """Act before the number-th (from 0) call of a kind: `set` (a file), `fsync`, `rename`; "renamed": after one."""
-    owner: Any = {"set": LocalStore, "fsync": os, "rename": Path, "renamed": Path}[kind]
+    """Act before the number-th (from 0) call of a kind: `set` (a file), `fsync`, `rename`.
+
+    "renamed" and "replaced": after one.
+    """
+    owner: Any = {"set": LocalStore, "fsync": os}.get(kind, Path)
     name = kind.removesuffix("d")
     original = getattr(owner, name)
     calls = 0
@@ -36,10 +39,10 @@ def before_call(kind: str, number: int, action: Callable[[], None]):
         return await original(self, *arguments, **keywords)
 
     def noted(*arguments, **keywords):
-        if kind != "renamed":
+        if not kind.endswith("d"):
             note()
         result = original(*arguments, **keywords)
-        if kind == "renamed":
+        if kind.endswith("d"):
             note()
         return result
 

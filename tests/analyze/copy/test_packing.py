@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import pytest
 import tensorstore
 import zarr
 
+from tests.kit.crashes import before_call, die, run_child
 from tests.kit.slow import slow_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.commands import COMMANDS
@@ -221,6 +223,42 @@ def test_an_interrupted_copy_goes_on(original, packed, tmp_path, monkeypatch):
     again = copy_store(open_store(original), target, (), packed=True)
     assert (again.present, again.added) == (2, 2)
     assert all_bytes(target) == all_bytes(packed)
+
+
+def test_two_copies_into_one_store_at_once(original, packed, tmp_path, monkeypatch, capsys):
+    """The second is refused with a sentence and changes nothing; the first ends with all episodes."""
+    target, write_zip, codes = tmp_path / "b.zarr", packing.write_zip, []
+
+    def meanwhile(folder: Path, path: Path) -> int:
+        if not codes:
+            codes.append(analyze(["copy", str(original), str(target), "--packed"]))
+        return write_zip(folder, path)
+
+    monkeypatch.setattr(packing, "write_zip", meanwhile)
+    assert copy_store(open_store(original), target, (), packed=True).added == 4
+    said = capsys.readouterr().err
+    assert codes == [2]
+    assert "another copy is packing into it" in said
+    assert said.count("\n") == 1
+    assert all_bytes(target) == all_bytes(packed)
+    assert not list(tmp_path.glob("*.partial"))
+
+
+def killed_in_the_third(original: Path, target: Path) -> None:
+    with before_call("replaced", 2, die):
+        copy_store(open_store(original), target, (), packed=True)
+
+
+def test_a_killed_copy_leaves_nothing_behind_for_long(original, packed, tmp_path):
+    target = tmp_path / "b.zarr"
+    assert run_child(killed_in_the_third, original, target) == -signal.SIGKILL
+    assert {file.suffix for file in target.rglob("*") if file.is_file()} == {".json", ".zip"}
+    (left,) = (tmp_path / "b.zarr.partial").iterdir()
+    assert left.name.startswith("copy-")
+    assert verify_store(open_store(target)) == []
+    pack(original, target)
+    assert all_bytes(target) == all_bytes(packed)
+    assert list(tmp_path.iterdir()) == [target]
 
 
 def test_a_packed_copy_is_brought_up_to_date_and_mends_what_is_missing(tmp_path):

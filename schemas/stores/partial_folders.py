@@ -1,0 +1,67 @@
+"""Folders for what is being written, beside the store: capture writes episodes there, and a copy its copies.
+
+What is whole is renamed into the store, so that readers never see the rest, and what a killed process leaves is
+removed by the next one that writes.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import uuid
+from pathlib import Path
+
+from vla_attention.schemas.stores.store_format import PARTIAL_SUFFIX
+
+
+def partial_folder(store: Path) -> Path:
+    """The folder for what is being written: beside the store, on the same file system, and not in it."""
+    return store.with_name(store.name + PARTIAL_SUFFIX)
+
+
+def process_tag() -> str:
+    """A name that no other process uses; it has the host and the process number, see `remove_dead_partials`."""
+    return f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
+
+
+def remove_dead_partials(store: Path) -> None:
+    """Remove what killed processes of this machine left beside the store.
+
+    Those of other machines cannot be checked here.
+    """
+    partial = partial_folder(store)
+    for folder in partial.glob("*"):
+        host, _, process = folder.name.partition("-")[2].rpartition("-")[0].rpartition("-")
+        if host == socket.gethostname() and process.isdigit() and not _is_running(int(process)):
+            shutil.rmtree(folder, ignore_errors=True)
+    remove_if_empty(partial)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)  # signal 0 only checks that the process exists
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def make_partial(folder: Path) -> None:
+    """Create a folder for what is being written; another process may be removing the (empty) parent at this moment."""
+    while True:
+        folder.parent.mkdir(exist_ok=True)
+        try:
+            folder.mkdir()
+        except FileNotFoundError:
+            continue
+        return
+
+
+def remove_if_empty(folder: Path) -> None:
+    """Remove a folder if it is empty."""
+    try:
+        folder.rmdir()
+    except OSError:
+        return  # another writer's episode is in it, or another process has removed it
