@@ -156,7 +156,8 @@ class AttentionRecorder(RowCollector):
             return None
 
         def take(pieces: Sequence[Tensor]) -> None:
-            self._pieces = [_of_queries(piece, 2, action_queries) for piece in pieces]
+            of_all = _of_queries(pieces[0], 2, action_queries) is pieces[0]
+            self._pieces = pieces if of_all else [_of_queries(piece, 2, action_queries) for piece in pieces]
 
         return take
 

@@ -159,46 +159,40 @@ class SharedLayer:
         The parts stand in the order of the shares, then the update; those without a key that is read are left out.
         """
         shares = self._shares
-        update = torch.cat([update for update in self._updates if update is not None])  # (step, query, width)
+        updates = [update for update in self._updates if update is not None]
         gates = [gate for gate in self._gates if gate is not None]
         parts, mixed = len(shares.order), len(shares.mixed) - shares.one_is_left
-        vectors = update.new_empty(parts + 1, *update.shape)  # (part, step, query, width)
-        made = vectors[: parts - shares.one_is_left]
+        vectors = updates[0].new_empty(parts + 1, len(updates), *updates[0].shape[1:])  # (part, step, query, width)
+        made, update = vectors[: parts - shares.one_is_left], vectors[-1]
+        torch.cat(updates, out=update)
         if mixed:
             given = self._mixed[:, :mixed].permute(1, 0, 3, 2, 4).reshape(-1, self._weight.shape[1])
             torch.mm(given, self._weight.t(), out=made[:mixed].view(len(given), -1))
         if shares.single:
-            self._project_keys(made[mixed:])
+            self._project_keys(made[mixed:].flatten(1, 2))
         if gates:
             made.mul_(torch.cat(gates)[:, None])
         if shares.one_is_left:
             torch.sub(update, made.sum(dim=0), out=vectors[-2])
-        vectors[-1] = update
         flat = vectors.flatten(2).transpose(0, 1)  # (step, part, query · width)
-        products = torch.matmul(flat, flat.transpose(1, 2))
-        if shares.one_is_left:
-            self._nothing_where_nothing_was_read(products)
-        return products
+        return torch.bmm(flat, flat.transpose(1, 2))
 
-    def _nothing_where_nothing_was_read(self, products: Tensor) -> None:
-        """Set to zero what rounding left of the last part in calls where it was knocked out."""
-        squares = products.diagonal(dim1=1, dim2=2)
-        for step in (squares[:, -2] <= _NEXT_TO_NOTHING * squares.amax(dim=1)).nonzero()[:, 0].tolist():
-            if not self._mixed[step, -1].any():
-                products[step, -2], products[step, :, -2] = 0, 0
+    def left_nothing(self, step: int) -> bool:
+        """Return whether the last mixed part, which is what the others leave, was knocked out at a step."""
+        return not self._mixed[step, -1].any()
 
     def _project_keys(self, out: Tensor) -> None:
-        """Write the contributions (part, step, query, width) of the parts of single keys, without gates."""
+        """Write the contributions (part, step · query, width) of the parts of single keys, without gates."""
         assert self._values is not None
         heads, width = self._single.shape[1], out.shape[-1]
         by_head = self._weight.view(width, heads, -1).permute(1, 2, 0)  # (head, dim, width)
         kv_heads, count, dim = self._values.shape
         values = self._values[:, None].expand(kv_heads, heads // kv_heads, count, dim).reshape(heads, count, dim)
-        keys = torch.matmul(values, by_head)  # (head, key, width)
+        keys = torch.bmm(values, by_head)  # (head, key, width)
         rows = self._single.transpose(1, 2)  # (step, query, head, key)
-        for number, (_, place) in enumerate(self._shares.single):
+        for (_, place), of_part in zip(self._shares.single, out.unbind(), strict=True):
             of_keys = keys[:, place].reshape(-1, width)
-            torch.mm(rows[..., place].reshape(-1, len(of_keys)), of_keys, out=out[number].view(-1, width))
+            torch.mm(rows[..., place].reshape(-1, len(of_keys)), of_keys, out=of_part)
 
 
 def _mixed(rows: Tensor, values: Tensor, keys: slice | Tensor) -> Tensor:
@@ -211,6 +205,12 @@ def _mixed(rows: Tensor, values: Tensor, keys: slice | Tensor) -> Tensor:
 def gram_matrices(shares: Shares, layers: Sequence[SharedLayer]) -> Tensor:
     """Return the Gram matrices (layer · step, part + 1, part + 1) float32 of all parts and the update."""
     inner = torch.cat([layer.inner_products() for layer in layers]) / layers[0].num_queries
+    if shares.one_is_left:
+        squares = inner.diagonal(dim1=1, dim2=2)
+        steps = len(inner) // len(layers)
+        for cell in (squares[:, -2] <= _NEXT_TO_NOTHING * squares.amax(dim=1)).nonzero()[:, 0].tolist():
+            if layers[cell // steps].left_nothing(cell % steps):  # and not what rounding leaves
+                inner[cell, -2], inner[cell, :, -2] = 0, 0
     place = torch.tensor([*shares.order, shares.size])
     gram = inner.new_zeros(len(inner), shares.size + 1, shares.size + 1)
     gram[:, place[:, None], place] = inner
