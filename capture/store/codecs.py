@@ -26,9 +26,9 @@ CHUNK_KEYS: dict[str, Any] = {"name": "default", "configuration": {"separator": 
 
 _ROWS = BloscCodec(cname="lz4", clevel=5, shuffle="bitshuffle", typesize=4)
 
-#: Fill values, which zarr gives for a missing chunk, by kind of number. No stored float or signed integer has this
-#: value. A stored byte may, so readers of pictures must check that the chunk's file exists.
-MISSING = {"f": float("nan"), "i": -1, "u": 0}
+#: Fill values, which zarr gives for a missing chunk, by kind of number. No stored float has this value. A stored byte
+#: may, so readers of pictures must check that the chunk's file exists.
+MISSING = {"f": float("nan"), "u": 0}
 
 
 def replans_per_block(bytes_per_replan: int, max_replans: int) -> int:

@@ -210,7 +210,7 @@ def test_core_codecs_only_and_a_checksum_on_every_chunk(written):
         assert document["fill_value"] == (
             "NaN" if document["data_type"].startswith("float") else document["fill_value"]
         )
-        assert document["fill_value"] == -1 or not document["data_type"].startswith("int")
+        assert document["data_type"] in ("uint8", "float32", "float64")
         assert len(document["dimension_names"]) == len(document["shape"])
 
 
@@ -227,7 +227,6 @@ def test_chunks_that_hold_only_the_fill_value_are_written(tmp_path):
     group = zarr.create_group(tmp_path / "g", zarr_format=3)
     for name, values in {
         "black": np.zeros((20, 30, 30, 3), dtype=np.uint8),
-        "minus": np.full((4,), -1, dtype=np.int32),
         "nan": np.full((4, 2), np.nan, dtype=np.float32),
     }.items():
         write_whole(group, name, values, [f"axis{i}" for i in range(values.ndim)])

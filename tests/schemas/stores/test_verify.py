@@ -219,6 +219,12 @@ def test_damaged_attributes_are_not_read(path):
         (lambda attributes: attributes["arrays"].pop("joint/rows"), "joint/rows is not in the episode"),
         (lambda attributes: attributes["prompts"].pop(), "prompt_index names prompts"),
         (lambda attributes: attributes["arrays"].update({"../../a": {"shape": [1], "sha256": ""}}), "../../a"),
+        (lambda attributes: attributes.pop("env_step"), "env_step is not in the episode"),
+        (lambda attributes: attributes["noise_seed"].pop(), "noise_seed has the shape (2,); expected (3,)"),
+        (lambda attributes: attributes["denoise_time"].append(0.5), "denoise_time has the shape (3,); expected (2,)"),
+        (lambda attributes: attributes["env_step"].reverse(), "env_step does not increase: 15 follows 20"),
+        (lambda attributes: attributes["prompt_index"].__setitem__(0, 2**40), "its prompt_index is damaged"),
+        (lambda attributes: attributes["prompt_index"].__setitem__(0, 0.5), "its attributes are damaged"),
     ],
 )
 def test_attributes_that_contradict_the_arrays(path, change, problem):
@@ -229,6 +235,15 @@ def test_attributes_that_contradict_the_arrays(path, change, problem):
     (folder / "zarr.json").write_text(json.dumps(document))
     reseal(folder)
     assert problem in only_fault_of(path)
+
+
+def test_the_numbers_of_a_site_s_axes_are_those_of_the_run(path):
+    folder = path / "episodes" / EPISODE
+    document = json.loads((folder / "joint/zarr.json").read_text())
+    document["attributes"]["layer"].reverse()
+    (folder / "joint/zarr.json").write_text(json.dumps(document))
+    reseal(folder)
+    assert "the attributes of joint are {'layer': [2, 0]" in only_fault_of(path)
 
 
 def test_an_empty_episode_folder(path):
