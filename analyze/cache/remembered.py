@@ -70,8 +70,9 @@ def remembered(
     Args:
         question: what is measured.
         episodes: the episodes.
-        measure: called once with the positions of the episodes to measure, if there are any; gives their arrays in
-            this order, each as soon as it is known. It reports its own progress.
+        measure: called with the positions of the episodes to measure, if there are any; gives their arrays in this
+            order, each as soon as it is known. It reports its own progress. It is called again for an episode whose
+            numbers in the cache turn out to be damaged.
         arguments: what the numbers depend on that differs between episodes, a JSON value for each of them.
         progress: called with the number of episodes that need not be measured.
     """
@@ -84,21 +85,19 @@ def remembered(
     keys = [_episode_key(episode, one) for episode, one in zip(episodes, extra, strict=True)]
     # Before anything is measured: a file that changes in the meantime makes what is kept of it invalid.
     states = [file_state(episode) for episode in episodes]
-    found: list[Arrays | None] = [
-        None if state is None else cache.find(key, state) for key, state in zip(keys, states, strict=True)
-    ]
-    missing = [i for i, arrays in enumerate(found) if arrays is None]
+    records = [() if state is None else cache.records(key, state) for key, state in zip(keys, states, strict=True)]
+    missing = [i for i, found in enumerate(records) if not found]
     if progress is not None and len(missing) < len(episodes):
         progress(len(episodes) - len(missing))
     with _Keeper(cache.digest, question.about, place) as keeper:
         measured = iter(measure(missing) if missing else ())
-        for key, state, known in zip(keys, states, found, strict=True):
-            if known is not None:
-                yield known
-                continue
-            arrays = next(measured)
-            if state is not None:
-                keeper.add(key, state, arrays)
+        for i, (key, state, found) in enumerate(zip(keys, states, records, strict=True)):
+            # Read when its turn comes: numbers of thousands of episodes would not fit into memory.
+            arrays = cache.read(found, key)
+            if arrays is None:
+                arrays = next(iter(measure([i]))) if found else next(measured)
+                if state is not None:
+                    keeper.add(key, state, arrays)
             yield arrays
 
 
@@ -114,13 +113,14 @@ class _Lookup:
         self._records = find_records(question_folder(place, self.digest), self.digest)
         self._touched: set[str] = set()
 
-    def find(self, key: bytes, state: bytes) -> Arrays | None:
-        for record in self._records.get(key, ()):
-            if record.state == state:
-                arrays = self._read(record, key)
-                if arrays is not None:
-                    return arrays
-        return None
+    def records(self, key: bytes, state: bytes) -> Sequence[Record]:
+        """Those of an episode that is as it was."""
+        return [record for record in self._records.get(key, ()) if record.state == state]
+
+    def read(self, records: Sequence[Record], key: bytes) -> Arrays | None:
+        """The arrays of the first record that is whole."""
+        found = (self._read(record, key) for record in records)
+        return next((arrays for arrays in found if arrays is not None), None)
 
     def _read(self, record: Record, key: bytes) -> Arrays | None:
         content = read_record(record, key, self.digest)

@@ -59,6 +59,8 @@ from vla_attention.schemas.groupings.vocabulary import NO_COVERAGE
 Array = NDArray[np.float64]
 #: Maps of a replan that are compared with masks at once: of two denoise steps of 18 layers, or of as many heads.
 _MAPS_TOGETHER = 36
+#: Replans of a camera that are a part of the tables of steps: 30,000 rows for four thresholds and 14 items.
+_REPLANS_TOGETHER = 16
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,7 @@ class _Steps:
 
     Attributes:
         items: labels of the axis of items.
-        columns: camera -> column of `steps` -> (replan or 1, layer or 1, denoise or 1, head or 1, item or 1).
+        columns: camera -> column of `steps` -> (replan, layer or 1, denoise or 1, head or 1, item or 1).
         iou_columns: camera -> column of `iou_steps` -> (replan, layer, denoise, head, threshold, item).
     """
 
@@ -169,17 +171,24 @@ def _step_tables(
     selection: Selection,
     thresholds: Sequence[str] | None = None,
 ) -> TableInParts:
-    """`steps`, or with `thresholds` `iou_steps`, a part for each episode and camera."""
-    parts = [(i, camera) for i, item in enumerate(items) for camera in cameras_of(item)]
+    """`steps`, or with `thresholds` `iou_steps`, in parts of some replans of one camera of an episode."""
+    parts = [
+        (i, camera, slice(first, first + _REPLANS_TOGETHER))
+        for i, item in enumerate(items)
+        for camera in cameras_of(item)
+        for first in range(0, item.tokens.num_replans, _REPLANS_TOGETHER)
+    ]
 
     def part(number: int) -> pl.DataFrame:
-        i, camera = parts[number]
+        i, camera, replans = parts[number]
         item, found = items[i], steps[i]
-        axes = [{"camera": (camera,)}, replan_axis(item), layer_axis(selection), denoise_axis(selection)]
+        replan = {name: labels[replans] for name, labels in replan_axis(item).items()}
+        axes: list[Axis] = [{"camera": (camera,)}, replan, layer_axis(selection), denoise_axis(selection)]
         axes.append(head_axis(selection))
         if thresholds is not None:
             axes.append({"threshold": thresholds})
-        values = (found.columns if thresholds is None else found.iou_columns)[camera]
+        columns = (found.columns if thresholds is None else found.iou_columns)[camera]
+        values = {name: array[replans] for name, array in columns.items()}
         return long_table(item, [*axes, found.items], values, EPISODE_KEYS)
 
     return TableInParts(MadeWhenAsked(part, range(len(parts))))

@@ -267,7 +267,7 @@ class StoredEpisode:
         layout = root.site(site)
         return EpisodeTokens(
             layout=layout,
-            key_role=self.read(f"{site}/key_role"),
+            key_role=_once_if_same(self.read(f"{site}/key_role")),
             prompts=self.prompts(root, site),
             prompt_index=self.read("prompt_index"),
             objects=self.attributes.objects,
@@ -353,6 +353,12 @@ def open_store(path: str | StorePlace) -> Store:
 def _packed(path: StorePlace, source: ByteSource, run: str, name: str, entry: PackedEpisode) -> StoredEpisode:
     members = ZipMembers(source.bound_to(entry.seal), entry.file, entry.bytes, entry.tail)
     return StoredEpisode(path / entry.file, name, run, members, entry.seal)
+
+
+def _once_if_same(values: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Values (replan, key); in memory once where all replans have the same, which are 50 kB an episode."""
+    same = (values == values[:1]).all()
+    return np.broadcast_to(values[0].copy(), values.shape) if same and len(values) else values
 
 
 def _lost_chunk(episode: StoredEpisode, name: str) -> CorruptEpisode:
