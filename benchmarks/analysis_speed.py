@@ -11,8 +11,9 @@ measures goes to docs/benchmarks/analysis_speed.json; nothing is asserted. The p
                intervals; the same masses by a loop with zarr-python, and by xarray with dask (`pip install dask`)
     bytes      what the process reads for all layers and for three of eighteen, as Linux counts it
     processes  whole `vla-analyze` processes without the cache: wall seconds and peak memory
-    memory     peak memory of whole processes at 50, 100 and 200 episodes; of one head, because masses of more are as
-               large
+    memory     peak memory of whole processes by number of episodes (--sizes 50 500, each a multiple of the first):
+               stores of one head, because masses of more are as large, with fifty episodes again and again
+               (repeated_store.py). Without the cache, so that everything is measured
     masses     the same of processes that compute masses and nothing else
 """
 
@@ -26,7 +27,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from importlib.util import find_spec
@@ -34,6 +35,7 @@ from pathlib import Path
 from typing import Any
 
 from measurement import ROOT, Table, in_turn, measured, ratios, run_process, write_rows
+from repeated_store import repeat_store
 
 sys.path.insert(0, str(ROOT))
 
@@ -53,6 +55,14 @@ COMMANDS = {
     "spans (--grouping cameras --no-plots)": ("--grouping", "cameras", "--no-plots"),
     "words (--group soup=word:soup ... --no-plots)": (*WORDS, "--no-plots"),
     "objects (--grouping objects --no-plots)": ("--grouping", "objects", "--no-plots"),
+}
+#: Those of the part `memory`: the command, the arguments after the store.
+MEMORY_COMMANDS = {
+    **{kind: ((), given) for kind, given in COMMANDS.items() if given},
+    "words STORE": (("words",), ("--no-plots",)),
+    "heads STORE": (("heads",), ("--no-plots",)),
+    "objects STORE": (("objects",), ("--no-plots",)),
+    "objects STORE --save-steps": (("objects",), ("--save-steps", "--no-plots")),
 }
 
 
@@ -225,14 +235,16 @@ def measure_bytes(store: Path) -> Table:
     return Table({"what": "masses of words", "megabytes": "MB read", "part": "part"}, rows)
 
 
-def measure_processes(stores: Sequence[Path], rounds: int, kinds: Sequence[str]) -> Table:
+def measure_processes(
+    stores: Sequence[Path], rounds: int, commands: Mapping[str, tuple[Sequence[str], Sequence[str]]]
+) -> Table:
     """The parts `processes` and `memory`."""
     rows = []
-    for kind in kinds:
+    for kind, (before, after) in commands.items():
         row: dict[str, Any] = {"what": kind}
         for store in stores:
             with tempfile.TemporaryDirectory() as output:
-                given = [str(store), *COMMANDS[kind], "--output", output]
+                given = [*before, str(store), *after, "--output", output]
                 command = [sys.executable, "-m", "vla_attention.analyze", *given]
                 costs = [run_process(command, cwd=ROOT) for _ in range(rounds)]
             of = f" of {store.stem}" if len(stores) > 1 else ""
@@ -269,6 +281,8 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--replans", type=int, default=52)
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--sizes", type=int, nargs="+", default=[50, 500], help="episodes of memory and masses")
+    parser.add_argument("--only", default="", metavar="TEXT", help="of memory, the commands whose name has this text")
     parser.add_argument("--parts", nargs="+", default=["scan", "bytes", "processes"])
     arguments = parser.parse_args()
     os.environ["VLA_CACHE"] = "off"  # an analysis that was made before is not measured
@@ -283,16 +297,23 @@ def main() -> None:
         if "bytes" in arguments.parts:
             tables["bytes"] = measure_bytes(store)
         if "processes" in arguments.parts:
-            tables["processes"] = measure_processes([store], 3, list(COMMANDS))
+            tables["processes"] = measure_processes([store], 3, {kind: ((), given) for kind, given in COMMANDS.items()})
     if {"memory", "masses"} & set(arguments.parts):
-        stores = [made(scratch / f"{count} episodes.zarr", count, arguments.replans, 1) for count in (50, 100, 200)]
+        first, *further = arguments.sizes
+        stores = [made(scratch / f"{first} episodes.zarr", first, arguments.replans, 1)]
+        stores += [repeat_store(stores[0], scratch / f"{count} episodes.zarr", count // first) for count in further]
     if "masses" in arguments.parts:
         tables["masses"] = measure_masses(stores)
     if "memory" in arguments.parts:
-        tables["memory"] = measure_processes(stores, 1, [kind for kind in COMMANDS if "--no-plots" in kind])
+        chosen = {kind: given for kind, given in MEMORY_COMMANDS.items() if arguments.only in kind}
+        tables["memory"] = measure_processes(stores, 1, chosen)
     shutil.rmtree(scratch)
     # Where the store was kept is of no interest.
     given = ["--episodes", str(arguments.episodes), "--parts", *arguments.parts, "--rounds", str(arguments.rounds)]
+    if {"memory", "masses"} & set(arguments.parts):
+        given += ["--sizes", *map(str, arguments.sizes)]
+    if arguments.only:
+        given += ["--only", f"'{arguments.only}'"]
     command = " ".join([f"OMP_NUM_THREADS={threads} python benchmarks/analysis_speed.py", *given])
     print(write_rows("analysis_speed", tables, command=command))
     for table_name, table in tables.items():
