@@ -19,9 +19,9 @@ else:
     class cached_property(Generic[Value]):
         """A property that is computed once for each object; two threads at once may both compute it."""
 
-        def __init__(self, compute: Callable[[Any], Value]) -> None:
-            self._compute = compute
-            self.__doc__ = compute.__doc__
+        def __init__(self, func: Callable[[Any], Value]) -> None:
+            self.func = func
+            self.__doc__ = func.__doc__
 
         def __set_name__(self, owner: type, name: str) -> None:
             self._name = name
@@ -30,7 +30,7 @@ else:
             if instance is None:
                 return self
             # The class has no __set__: what is in the object's own dictionary comes first from now on.
-            return instance.__dict__.setdefault(self._name, self._compute(instance))
+            return instance.__dict__.setdefault(self._name, self.func(instance))
 
 
 __all__ = ["cached_property"]
