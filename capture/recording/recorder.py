@@ -274,7 +274,8 @@ class AttentionRecorder(RowCollector):
 
     def finish(self) -> RecordedRows:
         """Return the rows of the whole plan; raise `SiteNotRecorded` if a call is missing or was recorded twice."""
-        moved = [array.numpy() for array in to_processor(self.on_device())]
+        with torch.inference_mode():
+            moved = [array.numpy() for array in to_processor(self.on_device())]
         axes = (len(self.plan.layers), len(self.plan.denoise_steps))
         rows, *grams = (array.reshape(*axes, *array.shape[1:]) for array in moved)
         sums = rows.sum(axis=-1, dtype=np.float64).astype(np.float32)

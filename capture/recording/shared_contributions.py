@@ -188,11 +188,15 @@ class SharedLayer:
         by_head = self._weight.view(width, heads, -1).permute(1, 2, 0)  # (head, dim, width)
         kv_heads, count, dim = self._values.shape
         values = self._values[:, None].expand(kv_heads, heads // kv_heads, count, dim).reshape(heads, count, dim)
-        keys = torch.bmm(values, by_head)  # (head, key, width)
-        rows = self._single.transpose(1, 2)  # (step, query, head, key)
+        keys = torch.bmm(values, by_head).transpose(0, 1).reshape(-1, width)  # (key · head, width)
+        rows = self._single.permute(0, 2, 3, 1).reshape(-1, len(keys))  # (step · query, key · head)
         for (_, place), of_part in zip(self._shares.single, out.unbind(), strict=True):
-            of_keys = keys[:, place].reshape(-1, width)
-            torch.mm(rows[..., place].reshape(-1, len(of_keys)), of_keys, out=of_part)
+            if isinstance(place, slice):
+                of_keys = slice(place.start * heads, place.stop * heads)
+                torch.mm(rows[:, of_keys], keys[of_keys], out=of_part)
+            else:
+                numbers = (place[:, None] * heads + torch.arange(heads)).flatten()
+                torch.mm(rows[:, numbers], keys[numbers], out=of_part)
 
 
 def _mixed(rows: Tensor, values: Tensor, keys: slice | Tensor) -> Tensor:
