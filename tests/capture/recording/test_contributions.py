@@ -178,3 +178,23 @@ def test_contributions_of_all_steps_at_once_are_those_of_each_call(pi05, state_d
     nothing_read = (expected.contribution == 0).all(axis=(0, 1, 2))
     assert nothing_read.any()  # the absent camera, the padding
     assert (got.contribution[..., nothing_read, :] == 0).all()
+
+
+def test_contributions_that_wait_on_a_gpu_are_those_of_each_call(monkeypatch):
+    """The way of a GPU, made on the processor: rows, values and updates are kept until the steps are done."""
+    from tests.kit.policy_inputs import make_observation
+    from vla_attention.capture.policies.pi.embedded import dummy_policy
+    from vla_attention.capture.recording.call_contributions import CallContributions
+
+    policy = dummy_policy()
+    given = policy.prepare(make_observation(1), "put the red cube on the plate")
+    recording = Recording((2, 0), (2, 0), (2, 0, 1), tuple(range(8)), "mean", 4, 10, contributions=True)
+    made = {}
+    for way in ("now", "later"):
+        monkeypatch.setattr(CallContributions, "_choose", lambda *_, way=way: way)
+        recorder = make_recorders(recording, policy.sites, given.key_role)["joint"]
+        policy.act(given, 7, {"joint": recorder})
+        made[way] = recorder.finish().contribution
+    assert made["now"].any()
+    scale = made["now"][..., -1:, -1:]
+    np.testing.assert_allclose(made["later"] / scale, made["now"] / scale, rtol=2e-4, atol=2e-6)
