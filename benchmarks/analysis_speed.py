@@ -11,9 +11,8 @@ measures goes to docs/benchmarks/analysis_speed.json; nothing is asserted. The p
                intervals; the same masses by a loop with zarr-python, and by xarray with dask (`pip install dask`)
     bytes      what the process reads for all layers and for three of eighteen, as Linux counts it
     processes  whole `vla-analyze` processes without the cache: wall seconds and peak memory
-    memory     peak memory of whole processes by number of episodes (--sizes 50 500, each a multiple of the first):
-               stores of one head, because masses of more are as large, with fifty episodes again and again
-               (repeated_store.py). Without the cache, so that everything is measured
+    memory     peak memory of whole processes by number of episodes (--sizes 50 500, each a multiple of the first),
+               of which the further ones are the first again and again (repeated_store.py)
     masses     the same of processes that compute masses and nothing else
 """
 
@@ -300,7 +299,7 @@ def main() -> None:
             tables["processes"] = measure_processes([store], 3, {kind: ((), given) for kind, given in COMMANDS.items()})
     if {"memory", "masses"} & set(arguments.parts):
         first, *further = arguments.sizes
-        stores = [made(scratch / f"{first} episodes.zarr", first, arguments.replans, 1)]
+        stores = [made(scratch / f"{first} episodes.zarr", first, arguments.replans)]
         stores += [repeat_store(stores[0], scratch / f"{count} episodes.zarr", count // first) for count in further]
     if "masses" in arguments.parts:
         tables["masses"] = measure_masses(stores)

@@ -109,7 +109,9 @@ def episode_tables(replans: Tables, grouping: Grouping) -> Tables:
 
 def episode_tables_of(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Tables:
     """`episode_tables` of the replans of measured episodes, without a table of their replans."""
-    return _joined([_of_episodes(batch, grouping) for batch in _batches(in_order_of_episodes(measured))])
+    # Each batch sorted by itself: sorting all of them together would need the same memory again.
+    parts = [_joined([_of_episodes(batch, grouping)]) for batch in _batches(in_order_of_episodes(measured))]
+    return Tables(pl.concat([part.cells for part in parts]), pl.concat([part.groups for part in parts]))
 
 
 def _batches(measured: Iterable[MeasuredEpisode]) -> Iterator[list[MeasuredEpisode]]:
