@@ -13,6 +13,7 @@ docs/scale.md computes with them. Everything runs on one thread.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import tempfile
 import time
@@ -43,6 +44,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--only", choices=("listing", "parts"))
     arguments = parser.parse_args()
+    os.environ["VLA_CACHE"] = "off"  # every round measures
     with tempfile.TemporaryDirectory() as temporary:
         folder: Path = arguments.folder or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
@@ -54,7 +56,7 @@ def main() -> None:
             if not store.exists():
                 from analysis_speed import make_store
 
-                make_store(store, TASKS, replans=20, heads=8)
+                make_store(store, TASKS, replans=52, heads=8)
             write_rows("scale", {"parts": parts_rows(store, arguments.rounds)})
 
 

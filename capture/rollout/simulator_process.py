@@ -11,6 +11,7 @@ import gc
 import os
 import subprocess
 import sys
+import tempfile
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -102,6 +103,8 @@ class SimulatorProcess:
     def __init__(self, setup: SimulatorSetup) -> None:
         self.connection, theirs = Pipe()
         one_thread = dict.fromkeys(("OMP_NUM_THREADS", *OTHER_LIBRARIES), "1") | _DRAWS_ITSELF
+        # Its temporary files are removed here: it is killed, and removes none.
+        self._temporary = tempfile.TemporaryDirectory(prefix="vla-simulator-", ignore_cleanup_errors=True)
         with theirs:
             # A process group of its own: Ctrl-C reaches the policy's process alone, which ends this one. It also ends
             # when the other end of the connection closes, however the policy's process ended.
@@ -110,7 +113,7 @@ class SimulatorProcess:
                 stdin=subprocess.DEVNULL,
                 stdout=sys.stderr.fileno() if _has_descriptor(sys.stderr) else None,
                 pass_fds=[theirs.fileno()],
-                env=os.environ | one_thread,
+                env=os.environ | one_thread | {"TMPDIR": self._temporary.name},
                 process_group=0,
             )
         self._send(setup)
@@ -147,6 +150,7 @@ class SimulatorProcess:
         self._process.kill()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_END_WITHIN_S)
+        self._temporary.cleanup()
 
 
 def _has_descriptor(stream: Any) -> bool:

@@ -503,7 +503,8 @@ class Run:
     """A capture with two simulators in a process of its own, and what the operating system knows of it."""
 
     def __init__(self, folder: Path, max_steps: int) -> None:
-        self.store, self.log = folder / "a.zarr", folder / "log"
+        self.store, self.log, self.temporary = folder / "a.zarr", folder / "log", folder / "temporary"
+        self.temporary.mkdir()
         words = ["--task-suite", "robosuite", "--task-id", "0", "--num-episodes", "3", "--num-envs", "2"]
         words = [*TINY[:-1], str(max_steps), *words, "--store", str(self.store)]
         with self.log.open("w") as out:
@@ -511,7 +512,8 @@ class Run:
                 [sys.executable, "-m", "vla_attention.capture", *words],
                 stdout=out,
                 stderr=subprocess.STDOUT,
-                env=os.environ | {"MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl"), "SLURM_JOB_ID": ""},
+                env=os.environ
+                | {"MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl"), "SLURM_JOB_ID": "", "TMPDIR": str(self.temporary)},
             )
 
     def wait_until(self, what: Any) -> Any:
@@ -570,11 +572,14 @@ def test_a_killed_simulator_is_replaced(tmp_path):
     run = Run(tmp_path, max_steps=40)
     run.wait_until(run.both_are_in_an_episode)
     victim = run.simulators()[0]
+    folders = list(run.temporary.glob("vla-simulator-*"))
+    assert len(folders) == 2
     os.kill(victim, signal.SIGKILL)
     assert run.process.wait(600) == 0, run.log.read_text()
     assert run.log.read_text().count("its simulator ended (killed by signal 9); the episode begins again.") == 1
     assert store_status(run.store).complete
     assert analyze(["verify", str(run.store)]) == 0
+    assert list(run.temporary.glob("vla-*")) == []
 
 
 @pytest.mark.parametrize(("cores", "expected"), [(1, 1), (3, 3), (64, 8)])
