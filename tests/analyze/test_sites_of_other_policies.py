@@ -17,6 +17,7 @@ from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions, KeyKnockout
 from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.root import group_attributes
 from vla_attention.testing import assert_whole, rerun_source
 from vla_attention.testing.site_stores import SiteStoreSpec, key_exists, site_root, write_site_store
 
@@ -45,7 +46,7 @@ def test_stores_are_whole_and_every_site_has_its_own_axes(stores, name):
             rows = episode.read(f"{site.name}/rows")
             assert rows.shape[1] == len(recording.layers)
             assert rows.shape[3] == len(recording.heads)
-            assert episode.read(f"{site.name}/layer").tolist() == list(recording.layers)
+            assert group_attributes(episode.sealed(f"{site.name}/zarr.json"))["layer"] == list(recording.layers)
 
 
 @pytest.mark.parametrize("queries", ["mean", "all"])

@@ -9,6 +9,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
+from tests.kit.attacks import files_of
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.ratios.analysis import analyse
@@ -19,7 +20,7 @@ from vla_attention.testing.stores import reseal, write_store
 
 def damage_rows(store: Path, episode: str) -> None:
     """Flip bits in the middle of an episode's rows."""
-    (file,) = (path for path in (store / "episodes" / episode / "joint/rows/c").rglob("*") if path.is_file())
+    (file,) = files_of(store / "episodes" / episode, "joint/rows")
     content = bytearray(file.read_bytes())
     content[len(content) // 3] ^= 0xFF
     file.write_bytes(bytes(content))
