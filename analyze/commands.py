@@ -20,7 +20,9 @@ COMMANDS: dict[str, str] = {
     "report": "one self-contained HTML file",
     "export": "tables as CSV or Parquet, masses or rows as NetCDF",
     "copy": "a smaller copy of a store, for instance without frames",
-    "verify": "read everything back and check it",
+    "merge": "one store of the episodes of several stores of one run",
+    "verify": "read everything back and check it; --quick looks at presence and sizes",
+    "repair": "move damaged episodes aside, and remove what killed processes left",
     "cache": "what is kept of earlier analyses: where, how much; --clear removes it",
 }
 #: The command of `vla-analyze STORE`.

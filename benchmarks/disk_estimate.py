@@ -28,7 +28,7 @@ from vla_attention.capture.store.measured_size import SampleOfReplans, mean_size
 from vla_attention.capture.trial import run_trial
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.interventions import Interventions
-from vla_attention.schemas.stores.store_format import FORMAT_NAME, FORMAT_VERSION, RootAttributes
+from vla_attention.schemas.stores.store_format import FORMAT_NAME, STORE_VERSION, RootAttributes
 
 BITS = (4, 7, 10, 12, 23)
 
@@ -61,7 +61,7 @@ def samples_of(case: Case, assets: Path | None) -> tuple[list[SampleOfReplans], 
     protocol = plan_protocol(settings, policy.default_protocol, policy)
     recording = plan_recording(settings.recording, policy)[0]
     attributes = RootAttributes(
-        FORMAT_NAME, FORMAT_VERSION, policy.identity(), protocol, recording, policy.sites, {"made": "by a benchmark"}
+        FORMAT_NAME, STORE_VERSION, policy.identity(), protocol, recording, policy.sites, {"made": "by a benchmark"}
     )
     tasks, environment = list_tasks(settings.suite), EnvironmentSettings(policy.default_protocol, assets)
 

@@ -21,14 +21,16 @@ from vla_attention.capture.rerun.arguments import RERUN_EXAMPLES, add_rerun_argu
 from vla_attention.capture.tasks_command import run_tasks_command
 from vla_attention.schemas.command_line import OneSentenceParser
 from vla_attention.schemas.errors import listing
+from vla_attention.schemas.stores import repair_command, verify_command
+from vla_attention.schemas.stores.repair_command import VERIFY_HELP
 
 _FURTHER_EXAMPLES = """\
   vla-capture status runs/libero_10.zarr                     what is there, what is missing, who is writing
   vla-capture repair runs/libero_10.zarr                     move damaged episodes aside; --resume records them again
+  vla-capture verify runs/libero_10.zarr                     read everything back and check it
   vla-capture doctor                                         what this machine can do, and what is missing
   vla-capture parity CASE                                    our numbers against a reference's, on your own checkpoint
 """
-_VERIFY_HELP = "read every byte, instead of only seals, presence and sizes of files"
 
 
 def build_parser(given: Sequence[str] = ()) -> argparse.ArgumentParser:
@@ -65,11 +67,12 @@ def build_parser(given: Sequence[str] = ()) -> argparse.ArgumentParser:
     repair = commands.add_parser(
         "repair",
         help="move damaged episodes of a store aside, so that --resume records them again",
-        description="Look for damaged episodes and move each into NAME.zarr.quarantine, beside the store, with the "
-        "reason. Nothing is deleted, and episodes that another process is writing are left alone. Exit code 1 when a "
-        "damaged episode is left in a store.",
+        description=repair_command.DESCRIPTION,
+        epilog=repair_command.EXAMPLES.replace("NAME", "vla-capture"),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    _add_repair_arguments(repair)
+    repair_command.add_repair_arguments(repair)
+    repair.set_defaults(command=_run_repair)
     replay = commands.add_parser(
         "replay",
         help="make policy calls on the frames of a data set of a robot",
@@ -109,6 +112,15 @@ def build_parser(given: Sequence[str] = ()) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_doctor_arguments(doctor, given[1:] if "doctor" in given[:1] else (), _add_capture_arguments)
+    verify = commands.add_parser(
+        "verify",
+        help="read stores back and check every file, digest and row sum",
+        description=verify_command.DESCRIPTION,
+        epilog=verify_command.EXAMPLES.replace("NAME", "vla-capture"),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    verify_command.add_verify_arguments(verify)
+    verify.set_defaults(command=_run_verify)
     tasks = commands.add_parser("tasks", help="the tasks of a suite", description="The tasks of a suite by their ids.")
     tasks.add_argument("suite", metavar="SUITE", help="task suite")
     tasks.add_argument("--array", action="store_true", help="only the range of ids, as sbatch --array takes it")
@@ -288,7 +300,7 @@ def _add_status_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--check", action="store_true", help="exit code 1 when an expected episode is missing, or one is damaged"
     )
-    parser.add_argument("--verify", action="store_true", help=_VERIFY_HELP)
+    parser.add_argument("--verify", action="store_true", help=VERIFY_HELP)
     parser.set_defaults(command=_run_status)
 
 
@@ -304,14 +316,9 @@ def _run_status(arguments: argparse.Namespace, termination: Termination) -> int:
     )
 
 
-def _add_repair_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("stores", nargs="+", type=Path, metavar="STORE", help="one or several NAME.zarr")
-    parser.add_argument("--verify", action="store_true", help=_VERIFY_HELP)
-    parser.add_argument("--dry-run", action="store_true", help="list the damaged episodes, and move nothing")
-    parser.set_defaults(command=_run_repair)
-
-
 def _run_repair(arguments: argparse.Namespace, termination: Termination) -> int:
-    from vla_attention.capture.jobs.repair import print_repair
+    return repair_command.run_repair(arguments.stores, verify=arguments.verify, dry_run=arguments.dry_run)
 
-    return print_repair(arguments.stores, verify=arguments.verify, dry_run=arguments.dry_run)
+
+def _run_verify(arguments: argparse.Namespace, termination: Termination) -> int:
+    return verify_command.run_verify(arguments.stores, quick=arguments.quick, as_json=arguments.json)

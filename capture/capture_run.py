@@ -15,9 +15,7 @@ from vla_attention.capture.environments.suites import list_tasks
 from vla_attention.capture.interventions.prompts import check_synonyms
 from vla_attention.capture.interventions.resolution import check_not_compiled, interventions_for
 from vla_attention.capture.interventions.run_changes import RunChanges
-from vla_attention.capture.jobs.damaged_episodes import DamagedEpisodesLeft, find_damaged, what_to_do
 from vla_attention.capture.jobs.termination import Termination
-from vla_attention.capture.jobs.worker import this_worker
 from vla_attention.capture.jobs.worker_records import (
     PlannedTask,
     RecordWriter,
@@ -37,15 +35,17 @@ from vla_attention.capture.store.disk_estimate import DiskEstimate, describe, es
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.layers import select_layers
+from vla_attention.schemas.stores.damaged_episodes import DamagedEpisodesLeft, find_damaged, what_to_do
 from vla_attention.schemas.stores.store_format import (
     FORMAT_NAME,
-    FORMAT_VERSION,
+    STORE_VERSION,
     PolicyIdentity,
     Protocol,
     Recording,
     RootAttributes,
     episode_name,
 )
+from vla_attention.schemas.stores.worker import this_worker
 
 _QUERIES = {"mean": "the mean over", "steps": "the action steps' means over", "all": "each of"}
 
@@ -147,7 +147,7 @@ def _record_missing(
     machine = describe_machine(device)
     attributes = RootAttributes(
         format=FORMAT_NAME,
-        format_version=FORMAT_VERSION,
+        store_version=STORE_VERSION,
         policy=policy.identity(),
         protocol=protocol,
         recording=recording,

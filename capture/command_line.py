@@ -27,7 +27,7 @@ def run_capture_command(program: str, command: Callable[[Termination], int], max
             )
         except Terminated:
             from vla_attention.capture.jobs.slurm import ask_for_requeue
-            from vla_attention.capture.jobs.worker import this_worker
+            from vla_attention.schemas.stores.worker import this_worker
 
             # SLURM sends the signal again to a job that is being requeued.
             signal.signal(signal.SIGTERM, signal.SIG_IGN)

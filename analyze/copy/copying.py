@@ -10,15 +10,17 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import re
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from vla_attention.analyze.copy.packing import Packing
-from vla_attention.schemas.errors import BadArgument, UserError, unknown_name
-from vla_attention.schemas.stores.digest import run_digest
+from vla_attention.analyze.copy.packing import Packing, lock_for_writing
+from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
+from vla_attention.schemas.stores.digest import run_digest, with_digest
+from vla_attention.schemas.stores.episode_files import files_of_no_array
 from vla_attention.schemas.stores.partial_folders import (
     make_partial,
     partial_folder,
@@ -27,10 +29,11 @@ from vla_attention.schemas.stores.partial_folders import (
     remove_if_empty,
 )
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
-from vla_attention.schemas.stores.remote_source import source_of
-from vla_attention.schemas.stores.root import episode_folders, group_attributes
+from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
+from vla_attention.schemas.stores.root import episode_folders, group_attributes, group_document, without_other_fields
 from vla_attention.schemas.stores.seal import SEAL_FILE, seal_episode
 from vla_attention.schemas.stores.store_format import (
+    EPISODES_DOCUMENT,
     EPISODES_GROUP,
     STORE_SUFFIX,
     CorruptEpisode,
@@ -123,15 +126,17 @@ def _copy(
     building = partial_folder(target) / f"copy-{process_tag()}"
     make_partial(building)
     pack: Packing | None = None
+    lock: int | None = None
     try:
         _ensure_root(store, target, root, building)
+        lock = lock_for_writing(target, packing=packed)
         pack = Packing(target, run, building) if packed else None
         present = {folder.name for folder in episode_folders(target)} if pack is None else pack.present()
         added = copied = left = 0
         for episode in store.episodes:
             if episode.name not in present:
                 folder = building / episode.name
-                sizes = _copy_episode(episode, folder, without, run)
+                sizes = _copy_episode(store, episode, folder, without, run)
                 copied, left, added = copied + sizes[0], left + sizes[1], added + 1
                 if pack is None:
                     _rename_new(folder, target / EPISODES_GROUP / episode.name)
@@ -143,8 +148,10 @@ def _copy(
     finally:
         try:
             if pack is not None:
-                pack.close()
+                pack.write_index()
         finally:
+            if lock is not None:
+                os.close(lock)
             shutil.rmtree(building, ignore_errors=True)
             remove_if_empty(building.parent)
     return Copied(added, len(store.episodes) - added, copied, left)
@@ -156,8 +163,7 @@ def _ensure_root(store: Store, target: Path, root: bytes, building: Path) -> Non
         empty = building / "root"
         (empty / EPISODES_GROUP).mkdir(parents=True)
         (empty / "zarr.json").write_bytes(root)
-        group = source_of(store.path).whole(f"{EPISODES_GROUP}/zarr.json")
-        (empty / EPISODES_GROUP / "zarr.json").write_bytes(group)
+        (empty / EPISODES_DOCUMENT).write_bytes(_episodes_document(store))
         _rename_new(empty, target)
     if (target / "zarr.json").read_bytes() != root if (target / "zarr.json").is_file() else True:
         open_store(target)  # raises when it is no store
@@ -167,8 +173,15 @@ def _ensure_root(store: Store, target: Path, root: bytes, building: Path) -> Non
         )
 
 
-def _copy_episode(episode: StoredEpisode, folder: Path, without: tuple[str, ...], run: str) -> tuple[int, int]:
+def _copy_episode(
+    store: Store, episode: StoredEpisode, folder: Path, without: tuple[str, ...], run: str
+) -> tuple[int, int]:
     """Write the copy of one episode; returns (bytes copied, bytes omitted)."""
+    if beyond := files_of_no_array(store.attributes, episode.attributes, episode.files.records):
+        raise CorruptEpisode(
+            f"Episode {episode.name} has files that belong to no array: {listing(beyond, 5)}. They are not copied, and "
+            "without them its seal would not fit."
+        )
     for name in episode.attributes.arrays:
         if _part_of(name) not in without and f"{name}/zarr.json" not in episode.files.records:
             raise CorruptEpisode(f"Episode {episode.name} lacks the array {name}: its files are gone.")
@@ -189,23 +202,35 @@ def _copy_episode(episode: StoredEpisode, folder: Path, without: tuple[str, ...]
         seal_episode(folder, episode.name, run, copied_from=episode.seal.copied_from or episode.seal.digest)
     else:
         seal.parent.mkdir()
-        seal.write_bytes(episode.source.whole(SEAL_FILE))
+        seal.write_bytes(without_other_fields(episode.source.whole(SEAL_FILE)))
     return copied + seal.stat().st_size, left
 
 
 def _root_document(store: Store, without: tuple[str, ...]) -> bytes:
     """The copy's `zarr.json`: that of the run, in the version that it has, with the omitted parts."""
-    content = source_of(store.path).whole("zarr.json")
+    content = without_other_fields(source_of(store.path).whole("zarr.json"))
     if not without:
         return content
-    document = json.loads(content)
-    recording, provenance = (document["attributes"][field] for field in ("recording", "provenance"))
+    attributes = group_attributes(content)
+    recording, provenance = attributes["recording"], attributes["provenance"]
     recording.update({name: False for name in without if name in recording})
     before = provenance.get("copied_without", "").split(", ")
     provenance["copied_without"] = ", ".join(name for name in PARTS if name in without or name in before)
     # A copy of a copy names the store that was captured, not the copy.
     provenance.setdefault("copied_from", store.run)
-    return json.dumps(document, indent=2).encode()
+    return group_document(with_digest(attributes) if store.attributes.store_version else attributes)
+
+
+def _episodes_document(store: Store) -> bytes:
+    """The `zarr.json` of the group of episodes: the store's own, or a new one where that is lost or damaged."""
+    try:
+        content = source_of(store.path).whole(EPISODES_DOCUMENT)
+        stated = group_attributes(content)
+    except RemoteFailure:
+        raise
+    except (OSError, ValueError):
+        return group_document({})
+    return group_document({}) if stated else without_other_fields(content)
 
 
 def _without_arrays(document: bytes, without: tuple[str, ...]) -> bytes:

@@ -26,6 +26,7 @@ from vla_attention.schemas.stores.packed_index import (
 )
 from vla_attention.schemas.stores.seal import SEAL_FILE, read_seal
 from vla_attention.schemas.stores.store_format import EPISODES_GROUP
+from vla_attention.schemas.stores.zip_members import ZipMembers
 
 #: Files of at most so many bytes are in the tail, which is read when the episode is opened.
 SMALL_BYTES = 4096
@@ -38,12 +39,12 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 class Packing:
     """A packed store that episodes are added to. The index lists whole zips only, and is written now and then.
 
-    It is there before the first zip: a copy that ends early is a packed store of the episodes that it has. One process
-    at a time packs into a store, because the index that is written last would lack the zips of the other.
+    It is there before the first zip: a copy that ends early is a packed store of the episodes that it has. The caller
+    holds the lock of the store (`lock_for_writing`), and calls `write_index` when it has ended.
     """
 
     def __init__(self, target: Path, run: str, building: Path) -> None:
-        """Continue what is at `target`, until `close`.
+        """Continue what is at `target`.
 
         Args:
             target: the store.
@@ -51,7 +52,7 @@ class Packing:
             building: a folder beside the store, in which files are written.
 
         Raises:
-            BadArgument: its episodes are folders, or another copy is packing into it.
+            BadArgument: its episodes are folders.
             StoreError: its index is damaged or of another run.
         """
         self.target = target
@@ -59,15 +60,10 @@ class Packing:
         self.building = building
         if next((target / EPISODES_GROUP).glob("task*_episode*/zarr.json"), None) is not None:
             raise BadArgument(f"Cannot pack into {target}: its episodes are folders; give another name.")
-        self._lock = _locked(target)
-        try:
-            index = read_index(Folder(target), target, run)
-            self.episodes: dict[str, PackedEpisode] = {} if index is None else dict(index.episodes)
-            if index is None:
-                self.write_index()
-        except BaseException:
-            os.close(self._lock)
-            raise
+        index = read_index(Folder(target), target, run)
+        self.episodes: dict[str, PackedEpisode] = {} if index is None else dict(index.episodes)
+        if index is None:
+            self.write_index()
 
     def present(self) -> set[str]:
         """Names of the episodes whose zips are there, with the bytes that the index says."""
@@ -84,8 +80,9 @@ class Packing:
         building = self.building / path.name
         tail = write_zip(folder, building)
         size = building.stat().st_size
+        frame = ZipMembers(Folder(self.building), building.name, size, tail).frame_digest()
         building.replace(path)
-        self.episodes[name] = PackedEpisode(packed_file(name), size, tail, read_seal(folder).digest)
+        self.episodes[name] = PackedEpisode(packed_file(name), size, tail, read_seal(folder).digest, frame)
         if len(self.episodes) % _INDEX_EVERY == 0:
             self.write_index()
 
@@ -96,25 +93,27 @@ class Packing:
         building.write_bytes(index.document())
         building.replace(self.target / INDEX_FILE)
 
-    def close(self) -> None:
-        """Write the index a last time, and let others pack."""
-        try:
-            self.write_index()
-        finally:
-            os.close(self._lock)
 
+def lock_for_writing(target: Path, *, packing: bool) -> int:
+    """Open and lock the `zarr.json` of a copy that is written; closing it, or the end of the process, unlocks it.
 
-def _locked(target: Path) -> int:
-    """The root's `zarr.json`, opened and locked; the lock ends with the process, whatever ends that."""
-    handle = os.open(target / "zarr.json", os.O_RDWR | os.O_CLOEXEC)
+    One process at a time packs into a store, because the index that is written last would lack the zips of the other,
+    and nobody writes folders into it meanwhile. Several may write folders.
+
+    Raises:
+        BadArgument: another copy holds a lock that forbids this one.
+    """
+    # Locks of NFS need a file that may be written.
+    handle = os.open(target / "zarr.json", os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(handle, (fcntl.LOCK_EX if packing else fcntl.LOCK_SH) | fcntl.LOCK_NB)
     except OSError as error:
         if error.errno in (errno.EAGAIN, errno.EACCES):
             os.close(handle)
             raise BadArgument(
-                f"Cannot pack into {target}: another copy is packing into it; run the same command again when that has "
-                "ended, or give another name."
+                f"Cannot {'pack into' if packing else 'copy to'} {target}: another copy is "
+                f"{'writing' if packing else 'packing'} into it; run the same command again when that has ended, or "
+                "give another name."
             ) from None
         # A file system without locks: there, nothing but the user keeps two copies apart.
     return handle

@@ -226,7 +226,7 @@ def _plan(settings: RunSettings, policy: Policy, device: str, termination: Termi
     from vla_attention.capture.rollout.episode import check_protocol
     from vla_attention.capture.store.store_root import check_same_run, read_existing_root
     from vla_attention.capture.trial import run_trial, spread
-    from vla_attention.schemas.stores.store_format import FORMAT_NAME, FORMAT_VERSION, Recording, RootAttributes
+    from vla_attention.schemas.stores.store_format import FORMAT_NAME, STORE_VERSION, Recording, RootAttributes
 
     evaluation = settings.protocol or policy.default_protocol
     protocol = plan_protocol(settings, evaluation, policy)
@@ -236,7 +236,7 @@ def _plan(settings: RunSettings, policy: Policy, device: str, termination: Termi
     changes = plan_changes(settings, policy, tasks)
     attributes = RootAttributes(
         format=FORMAT_NAME,
-        format_version=FORMAT_VERSION,
+        store_version=STORE_VERSION,
         policy=policy.identity(),
         protocol=protocol,
         recording=plan_recording(settings.recording, policy)[0],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 
-from vla_attention.capture.jobs.worker import Worker
+from vla_attention.schemas.stores.worker import Worker
 
 #: Only a job in one of these states may be requeued. A cancelled job must stay cancelled.
 _REQUEUEABLE_STATES = ("RUNNING",)

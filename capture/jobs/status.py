@@ -9,13 +9,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from vla_attention.capture.environments.suites import SUITES
-from vla_attention.capture.jobs.claims import Holder, holders
-from vla_attention.capture.jobs.damaged_episodes import DamagedEpisode, look_at
 from vla_attention.capture.jobs.worker_records import planned_tasks, read_records
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.safe_text import visible
+from vla_attention.schemas.stores.claims import Holder, holders
+from vla_attention.schemas.stores.damaged_episodes import DamagedEpisode, look_at
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import parse_episode_name
 from vla_attention.schemas.stores.store_url import local_path

@@ -15,9 +15,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
-from vla_attention.capture.jobs.claims import jobs_folder
-from vla_attention.capture.jobs.worker import Worker
 from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
+from vla_attention.schemas.stores.claims import jobs_folder
+from vla_attention.schemas.stores.worker import Worker
 
 
 @dataclass(frozen=True)

@@ -183,8 +183,8 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], threads: Threa
 
     from vla_attention.capture.capture_run import run_capture
     from vla_attention.capture.device import load_torch
-    from vla_attention.capture.jobs.damaged_episodes import DamagedEpisodesLeft
     from vla_attention.capture.rollout.progress import say
+    from vla_attention.schemas.stores.damaged_episodes import DamagedEpisodesLeft
 
     say(threads.describe())
     device = load_torch(arguments.device, threads.number)

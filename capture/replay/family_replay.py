@@ -19,7 +19,7 @@ from vla_attention.capture.rollout.progress import say
 from vla_attention.capture.run_settings import recording_settings
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import listing
-from vla_attention.schemas.stores.store_format import FORMAT_NAME, FORMAT_VERSION, RootAttributes
+from vla_attention.schemas.stores.store_format import FORMAT_NAME, STORE_VERSION, RootAttributes
 
 
 def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: str) -> int:
@@ -35,7 +35,7 @@ def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: 
     every = plan.every or policy.default_replan_steps
     attributes = RootAttributes(
         format=FORMAT_NAME,
-        format_version=FORMAT_VERSION,
+        store_version=STORE_VERSION,
         policy=policy.identity(),
         protocol=plan.protocol(every),
         recording=recording,

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vla_attention.capture.command_line import check_writable
-from vla_attention.capture.jobs.damaged_episodes import find_damaged
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.identity import announcement
 from vla_attention.capture.policies.robot import RobotData
@@ -24,6 +23,7 @@ from vla_attention.capture.store.disk_estimate import describe, estimate_disk
 from vla_attention.capture.store.store_writer import WriteMode, refuse_existing
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.safe_text import file_part
+from vla_attention.schemas.stores.damaged_episodes import find_damaged
 from vla_attention.schemas.stores.root import episode_folders
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from vla_attention.capture.jobs.damaged_episodes import look_at
 from vla_attention.capture.rerun.stored_calls import StoreWithoutInputs
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.stores.damaged_episodes import look_at
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode, StoreError, parse_episode_name
 

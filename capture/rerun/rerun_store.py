@@ -25,7 +25,7 @@ from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import (
     FORMAT_NAME,
-    FORMAT_VERSION,
+    STORE_VERSION,
     Recording,
     RootAttributes,
     parse_episode_name,
@@ -145,7 +145,7 @@ class Rerun:
         base = self.base
         return RootAttributes(
             format=FORMAT_NAME,
-            format_version=FORMAT_VERSION,
+            store_version=STORE_VERSION,
             policy=self.policy.identity(),
             protocol=base.attributes.protocol,
             recording=self.recording,

@@ -9,15 +9,15 @@ from dataclasses import dataclass, field
 
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Suite, Task
 from vla_attention.capture.environments.suites import make_environment
-from vla_attention.capture.jobs.claims import Claims, Holder
 from vla_attention.capture.jobs.termination import Terminated, Termination
-from vla_attention.capture.jobs.worker import Worker
 from vla_attention.capture.jobs.worker_records import RecordWriter
 from vla_attention.capture.rollout.episode import EpisodeResult, EpisodeRun, record_episode
 from vla_attention.capture.rollout.progress import EpisodeProgress, Progress
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import listing
+from vla_attention.schemas.stores.claims import Claims, Holder
 from vla_attention.schemas.stores.store_format import StoreExists, episode_name
+from vla_attention.schemas.stores.worker import Worker
 
 #: A task and the index of one of its episodes.
 TaskEpisode = tuple[Task, int]

@@ -18,7 +18,6 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 
 from vla_attention.capture.environments.base import Task
-from vla_attention.capture.jobs.claims import Holder
 from vla_attention.capture.memory import memory_left
 from vla_attention.capture.rollout.background_writing import BackgroundWriting, Committed, EpisodeInBackground
 from vla_attention.capture.rollout.episode import (
@@ -44,6 +43,7 @@ from vla_attention.capture.rollout.simulator_process import (
     SimulatorSetup,
 )
 from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.stores.claims import Holder
 from vla_attention.schemas.stores.store_format import StoreExists, episode_name
 from vla_attention.schemas.threads import available_cores
 

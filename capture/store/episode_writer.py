@@ -29,6 +29,7 @@ from vla_attention.schemas.stores.content_rules import (
     sites_with_text,
 )
 from vla_attention.schemas.stores.digest import ArrayDigest
+from vla_attention.schemas.stores.episode_checks import content_problems
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.root import read_run
 from vla_attention.schemas.stores.seal import seal_episode
@@ -42,7 +43,6 @@ from vla_attention.schemas.stores.store_format import (
     StoreExists,
     episode_name,
 )
-from vla_attention.schemas.stores.verify import content_problems
 
 
 @dataclass(frozen=True)

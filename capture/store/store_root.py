@@ -9,9 +9,10 @@ import zarr
 
 from vla_attention.capture.store.durable_files import publish
 from vla_attention.schemas.jsonable import to_json
-from vla_attention.schemas.stores.digest import run_configuration
+from vla_attention.schemas.stores.digest import with_digest
 from vla_attention.schemas.stores.partial_folders import make_partial, partial_folder, process_tag, remove_if_empty
 from vla_attention.schemas.stores.root import read_root
+from vla_attention.schemas.stores.run_differences import run_differences
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
     FormatTooNew,
@@ -23,26 +24,16 @@ from vla_attention.schemas.stores.store_format import (
 
 def check_same_run(path: Path, existing: RootAttributes, wanted: RootAttributes) -> None:
     """Raise `RunMismatch` for the first field of the run's configuration that differs."""
-    difference = _first_difference(run_configuration(to_json(existing)), run_configuration(to_json(wanted)), "")
-    if difference:
-        where, old, new = difference
+    if existing.store_version != wanted.store_version:
+        raise RunMismatch(
+            f"Cannot resume {path}: it is of {existing.version_text}, and captures write {wanted.version_text}; give "
+            "another --store."
+        )
+    for where, old, new in run_differences(existing, wanted):
         raise RunMismatch(
             f"Cannot resume {path}: its {where} is {old!r}, this run's is {new!r}; "
             "use the same settings, or another --store."
         )
-
-
-def _first_difference(old: object, new: object, where: str) -> tuple[str, object, object] | None:
-    if isinstance(old, dict) and isinstance(new, dict):
-        for key in [*old, *(key for key in new if key not in old)]:
-            found = _first_difference(old.get(key), new.get(key), f"{where}.{key}".lstrip("."))
-            if found:
-                return found
-        return None
-    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new) and where.startswith("sites"):
-        pairs = enumerate(zip(old, new, strict=True))
-        return next((found for i, (a, b) in pairs if (found := _first_difference(a, b, f"{where}[{i}]"))), None)
-    return None if old == new else (where, old, new)
 
 
 def read_existing_root(path: Path) -> RootAttributes:
@@ -64,7 +55,7 @@ def create_root(path: Path, attributes: RootAttributes, durable: bool) -> RootAt
     try:
         make_partial(building)
         root = zarr.create_group(building, zarr_format=3)
-        root.update_attributes(to_json(attributes))
+        root.update_attributes(with_digest(to_json(attributes)))
         root.create_group(EPISODES_GROUP)
         publish(building, path, durable)
     except OSError:

@@ -29,7 +29,7 @@ from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
 from vla_attention.schemas.stores.store_format import (
     CALLERS_MODULES,
     FORMAT_NAME,
-    FORMAT_VERSION,
+    STORE_VERSION,
     PolicyCameraView,
     PolicyIdentity,
     Protocol,
@@ -140,7 +140,7 @@ def record(
     facts |= dict(provenance or {})
     attributes = RootAttributes(
         format=FORMAT_NAME,
-        format_version=FORMAT_VERSION,
+        store_version=STORE_VERSION,
         policy=_identity(policy, layout, checkpoint, dtype, untrained=untrained),
         protocol=Protocol(
             suite=suite, seed=0, wait_steps=0, replan_steps=0, max_steps=0, name="recorded", image_size=0

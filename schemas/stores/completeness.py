@@ -1,23 +1,20 @@
 """Whether an episode is there at all, looked at cheaply: its seal, its metadata, and the sizes of its files.
 
-`--resume`, `status` and `vla-capture repair` ask this of every episode. `verify.py` reads everything.
+`--resume`, `status`, `repair` and `verify --quick` ask this of every episode. `verify.py` reads everything.
 """
 
 from __future__ import annotations
-
-from pathlib import Path
 
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 
 
-def check_presence(folder: Path, run: str) -> list[str]:
-    """What is wrong with the episode in a store's folder, one sentence each; an empty list means that it is present.
+def check_presence(episode: StoredEpisode) -> list[str]:
+    """What is wrong with an episode, one sentence each; an empty list means that it is present.
 
     Looked at are the seal, the episode's name and run, every `zarr.json`, and the presence and size of every file; the
-    content of arrays is not read. `run` is the digest of the run's configuration: `run` of an open `Store`.
+    content of arrays is not read.
     """
-    episode = StoredEpisode(folder, folder.name, run)
     try:
         _ = episode.attributes
     except CorruptEpisode as error:

@@ -64,8 +64,13 @@ def run_digest(attributes: Mapping[str, Any]) -> str:
 
 
 def seal_digest(attributes: Mapping[str, Any]) -> str:
-    """The digest of a seal over all its fields but `digest`; `attributes` are those in its `zarr.json`."""
+    """The digest of a seal or a root over all its fields but `digest`; `attributes` are those in its `zarr.json`."""
     return bytes_digest(_canonical({name: value for name, value in attributes.items() if name != "digest"}))
+
+
+def with_digest(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Attributes with their own digest as the last field, in place of the one that they have."""
+    return {**attributes, "digest": seal_digest(attributes)}
 
 
 def _canonical(document: object) -> bytes:

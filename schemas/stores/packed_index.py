@@ -26,12 +26,16 @@ _MOST_TAIL_BYTES = 256_000_000
 
 @dataclass(frozen=True)
 class PackedEpisode:
-    """One episode's zip: its path in the store, its bytes, the offset of its tail, and the digest of its seal."""
+    """One episode's zip: its path in the store, its bytes, the offset of its tail, and the digest of its seal.
+
+    `frame` is the digest of the bytes around its files (`ZipMembers.frame_digest`); empty in indices of drafts.
+    """
 
     file: str
     bytes: int
     tail: int
     seal: str
+    frame: str = ""
 
     def __post_init__(self) -> None:
         """Check the numbers: the tail is read into memory."""

@@ -1,7 +1,7 @@
 """Folders for what is being written, beside the store: capture writes episodes there, and a copy its copies.
 
 What is whole is renamed into the store, so that readers never see the rest, and what a killed process leaves is
-removed by the next one that writes.
+removed by the next one that writes, or by `repair`.
 """
 
 from __future__ import annotations
@@ -25,17 +25,31 @@ def process_tag() -> str:
     return f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
 
 
-def remove_dead_partials(store: Path) -> None:
-    """Remove what killed processes of this machine left beside the store.
+def dead_partials(store: Path) -> list[Path]:
+    """What killed processes of this machine left beside the store. Those of other machines cannot be checked here."""
+    return [folder for folder in _partials(store) if _process_of(folder) and not _is_running(_process_of(folder))]
 
-    Those of other machines cannot be checked here.
-    """
-    partial = partial_folder(store)
-    for folder in partial.glob("*"):
-        host, _, process = folder.name.partition("-")[2].rpartition("-")[0].rpartition("-")
-        if host == socket.gethostname() and process.isdigit() and not _is_running(int(process)):
-            shutil.rmtree(folder, ignore_errors=True)
-    remove_if_empty(partial)
+
+def partials_of_others(store: Path) -> list[Path]:
+    """What processes of other machines are writing beside the store, or have left there."""
+    return [folder for folder in _partials(store) if not _process_of(folder)]
+
+
+def remove_dead_partials(store: Path) -> None:
+    """Remove what `dead_partials` lists."""
+    for folder in dead_partials(store):
+        shutil.rmtree(folder, ignore_errors=True)
+    remove_if_empty(partial_folder(store))
+
+
+def _partials(store: Path) -> list[Path]:
+    return sorted(partial_folder(store).glob("*"))
+
+
+def _process_of(folder: Path) -> int:
+    """The process of this machine that wrote a folder, by `process_tag`; 0 for one of another machine or of nobody."""
+    host, _, process = folder.name.partition("-")[2].rpartition("-")[0].rpartition("-")
+    return int(process) if host == socket.gethostname() and process.isdigit() and len(process) < 10 else 0
 
 
 def _is_running(process: int) -> bool:

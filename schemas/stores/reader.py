@@ -351,7 +351,7 @@ def open_store(path: str | StorePlace) -> Store:
 
 
 def _packed(path: StorePlace, source: ByteSource, run: str, name: str, entry: PackedEpisode) -> StoredEpisode:
-    members = ZipMembers(source.bound_to(entry.seal), entry.file, entry.bytes, entry.tail)
+    members = ZipMembers(source.bound_to(entry.seal), entry.file, entry.bytes, entry.tail, entry.frame)
     return StoredEpisode(path / entry.file, name, run, members, entry.seal)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
-from vla_attention.schemas.jsonable import MalformedDocument, from_json
+from vla_attention.schemas.jsonable import MalformedDocument
 from vla_attention.schemas.stores.digest import run_digest
 from vla_attention.schemas.stores.packed_index import INDEX_FILE
 from vla_attention.schemas.stores.remote_source import RemoteFailure, RemoteFolder, source_of
@@ -17,9 +17,12 @@ from vla_attention.schemas.stores.store_format import (
     RootAttributes,
     StoreError,
     StoreNotFound,
-    check_format,
 )
 from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
+from vla_attention.schemas.stores.versions import decode_root
+
+#: What the document of a group may say; zarr-python writes the last one as null.
+_GROUP_FIELDS = {"attributes", "zarr_format", "node_type", "consolidated_metadata"}
 
 
 def read_root(path: StorePlace) -> RootAttributes:
@@ -56,9 +59,10 @@ def read_run(path: StorePlace) -> tuple[RootAttributes, str]:
         raise StoreError(f"The store {path} cannot be read: {error}.") from None
     if isinstance(path, Path):
         _refuse_inside(path, attributes)
-    check_format(attributes, path)
     try:
-        return from_json(RootAttributes, attributes), run_digest(attributes)
+        return decode_root(attributes, path), run_digest(attributes)
+    except StoreError:
+        raise
     except (MalformedDocument, ValueError) as error:
         raise StoreError(f"The store {path} cannot be read: {error}") from None
 
@@ -112,3 +116,22 @@ def group_attributes(document: bytes) -> dict[str, Any]:
     if not isinstance(attributes, dict):
         raise ValueError("zarr.json has no attributes")
     return attributes
+
+
+def fields_beyond(document: dict[str, Any]) -> list[str]:
+    """What a `zarr.json` says beyond that it is a group with attributes: other readers of Zarr may believe it."""
+    beyond = sorted(set(document) - _GROUP_FIELDS)
+    return beyond if document.get("consolidated_metadata") is None else [*beyond, "consolidated_metadata"]
+
+
+def without_other_fields(content: bytes) -> bytes:
+    """A group's `zarr.json` as it is, or a new one with its attributes only where it says more (`fields_beyond`)."""
+    attributes = group_attributes(content)
+    if not fields_beyond(json.loads(content)):
+        return content
+    return group_document(attributes)
+
+
+def group_document(attributes: dict[str, Any]) -> bytes:
+    """The `zarr.json` of a group, as zarr-python writes it."""
+    return json.dumps({"attributes": attributes, "zarr_format": 3, "node_type": "group"}, indent=2).encode()

@@ -1,8 +1,9 @@
 """The store format: its version, the names, axes and attributes of `NAME.zarr`, and its errors. No I/O here.
 
-To raise the version, change `FORMAT_VERSION` and the dataclasses below; a new field with a default lets stores of lower
-versions be read, down to `OLDEST_VERSION`. Then write the JSON Schema files again (`python -m
-vla_attention.schemas.json_files`) and describe the version in `docs/store.md`.
+The format is frozen: within a version nothing here changes (`docs/store.md`, "Versions"). A new version raises
+`STORE_VERSION` and changes the dataclasses below; a new field has a default, with which stores of lower versions are
+read. Then write the JSON Schema files again (`python -m vla_attention.schemas.json_files`). Stores that were written
+before version 1 are in `draft_versions.py`.
 
 NAME.zarr/                            attributes: `RootAttributes`
   episodes/task003_episode007/        attributes: `EpisodeAttributes`; listed = complete
@@ -34,12 +35,12 @@ from vla_attention.schemas.safe_text import check_inner_path, check_name, check_
 from vla_attention.schemas.segments import Segment
 
 FORMAT_NAME = "vla-attention"
-#: A whole number. A reader accepts versions from `OLDEST_VERSION` to its own.
-FORMAT_VERSION = 5
-#: Seals of version 1 bind metadata only: files that were exchanged between episodes would be read without an error.
-OLDEST_VERSION = 2
+#: A whole number, the root attribute `store_version`. A reader accepts every version up to its own.
+STORE_VERSION = 1
 STORE_SUFFIX = ".zarr"
 EPISODES_GROUP = "episodes"
+#: The document of that group. It states nothing but that it is a group.
+EPISODES_DOCUMENT = f"{EPISODES_GROUP}/zarr.json"
 #: Ending of the folder beside the store in which episodes are written. Readers of the store do not look there.
 PARTIAL_SUFFIX = ".partial"
 
@@ -48,8 +49,6 @@ ATOM_AXES = (*ROW_AXES[:-1], "segment")
 #: Parts are the episode's segments in order, then the block's whole attention update.
 CONTRIBUTION_AXES = ("replan", "layer", "denoise", "part", "other_part")
 
-#: The version from which on numbers along one axis are attributes of their group. Before it they are small arrays.
-NUMBERS_VERSION = 5
 #: Fields of `EpisodeAttributes` that are numbers of each replan or denoise step, and their types.
 NUMBERS = {
     "env_step": "int32",
@@ -62,7 +61,7 @@ NUMBERS = {
 #: The group of an episode whose attributes are an `EpisodeSeal`.
 SEAL_GROUP = "seal"
 
-_EPISODE_NAME = re.compile(r"task(\d{3,})_episode(\d{3,})$")
+_EPISODE_NAME = re.compile(r"task([0-9]{3,})_episode([0-9]{3,})")
 
 
 class StoreError(UserError, ValueError):
@@ -265,13 +264,13 @@ class RootAttributes:
     """Attributes of the store's root group: the run's identity. The same for every process that adds episodes.
 
     All of it is the run's configuration, except the fields in `JOB_RECORDS`. `interventions` says what the run changed
-    in the policy and its input, `rerun_of` which store's policy calls it repeated. Version 2 has neither of the two,
-    and up to version 3 sites are `joint`, `self` and `cross`, and in all recorded layers. `data_set` is the one that
-    was replayed; None for every other run.
+    in the policy and its input, `rerun_of` which store's policy calls it repeated. `data_set` is the one that was
+    replayed; None for every other run. `digest` is the sha256 of the other attributes (`seal_digest`), which is made
+    when the root is written: `verify` compares it.
     """
 
     format: str
-    format_version: int
+    store_version: int
     policy: PolicyIdentity
     protocol: Protocol
     recording: Recording
@@ -280,6 +279,7 @@ class RootAttributes:
     interventions: Interventions = field(default_factory=Interventions)
     rerun_of: RerunSource | None = None
     data_set: DataSetSource | None = None
+    digest: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
         """Check that sites have different names, and that something of each is recorded."""
@@ -288,6 +288,16 @@ class RootAttributes:
             raise BadArgument(f"The sites {listing(names)} do not have different names.")
         for site in self.sites:
             self.recording.of_site(site)
+
+    @property
+    def version_text(self) -> str:
+        """The version in words."""
+        return f"version {self.store_version}"
+
+    @property
+    def numbers_in_arrays(self) -> bool:
+        """Whether numbers along one axis (`NUMBERS`, `Recording.axis_numbers`) are arrays: in drafts they may be."""
+        return False
 
     def site(self, name: str) -> SiteLayout:
         """The site of that name; the error lists the existing ones."""
@@ -308,7 +318,8 @@ class RootAttributes:
 
 #: Paths of the fields of `RootAttributes` that describe the job which made the store, not the run's configuration:
 #: another job, on another machine, may add episodes. The checkpoint's path is one; the digest of its weights is not.
-JOB_RECORDS = (("provenance",), ("policy", "checkpoint"))
+#: `digest` is over these, too.
+JOB_RECORDS = (("provenance",), ("policy", "checkpoint"), ("digest",))
 
 
 @dataclass(frozen=True)
@@ -365,7 +376,7 @@ class EpisodeAttributes:
 
     The last five fields are numbers of each replan, and the noise level or flow time of each recorded denoise step;
     `env_step` counts the waiting steps too, `prompt_index` is the number of a prompt, `dataset_action_count` how many
-    of `dataset_actions` there are. Empty where they are not known, and up to version 4, in which they are arrays.
+    of `dataset_actions` there are. Empty where they are not known, and in drafts in which they are arrays.
     """
 
     task_id: int
@@ -411,28 +422,3 @@ def parse_episode_name(name: str) -> tuple[int, int]:
     if match is None:
         raise BadArgument(f"'{name}' is no episode name; expected for instance {episode_name(3, 7)}.")
     return int(match[1]), int(match[2])
-
-
-def check_format(attributes: object, path: object) -> None:
-    """Raise unless root attributes belong to a store that this version can read."""
-    given = attributes if isinstance(attributes, dict) else {}
-    if given.get("format") != FORMAT_NAME:
-        raise StoreError(
-            f"{path} is a Zarr group, but not a store of this tool: its attribute 'format' is not '{FORMAT_NAME}'."
-        )
-    version = given.get("format_version")
-    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
-        raise StoreError(
-            f"{path} has the format version {version!r}; expected a whole number from {OLDEST_VERSION} to "
-            f"{FORMAT_VERSION}."
-        )
-    if version < OLDEST_VERSION:
-        raise StoreError(
-            f"{path} has format version {version}, whose seals do not bind the numbers to their episodes; this program "
-            f"reads versions from {OLDEST_VERSION} to {FORMAT_VERSION}: capture the episodes again."
-        )
-    if version > FORMAT_VERSION:
-        raise FormatTooNew(
-            f"{path} has format version {version}, and this program reads up to version {FORMAT_VERSION}; "
-            "install a newer version of it."
-        )

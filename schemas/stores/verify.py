@@ -1,229 +1,146 @@
-"""Verification: read everything back and compare it with the attributes, digests and row sums of each episode.
+"""Checking whole stores: every file of every episode, and what lies beside them. Both command lines use it.
 
-`verify_store` checks a store; capture checks an episode with `content_problems` before it publishes it.
+A quick look (`quick`) reads seals and metadata, and compares the presence and the size of every file; otherwise
+everything is read (`episode_checks.py`). Foreign files are named and are no faults, because nothing reads them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import json
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-from vla_attention.schemas.jsonable import to_json
-from vla_attention.schemas.layout import prompt_at
-from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
-from vla_attention.schemas.stores.content_rules import (
-    absent_problems,
-    camera_picture_problems,
-    counter_problems,
-    coverage_problems,
-    gram_problems,
-    picture_problems,
-    piece_role_problems,
-    prompt_problems,
-    role_problems,
-    row_problems,
-    row_sum_problems,
-    sites_with_text,
-)
-from vla_attention.schemas.stores.digest import ArrayDigest
+from vla_attention.schemas.errors import listing
+from vla_attention.schemas.stores.completeness import check_presence
+from vla_attention.schemas.stores.digest import seal_digest
+from vla_attention.schemas.stores.episode_checks import content_problems
+from vla_attention.schemas.stores.foreign_files import foreign_in_episode
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
-from vla_attention.schemas.stores.root import group_attributes
-from vla_attention.schemas.stores.store_format import (
-    NUMBERS,
-    NUMBERS_VERSION,
-    CorruptEpisode,
-    EpisodeAttributes,
-    RootAttributes,
-)
+from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
+from vla_attention.schemas.stores.root import fields_beyond, group_attributes
+from vla_attention.schemas.stores.seal import SEAL_FILE
+from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, CorruptEpisode
+from vla_attention.schemas.stores.store_url import StoreUrl
+from vla_attention.schemas.stores.zip_members import ZipMembers
+
+_ROOT_FILES = ("zarr.json", EPISODES_DOCUMENT)
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Something wrong with one episode."""
+    """Something wrong with an episode, or with a file of the store beside its episodes: its name is in `where`."""
 
-    episode: str
+    where: str
     problem: str
 
 
-def verify_store(store: Store, progress: Callable[[int], object] | None = None) -> list[Fault]:
-    """Check every episode; `progress` is called with 1 after each. An empty list means the store is whole."""
-    faults = []
+@dataclass(frozen=True)
+class EpisodeReport:
+    """What was found of one episode.
+
+    files, bytes: of the sealed files, with the seal; 0 when the seal cannot be read.
+    problems: sentences; none means that the episode is whole, as far as was looked.
+    foreign: paths in the episode that its seal does not list.
+    """
+
+    episode: str
+    files: int
+    bytes: int
+    problems: tuple[str, ...]
+    foreign: tuple[str, ...]
+
+    @property
+    def faults(self) -> list[Fault]:
+        """The problems with the episode's name."""
+        return [Fault(self.episode, problem) for problem in self.problems]
+
+
+def verify_store(store: Store, progress: Callable[[int], object] | None = None, *, quick: bool = False) -> list[Fault]:
+    """Check a store and every episode; `progress` is called with 1 after each. An empty list means: it is whole."""
+    faults = store_faults(store)
     for episode in store.episodes:
-        faults += episode_faults(store, episode)
+        faults += episode_report(store, episode, quick=quick).faults
         if progress is not None:
             progress(1)
     return faults
 
 
+def episode_report(store: Store, episode: StoredEpisode, *, quick: bool = False) -> EpisodeReport:
+    """Look at one episode of a store, and read all of it unless `quick`."""
+    problems = list(dict.fromkeys(_problems(store, episode, quick)))  # several checks may find the same fault
+    try:
+        foreign = foreign_in_episode(episode)
+        records = episode.files.records
+        size = sum(record.size for record in records.values()) + episode.source.size(SEAL_FILE)
+    except RemoteFailure:
+        raise
+    except (CorruptEpisode, OSError):
+        return EpisodeReport(episode.name, 0, 0, tuple(problems), ())
+    return EpisodeReport(episode.name, len(records) + 1, size, tuple(problems), foreign)
+
+
 def episode_faults(store: Store, episode: StoredEpisode) -> list[Fault]:
     """Everything that is wrong with one episode of a store; reads all of it."""
-    problems = dict.fromkeys(_problems(store.attributes, episode))  # several checks may find the same fault
-    return [Fault(episode.name, problem) for problem in problems]
+    return episode_report(store, episode).faults
 
 
-def _problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
+def store_faults(store: Store) -> list[Fault]:
+    """What is wrong with the files of a store beside its episodes: the `zarr.json` of its two groups."""
+    faults = []
+    for file in _ROOT_FILES:
+        try:
+            faults += [Fault(file, problem) for problem in _group_problems(store, file)]
+        except RemoteFailure:
+            raise
+        except OSError as error:
+            faults.append(Fault(file, f"it is lost ({error.strerror or error})"))
+        except (ValueError, RecursionError) as error:
+            faults.append(Fault(file, f"it is damaged: {error}"))
+    return faults
+
+
+def _group_problems(store: Store, file: str) -> Iterator[str]:
+    content = source_of(store.path).whole(file)
+    attributes = group_attributes(content)
+    if others := fields_beyond(json.loads(content)):
+        yield f"it says more than that it is a group with attributes: {listing(others, 5)}"
+    if file == EPISODES_DOCUMENT:
+        if attributes:
+            yield "it has attributes, and the group of episodes has none"
+    elif store.attributes.digest and store.attributes.digest != seal_digest(attributes):
+        yield "it was changed: its own digest does not fit"
+    elif not store.attributes.digest and store.attributes.store_version:
+        yield "it has lost its own digest"
+
+
+def _problems(store: Store, episode: StoredEpisode, quick: bool) -> list[str]:
     try:
-        yield from content_problems(root, episode)
+        _ = episode.attributes
     except CorruptEpisode as error:
-        yield str(error)
+        return [str(error)]
+    problems = [] if quick else list(content_problems(store.attributes, episode))
+    said = {file for file in episode.files.records if _is_named(file, problems)}
+    problems += [one for one in check_presence(episode) if not any(_is_named(file, [one]) for file in said)]
+    if not quick:
+        problems += _problems_of_bytes(episode, problems)
+    return problems
 
 
-def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
-    """What is wrong inside an episode, wherever its folder is: metadata, shapes, values, row sums. Reads all of it.
-
-    Raises:
-        CorruptEpisode: the episode's attributes or its seal cannot be read.
-    """
-    attributes = episode.attributes
-    # The files of arrays are compared with the seal when the arrays are read.
-    for file in episode.files.records:
-        if file.endswith("zarr.json"):
-            yield from _guarded(_metadata_problems(episode, file))
-    shapes = _expected_shapes(root, attributes)
-    numbers = {name: (len(given),) for name in NUMBERS if (given := getattr(attributes, name))}
-    listed = {name: record.shape for name, record in attributes.arrays.items()} | numbers
-    for name in sorted(set(shapes) - set(listed)):
-        yield f"{name} is not in the episode"
-    for name, shape in listed.items():
-        expected = shapes.get(name, (attributes.num_replans,))
-        if shape[: len(expected)] != expected:
-            yield f"{name} has the shape {shape}; expected {expected}"
-        elif name not in numbers:
-            yield from _guarded(_array_problems(root, episode, name, attributes.arrays[name].sha256))
-    for check in (_axis_problems, _token_problems, _camera_problems, _counter_problems):
-        yield from _guarded(check(root, episode))
+def _problems_of_bytes(episode: StoredEpisode, known: Iterable[str]) -> Iterator[str]:
+    """Bytes that no check before has read: of shards all that is in no chunk, and of a zip what is in no file."""
+    elsewhere = isinstance(episode.folder, StoreUrl)
+    for file, record in episode.files.records.items():
+        # Every chunk of a shard has been compared with its checksum in the seal: it is not fetched a second time.
+        if not (file.endswith("zarr.json") or _is_named(file, known) or (elsewhere and record.chunks)):
+            try:
+                episode.sealed(file)
+            except CorruptEpisode as error:
+                yield str(error)
+    if isinstance(episode.place, ZipMembers) and isinstance(episode.source, ZipMembers):
+        expected = episode.place.frame
+        if expected and episode.source.frame_digest() != expected:
+            yield "its zip has other bytes around its files than vla-analyze copy --packed wrote"
 
 
-def _guarded(check: Iterator[str]) -> Iterator[str]:
-    """The problems that a check finds; an array or file that it cannot read is one more."""
-    try:
-        yield from check
-    except CorruptEpisode as error:
-        yield str(error)
-
-
-def _expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dict[str, tuple[int, ...]]:
-    """First axes of every array that must be there; arrays that are not named here begin with the replans."""
-    replans = attributes.num_replans
-    shapes: dict[str, tuple[int, ...]] = {"denoise_time": (len(root.recording.denoise_steps),)}
-    shapes |= dict.fromkeys(("env_step", "prompt_index"), (replans,))
-    if not root.protocol.of_other_loop:
-        shapes |= dict.fromkeys(("noise_seed", "state", "actions"), (replans,))
-    if "dataset_actions" in attributes.arrays:
-        shapes["dataset_action_count"] = (replans,)
-    for site in root.sites:
-        recording = root.recording.of_site(site)
-        cells = (
-            replans,
-            len(recording.layers),
-            len(recording.denoise_steps),
-            len(recording.heads),
-            recording.num_queries,
-        )
-        shapes[f"{site.name}/rows"] = (*cells, site.num_keys)
-        shapes[f"{site.name}/row_sum"] = cells
-        shapes[f"{site.name}/atoms"] = (*cells, len(attributes.segments.get(site.name, ())))
-        shapes[f"{site.name}/key_role"] = (replans, site.num_keys)
-        if recording.contributions:
-            parts = len(attributes.segments.get(site.name, ())) + 1
-            shapes[f"{site.name}/contribution"] = (*cells[:3], parts, parts)
-        if root.format_version < NUMBERS_VERSION:
-            shapes |= {f"{site.name}/{axis}": (len(given),) for axis, given in recording.axis_numbers.items()}
-    return shapes
-
-
-def _metadata_problems(episode: StoredEpisode, file: str) -> Iterator[str]:
-    episode.sealed(file)
-    yield from ()
-
-
-def _array_problems(root: RootAttributes, episode: StoredEpisode, name: str, sha256: str) -> Iterator[str]:
-    """One pass over an array: its digest, and the rules for the numbers of rows, segments' masses and contributions."""
-    array = episode.array(name)
-    site_name, _, kind = name.rpartition("/")
-    site = next((site for site in root.sites if site.name == site_name), None)
-    recording = root.recording if site is None else root.recording.of_site(site)
-    sums = _row_sums(episode, name, array.shape[:-1]) if kind in ("rows", "atoms") else None
-    digest, problems = ArrayDigest(), list[str]()
-    step = max(1, (array.shards or array.chunks)[0])
-    for first in range(0, array.shape[0], step):
-        values = episode.read(name, slice(first, first + step))
-        digest.update(values)
-        if problems:
-            continue  # the first block with a fault names its place
-        if sums is not None:
-            bits = recording.mantissa_bits if kind == "rows" else FLOAT32_MANTISSA_BITS
-            problems += row_problems(name, values, sums[first : first + step], recording, bits, first)
-            if kind == "rows" and site is not None and not problems:
-                roles = episode.read(f"{site_name}/key_role", slice(first, first + step))
-                problems += absent_problems(site, values, roles, recording, first)
-        elif kind == "row_sum":
-            problems += row_sum_problems(name, values, recording, first)
-        elif kind == "contribution":
-            problems += gram_problems(name, values, recording, first)
-    if digest.hexdigest() != sha256:
-        yield f"the values of {name} are not those that were written (digest differs)"
-    yield from problems
-
-
-def _row_sums(episode: StoredEpisode, name: str, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
-    """The exact sums that belong to rows or atoms; None when they are damaged (reported by their own check)."""
-    try:
-        sums: NDArray[np.float64] = episode.read(f"{name.rpartition('/')[0]}/row_sum").astype(np.float64)
-    except CorruptEpisode:
-        return None
-    return sums if sums.shape == shape else None
-
-
-def _axis_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
-    """The numbers of layers, denoise steps and heads in the attributes of every site are those of the run."""
-    if root.format_version < NUMBERS_VERSION:
-        return  # they are arrays
-    for site in root.sites:
-        given = group_attributes(episode.sealed(f"{site.name}/zarr.json"))
-        expected = to_json(root.recording.of_site(site).axis_numbers)
-        if given != expected:
-            yield f"the attributes of {site.name} are {given}; expected {expected}"
-
-
-def _token_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
-    prompts = episode.attributes.prompts
-    for prompt in prompts:
-        yield from prompt_problems(root.sites, prompt)
-    index = episode.read("prompt_index")
-    if not np.isin(index, np.arange(len(prompts))).all():
-        yield "prompt_index names prompts that the attributes do not have"
-        return
-    only_site = len(sites_with_text(root.sites)) == 1
-    for site in root.sites:
-        roles = episode.read(f"{site.name}/key_role")
-        yield from role_problems(site, roles)
-        of_site = [prompt_at(root.sites, site, prompt) for prompt in prompts]
-        for replan, number in enumerate(index):
-            yield from piece_role_problems(site, roles[replan], of_site[number], replan, only_site=only_site)
-
-
-def _camera_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
-    for name in episode.attributes.arrays:
-        group, _, camera = name.partition("/")
-        if group == "frames":
-            array = episode.array(name)
-            yield from picture_problems(root.sites, camera, array.shape[1:], array.dtype)
-        elif group == "camera_frames":
-            array = episode.array(name)
-            yield from camera_picture_problems(root.sites, camera, array.shape[1:], array.dtype)
-        elif group == "objects":
-            yield from coverage_problems(root.sites, camera, episode.read(name), len(episode.attributes.objects))
-
-
-def _counter_problems(_root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
-    seeds = episode.read("noise_seed") if episode.has("noise_seed") else np.zeros(0, dtype=np.int64)
-    yield from counter_problems(episode.read("env_step"), seeds)
-    if episode.has("dataset_actions") and episode.has("dataset_action_count"):
-        horizon = episode.shape_of("dataset_actions")[1]
-        counts = episode.read("dataset_action_count")
-        if not ((counts >= 1) & (counts <= horizon)).all():
-            yield f"dataset_action_count is {counts.min()} to {counts.max()}; expected 1 to {horizon}"
+def _is_named(file: str, problems: Iterable[str]) -> bool:
+    return any(f"its {file} " in problem for problem in problems)

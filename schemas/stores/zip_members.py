@@ -8,6 +8,7 @@ episode's seal lists.
 
 from __future__ import annotations
 
+import hashlib
 import io
 import struct
 import zipfile
@@ -36,12 +37,14 @@ class ZipMembers:
         file: its path there.
         length: how many bytes it has.
         tail: the offset from which on it is read at once: small files, metadata and the directory.
+        frame: what `frame_digest` gives of an undamaged zip; empty if it is not known.
     """
 
     source: ByteSource
     file: str
     length: int
     tail: int
+    frame: str = ""
 
     @property
     def remembers(self) -> bool:
@@ -85,6 +88,19 @@ class ZipMembers:
     def names(self) -> list[str]:
         """The files in the zip."""
         return list(self._opened()[0])
+
+    def frame_digest(self) -> str:
+        """sha256 of all bytes of the zip that are in none of its files: the headers before them, and the directory."""
+        members, tail = self._opened()
+        digest, at = hashlib.sha256(), 0
+        for first, size in [*sorted(members.values()), (self.length, 0)]:
+            before = max(0, min(first, self.tail) - at)
+            if before:
+                digest.update(self.source.parts(self.file, at, (before,))[0])
+            if first > self.tail:
+                digest.update(tail[max(at, self.tail) - self.tail : first - self.tail])
+            at = first + size
+        return digest.hexdigest()
 
     def _member(self, file: str, *, fresh: bool = False) -> tuple[int, int]:
         try:

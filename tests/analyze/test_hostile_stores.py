@@ -23,7 +23,7 @@ from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import SiteLayout, Span
 from vla_attention.schemas.stores.digest import bytes_digest, seal_digest
 from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
-from vla_attention.testing.stores import StoreSpec, rerun_source, reseal, write_store
+from vla_attention.testing.stores import StoreSpec, rerun_source, reseal, reseal_root, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, contributions=True)
 #: Clears a screen, moves the cursor, reverses the direction of writing, begins a line, is markup, and is a formula.
@@ -74,6 +74,7 @@ def hostile_texts(store: Path) -> None:
         attributes["objects"][1]["name"] = FORMULA
 
     change(store / "zarr.json", root)
+    reseal_root(store)
     change_episodes(store, episode)
 
 
@@ -124,7 +125,9 @@ WORDS: dict[str, tuple[str, ...]] = {
     "report": ("STORE", "--output", "OUT", "--episodes", "1", "--tasks", "0", "--layers", "0"),
     "export": ("STORE", "--csv", "--output", "OUT"),
     "copy": ("STORE", "OUT/copy.zarr", "--without", "frames"),
+    "merge": ("STORE", "OTHER", "--output", "OUT/merged.zarr"),
     "verify": ("STORE",),
+    "repair": ("STORE", "--dry-run"),
     "cache": (),
 }
 
@@ -147,6 +150,12 @@ def test_hostile_texts_are_printed_visibly_and_nothing_is_written_elsewhere(
     if command == "compare":
         shutil.rmtree(other)
         shutil.copytree(store, other)
+    if command == "merge":  # each has episodes that the other lacks
+        shutil.rmtree(other)
+        shutil.copytree(store, other)
+        for place, lost in ((store, "task000_*"), (other, "task001_*")):
+            for folder in (place / "episodes").glob(lost):
+                shutil.rmtree(folder)
     if command == "effects":
         shutil.rmtree(other)
         shutil.copytree(store, other)

@@ -9,7 +9,7 @@ import pytest
 
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.schemas.stores.store_format import FORMAT_VERSION
+from vla_attention.schemas.stores.store_format import STORE_VERSION
 
 DUMMY = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--replan-steps", "4"]
 
@@ -119,9 +119,9 @@ def test_stores_that_cannot_be_read(captured_store, tmp_path, capsys):
     newer = tmp_path / "newer.zarr"
     shutil.copytree(captured_store, newer)
     document = json.loads((newer / "zarr.json").read_text())
-    document["attributes"]["format_version"] = FORMAT_VERSION + 1
+    document["attributes"]["store_version"] = STORE_VERSION + 1
     (newer / "zarr.json").write_text(json.dumps(document))
-    expected = f"format version {FORMAT_VERSION + 1}, and this program reads up to version {FORMAT_VERSION}"
+    expected = f"is a store of version {STORE_VERSION + 1}, and this program reads stores up to version {STORE_VERSION}"
     assert expected in run(analyze, [newer], capsys)
 
     (newer / "zarr.json").write_text("{")

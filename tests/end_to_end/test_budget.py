@@ -19,7 +19,7 @@ from vla_attention.capture.trial import Trial, run_trial
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.precision import parse_precision
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.schemas.stores.store_format import FORMAT_NAME, FORMAT_VERSION, RootAttributes
+from vla_attention.schemas.stores.store_format import FORMAT_NAME, STORE_VERSION, RootAttributes
 
 pytestmark = pytest.mark.simulator
 
@@ -31,7 +31,7 @@ def trials_of(arguments: list[str], tasks: tuple[int, ...]) -> list[Trial]:
     policy = parsed.family.build(parsed, "cpu")
     attributes = RootAttributes(
         FORMAT_NAME,
-        FORMAT_VERSION,
+        STORE_VERSION,
         policy.identity(),
         plan_protocol(settings, policy.default_protocol, policy),
         plan_recording(settings.recording, policy)[0],

@@ -17,11 +17,11 @@ import pytest
 from tests.kit.attacks import files_of
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.capture.jobs.claims import Claims, holders
 from vla_attention.capture.jobs.status import store_status
 from vla_attention.capture.jobs.termination import EXIT_TERMINATED
-from vla_attention.capture.jobs.worker import Worker
 from vla_attention.capture.published.evaluate import evaluate_attention_ratio
+from vla_attention.schemas.stores.claims import Claims, holders
+from vla_attention.schemas.stores.worker import Worker
 
 pytestmark = pytest.mark.simulator
 

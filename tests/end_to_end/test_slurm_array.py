@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.capture.jobs.claims import holders
 from vla_attention.capture.jobs.status import store_status
 from vla_attention.capture.published.evaluate import evaluate_attention_ratio
+from vla_attention.schemas.stores.claims import holders
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import PARTIAL_SUFFIX
 

@@ -14,7 +14,7 @@ from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import PatchGrid, Piece, Prompt, SiteLayout, Span
 from vla_attention.schemas.segments import Segment
 from vla_attention.schemas.stores.store_format import (
-    FORMAT_VERSION,
+    STORE_VERSION,
     ArrayRecord,
     EpisodeAttributes,
     PolicyCameraView,
@@ -77,7 +77,7 @@ def test_root_attributes_validate():
     )
     attributes = RootAttributes(
         format="vla-attention",
-        format_version=FORMAT_VERSION,
+        store_version=STORE_VERSION,
         policy=policy,
         protocol=Protocol(
             suite="libero_10", seed=7, wait_steps=10, replan_steps=5, max_steps=520, name="openpi", image_size=256

@@ -12,7 +12,8 @@
 - `episode_records`: what a recorder gives to the writer, replan by replan (`vla_attention.capture.store.store_writer`).
 - `small_tokens`, `libero_tokens`, `random_rows`: tokens of an episode, and attention-like rows for them.
 - `rerun_source`: what a rerun of a store says of it (`StoreSpec.rerun_of`).
-- `reseal`: seal an episode anew after changing its files, as a test of checks behind the seal needs.
+- `reseal`: seal an episode anew after changing its files, as a test of checks behind the seal needs;
+  `reseal_root`: the digest in the root, too.
 - `SiteStoreSpec`, `write_site_store`: stores of other policies: sites in some of the blocks, absent keys, generated
   tokens, unknown outcomes, a data set's actions.
 - `assert_whole`: read a store back and fail on everything that `vla-analyze verify` would report.
@@ -32,6 +33,7 @@ from vla_attention.testing.stores import (
     expected_arrays,
     rerun_source,
     reseal,
+    reseal_root,
     root_attributes,
     write_store,
 )
@@ -47,6 +49,7 @@ __all__ = [
     "random_rows",
     "rerun_source",
     "reseal",
+    "reseal_root",
     "root_attributes",
     "small_tokens",
     "write_site_store",
@@ -57,4 +60,4 @@ __all__ = [
 def assert_whole(path: Path) -> None:
     """Raise `AssertionError` with every fault of the store at `path`."""
     faults = verify_store(open_store(path))
-    assert not faults, "; ".join(f"{fault.episode}: {fault.problem}" for fault in faults)
+    assert not faults, "; ".join(f"{fault.where}: {fault.problem}" for fault in faults)

@@ -27,7 +27,7 @@ from vla_attention.schemas.layout import INVALID_ROLES, PatchGrid, Piece, Prompt
 from vla_attention.schemas.segments import segment_members, segments_of
 from vla_attention.schemas.stores.store_format import (
     FORMAT_NAME,
-    FORMAT_VERSION,
+    STORE_VERSION,
     PolicyCameraView,
     PolicyIdentity,
     Protocol,
@@ -110,7 +110,7 @@ def site_root(spec: SiteStoreSpec) -> RootAttributes:
     cameras = dict.fromkeys(camera for site in spec.sites for camera in site.cameras)
     return RootAttributes(
         format=FORMAT_NAME,
-        format_version=FORMAT_VERSION,
+        store_version=STORE_VERSION,
         policy=PolicyIdentity(
             name=spec.policy,
             family=f"made-up-{spec.kind}",

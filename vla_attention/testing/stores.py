@@ -8,6 +8,7 @@ A `StoreSpec` decides every number in its store, so that what a reader must find
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -24,11 +25,12 @@ from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.precision import round_mantissa
 from vla_attention.schemas.segments import segment_members, segments_of
+from vla_attention.schemas.stores.digest import with_digest
 from vla_attention.schemas.stores.root import read_run
 from vla_attention.schemas.stores.seal import seal_episode
 from vla_attention.schemas.stores.store_format import (
     FORMAT_NAME,
-    FORMAT_VERSION,
+    STORE_VERSION,
     PolicyCameraView,
     PolicyIdentity,
     Protocol,
@@ -143,6 +145,13 @@ def reseal(folder: Path) -> None:
     seal_episode(folder, folder.name, read_run(folder.parents[1])[1])
 
 
+def reseal_root(store: Path) -> None:
+    """Make the digest in a store's root anew, after a test has changed the attributes there."""
+    document = json.loads((store / "zarr.json").read_bytes())
+    document["attributes"] = with_digest(document["attributes"])
+    (store / "zarr.json").write_text(json.dumps(document), encoding="utf-8")
+
+
 def denoise_times(spec: StoreSpec) -> NDArray[np.float64]:
     """Flow time of each recorded denoise step, shape (denoise,)."""
     return 1.0 - np.array(spec.denoise_steps) / 10
@@ -152,7 +161,7 @@ def root_attributes(spec: StoreSpec) -> RootAttributes:
     """The attributes of the store's root group."""
     return RootAttributes(
         format=FORMAT_NAME,
-        format_version=FORMAT_VERSION,
+        store_version=STORE_VERSION,
         policy=PolicyIdentity(
             name=spec.policy,
             family="made-up",

@@ -119,7 +119,7 @@ WORDS: dict[str, tuple[str, ...]] = {
 
 
 def test_every_command_that_reads_numbers_is_tried():
-    assert set(WORDS) == set(COMMANDS) - {"copy", "verify", "cache"}
+    assert set(WORDS) == set(COMMANDS) - {"copy", "merge", "verify", "repair", "cache"}
 
 
 def prepared(command: str, folder: Path) -> tuple[Path, Path]:
@@ -238,7 +238,7 @@ def test_two_copies_into_one_store_at_once(original, packed, tmp_path, monkeypat
     assert copy_store(open_store(original), target, (), packed=True).added == 4
     said = capsys.readouterr().err
     assert codes == [2]
-    assert "another copy is packing into it" in said
+    assert "another copy is writing into it" in said
     assert said.count("\n") == 1
     assert all_bytes(target) == all_bytes(packed)
     assert not list(tmp_path.glob("*.partial"))

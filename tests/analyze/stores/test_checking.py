@@ -22,7 +22,7 @@ def damaged(tmp_path):
 def test_workers_find_the_faults_that_verify_store_finds(damaged, capsys):
     store = open_store(damaged)
     expected = verify_store(store)
-    assert {fault.episode for fault in expected} == {"task001_episode000"}
+    assert {fault.where for fault in expected} == {"task001_episode000"}
     pairs = [(store, episode) for episode in store.episodes]
     assert [fault for found in faults_of_each(pairs) for fault in found] == expected
     with workers(2):

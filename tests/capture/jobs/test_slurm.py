@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from vla_attention.capture.jobs.slurm import array_task_ids, ask_for_requeue
-from vla_attention.capture.jobs.worker import Worker
+from vla_attention.schemas.stores.worker import Worker
 
 NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2")
 

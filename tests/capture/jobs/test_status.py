@@ -10,9 +10,7 @@ from pathlib import Path
 import pytest
 
 from vla_attention.capture.__main__ import main
-from vla_attention.capture.jobs.claims import Claims, jobs_folder
 from vla_attention.capture.jobs.status import store_status
-from vla_attention.capture.jobs.worker import Worker
 from vla_attention.capture.jobs.worker_records import (
     PlannedTask,
     RecordWriter,
@@ -20,6 +18,8 @@ from vla_attention.capture.jobs.worker_records import (
     planned_tasks,
     read_records,
 )
+from vla_attention.schemas.stores.claims import Claims, jobs_folder
+from vla_attention.schemas.stores.worker import Worker
 from vla_attention.testing.stores import StoreSpec, write_store
 from vla_attention.testing.tokens import INSTRUCTIONS
 

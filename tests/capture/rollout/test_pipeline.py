@@ -23,16 +23,16 @@ import zarr
 from tests.kit.still_scene import StillScene
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.capture.jobs.claims import Claims, holders
 from vla_attention.capture.jobs.status import store_status
 from vla_attention.capture.jobs.termination import EXIT_TERMINATED
-from vla_attention.capture.jobs.worker import Worker
 from vla_attention.capture.rerun.same_policy import machine_differences
 from vla_attention.capture.rollout import pipeline, simulator_process
 from vla_attention.capture.rollout.policy_call import record_calls
 from vla_attention.capture.rollout.simulation import Advanced
 from vla_attention.schemas.errors import MissingDependency
+from vla_attention.schemas.stores.claims import Claims, holders
 from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.worker import Worker
 
 NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2")
 TINY = ["pi", "--checkpoint", "untrained-tiny", "--replan-steps", "4", "--max-steps", "8"]

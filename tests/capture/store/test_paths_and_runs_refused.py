@@ -14,7 +14,7 @@ from tests.kit.durable_stores import SPEC, store_bytes, write_store
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.store_format import (
-    FORMAT_VERSION,
+    STORE_VERSION,
     FormatTooNew,
     RunMismatch,
     StoreError,
@@ -132,7 +132,7 @@ def test_what_is_not_a_store_is_never_touched(tmp_path, kind, mode):
 def test_a_store_of_a_later_format_is_never_touched(tmp_path, mode):
     path = write_store(tmp_path / "a.zarr", spec=SPEC)
     root = path / "zarr.json"
-    versions = (f'"format_version": {version}' for version in (FORMAT_VERSION, FORMAT_VERSION + 1))
+    versions = (f'"store_version": {version}' for version in (STORE_VERSION, STORE_VERSION + 1))
     root.write_text(root.read_text().replace(*versions))
     before = store_bytes(path)
     with pytest.raises(FormatTooNew):

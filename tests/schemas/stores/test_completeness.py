@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from vla_attention.schemas.stores.completeness import check_presence
-from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.testing.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0,), episodes=2, replans=2, layers=(0,), heads=(0,), contributions=True)
@@ -27,7 +27,7 @@ def episode(original, tmp_path) -> Path:
 
 
 def problems(episode: Path) -> list[str]:
-    return check_presence(episode, open_store(episode.parents[1]).run)
+    return check_presence(StoredEpisode(episode, episode.name, open_store(episode.parents[1]).run))
 
 
 def test_a_whole_episode_is_present(episode):

@@ -142,10 +142,9 @@ def test_a_flipped_byte_of_a_file_is_named_by_verify(path, capsys):
     (path / FIRST).write_bytes(bytes(content))
     assert analyze(["verify", str(path)]) == 1
     said = capsys.readouterr().out
-    assert "task000_episode000" in said
-    assert "joint/rows" in said
-    assert "task000_episode001" not in said
-    (fault,) = {fault.episode for fault in verify_store(open_store(path))}
+    assert f"{path}: task000_episode000: Array joint/rows" in said
+    assert f"{path}: task000_episode001: whole" in said
+    (fault,) = {fault.where for fault in verify_store(open_store(path))}
     assert fault == "task000_episode000"
 
 
@@ -374,3 +373,23 @@ def test_a_copy_refuses_damage_and_packs_none_of_it(path, tmp_path, capsys):
     assert "task000_episode001 is damaged" in capsys.readouterr().err
     assert [episode.name for episode in open_store(tmp_path / "c.zarr").episodes] == ["task000_episode000"]
     assert verify_store(open_store(tmp_path / "c.zarr")) == []
+
+
+@pytest.mark.parametrize("bits", slow_except((0x01,), (0x01, 0x80, 0xFF)))
+def test_every_byte_of_a_zip_is_compared_by_verify(path, bits):
+    """Names and dates before each file, by which nothing is read, too."""
+    zip_file = path / FIRST
+    whole = zip_file.read_bytes()
+    with zipfile.ZipFile(zip_file) as found:
+        headers = [one.header_offset for one in found.infolist()]
+        directory = found.start_dir
+    generator = np.random.default_rng(bits)
+    places = {
+        *(int(place) + int(generator.integers(30)) for place in generator.choice(headers, examples(8))),
+        *generator.integers(directory, len(whole), examples(8)).tolist(),
+    }
+    for place in sorted(places):
+        zip_file.write_bytes(whole[:place] + bytes([whole[place] ^ bits]) + whole[place + 1 :])
+        assert {fault.where for fault in verify_store(open_store(path))} == {"task000_episode000"}, place
+    zip_file.write_bytes(whole)
+    assert verify_store(open_store(path)) == []

@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.kit.attacks import files_of
+from tests.kit.attacks import files_of, with_checksum
 from tests.kit.examples import examples
 from tests.kit.slow import slow_except
 from vla_attention.analyze.__main__ import main
+from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 from vla_attention.schemas.stores.verify import Fault, verify_store
@@ -66,7 +67,7 @@ def only_fault_of(path: Path) -> str:
     """All problems of the damaged episode, in one text; the other episode must be whole."""
     found = faults(path)
     assert found, "the damage was not noticed"
-    assert {fault.episode for fault in found} == {EPISODE}
+    assert {fault.where for fault in found} == {EPISODE}
     return " | ".join(fault.problem for fault in found)
 
 
@@ -146,9 +147,9 @@ def test_arrays_of_two_episodes_changed_places(path, array):
     second.rename(first)
     (path / "aside").rename(second)
     found = faults(path)
-    assert {fault.episode for fault in found} == {EPISODE, "task001_episode000"}
+    assert {fault.where for fault in found} == {EPISODE, "task001_episode000"}
     for name in (EPISODE, "task001_episode000"):
-        assert array in " | ".join(fault.problem for fault in found if fault.episode == name)
+        assert array in " | ".join(fault.problem for fault in found if fault.where == name)
 
 
 def test_episodes_changed_places(path):
@@ -157,7 +158,7 @@ def test_episodes_changed_places(path):
     second.rename(first)
     (path / "aside").rename(second)
     for fault, other in zip(faults(path), ("task001_episode000", EPISODE), strict=True):
-        assert f"{fault.episode} cannot be read: its seal is that of {other}" in fault.problem
+        assert f"{fault.where} cannot be read: its seal is that of {other}" in fault.problem
 
 
 def test_an_episode_of_another_run(path, tmp_path):
@@ -198,8 +199,9 @@ def test_a_changed_run(path):
     root = path / "zarr.json"
     root.write_text(root.read_text().replace('"made-up"', '"made up"'))
     found = faults(path)
-    assert [fault.episode for fault in found] == [EPISODE, "task001_episode000"]
-    assert all("a run of another configuration" in fault.problem for fault in found)
+    assert [fault.where for fault in found] == ["zarr.json", EPISODE, "task001_episode000"]
+    assert found[0].problem == "it was changed: its own digest does not fit"
+    assert all("a run of another configuration" in fault.problem for fault in found[1:])
 
 
 def test_damaged_attributes_are_not_read(path):
@@ -248,7 +250,7 @@ def test_the_numbers_of_a_site_s_axes_are_those_of_the_run(path):
 
 def test_an_empty_episode_folder(path):
     (path / "episodes" / "task007_episode000").mkdir()
-    assert [fault.episode for fault in faults(path)] == ["task007_episode000"]
+    assert [fault.where for fault in faults(path)] == ["task007_episode000"]
 
 
 @pytest.fixture(scope="module")
@@ -270,7 +272,7 @@ def test_a_random_bit_flip_is_noticed_or_changes_nothing(victim, data):
     bit = data.draw(st.integers(0, 8 * len(content) - 1))
     try:
         flip(file, bit // 8, 1 << bit % 8)
-        if EPISODE not in {fault.episode for fault in faults(path)}:
+        if EPISODE not in {fault.where for fault in faults(path)}:
             assert (open_store(path).episodes[0].read(array) == values[array]).all()
     finally:
         file.write_bytes(content)
@@ -286,3 +288,142 @@ def test_the_command_line_says_it_and_fails(path, capsys):
     assert "Traceback" not in output
     assert main(["verify", str(path.with_name("b.zarr"))]) == 2
     assert "Did you mean" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "where", "problem"),
+    [
+        (lambda path: (path / "episodes/zarr.json").unlink(), "episodes/zarr.json", "it is lost (No such file"),
+        (lambda path: (path / "episodes/zarr.json").write_text("[]"), "episodes/zarr.json", "it is damaged: zarr.json"),
+        (
+            lambda path: edit_json(path / "episodes/zarr.json", lambda group: group["attributes"].update(a=1)),
+            "episodes/zarr.json",
+            "it has attributes, and the group of episodes has none",
+        ),
+        (
+            lambda path: edit_json(path / "episodes/zarr.json", lambda group: group.update(consolidated_metadata={})),
+            "episodes/zarr.json",
+            "says more than that it is a group with attributes: consolidated_metadata",
+        ),
+        (
+            lambda path: edit_json(
+                path / "zarr.json", lambda group: group["attributes"]["provenance"].update(numpy="1")
+            ),
+            "zarr.json",
+            "it was changed: its own digest does not fit",
+        ),
+        (
+            lambda path: edit_json(
+                path / "zarr.json", lambda group: group["attributes"]["policy"].update(checkpoint="")
+            ),
+            "zarr.json",
+            "it was changed: its own digest does not fit",
+        ),
+        (
+            lambda path: edit_json(path / "zarr.json", lambda group: group["attributes"].pop("digest")),
+            "zarr.json",
+            "it has lost its own digest",
+        ),
+    ],
+)
+@pytest.mark.parametrize("quick", [False, True])
+def test_the_files_beside_the_episodes_are_checked(path, change, where, problem, quick):
+    change(path)
+    (fault,) = verify_store(open_store(path), quick=quick)
+    assert fault.where == where
+    assert problem in fault.problem
+
+
+def edit_json(file: Path, change) -> None:
+    document = json.loads(file.read_text())
+    change(document)
+    file.write_text(json.dumps(document))
+
+
+def test_a_file_that_the_seal_lists_and_no_array_has_is_a_fault(path):
+    folder = path / "episodes" / EPISODE
+    for file in ("payload.sh", "joint/atoms/payload.sh", "other/zarr.json", "c.0"):
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).write_text("{}")
+        reseal(folder)
+        assert f"its seal lists {file}, which belongs to no array of an episode" in only_fault_of(path)
+        (folder / file).unlink()
+
+
+def foreign_things(path: Path) -> list[str]:
+    """Put things into a store that nobody reads; returns the lines about them."""
+    episode = path / "episodes" / EPISODE
+    (path / "notes.txt").write_text("mine")
+    (path / "episodes/a.png").write_text("")
+    (episode / ".DS_Store").write_text("")
+    (episode / "joint/rows/c.9.9.9.9.9.9").write_text("")
+    (episode / "joint/rows/link").symlink_to(path / "notes.txt")
+    return [
+        f"{path}: {name} is no part of the store; nothing reads it"
+        for name in (
+            "episodes/a.png",
+            "notes.txt",
+            f"{EPISODE}: .DS_Store",
+            f"{EPISODE}: joint/rows/c.9.9.9.9.9.9",
+            f"{EPISODE}: joint/rows/link (a link)",
+        )
+    ]
+
+
+@pytest.mark.parametrize("program", [main, capture], ids=["vla-analyze", "vla-capture"])
+def test_a_line_for_every_episode_and_foreign_file(path, capsys, program):
+    assert program(["verify", str(path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(", ")[0] for line in lines] == [
+        f"{path}: {EPISODE}: whole",
+        f"{path}: task001_episode000: whole",
+        f"{path}: 2 episodes",
+    ]
+    shutil.rmtree(path / "episodes/task001_episode000/actions")
+    foreign = [] if program is capture else foreign_things(path)
+    assert program(["verify", str(path), "--quick"]) == 1
+    found = capsys.readouterr().out.splitlines()
+    assert found[0] == lines[0]
+    assert all(line.startswith(f"{path}: task001_episode000: Episode task001") for line in found[1:3])
+    assert found[3:-1] == foreign
+    assert found[-1].startswith(f"{path}: 2 episodes, 2 faults (seals, metadata, presence and sizes;")
+
+
+def test_verify_for_programs(path, capsys):
+    flip(chunk_file(path, "joint/rows"), 30)
+    lines = foreign_things(path)
+    assert main(["verify", str(path), "--json"]) == 1
+    (report,) = json.loads(capsys.readouterr().out)
+    assert (report["store"], report["version"], report["quick"], report["whole"]) == (
+        str(path),
+        "version 1",
+        False,
+        False,
+    )
+    assert (report["faults"], report["foreign"]) == ([], ["episodes/a.png", "notes.txt"])
+    first, second = report["episodes"]
+    assert first["episode"] == EPISODE
+    assert "joint/rows" in first["problems"][0]
+    assert len(first["foreign"]) == len(lines) - 2
+    assert (second["problems"], second["foreign"]) == ([], [])
+    folder = path / "episodes/task001_episode000"
+    files = [file for file in folder.rglob("*") if file.is_file()]
+    assert (second["files"], second["bytes"]) == (len(files), sum(file.stat().st_size for file in files))
+    assert main(["verify", str(path), "--json", "--quick"]) == 0
+    (report,) = json.loads(capsys.readouterr().out)
+    assert (report["quick"], report["whole"]) == (True, True)
+
+
+def test_bytes_of_a_shard_that_are_in_no_chunk_are_compared_too(path):
+    """A shard with room between its chunks: nothing reads it, and it is a changed file all the same."""
+    folder = path / "episodes" / EPISODE
+    file = chunk_file(path, "joint/rows")
+    content = file.read_bytes()
+    size = 16 * 4 + 4
+    index = np.frombuffer(content[-size:-4], dtype="<u8").reshape(-1, 2).copy()
+    index[:, 0] += 8
+    file.write_bytes(b"\0" * 8 + content[:-size] + with_checksum(index.tobytes()))
+    reseal(folder)
+    assert faults(path) == []
+    flip(file, 3)
+    assert "its joint/rows/c.0.0.0.0.0.0 does not agree with its seal" in only_fault_of(path)

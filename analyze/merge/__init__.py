@@ -1,0 +1,1 @@
+"""`vla-analyze merge`: one store of the episodes of several stores of one run."""

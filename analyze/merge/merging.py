@@ -1,0 +1,205 @@
+"""One store of the episodes of several stores of one run.
+
+The seal of an episode binds it to the configuration of its run and not to a store, so that episodes of one
+configuration may lie in one store. The merged store is made beside its place, read back, and renamed into it when it is
+whole. The given stores are only read.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import stat
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from vla_attention.analyze.stores.checking import reports_of_store
+from vla_attention.schemas.errors import BadArgument, UserError, listing
+from vla_attention.schemas.stores.digest import with_digest
+from vla_attention.schemas.stores.partial_folders import (
+    make_partial,
+    partial_folder,
+    process_tag,
+    remove_dead_partials,
+    remove_if_empty,
+)
+from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
+from vla_attention.schemas.stores.remote_source import source_of
+from vla_attention.schemas.stores.root import group_attributes, group_document
+from vla_attention.schemas.stores.run_differences import run_differences
+from vla_attention.schemas.stores.seal import SEAL_FILE
+from vla_attention.schemas.stores.store_format import (
+    EPISODES_DOCUMENT,
+    EPISODES_GROUP,
+    STORE_SUFFIX,
+    CorruptEpisode,
+    RunMismatch,
+    StoreExists,
+)
+from vla_attention.schemas.stores.store_url import StoreUrl
+
+#: Differing fields that are named of two stores.
+_MOST_NAMED = 5
+#: What a file system says that has no hard links, or none here.
+_NO_LINKS = (errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.ENOTSUP)
+
+
+@dataclass(frozen=True)
+class Merged:
+    """What a merge did: episodes of the new store, and bytes of its files, by whether they are shared."""
+
+    episodes: int
+    linked_bytes: int
+    copied_bytes: int
+
+
+def merge_stores(
+    stores: Sequence[Store], target: Path, progress: Callable[[int], object] | None = None, *, link: bool = True
+) -> Merged:
+    """Make a store of the episodes of others; `progress` is called with 1 after each.
+
+    link: files of stores of folders that are here are linked, where the file system can; otherwise they are copied.
+
+    Raises:
+        BadArgument: fewer than two stores, two that hold the same episode, or a place that cannot be written.
+        StoreExists: something is at the target.
+        RunMismatch: the stores are of different configurations; the fields are named.
+        CorruptEpisode: an episode is damaged. Nothing is left of the new store then.
+    """
+    _check(stores, target)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        remove_dead_partials(target)
+        building = partial_folder(target) / f"merge-{process_tag()}"
+        make_partial(building)
+        try:
+            return _merge(stores, target, building / target.name, progress, link)
+        finally:
+            shutil.rmtree(building, ignore_errors=True)
+            remove_if_empty(building.parent)
+    except OSError as error:
+        if isinstance(error, UserError) or error.errno is None:
+            raise
+        raise BadArgument(f"Cannot merge into {target}: {error.strerror or error}; give another place.") from None
+
+
+def _check(stores: Sequence[Store], target: Path) -> None:
+    if len(stores) < 2:
+        raise BadArgument("One store cannot be merged; give two or more, and the new one with -o.")
+    if target.suffix != STORE_SUFFIX:
+        raise BadArgument(f"Cannot merge into {target}: expected a name that ends with '{STORE_SUFFIX}'.")
+    if os.path.lexists(target):
+        raise StoreExists(f"Cannot merge into {target}: it exists already; give another name.")
+    for other in stores[1:]:
+        _check_same_run(stores[0], other)
+    holders: dict[str, Store] = {}
+    for store in stores:
+        twice = [episode.name for episode in store.episodes if episode.name in holders]
+        if twice:
+            other = holders[twice[0]]
+            both = [name for name in twice if holders[name] is other]
+            raise BadArgument(
+                f"Cannot merge: {other.path} and {store.path} hold the same episodes: {listing(both, 5)}. "
+                "Remove one of each pair, or leave a store out."
+            )
+        holders |= dict.fromkeys((episode.name for episode in store.episodes), store)
+
+
+def _check_same_run(one: Store, other: Store) -> None:
+    if one.run == other.run and _left_out(one) == _left_out(other):
+        return
+    found = [
+        f"{where} is {_short(here)} in the one and {_short(there)} in the other"
+        for where, here, there in run_differences(one.attributes, other.attributes)
+    ]
+    if one.run == other.run:
+        found = [f"the parts that copies left out are '{_left_out(one)}' and '{_left_out(other)}'"]
+    named = "; ".join(found[:_MOST_NAMED]) or "their zarr.json states the same in other numbers"
+    more = f"; and {len(found) - _MOST_NAMED} more fields differ" if len(found) > _MOST_NAMED else ""
+    raise RunMismatch(f"Cannot merge {one.path} and {other.path}, which are not of one run: {named}{more}.")
+
+
+def _left_out(store: Store) -> str:
+    return store.attributes.provenance.get("copied_without", "")
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _merge(
+    stores: Sequence[Store], target: Path, place: Path, progress: Callable[[int], object] | None, link: bool
+) -> Merged:
+    (place / EPISODES_GROUP).mkdir(parents=True)
+    (place / "zarr.json").write_bytes(_root_document(stores))
+    (place / EPISODES_DOCUMENT).write_bytes(group_document({}))
+    linked = copied = 0
+    origin: dict[str, Store] = {}
+    for store in stores:
+        for episode in store.episodes:
+            sizes = _bring(replace(episode), place / EPISODES_GROUP / episode.name, link)
+            linked, copied = linked + sizes[0], copied + sizes[1]
+            origin[episode.name] = store
+            if progress is not None:
+                progress(1)
+    built = open_store(place)
+    for report in reports_of_store(built, False):
+        if report.problems:
+            raise CorruptEpisode(
+                f"Cannot merge: {report.episode} of {origin[report.episode].path} is damaged: "
+                f"{report.problems[0].rstrip('.')}. Repair that store first."
+            )
+    place.rename(target)
+    return Merged(len(built.episodes), linked, copied)
+
+
+def _root_document(stores: Sequence[Store]) -> bytes:
+    """The root of the first store, with the names of all of them in its provenance."""
+    attributes = group_attributes(source_of(stores[0].path).whole("zarr.json"))
+    attributes["provenance"]["merged_from"] = ", ".join(
+        f"{store.path.name} ({len(store.episodes)} episodes)" for store in stores
+    )
+    return group_document(with_digest(attributes) if stores[0].attributes.store_version else attributes)
+
+
+def _bring(episode: StoredEpisode, folder: Path, link: bool) -> tuple[int, int]:
+    """Link or copy the files of an episode that its seal lists; returns the bytes that were linked and copied."""
+    linked = copied = 0
+    try:
+        files = [*episode.files.records, SEAL_FILE]
+        for file in files:
+            place = folder / file
+            place.parent.mkdir(parents=True, exist_ok=True)
+            if link and _linked(episode, file, place):
+                linked += place.stat().st_size
+                continue
+            content = episode.source.whole(file) if file == SEAL_FILE else episode.sealed(file)
+            place.write_bytes(content)
+            copied += len(content)
+    except CorruptEpisode as error:
+        raise CorruptEpisode(f"Cannot merge: {error} Repair the store first.") from None
+    return linked, copied
+
+
+def _linked(episode: StoredEpisode, file: str, place: Path) -> bool:
+    """Link one file; False where the file system cannot. What the file holds is looked at when all is read back."""
+    if episode.place is not None or isinstance(episode.folder, StoreUrl):
+        return False  # in a zip, or elsewhere
+    folder = os.path.realpath(episode.folder)
+    path = os.path.join(folder, file)
+    try:
+        regular = stat.S_ISREG(os.lstat(path).st_mode)
+    except OSError as error:
+        raise CorruptEpisode(f"Episode {episode.name} has lost its {file} ({error.strerror or error}).") from None
+    if not regular or os.path.realpath(path) != path:
+        raise CorruptEpisode(f"The file {file} of episode {episode.name} is a link or no file; no link is followed.")
+    try:
+        os.link(path, place, follow_symlinks=False)
+    except OSError as error:
+        if error.errno in _NO_LINKS:
+            return False
+        raise
+    return True

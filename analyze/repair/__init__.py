@@ -1,0 +1,1 @@
+"""`vla-analyze repair`: moves damaged episodes out of a store."""

@@ -1,0 +1,33 @@
+"""Which files an episode has: a `zarr.json` for each group and array, the chunks of the arrays, and the seal.
+
+A seal is made by whoever made the store. What it lists beyond these files is no part of an episode: `verify` names it,
+and nothing copies it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import PurePosixPath
+
+from vla_attention.schemas.stores.store_format import EpisodeAttributes, RootAttributes
+
+#: Names of chunks below their array, in the encodings that Zarr v3 has: `c.0.1`, `c/0/1`, `0.1`, `0/1`, `c`.
+_CHUNK = re.compile(r"c|(?:c[./])?[0-9]{1,20}(?:[./][0-9]{1,20}){0,30}")
+_DOCUMENT = "zarr.json"
+
+
+def files_of_no_array(root: RootAttributes, attributes: EpisodeAttributes, files: Iterable[str]) -> list[str]:
+    """Those of an episode's sealed files that belong to none of its arrays, groups and sites."""
+    arrays = attributes.arrays.keys()
+    groups = {str(parent) for name in arrays for parent in PurePosixPath(name).parents}
+    groups |= {".", *(site.name for site in root.sites)}
+    return [file for file in files if not _belongs(file, arrays, groups)]
+
+
+def _belongs(file: str, arrays: Iterable[str], groups: set[str]) -> bool:
+    path = PurePosixPath(file)
+    if path.name == _DOCUMENT:
+        return str(path.parent) in groups or str(path.parent) in arrays
+    above = next((parent for parent in path.parents if str(parent) in arrays), None)
+    return above is not None and _CHUNK.fullmatch(str(path.relative_to(above))) is not None

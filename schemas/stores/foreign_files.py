@@ -1,0 +1,87 @@
+"""What lies in a store and is no part of it: other people's files, links, and files that no seal lists.
+
+Nothing reads them: neither this program, which opens what the seals list, nor a reader of Zarr, to which they are no
+chunks of an array. `verify` names them, and no copy takes them along.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path, PurePosixPath
+
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.stores.packed_index import INDEX_FILE
+from vla_attention.schemas.stores.reader import Store, StoredEpisode
+from vla_attention.schemas.stores.seal import SEAL_FILE
+from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, EPISODES_GROUP, parse_episode_name
+from vla_attention.schemas.stores.store_url import StoreUrl
+from vla_attention.schemas.stores.zip_members import ZipMembers
+
+#: Foreign files that are named of one episode, or of one store beside its episodes. More of them are not counted: a
+#: folder may hold millions.
+MOST_NAMED = 100
+
+
+def foreign_in_episode(episode: StoredEpisode) -> tuple[str, ...]:
+    """Paths in an episode's folder or zip that its seal does not list; a folder without any sealed file ends with /.
+
+    Of an episode at an address that is not packed, nothing is known. `CorruptEpisode` when it has no readable seal.
+    """
+    known = {SEAL_FILE, *episode.files.records}
+    source = episode.source
+    if isinstance(source, ZipMembers):
+        return tuple(islice((name for name in source.names() if name not in known), MOST_NAMED))
+    if isinstance(episode.folder, StoreUrl):
+        return ()
+    folders = {str(parent) for file in known for parent in PurePosixPath(file).parents}
+    return tuple(islice(_beyond(episode.folder, "", known, folders), MOST_NAMED))
+
+
+def foreign_in_store(store: Store) -> tuple[str, ...]:
+    """Paths beside the episodes of a store that are no part of it; nothing is known of a store at an address."""
+    if isinstance(store.path, StoreUrl):
+        return ()
+    known = {"zarr.json", EPISODES_DOCUMENT}
+    folders = {".", EPISODES_GROUP}
+    packed = [
+        str(episode.folder.relative_to(store.path))
+        for episode in store.episodes
+        if episode.place is not None and isinstance(episode.folder, Path)
+    ]
+    if packed or (store.path / INDEX_FILE).is_file():
+        known |= {INDEX_FILE, *packed}
+        folders |= {str(PurePosixPath(file).parent) for file in packed}
+    else:
+        known |= {f"{EPISODES_GROUP}/{name}" for name in _episode_names(store.path / EPISODES_GROUP)}
+    return tuple(islice(_beyond(store.path, "", known, folders), MOST_NAMED))
+
+
+def _episode_names(folder: Path) -> Iterator[str]:
+    """Names of the folders of episodes; a link is none."""
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            try:
+                parse_episode_name(entry.name)
+            except BadArgument:
+                continue
+            if entry.is_dir(follow_symlinks=False):
+                yield entry.name
+
+
+def _beyond(folder: Path, inside: str, known: set[str], folders: set[str]) -> Iterator[str]:
+    """Paths below a folder that are neither known files nor lead to one. Links are followed nowhere."""
+    with os.scandir(folder) as entries:
+        found = sorted(entries, key=lambda entry: entry.name)
+    for entry in found:
+        path = f"{inside}{entry.name}"
+        mode = entry.stat(follow_symlinks=False).st_mode
+        if stat.S_ISDIR(mode):
+            if path in folders:
+                yield from _beyond(folder / entry.name, f"{path}/", known, folders)
+            elif path not in known:
+                yield f"{path}/"
+        elif path not in known:
+            yield f"{path} (a link)" if stat.S_ISLNK(mode) else path

@@ -1,0 +1,145 @@
+"""`verify` of both command lines: its arguments, a line for every episode, and JSON for programs."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from vla_attention.schemas.command_line import format_bytes
+from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.safe_text import plain_stderr, visible
+from vla_attention.schemas.stores.store_url import StorePlace, store_place
+
+if TYPE_CHECKING:
+    from vla_attention.schemas.stores.reader import Store
+    from vla_attention.schemas.stores.verify import EpisodeReport, Fault
+
+DESCRIPTION = (
+    "Read everything back and check it: every file, missing chunks, digests, counts, row sums. A line for every "
+    "episode. Foreign files are named; nothing reads them. Exit code 1 if anything is wrong."
+)
+EXAMPLES = """examples:
+  NAME verify libero_10.zarr                      every byte of every episode
+  NAME verify libero_10.zarr --quick              seals, metadata, presence and sizes of files: milliseconds an episode
+  NAME verify *.zarr --json > report.json         for programs
+"""
+#: Reports of the episodes of a store, in their order, looked at quickly or not.
+Reports = Callable[["Store", bool], Iterable["EpisodeReport"]]
+
+
+def add_verify_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of `verify`."""
+    parser.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses")
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="look at seals, metadata, and the presence and size of every file, and read no array",
+    )
+    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+
+
+def one_after_the_other(store: Store, quick: bool) -> Iterator[EpisodeReport]:
+    """Reports of the episodes, made in this thread."""
+    from vla_attention.schemas.stores.verify import episode_report
+
+    return (episode_report(store, episode, quick=quick) for episode in store.episodes)
+
+
+def run_verify(
+    stores: Sequence[StorePlace], *, quick: bool, as_json: bool, reports: Reports = one_after_the_other
+) -> int:
+    """Check stores, and print what was found; returns the exit code: 1 if anything is wrong."""
+    from vla_attention.schemas.stores.foreign_files import foreign_in_store
+    from vla_attention.schemas.stores.reader import open_store
+    from vla_attention.schemas.stores.verify import store_faults
+
+    documents, wrong = [], False
+    for path in stores:
+        store = open_store(path)
+        faults = store_faults(store)
+        foreign = foreign_in_store(store)
+        found = []
+        if not as_json:
+            _print_faults(path, faults)
+        with _counter(len(store.episodes), quiet=not as_json and sys.stdout.isatty()) as count:
+            for report in reports(store, quick):
+                count()
+                found.append(report)
+                if not as_json:
+                    _print_episode(path, report)
+        wrong = wrong or bool(faults) or any(report.problems for report in found)
+        if as_json:
+            documents.append(_document(store, quick, faults, foreign, found))
+        else:
+            _print_foreign(path, foreign, found)
+            number = len(faults) + sum(len(report.problems) for report in found)
+            result = "all whole" if not number else "1 fault" if number == 1 else f"{number} faults"
+            looked = " (seals, metadata, presence and sizes; without --quick every byte is read)" if quick else ""
+            plural = "" if len(found) == 1 else "s"
+            print(f"{path}: {len(found)} episode{plural}, {result}{looked}.", flush=True)
+    if as_json:
+        print(json.dumps(documents, indent=1))
+    return 1 if wrong else 0
+
+
+def _print_faults(path: StorePlace, faults: Iterable[Fault]) -> None:
+    for fault in faults:
+        print(f"{path}: {fault.where}: {fault.problem}", flush=True)
+
+
+def _print_episode(path: StorePlace, report: EpisodeReport) -> None:
+    if report.problems:
+        _print_faults(path, report.faults)
+    else:
+        print(f"{path}: {report.episode}: whole, {report.files} files, {format_bytes(report.bytes)}", flush=True)
+
+
+def _print_foreign(path: StorePlace, beside: Sequence[str], found: Iterable[EpisodeReport]) -> None:
+    from vla_attention.schemas.stores.foreign_files import MOST_NAMED
+
+    lists = [("", beside), *((f"{report.episode}: ", report.foreign) for report in found)]
+    for where, names in lists:
+        for name in names:
+            print(f"{path}: {where}{visible(name)} is no part of the store; nothing reads it")
+        if len(names) == MOST_NAMED:
+            print(f"{path}: {where}there may be more of them; {MOST_NAMED} are named")
+
+
+def _document(
+    store: Store, quick: bool, faults: Sequence[Fault], foreign: Sequence[str], found: Sequence[EpisodeReport]
+) -> dict[str, object]:
+    return {
+        "store": str(store.path),
+        "version": store.attributes.version_text,
+        "quick": quick,
+        "whole": not faults and not any(report.problems for report in found),
+        "faults": to_json(faults),
+        "foreign": list(foreign),
+        "episodes": to_json(found),
+    }
+
+
+@contextmanager
+def _counter(total: int, *, quiet: bool) -> Iterator[Callable[[], None]]:
+    """Yield a function that counts episodes on stderr, at a terminal. The lines of a terminal's stdout count, too."""
+    shown = plain_stderr()
+    quiet = quiet or not shown.isatty()
+    done = 0
+
+    def count() -> None:
+        nonlocal done
+        done += 1
+        if not quiet:
+            shown.write(f"\r{done} of {total} episodes")
+            shown.flush()
+
+    try:
+        yield count
+    finally:
+        if done and not quiet:
+            shown.write("\r" + " " * 40 + "\r")
+            shown.flush()

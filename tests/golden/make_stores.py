@@ -1,0 +1,63 @@
+"""Make the golden stores of version 1 and the numbers that they must give: python -m tests.golden.make_stores FOLDER
+
+They were made once, when version 1 was frozen, and stay as they are: `tests/schemas/stores/test_golden_stores.py` holds
+that today's code gives the same numbers. A later version gets stores of its own beside them. FOLDER is empty or new.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.kit.golden_stores import NAMES, write_tables
+from tests.kit.small_torch_policy import SmallPolicy, given, small_layout
+from tests.kit.still_scene import capture_without_simulator
+from vla_attention.analyze.copy.copying import copy_store
+from vla_attention.capture.__main__ import main as capture
+from vla_attention.capture.torch_policies.record import record
+from vla_attention.schemas.stores.reader import open_store
+
+_WHERE = ("--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", "0", "1", "--num-episodes", "1")
+
+
+def make_stores(folder: Path) -> None:
+    """Write the five stores and their tables into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with pytest.MonkeyPatch.context() as patch:
+        capture_without_simulator(patch)
+        _run("pi", *_WHERE, "--max-steps", "10", "--store", str(folder / "joint.zarr"))
+        cosmos = ("--max-steps", "20", "--query-frame", "curr_last", "--no-frames")
+        _run("cosmos", *_WHERE, *cosmos, "--store", str(folder / "cosmos.zarr"))
+    _record(folder / "library.zarr")
+    copy_store(open_store(folder / "joint.zarr"), folder / "packed.zarr", (), packed=True)
+    changes = ("--check", "0", "--knockout", "camera:base_0_rgb")
+    _run("rerun", str(folder / "joint.zarr"), *changes, "--store", str(folder / "rerun.zarr"))
+    for name in NAMES:
+        write_tables(folder / f"{name}.zarr", folder / name)
+
+
+def _run(*words: str) -> None:
+    code = capture(list(words))
+    if code:
+        sys.exit(code)
+
+
+def _record(path: Path) -> None:
+    """Two episodes of the caller's own policy, in the caller's own loop."""
+    policy = SmallPolicy()
+    settings = {"layout": small_layout(), "tokenizer": policy.tokenizer, "denoise_steps": "all"}
+    with record(path, policy, **settings) as run:
+        for number, text in enumerate(("pick the bowl", "pick up the plate")):
+            with run.episode(task_id=number, episode_index=0, instruction=text, seed=7) as episode:
+                for step in range(2):
+                    inputs = given(seed=10 * number + step, text=text)
+                    facts = {"frames": {"front": inputs["pictures"]}, "state": inputs["states"]}
+                    with episode.replan(env_step=5 * step, **facts) as replan:
+                        replan.actions = policy.act(**inputs)
+                episode.success = number == 0
+
+
+if __name__ == "__main__":
+    make_stores(Path(sys.argv[1]))

@@ -1,0 +1,83 @@
+"""The golden stores of version 1, and the numbers that a store gives: every array, and the tables of the analysis."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from pathlib import Path
+
+import polars as pl
+
+import vla_attention as va
+from tests.kit.paths import GOLDEN
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import NUMBERS
+
+FOLDER = GOLDEN / "stores" / "version1"
+#: joint: pi0.5 of test size. cosmos: sites `self` and `cross`. library: recorded by `va.record`. packed: `joint` again.
+#: rerun: the policy calls of `joint` without one of its cameras.
+NAMES = ("joint", "cosmos", "library", "packed", "rerun")
+#: Matrix products of other processors round otherwise; what is stored has to agree to the bit.
+_RELATIVE = 1e-6
+
+
+def numbers_of(path: Path) -> dict[str, pl.DataFrame]:
+    """Tables by name: the digests of what every array holds, and what the analysis makes of it."""
+    run = va.open(path)
+    tables = {"arrays": _arrays(path), "episodes": run.episodes.drop("store", strict=False)}
+    for site in run.attributes.sites:
+        asked = {"site": site.name, "grouping": "default"}
+        tables |= {
+            f"{site.name}_ratios": run.ratios("tasks", **asked),
+            f"{site.name}_masses": run.masses("replans", **asked),
+            f"{site.name}_heads": run.heads(**asked),
+        }
+    return {name: table for name, table in tables.items() if table.width}
+
+
+def _arrays(path: Path) -> pl.DataFrame:
+    """A row for each array, and each list of numbers of the attributes: shape, type and sha256 of its values."""
+    rows = []
+    for episode in open_store(path).episodes:
+        names = [*episode.attributes.arrays, *(name for name in NUMBERS if episode.has(name))]
+        for name in sorted(names):
+            values = episode.read(name)
+            digest = hashlib.sha256(values.astype(values.dtype.newbyteorder("<")).tobytes()).hexdigest()
+            rows.append((episode.name, name, str(values.shape), str(values.dtype), digest))
+    return pl.DataFrame(rows, schema=["episode", "array", "shape", "type", "sha256"], orient="row")
+
+
+def differences(found: pl.DataFrame, expected: pl.DataFrame) -> list[str]:
+    """Where a table differs from the one that was kept as CSV: everything has to be the same, floats to a millionth."""
+    if found.columns != expected.columns or found.height != expected.height:
+        return [f"{found.shape} with {found.columns}; expected {expected.shape} with {expected.columns}"]
+    return [
+        f"row {row}, {name}: {one!r}; expected {other!r}"
+        for name in found.columns
+        for row, (one, other) in enumerate(zip(found[name].to_list(), expected[name].to_list(), strict=True))
+        if not _same(one, other)
+    ]
+
+
+def _same(one: object, other: object) -> bool:
+    if isinstance(one, float) and isinstance(other, float):
+        return (math.isnan(one) and math.isnan(other)) or math.isclose(one, other, rel_tol=_RELATIVE, abs_tol=0)
+    return one == other
+
+
+def write_tables(path: Path, folder: Path) -> None:
+    """Write the numbers of a store as CSV files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, table in numbers_of(path).items():
+        flat(table).write_csv(folder / f"{name}.csv")
+
+
+def read_table(file: Path, like: pl.DataFrame) -> pl.DataFrame:
+    """A table of `write_tables`, with the types of the one that it is compared with."""
+    return pl.read_csv(file, schema=dict(flat(like).schema))
+
+
+def flat(table: pl.DataFrame) -> pl.DataFrame:
+    """A table as a CSV file can hold it: lists as text."""
+    nested = [name for name, kind in table.schema.items() if kind.is_nested()]
+    return table.with_columns(pl.Series(name, [str(value) for value in table[name].to_list()]) for name in nested)

@@ -1,0 +1,345 @@
+"""`vla-capture repair`, and what `status` and `--resume` say of damaged episodes."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from tests.kit.attacks import files_of
+from tests.kit.crashes import before_call, die, run_child
+from tests.kit.slow import slow_except
+from tests.kit.still_scene import capture_without_simulator
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.capture.__main__ import main
+from vla_attention.capture.jobs.status import store_status
+from vla_attention.capture.published.evaluate import evaluate_attention_ratio
+from vla_attention.schemas.stores import repair
+from vla_attention.schemas.stores.claims import Claims, holders
+from vla_attention.schemas.stores.damaged_episodes import DamagedEpisodesLeft
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.repair import damaged_folder, repair_store
+from vla_attention.schemas.stores.store_format import StoreError
+from vla_attention.schemas.stores.verify import verify_store
+from vla_attention.schemas.stores.worker import Worker, this_worker
+from vla_attention.testing.stores import StoreSpec, write_store
+
+SPEC = StoreSpec(tasks=(0, 2), episodes=2, replans=1, layers=(0,), heads=(0,), frames=False)
+DAMAGED, WHOLE = "task000_episode001", ["task000_episode000", "task002_episode000", "task002_episode001"]
+NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2", 0)
+
+
+def chunk(episode: Path, array: str) -> Path:
+    return next(iter(files_of(episode, array)))
+
+
+def empty(episode: Path) -> None:
+    shutil.rmtree(episode)
+    episode.mkdir()
+
+
+def other_name(episode: Path) -> None:
+    shutil.rmtree(episode)
+    shutil.copytree(episode.with_name(WHOLE[0]), episode)
+
+
+#: What happens to an episode, and what a cheap look says about it.
+DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "emptied": (empty, f"Episode {DAMAGED} cannot be read: it has lost its seal (No such file or directory)"),
+    "lacks atoms": (lambda episode: shutil.rmtree(episode / "joint/atoms"), "it has lost its joint/atoms/c.0"),
+    "lacks a chunk": (lambda episode: chunk(episode, "joint/rows").unlink(), "it has lost its joint/rows/c.0"),
+    "cut off": (lambda episode: os.truncate(chunk(episode, "joint/rows"), 20), "has 20 bytes; its seal says"),
+    "no attributes": (lambda episode: (episode / "zarr.json").unlink(), "it has lost its zarr.json"),
+    "edited attributes": (
+        lambda episode: (episode / "zarr.json").write_text((episode / "zarr.json").read_text().replace("bowl", "bowk")),
+        "its zarr.json does not agree with its seal",
+    ),
+    "a copy of another": (other_name, "its seal is that of task000_episode000"),
+}
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory) -> Path:
+    return write_store(tmp_path_factory.mktemp("original") / "a.zarr", spec=SPEC)
+
+
+@pytest.fixture
+def store(original, tmp_path) -> Path:
+    shutil.copytree(original, tmp_path / "a.zarr")
+    return tmp_path / "a.zarr"
+
+
+@pytest.fixture
+def episode(store) -> Path:
+    return store / "episodes" / DAMAGED
+
+
+def names(store: Path) -> list[str]:
+    return [found.name for found in open_store(store).episodes]
+
+
+@pytest.mark.parametrize("kind", slow_except(("emptied", "lacks atoms", "cut off"), DAMAGE))
+def test_a_damaged_episode_is_listed_moved_aside_and_missing(store, episode, original, capsys, kind):
+    damage, problem = DAMAGE[kind]
+    damage(episode)
+    remains = files(episode)
+
+    assert main(["status", str(store), "--expected", "2", "--check"]) == 1
+    printed = capsys.readouterr().out
+    assert "0     1 of 2    " in printed
+    assert f"damaged: Episode {DAMAGED} " in printed
+    assert problem in printed
+    assert "missing" not in printed
+    assert f"moved aside by: vla-capture repair {store}" in printed
+
+    assert main(["repair", str(store), "--dry-run"]) == 1
+    printed = capsys.readouterr().out
+    assert f"{store}: 1 of 4 episodes is damaged." in printed
+    assert problem in printed
+    assert names(store) == sorted([*WHOLE, DAMAGED])
+    assert list(store.parent.iterdir()) == [store]
+
+    assert main(["repair", str(store)]) == 0
+    printed = capsys.readouterr().out
+    assert problem in printed
+    assert "Run the same capture with --resume" in printed
+    (entry,) = damaged_folder(store).iterdir()
+    assert f"moved to {entry}" in printed
+    assert files(entry / DAMAGED) == remains
+    reason = json.loads((entry / "reason.json").read_text())
+    assert (reason["episode"], reason["store"]) == (DAMAGED, "a.zarr")
+    assert problem in " ".join(reason["problems"])
+    assert datetime.fromisoformat(reason["moved_at"]).tzinfo is not None
+
+    assert names(store) == WHOLE
+    assert verify_store(open_store(store)) == []
+    assert [task.missing for task in store_status(store, expected=2).tasks] == [(1,), ()]
+    assert sorted(path.name for path in store.parent.iterdir()) == ["a.zarr", "a.zarr.damaged"]  # no claims are left
+    assert main(["repair", str(store)]) == 0
+    assert f"{store}: none of 3 episodes is damaged" in capsys.readouterr().out
+    write_store(store, mode="resume", spec=SPEC)
+    assert files(store) == files(original)
+
+
+def test_damage_that_only_reading_shows_needs_verify(store, episode, capsys):
+    file = chunk(episode, "joint/rows")
+    content = bytearray(file.read_bytes())
+    content[30] ^= 1
+    file.write_bytes(content)
+    assert main(["status", str(store), "--expected", "2", "--check"]) == 0
+    assert main(["repair", str(store)]) == 0
+    assert "seals, presence and sizes; --verify reads every byte" in capsys.readouterr().out
+    assert main(["status", str(store), "--expected", "2", "--check", "--verify"]) == 1
+    assert f"damaged: Array joint/rows of episode {DAMAGED} cannot be read" in capsys.readouterr().out
+    assert main(["repair", str(store), "--verify"]) == 0
+    assert names(store) == WHOLE
+    assert main(["repair", str(store), "--verify"]) == 0
+    assert "(every byte was read)" in capsys.readouterr().out
+
+
+def test_the_same_episode_moved_twice_within_a_second(store, episode, monkeypatch):
+    class Clock(datetime):
+        @classmethod
+        def now(cls, tz=None):
+            return datetime(2026, 3, 2, 11, 40, tzinfo=UTC)
+
+    monkeypatch.setattr(repair, "datetime", Clock)
+    shutil.rmtree(episode)
+    for _ in range(3):
+        episode.mkdir()
+        (finding,) = repair_store(store)
+        assert finding.moved_to is not None
+    entries = sorted(entry.name for entry in damaged_folder(store).iterdir())
+    assert entries == [f"{DAMAGED}-20260302T114000Z{suffix}" for suffix in ("", "-2", "-3")]
+
+
+def test_a_claimed_episode_is_left_alone(store, episode, capsys):
+    empty(episode)
+    claims = Claims(store, NODE)
+    assert claims.acquire(DAMAGED) is None
+    assert main(["repair", str(store)]) == 1
+    printed = capsys.readouterr().out
+    assert "left in the store, because it is claimed: task000_episode001 by node7 (job 98_2)" in printed
+    assert "--resume" not in printed
+    assert episode.is_dir()
+    assert [holder.worker for holder in holders(store)] == [NODE]
+    claims.release(DAMAGED)
+    assert main(["repair", str(store)]) == 0
+    assert names(store) == WHOLE
+
+
+def test_an_episode_recorded_anew_in_the_meantime_stays(store, episode, original, monkeypatch):
+    empty(episode)
+    acquire = Claims.acquire
+
+    def after_another_process(claims, name):
+        shutil.rmtree(episode)
+        shutil.copytree(original / "episodes" / DAMAGED, episode)
+        return acquire(claims, name)
+
+    monkeypatch.setattr(Claims, "acquire", after_another_process)
+    assert repair_store(store) == []
+    assert verify_store(open_store(store)) == []
+    assert len(names(store)) == 4
+    monkeypatch.undo()
+    empty(episode)
+    monkeypatch.setattr(Claims, "acquire", lambda claims, name: shutil.rmtree(episode))  # another repair was faster
+    assert repair_store(store) == []
+
+
+def test_a_changed_root_is_no_damage_of_the_episodes(store, episode, capsys):
+    empty(episode)
+    root = store / "zarr.json"
+    root.write_text(root.read_text().replace('"seed":0', '"seed":1').replace('"seed": 0', '"seed": 1'))
+    before = files(store)
+    assert main(["repair", str(store)]) == 2
+    printed = capsys.readouterr().err
+    assert "No episode of" in printed
+    assert "the zarr.json was changed, not the episodes. Nothing was moved" in printed
+    assert files(store) == before
+
+
+def test_a_failing_repair_harms_nothing(store, episode, monkeypatch):
+    empty(episode)
+
+    rename = Path.rename
+
+    def refuse(source: Path, target: Path) -> None:
+        if damaged_folder(store) in target.parents:
+            raise PermissionError(13, "Permission denied")
+        rename(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", refuse)
+        with pytest.raises(StoreError, match=f"Cannot move {DAMAGED} of .*: Permission denied"):
+            repair_store(store)
+    assert episode.is_dir()
+    assert holders(store) == []
+    monkeypatch.setattr(Claims, "acquire", lambda claims, name: refuse(store, damaged_folder(store) / name))
+    with pytest.raises(StoreError, match="Permission denied"):  # not even a claim can be written
+        repair_store(store)
+    monkeypatch.undo()
+    (finding,) = repair_store(store)
+    assert finding.moved_to is not None
+    assert verify_store(open_store(store)) == []
+
+
+def repair_and_die(store: Path, kind: str, number: int) -> None:
+    with before_call(kind, number, die):
+        repair_store(store)
+
+
+@pytest.mark.parametrize("number", slow_except((1,), range(3)))  # renames: the claim, the episode, the claim's end
+@pytest.mark.parametrize("kind", ["rename", "renamed"])
+def test_a_killed_repair_harms_nothing(store, episode, original, kind, number):
+    empty(episode)
+    assert run_child(repair_and_die, store, kind, number) == -signal.SIGKILL
+    assert [found.name for found in open_store(store).episodes if found.name != DAMAGED] == WHOLE
+    repair_store(store)
+    assert names(store) == WHOLE
+    assert len(list(damaged_folder(store).glob(f"*/{DAMAGED}"))) == 1
+    write_store(store, mode="resume", spec=SPEC)
+    assert files(store) == files(original)
+    claims = Claims(store, this_worker())
+    assert claims.acquire(DAMAGED) is None  # the claim of the killed process does not stay
+    claims.release(DAMAGED)
+
+
+def test_a_link_to_a_store_and_several_stores(store, episode, tmp_path, capsys):
+    (tmp_path / "elsewhere").mkdir()
+    link = tmp_path / "elsewhere" / "b.zarr"
+    link.symlink_to(store)
+    empty(episode)
+    assert main(["repair", str(link), str(store)]) == 0
+    printed = capsys.readouterr().out
+    assert f"{link}: 1 of 4 episodes is damaged." in printed
+    assert f"{store}: none of 3 episodes is damaged" in printed
+    assert len(list(damaged_folder(store).iterdir())) == 1
+    assert list(link.parent.iterdir()) == [link]
+    assert main(["repair", str(tmp_path / "none.zarr")]) == 2
+    assert "There is no store at" in capsys.readouterr().err
+
+
+def test_resuming_records_what_is_missing_and_says_what_is_damaged(tmp_path, monkeypatch, capsys):
+    capture_without_simulator(monkeypatch)
+    store = tmp_path / "a.zarr"
+    given = [
+        "pi",
+        "--checkpoint",
+        "untrained-tiny",
+        "--task-suite",
+        "robosuite",
+        "--task-id",
+        "0",
+        "--replan-steps",
+        "4",
+        "--max-steps",
+        "4",
+    ]
+    given += ["--num-episodes", "3", "--store", str(store)]
+    assert main(given) == 0
+    reference = files(store)
+    shutil.rmtree(store / "episodes/task000_episode000/joint/atoms")
+    empty(store / "episodes/task000_episode001")
+    shutil.rmtree(store / "episodes/task000_episode002")
+    capsys.readouterr()
+    for added in (1, 0):
+        assert main([*given, "--resume"]) == 2
+        said = capsys.readouterr()
+        assert f"{1 - added} of 3 episodes are complete already and 2 damaged; {added} to run." in said.out
+        assert f"{added} episodes added" in said.out
+        assert "Not recorded again without vla-capture repair: Episode task000_episode001 cannot be read" in said.out
+        assert "2 of the episodes asked for are damaged: Episode task000_episode000 is damaged: it has lost" in said.err
+        assert f"run vla-capture repair {store}, which" in said.err
+        assert said.err.count("\n") == 1
+        assert (store / "episodes/task000_episode002").is_dir()
+    assert not store_status(store).complete
+    with (store / "episodes/task000_episode002/actions/c.0.0.0").open("r+b") as file:
+        file.seek(30)
+        file.write(b"??")
+    assert main([*given, "--resume", "--verify"]) == 2
+    assert "3 of the episodes asked for are damaged" in capsys.readouterr().err
+    # An episode that was not asked for is no business of this capture.
+    assert main([*given, "--resume", "--num-episodes", "1"]) == 2
+    assert "1 of the episodes asked for is damaged" in capsys.readouterr().err
+    assert main(["repair", str(store), "--verify"]) == 0
+    assert main([*given, "--resume", "--verify"]) == 0
+    assert files(store) == reference
+    assert main([*given, "--verify"]) == 2
+    assert "Cannot use --verify without --resume" in capsys.readouterr().err
+    assert store_status(store).complete
+    assert analyze(["verify", str(store)]) == 0
+
+
+def test_the_other_suites_do_not_wait_for_a_repair(tmp_path, monkeypatch, capsys):
+    captured: list[str] = []
+
+    def run_capture(settings, policy, device, termination):
+        captured.append(settings.suite.name)
+        if settings.suite.name in ("libero_spatial", "libero_goal"):
+            raise DamagedEpisodesLeft(f"damage in {settings.suite.name}.")
+
+    monkeypatch.setattr("vla_attention.capture.capture_run.run_capture", run_capture)
+    arguments = [
+        "--checkpoint",
+        "untrained-tiny",
+        "--task-suite",
+        "all",
+        "--stage",
+        "capture",
+        "--output-dir",
+        str(tmp_path),
+    ]
+    assert evaluate_attention_ratio(arguments) == 2
+    assert captured == ["libero_spatial", "libero_object", "libero_goal", "libero_10"]
+    assert "damage in libero_spatial. damage in libero_goal." in capsys.readouterr().err
