@@ -36,7 +36,7 @@ WORKERS ?= 2
 # An empty PYTHONDONTWRITEBYTECODE: where it is set, both processes compile all tests anew at every run.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: capture analyze test test-policies test-remote test-slurm test-thorough check unit package setup setup-analyze schemas clean
+.PHONY: capture analyze test test-policies test-remote test-slurm test-thorough check unit package audit setup setup-analyze schemas clean
 
 capture: .venv/capture-installed
 	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --store $(STORE) \
@@ -79,6 +79,10 @@ test-remote: .venv-remote/installed
 test-slurm:
 	@sinfo >/dev/null 2>&1 || { echo "make test-slurm needs a running SLURM: sinfo does not answer here (is SLURM_CONF set?)." >&2; exit 2; }
 	VLA_TEST_SLURM=1 $(if $(wildcard $(BIN)/pytest),$(BIN)/)pytest tests/end_to_end/test_slurm_array.py tests/end_to_end/test_slurm_dask.py $(ARGS)
+
+# What is installed, against the databases of known vulnerabilities; ends with 2 where none of them is reachable.
+audit: .venv/capture-installed .venv-audit/installed
+	$(BIN)/python scripts/audit.py --program .venv-audit/bin/pip-audit
 
 schemas: .venv/capture-installed
 	$(BIN)/python -m vla_attention.schemas.json_files
@@ -125,5 +129,11 @@ setup-analyze: .venv/analyze-installed
 	.venv-remote/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[remote]' 'moto[server]>=5' pytest hypothesis
 	@touch $@
 
+.venv-audit/installed:
+	@echo "Installing pip-audit into .venv-audit ..."
+	$(PYTHON) -m venv .venv-audit
+	.venv-audit/bin/python -m pip install --quiet --disable-pip-version-check 'pip-audit>=2.9'
+	@touch $@
+
 clean:
-	rm -rf .venv .venv-transformers .venv-lerobot .venv-remote build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-transformers .venv-lerobot .venv-remote .venv-audit build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

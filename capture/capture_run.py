@@ -23,7 +23,7 @@ from vla_attention.capture.jobs.worker_records import (
     planned_tasks,
     read_records,
 )
-from vla_attention.capture.policies.identity import announcement
+from vla_attention.capture.policies.identity import announcement, downloads_of
 from vla_attention.capture.policies.policy import BatchPolicy, Policy, is_compiled, stored_picture_sizes
 from vla_attention.capture.provenance import POLICY_BATCH, describe_machine
 from vla_attention.capture.rollout.episode import EpisodeResult, EpisodeRun, check_protocol, max_replans
@@ -144,7 +144,7 @@ def _record_missing(
         check_initial_state_index(task, settings.num_episodes - 1)
     changes = plan_changes(settings, policy, tasks)
     largest_batch = _policy_batch(settings, policy, device)
-    machine = describe_machine(device)
+    machine = describe_machine(device) | downloads_of(policy)
     attributes = RootAttributes(
         format=FORMAT_NAME,
         store_version=STORE_VERSION,

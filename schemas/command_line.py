@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import NoReturn
 
 from vla_attention.schemas.errors import UserError
-from vla_attention.schemas.safe_text import visible_output
+from vla_attention.schemas.safe_text import visible, visible_output
 
 #: Columns of a help text's description.
 _HELP_WIDTH = 100
@@ -57,7 +57,8 @@ def _run(program: str, command: Callable[[], int], if_stopped: str) -> int:
     try:
         return command()
     except UserError as error:
-        print(f"{program}: {error}", file=sys.stderr)
+        # One line, whatever a name in it holds: a line of its own could pass for another message.
+        print(f"{program}: {visible(str(error))}", file=sys.stderr)
         return 2
     except BrokenPipeError:  # `| head` has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter complains when it flushes

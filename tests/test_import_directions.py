@@ -33,6 +33,7 @@ LEVELS = {
     "analyze.__main__": 7,
     "capture.environments": 1,
     "capture.store": 1,
+    "capture.foreign_files": 1,
     "capture.memory": 1,
     "capture.provenance": 1,
     "capture.interventions": 3,

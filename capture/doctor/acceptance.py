@@ -39,7 +39,7 @@ def find_published_rate(
                 f"Cannot use --published-rate {given}; expected a share above 0, at most 1, such as 0.97."
             )
         return PublishedRate(checkpoint, suite or family.default_suite, round(500 * given), 500, "--published-rate")
-    name = PurePath(checkpoint.rstrip("/")).name
+    name = PurePath(checkpoint.rstrip("/")).name.partition("@")[0]
     known = [rate for rate in family.published_rates if PurePath(rate.checkpoint).name == name]
     of_suite = [rate for rate in known if suite in (None, rate.suite)]
     if of_suite:

@@ -13,9 +13,18 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import ROBOT, EnvironmentSettings, Task
 from vla_attention.capture.environments.libero_installation import find_assets, load_libero, package_folder
+from vla_attention.capture.environments.libero_task_file import UnusableTask, check_task_file
 from vla_attention.capture.environments.simulator import SimulatedEnvironment
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.capture.foreign_files.regular_files import check_regular
+from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.groupings.vocabulary import SceneObject
+
+#: Bytes of a file of initial states; 50 states of LIBERO have 30 kB.
+MAX_STATES_BYTES = 64_000_000
+
+
+class UnusableInitialStates(UserError, ValueError):
+    """The file with the initial states of a task is missing, damaged, or something else."""
 
 
 def load_initial_states(path: Path) -> NDArray[np.float64]:
@@ -23,8 +32,12 @@ def load_initial_states(path: Path) -> NDArray[np.float64]:
 
     The files are pickles, written by torch.save, of a numpy array. torch's restricted reader opens them if the few
     numpy functions that rebuild an array are allowed, by their names in numpy 1. No other code in a file can run.
+
+    Raises:
+        UnusableInitialStates: the file is missing, damaged, or holds anything else.
     """
-    import torch
+    from vla_attention.capture.foreign_files.pickles import ARRAYS, PickleRefused
+    from vla_attention.capture.foreign_files.torch_files import load_torch
 
     rebuild = np.empty(0).__reduce__()[0]
     allowed: list[Any] = [
@@ -34,9 +47,31 @@ def load_initial_states(path: Path) -> NDArray[np.float64]:
         np.dtype,
         type(np.dtype(np.float64)),
     ]
-    with torch.serialization.safe_globals(allowed):
-        states = torch.load(path, map_location="cpu", weights_only=True)
-    return np.asarray(states, dtype=np.float64)
+    install_again = "install LIBERO again with 'make setup'"
+    try:
+        size = check_regular(path, UnusableInitialStates)
+        if size > MAX_STATES_BYTES:
+            raise UnusableInitialStates(
+                f"'{path}' has {size} bytes; initial states of {MAX_STATES_BYTES} at most are read."
+            )
+        states = np.asarray(load_torch(path, ARRAYS, allowed), dtype=np.float64)
+    except FileNotFoundError:
+        raise UnusableInitialStates(f"There are no initial states at '{path}'; {install_again}.") from None
+    except PickleRefused as error:
+        raise UnusableInitialStates(
+            f"The initial states in '{path}' were refused: the file {error}; nothing of it was executed. To get them "
+            f"anew, {install_again}."
+        ) from error
+    except (TypeError, ValueError, OSError) as error:
+        if isinstance(error, UserError):
+            raise
+        raise UnusableInitialStates(f"'{path}' holds no initial states ({error}); {install_again}.") from error
+    if states.ndim != 2 or not np.isfinite(states).all():
+        raise UnusableInitialStates(
+            f"'{path}' holds numbers of shape {states.shape}, or NaN; expected (state, number), all finite: "
+            f"{install_again}."
+        )
+    return states
 
 
 def parent_of_region(name: str, known: Sequence[str]) -> str | None:
@@ -92,10 +127,28 @@ class LiberoEnvironment(SimulatedEnvironment):
         classes = load_libero(self._assets)
         from libero.libero.envs.bddl_utils import get_problem_info
 
-        task_file = str(package_folder() / "bddl_files" / self.task.suite / f"{self.task.name}.bddl")
-        problem = get_problem_info(task_file)["problem_name"]
+        path = package_folder() / "bddl_files" / self.task.suite / f"{self.task.name}.bddl"
+        try:
+            check_task_file(path)
+            problem = get_problem_info(str(path))["problem_name"]
+            environment = classes[problem]
+        except UserError:
+            raise
+        except Exception as error:  # LIBERO's parser raises what its own code meets
+            raise UnusableTask(
+                f"The task file '{path}' cannot be read ({type(error).__name__}: {error}); install LIBERO again with "
+                "'make setup'."
+            ) from error
         # The stored state sets the robot's joints, so they need no noise.
-        return self._construct(classes[problem], task_file, initialization_noise=None, **options)
+        try:
+            return self._construct(environment, str(path), initialization_noise=None, **options)
+        except UserError:
+            raise
+        except Exception as error:  # MuJoCo's and LIBERO's own, for a scene that their files do not make
+            raise UnusableTask(
+                f"The scene of '{self.task.name}' cannot be built from '{path}' and the assets in '{self._assets}' "
+                f"({type(error).__name__}: {error})."
+            ) from error
 
     def _reset_seed(self, initial_state_index: int, seed: int) -> int:
         return {"once per task": seed, "per episode": seed + initial_state_index, "always 0": 0}[self._protocol.seeding]

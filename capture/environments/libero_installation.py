@@ -23,6 +23,7 @@ from typing import Any
 
 from vla_attention.capture.environments.base import Suite, Task
 from vla_attention.capture.environments.robosuite_installation import import_robosuite, readable_device_choice
+from vla_attention.capture.foreign_files.regular_files import check_folder
 from vla_attention.schemas.errors import MissingDependency, UserError
 
 ASSETS_VARIABLE = "VLA_LIBERO_ASSETS"
@@ -107,6 +108,7 @@ def find_assets(configured: Path | None) -> Path:
                     f"The LIBERO asset folder '{folder}' ({origin}) {problem}; give the folder that holds "
                     f"{', '.join(ASSET_SUBFOLDERS)}, for example a copy of the hub dataset {ASSETS_SOURCE}."
                 )
+            _check_assets(folder.resolve())
             return folder.resolve()
     own_places = (package_folder() / "assets", Path.home() / ".cache" / "libero" / "assets")
     for folder in own_places:
@@ -116,6 +118,12 @@ def find_assets(configured: Path | None) -> Path:
         f"No LIBERO assets (scenes, objects, textures) were found in {own_places[0]} or {own_places[1]}; download the "
         f"hub dataset {ASSETS_SOURCE} and give its folder with --libero-assets PATH or {ASSETS_VARIABLE}=PATH."
     )
+
+
+@functools.cache
+def _check_assets(folder: Path) -> None:
+    """Raise `LiberoAssetsMissing` for pipes and devices among the assets, which MuJoCo opens by itself."""
+    check_folder(folder, LiberoAssetsMissing, inside=False)
 
 
 def load_libero(assets: Path) -> dict[str, Any]:

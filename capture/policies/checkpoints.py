@@ -2,11 +2,25 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from vla_attention.capture.foreign_files.json_objects import read_object
+from vla_attention.capture.foreign_files.regular_files import check_regular
 from vla_attention.schemas.errors import UserError
+
+#: Size of an axis, or a number of parts, that a checkpoint states. The largest of the models here is a vocabulary of
+#: 257,152.
+MAX_SIZE = 1_000_000
+#: Blocks of a transformer; each is made before the first tensor is compared. The models here have 28.
+MAX_BLOCKS = 500
+#: Steps, actions of a chunk, text slots: no tensor has their number, so that none is compared with it.
+MAX_STEPS = 10_000
+
+#: What values of wrong types raise when they are used.
+_WRONG_VALUES = (TypeError, ValueError, KeyError, IndexError, AttributeError, ArithmeticError, RecursionError)
 
 
 class CheckpointNotFound(UserError, FileNotFoundError):
@@ -28,11 +42,34 @@ class CheckpointMismatch(UserError, ValueError):
 def read_json_object(path: Path) -> dict[str, Any]:
     """Read a JSON file that holds an object; anything else is an `UnreadableCheckpoint`."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        return read_object(path, UnreadableCheckpoint, inside=path.parent)
     except FileNotFoundError:
         raise UnreadableCheckpoint(f"There is no '{path}', which the checkpoint needs.") from None
-    except (ValueError, OSError) as error:
-        raise UnreadableCheckpoint(f"'{path}' is not valid JSON ({error}).") from error
-    if not isinstance(content, dict):
-        raise UnreadableCheckpoint(f"'{path}' should hold a JSON object, but holds a {type(content).__name__}.")
-    return content
+
+
+def check_checkpoint_file(path: Path) -> int:
+    """Return the size of a checkpoint's file in bytes; `UnreadableCheckpoint` if it is none, see `check_regular`."""
+    try:
+        return check_regular(path, UnreadableCheckpoint, inside=path.parent)
+    except FileNotFoundError:
+        raise UnreadableCheckpoint(f"There is no '{path}', which the checkpoint needs.") from None
+
+
+@contextmanager
+def values_of(path: Path) -> Iterator[None]:
+    """Turn what values of wrong types raise into an `UnreadableCheckpoint` that names their file."""
+    try:
+        yield
+    except UserError:
+        raise
+    except _WRONG_VALUES as error:
+        raise UnreadableCheckpoint(
+            f"'{path}' has values of other types or sizes than a checkpoint's ({type(error).__name__}: {error})."
+        ) from error
+
+
+def check_size(what: str, value: object, most: int = MAX_SIZE, *, least: int = 1) -> int:
+    """Return a whole number that a checkpoint states, or raise `UnreadableCheckpoint`. what: begins the sentence."""
+    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
+        raise UnreadableCheckpoint(f"{what} is {value!r}; expected a whole number from {least} to {most}.")
+    return value

@@ -1,17 +1,24 @@
-"""Repositories of the Hugging Face hub: names, the local cache, and downloads with the hub's own client."""
+"""Repositories of the Hugging Face hub: names, the local cache, and downloads with the hub's own client.
+
+A name stands for files that their owner may replace at any time. What is downloaded is of one commit, and the store
+says which (`downloads`).
+"""
 
 from __future__ import annotations
 
 import os
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from vla_attention.schemas.errors import MissingDependency, UserError
 
-#: `ORG/NAME`.
-HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
+#: `ORG/NAME`, or `ORG/NAME@REVISION` with a commit, a branch or a tag.
+HUB_NAME = re.compile(r"([A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)(?:@([A-Za-z0-9][\w./-]*))?")
+_COMMIT = re.compile(r"[0-9a-f]{40}")
+_SNAPSHOTS = "snapshots"
 
 
 class CheckpointUnavailable(UserError, ConnectionError):
@@ -26,16 +33,71 @@ def hub_cache() -> Path:
 
 def snapshots_folder(repository: str) -> Path:
     """Return the folder for a repository's downloaded versions; it may not exist."""
-    return hub_cache() / f"models--{repository.replace('/', '--')}" / "snapshots"
+    return hub_cache() / f"models--{repository.replace('/', '--')}" / _SNAPSHOTS
+
+
+def in_hub_cache(repository: str, file: str) -> Path | None:
+    """Return a file of a repository that was downloaded before, or None.
+
+    Of several versions, that of the branch `main` at its last download is taken, else the first in the order of their
+    commits.
+    """
+    snapshots = snapshots_folder(repository)
+    found = {path.relative_to(snapshots).parts[0]: path for path in sorted(snapshots.glob(f"*/{file}"))}
+    try:
+        newest = (snapshots.parent / "refs" / "main").read_text(encoding="ascii").strip()
+    except (OSError, ValueError):
+        newest = ""
+    return found.get(newest) or next(iter(found.values()), None)
+
+
+@dataclass(frozen=True)
+class HubVersion:
+    """A version of a repository: its name, and the commit of its files."""
+
+    repository: str
+    commit: str
+
+    def __str__(self) -> str:
+        return f"{self.repository}@{self.commit}"
+
+
+def hub_version(path: Path) -> HubVersion | None:
+    """Return which version a file or folder in the hub's cache belongs to, or None for one that is elsewhere."""
+    parts = path.absolute().parts
+    for folder, above, commit in zip(parts, parts[1:], parts[2:], strict=False):
+        kind, _, name = folder.partition("--")
+        if above == _SNAPSHOTS and kind in ("models", "datasets") and _COMMIT.fullmatch(commit):
+            return HubVersion(name.replace("--", "/", 1), commit)
+    return None
+
+
+def downloads(*paths: Path | None) -> dict[str, str]:
+    """Return for a store's provenance which commit of which repository files are of, without those from elsewhere."""
+    versions = [hub_version(path) for path in paths if path is not None]
+    return {f"hub {version.repository}": version.commit for version in versions if version is not None}
+
+
+def split_hub_name(name: str) -> tuple[str, str | None] | None:
+    """Return repository and revision (None: the newest) of a name on the hub, or None for any other text."""
+    match = HUB_NAME.fullmatch(name)
+    return None if match is None else (match[1], match[2])
 
 
 def fetch_from_hub(
-    repository: str, patterns: Sequence[str], how: str, kind: Literal["model", "dataset"] = "model"
+    repository: str,
+    patterns: Sequence[str],
+    how: str,
+    kind: Literal["model", "dataset"] = "model",
+    revision: str | None = None,
 ) -> Path:
     """Return the folder of a repository's files that match the patterns, downloaded unless they are in the cache.
 
-    how: ends an error message with another way to get the files. kind: of the repository. Raises `MissingDependency`
-    without the client, `CheckpointUnavailable` if the download fails.
+    All files of one call are of one commit, which `hub_version` gives; a later call with this commit as its revision
+    gives files of the same.
+
+    how: ends an error message with another way to get the files. kind: of the repository. revision: a commit, branch or
+    tag; None: the newest. Raises `MissingDependency` without the client, `CheckpointUnavailable` if the download fails.
     """
     try:
         from huggingface_hub import snapshot_download
@@ -45,11 +107,13 @@ def fetch_from_hub(
             f"`pip install 'vla-attention[hub]'`, or {how}."
         ) from error
     try:
-        return Path(snapshot_download(repository, repo_type=kind, allow_patterns=list(patterns)))
+        folder = snapshot_download(repository, repo_type=kind, revision=revision, allow_patterns=list(patterns))
     except Exception as error:  # the client's own errors, those of its HTTP library, and OSError
+        version = "" if revision is None else f" at '{revision}'"
         raise CheckpointUnavailable(
-            f"'{repository}' could not be fetched from the Hugging Face hub ({first_line(error)}); {how}."
+            f"'{repository}'{version} could not be fetched from the Hugging Face hub ({first_line(error)}); {how}."
         ) from error
+    return Path(folder)
 
 
 def first_line(error: BaseException) -> str:

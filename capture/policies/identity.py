@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from vla_attention.schemas.stores.store_format import PolicyIdentity
@@ -15,8 +16,9 @@ if TYPE_CHECKING:
 class PolicySource:
     """The source of a policy's weights.
 
-    checkpoint: a path, a name on a hub, or a description of random weights. untrained: the weights are random.
-    configuration: the source of sizes and layout: the checkpoint itself, a named configuration, a case.json.
+    checkpoint: a path, a name on a hub with the commit (`ORG/NAME@COMMIT`), or a description of random weights.
+    untrained: the weights are random. configuration: the source of sizes and layout: the checkpoint itself, a named
+    configuration, a case.json. downloads: the commits of all files from the hub, for a store's provenance.
     """
 
     name: str
@@ -24,6 +26,7 @@ class PolicySource:
     checkpoint_format: str
     untrained: bool
     configuration: str = "built in"
+    downloads: Mapping[str, str] = field(default_factory=dict)
 
 
 def describe_policy(policy: Policy, source: PolicySource, digest: str, config: dict[str, Any]) -> PolicyIdentity:
@@ -46,6 +49,12 @@ def describe_policy(policy: Policy, source: PolicySource, digest: str, config: d
         cameras=policy.cameras,
         config={"configuration": source.configuration, **config},
     )
+
+
+def downloads_of(policy: object) -> dict[str, str]:
+    """Return the commits of the files from the hub that a policy was built from, for a store's provenance."""
+    source = getattr(policy, "source", None)
+    return dict(source.downloads) if isinstance(source, PolicySource) else {}
 
 
 def announcement(identity: PolicyIdentity) -> list[str]:

@@ -6,14 +6,17 @@ import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
-from zipfile import BadZipFile
+from zipfile import ZipFile
 
 import numpy as np
 
+from vla_attention.capture.foreign_files.regular_files import check_regular
 from vla_attention.capture.policies.checkpoints import read_json_object
 from vla_attention.schemas.errors import UserError, listing
 
 CASE_FILE = "case.json"
+#: Bytes of the arrays in one file of a case; the largest case here has 20 MB.
+MAX_ARRAYS_BYTES = 400_000_000
 
 
 class UnusableCase(UserError, ValueError):
@@ -47,11 +50,20 @@ def read_case_file(folder: Path) -> dict[str, Any]:
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Return the arrays of an npz file by their names; `UnusableCase` if it is missing or damaged."""
     try:
+        check_regular(path, UnusableCase, inside=path.parent)
+        with ZipFile(path) as opened:
+            claimed = sum(member.file_size for member in opened.infolist())
+        if claimed > MAX_ARRAYS_BYTES:
+            raise UnusableCase(f"'{path}' holds {claimed} bytes of arrays; {MAX_ARRAYS_BYTES} at most are read.")
         with np.load(path, allow_pickle=False) as stored:
             return dict(stored)
+    except UserError:
+        raise
     except FileNotFoundError:
         raise UnusableCase(f"There is no '{path}', which a case needs.") from None
-    except (ValueError, OSError, EOFError, BadZipFile) as error:
+    except (
+        Exception
+    ) as error:  # a damaged zip, or an array whose header claims more than there is, raises almost anything
         raise UnusableCase(f"'{path}' cannot be read as arrays ({error}).") from error
 
 

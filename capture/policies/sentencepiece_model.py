@@ -8,8 +8,11 @@ from pathlib import Path
 
 import sentencepiece
 
+from vla_attention.capture.foreign_files.regular_files import check_regular
 from vla_attention.schemas.errors import UserError
 
+#: Bytes of a model. PaliGemma's, of 257,152 pieces, has 4.3 MB.
+MAX_MODEL_BYTES = 64_000_000
 #: The small model of the untrained policies that come with this package.
 EMBEDDED_TOKENIZER = Path(__file__).parent / "embedded" / "tokenizer.model"
 
@@ -37,8 +40,14 @@ class SentencepieceModel:
 
     def __init__(self, path: str | Path, needed: str):
         path = Path(path)
-        if not path.is_file():
-            raise TokenizerNotFound(f"There is no tokenizer file at '{path}'; {needed}.")
+        try:
+            size = check_regular(path, UnreadableTokenizer)
+        except FileNotFoundError:
+            raise TokenizerNotFound(f"There is no tokenizer file at '{path}'; {needed}.") from None
+        if size > MAX_MODEL_BYTES:
+            raise UnreadableTokenizer(
+                f"'{path}' has {size} bytes; a sentencepiece model of {MAX_MODEL_BYTES} at most is read."
+            )
         content = path.read_bytes()
         self.path = str(path)
         #: SHA-256 (hex) of the file

@@ -1,4 +1,4 @@
-"""Strict loading: a checkpoint has exactly the tensors of the model, or the error lists every difference."""
+"""Strict loading: a checkpoint has exactly the tensors of the model, or the error lists the differences."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch
+from vla_attention.schemas.errors import listing
 
+#: Names of one kind of difference that an error lists.
+_LISTED = 40
 Shapes = dict[str, tuple[int, ...]]
 Model = TypeVar("Model", bound=nn.Module)
 
@@ -26,7 +29,7 @@ def shapes_of(tensors: Mapping[str, Tensor]) -> Shapes:
 
 
 def check_shapes(found: Shapes, expected: Shapes, what: str = "the model") -> None:
-    """Raise `CheckpointMismatch` that lists every missing, extra and misshapen tensor, if there is any.
+    """Raise `CheckpointMismatch` that lists missing, extra and misshapen tensors, if there are any.
 
     what: the model or the part of it that needs the expected tensors.
     """
@@ -40,7 +43,7 @@ def check_shapes(found: Shapes, expected: Shapes, what: str = "the model") -> No
         ("extra", sorted(found.keys() - expected.keys())),
         ("of the wrong shape", misshapen),
     )
-    parts = [f"{len(names)} {fault}: {', '.join(names)}" for fault, names in faults if names]
+    parts = [f"{len(names)} {fault}: {listing(names, _LISTED)}" for fault, names in faults if names]
     if parts:
         raise CheckpointMismatch(f"The checkpoint's tensors are not those of {what}; {'; '.join(parts)}.")
 

@@ -8,6 +8,7 @@ from typing import cast
 
 from vla_attention.capture.capture_run import plan_recording
 from vla_attention.capture.policies.family import PolicyFamily
+from vla_attention.capture.policies.identity import downloads_of
 from vla_attention.capture.policies.policy import camera_grid
 from vla_attention.capture.provenance import describe_machine
 from vla_attention.capture.replay.lerobot_dataset import LeRobotDataset
@@ -40,7 +41,7 @@ def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: 
         protocol=plan.protocol(every),
         recording=recording,
         sites=policy.sites,
-        provenance=describe_machine(device) | decoder_version(),
+        provenance=describe_machine(device) | downloads_of(policy) | plan.data.downloads | decoder_version(),
         data_set=plan.source(columns_of(robot.cameras, robot.state, robot.actions)),
     )
     store = open_run(plan.store, attributes, plan.mode)

@@ -105,7 +105,7 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
         frames=settings.frames,
         knockout=None if of_attention.is_none else of_attention,
         allow_empty=arguments.allow_empty,
-        provenance=decoder_version(),
+        provenance=plan.data.downloads | decoder_version(),
         resume=plan.mode == "resume",
         overwrite=plan.mode == "overwrite",
     )

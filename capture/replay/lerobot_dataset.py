@@ -60,8 +60,17 @@ class DataSetFrame:
 class LeRobotDataset:
     """A data set: its columns, tasks and episodes. Made by `open_dataset`."""
 
-    def __init__(self, folder: Path, name: str, info: DataSetInfo, fetch: Fetch | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        name: str,
+        info: DataSetInfo,
+        fetch: Fetch | None = None,
+        downloads: Mapping[str, str] | None = None,
+    ) -> None:
         self.folder = folder
+        #: the commit of the files from the hub, for a store's provenance
+        self.downloads = dict(downloads or {})
         self.name = name
         self.info = info
         self._fetch = fetch
@@ -338,7 +347,7 @@ class DataSetEpisode:
 
 
 def open_dataset(name: str | Path) -> LeRobotDataset:
-    """Open a LeRobotDataset: a folder, or `ORG/NAME` of the Hugging Face hub.
+    """Open a LeRobotDataset: a folder, or `ORG/NAME` or `ORG/NAME@REVISION` of the Hugging Face hub.
 
     From the hub, only the meta files are fetched now, and the files of an episode when it is read. A copy that LeRobot
     made is used.
@@ -348,28 +357,33 @@ def open_dataset(name: str | Path) -> LeRobotDataset:
         MissingDependency, CheckpointUnavailable: the hub's client is missing, or the download failed.
     """
     # Imported here: a folder needs none of it.
-    from vla_attention.capture.policies.hub import HUB_NAME, fetch_from_hub
+    from vla_attention.capture.policies.hub import downloads, fetch_from_hub, hub_version, split_hub_name
 
     folder = Path(name).expanduser()
-    if folder.is_dir() or not HUB_NAME.fullmatch(str(name)):
+    on_hub = split_hub_name(str(name))
+    if folder.is_dir() or on_hub is None:
         if not folder.exists():
             raise DataSetNotFound(f"There is no data set at '{name}'; give a folder, or ORG/NAME of the hub.")
         return LeRobotDataset(folder, folder.resolve().name, read_info(folder))
-    repository = str(name)
+    repository, revision = on_hub
     copy = _lerobot_home() / repository
-    if (copy / INFO).is_file():
+    if revision is None and (copy / INFO).is_file():
         return LeRobotDataset(copy, repository, read_info(copy))
     how = (
         f"fetch it where there is a network with `hf download --repo-type dataset {name}`, copy the folder here and "
         "give its path (there is no such local folder)"
     )
 
+    folder = fetch_from_hub(repository, META_FILES, how, kind="dataset", revision=revision)
+    version = hub_version(folder)
+    # The files of episodes are of the same commit as the meta files, whatever is uploaded meanwhile.
+    commit = revision if version is None else version.commit
+
     def fetch(paths: Sequence[str]) -> None:
         if paths:
-            fetch_from_hub(repository, paths, how, kind="dataset")
+            fetch_from_hub(repository, paths, how, kind="dataset", revision=commit)
 
-    folder = fetch_from_hub(repository, META_FILES, how, kind="dataset")
-    return LeRobotDataset(folder, repository, read_info(folder), fetch)
+    return LeRobotDataset(folder, repository, read_info(folder), fetch, downloads(folder))
 
 
 def _lerobot_home() -> Path:

@@ -11,6 +11,7 @@ from vla_attention.capture.device import load_torch
 from vla_attention.capture.interventions.resolution import check_not_compiled, check_places, interventions_for
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.family import PolicyFamily
+from vla_attention.capture.policies.identity import downloads_of
 from vla_attention.capture.provenance import describe_machine
 from vla_attention.capture.rerun.base_store import check_may_change, open_base
 from vla_attention.capture.rerun.interventions_of_rerun import check_on_store, rerun_interventions
@@ -108,4 +109,4 @@ def _prepare(arguments: argparse.Namespace, base: Store, threads: Threads, termi
     if note:
         say(note)
     say(f"Policy: {identity.name} ({identity.checkpoint_format}: {identity.checkpoint}), weights as in {base.path}.")
-    return Rerun(policy, base, recording, describe_machine(device), termination)
+    return Rerun(policy, base, recording, describe_machine(device) | downloads_of(policy), termination)

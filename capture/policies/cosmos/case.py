@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from vla_attention.capture.policies.checkpoints import values_of
 from vla_attention.capture.policies.cosmos.config import (
     LIBERO_FRAMES,
     CosmosConfig,
@@ -60,9 +61,18 @@ class CosmosCase:
             raise UnusableCase(f"'{self.folder / CASE_FILE}' does not state '{name}'.")
         return self.facts[name]
 
+    def file(self, name: str) -> Path:
+        """Return the path of a file that case.json names, which is beside it."""
+        stated = self.fact(name)
+        if not isinstance(stated, str) or Path(stated).name != stated:
+            raise UnusableCase(
+                f"'{self.folder / CASE_FILE}' has {name} {stated!r}; expected the name of a file beside it."
+            )
+        return self.folder / stated
+
     def weights(self) -> tuple[DitConfig, dict[str, Any]]:
         """Return the transformer's sizes and its weights by model name; the sizes are checked against case.json."""
-        weights = dit_tensors(read_tensors(self.folder / self.fact("state_dict")))
+        weights = dit_tensors(read_tensors(self.file("state_dict")))
         stated = self.fact("net_config")
         base = DitConfig(
             patch_size=stated.get("patch_spatial", 2),
@@ -91,6 +101,10 @@ class CosmosCase:
 
     def build_model(self, device: str) -> CosmosModel:
         """Build the case's transformer and image encoder in float32."""
+        with values_of(self.folder / CASE_FILE):
+            return self._build_model(device)
+
+    def _build_model(self, device: str) -> CosmosModel:
         dit_config, weights = self.weights()
         vae = self.fact("vae_config")
         vae_config = VaeConfig(
@@ -116,7 +130,7 @@ class CosmosCase:
             action_dim=self.fact("action_dim"),
             proprio_dim=len(self.inputs["proprio"]),
         )
-        vae_state = read_tensors(self.folder / self.fact("vae_state_dict"))
+        vae_state = read_tensors(self.file("vae_state_dict"))
         encoder = build_encoder(vae_config, vae_state, device=device)
         return CosmosModel(config, build_dit(dit_config, weights, device=device), encoder)
 
@@ -144,6 +158,8 @@ def read_case(folder: str | Path) -> CosmosCase:
     if facts.get("dtype", "float32") != "float32":
         raise UnusableCase(f"'{folder / CASE_FILE}' says dtype '{facts['dtype']}'; expected float32.")
     stated = facts.get("net_config", {})
+    if not isinstance(stated, dict):
+        raise UnusableCase(f"'{folder / CASE_FILE}' has the net_config {stated!r}; expected a table of sizes.")
     for name, value in _FIXED.items():
         if stated.get(name, value) != value:
             raise UnusableCase(

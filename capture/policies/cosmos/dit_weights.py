@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vla_attention.capture.policies.checkpoints import CheckpointMismatch
+from vla_attention.capture.policies.checkpoints import MAX_BLOCKS, MAX_SIZE, CheckpointMismatch, check_size
 from vla_attention.capture.policies.cosmos.config import DitConfig
 from vla_attention.capture.policies.cosmos.dit import Dit
 from vla_attention.capture.policies.cosmos.tensor_files import UnreadableTensors
@@ -40,6 +40,11 @@ def dit_tensors(stored: Mapping[str, Any]) -> dict[str, Tensor]:
             continue
         if not isinstance(value, Tensor):
             raise UnreadableTensors(f"'{name}' of the checkpoint is no tensor, but {type(value).__name__}.")
+        if not value.is_floating_point() or value.element_size() < 2:
+            raise CheckpointMismatch(
+                f"'{name}' of the checkpoint has numbers of type {value.dtype}; expected floating point numbers of 16 "
+                "bits or more: use the checkpoint before it was quantized."
+            )
         weights[plain] = value
     return weights
 
@@ -48,30 +53,33 @@ def infer_dit_config(weights: Mapping[str, Tensor], base: DitConfig | None = Non
     """Return the sizes of the weights. Rotary factors and patch size, which no weight states, are those of `base`."""
     base = base or DitConfig()
 
-    def shape(name: str) -> tuple[int, ...]:
+    def size(name: str, axis: int, least: int = 1) -> int:
         if name not in weights:
             raise CheckpointMismatch(
                 f"The checkpoint has no '{name}', so it is no Cosmos transformer; it has {listing(sorted(weights), 4)}."
             )
-        return tuple(weights[name].shape)
+        shape = tuple(weights[name].shape)
+        if len(shape) <= axis:
+            raise CheckpointMismatch(f"The checkpoint's '{name}' has shape {shape}, from which a size cannot be read.")
+        return check_size(f"Axis {axis} of the checkpoint's '{name}'", shape[axis], MAX_SIZE, least=least)
 
     patch = base.patch_size**2
-    width, features = shape("x_embedder.proj.1.weight")
-    blocks = {
-        int(name.split(".")[1]) for name in weights if name.startswith("blocks.") and name.split(".")[1].isdigit()
-    }
-    head_dim = shape("blocks.0.self_attn.q_norm.weight")[0]
+    embedder = "x_embedder.proj.1.weight"
+    width, features = size(embedder, 0), size(embedder, 1, least=3 * patch)
+    blocks = {name.split(".")[1] for name in weights if name.startswith("blocks.")}
+    head_dim = size("blocks.0.self_attn.q_norm.weight", 0)
     return DitConfig(
         width=width,
-        num_blocks=max(blocks) + 1,
-        num_heads=width // head_dim,
-        mlp_dim=shape("blocks.0.mlp.layer1.weight")[0],
-        text_dim=shape("blocks.0.cross_attn.k_proj.weight")[1],
-        adaln_dim=shape("blocks.0.adaln_modulation_mlp.1.weight")[0],
+        # Their numbers are compared with the model's when all names are.
+        num_blocks=check_size("The number of blocks of the checkpoint", len(blocks), MAX_BLOCKS),
+        num_heads=max(1, width // head_dim),
+        mlp_dim=size("blocks.0.mlp.layer1.weight", 0),
+        text_dim=size("blocks.0.cross_attn.k_proj.weight", 1),
+        adaln_dim=size("blocks.0.adaln_modulation_mlp.1.weight", 0),
         in_channels=features // patch - 2,
-        out_channels=shape("final_layer.linear.weight")[0] // patch,
+        out_channels=size("final_layer.linear.weight", 0, least=patch) // patch,
         patch_size=base.patch_size,
-        max_positions=shape("pos_embedder.seq")[0],
+        max_positions=size("pos_embedder.seq", 0),
         rope_t_extrapolation=base.rope_t_extrapolation,
         rope_h_extrapolation=base.rope_h_extrapolation,
         rope_w_extrapolation=base.rope_w_extrapolation,

@@ -29,6 +29,7 @@ from vla_attention.capture.policies.cosmos.t5_pickle import read_embeddings
 from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
 from vla_attention.capture.policies.cosmos.text import PieceTokenizer, PrecomputedText
 from vla_attention.capture.policies.cosmos.vae import build_encoder, infer_vae_config
+from vla_attention.capture.policies.hub import downloads, hub_version
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.schemas.errors import BadArgument
 
@@ -85,10 +86,10 @@ def load_cosmos_policy(
     place = find_checkpoint(checkpoint)
     # Small files first: if one is missing, the minutes for loading the weights are saved.
     weights_path = find_weights(place)
-    statistics = read_statistics(
-        find_beside(place, options.statistics_path, STATISTICS_NAME), base.action_dim, base.proprio_dim
-    )
-    embeddings = read_embeddings(find_beside(place, options.embeddings_path, EMBEDDINGS_NAME))
+    statistics_path = find_beside(place, options.statistics_path, STATISTICS_NAME)
+    statistics = read_statistics(statistics_path, base.action_dim, base.proprio_dim)
+    embeddings_path = find_beside(place, options.embeddings_path, EMBEDDINGS_NAME)
+    embeddings = read_embeddings(embeddings_path)
     encoder = T5Encoder(options.t5_encoder) if options.t5_encoder is not None else None
     # The folder of an encoder also has the tokenizer.
     tokenizer_path = find_t5_tokenizer(place, options.t5_tokenizer or options.t5_encoder)
@@ -122,12 +123,15 @@ def load_cosmos_policy(
         build_dit(config.dit, weights, dtype=dtype, device=device),
         build_encoder(config.vae, vae_state, dtype=dtype, device=device),
     )
+    version = hub_version(place) if from_hub else None
     source = PolicySource(
         name="cosmos",
-        checkpoint=str(checkpoint),
+        # A name on the hub stands for other files tomorrow; with the commit it does not.
+        checkpoint=str(version or checkpoint),
         checkpoint_format=weights_path.suffix.removeprefix("."),
         untrained=False,
         configuration=options.config_name,
+        downloads=downloads(weights_path, vae_path, statistics_path, embeddings_path, tokenizer_path),
     )
     tokenizer = PieceTokenizer(tokenizer_path) if tokenizer_path is not None else None
     return CosmosPolicy(

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
-from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnsupportedCheckpoint
-from vla_attention.capture.policies.hub import HUB_NAME, fetch_from_hub, snapshots_folder
+from vla_attention.capture.foreign_files.regular_files import check_regular
+from vla_attention.capture.policies.checkpoints import (
+    CheckpointNotFound,
+    UnreadableCheckpoint,
+    UnsupportedCheckpoint,
+    check_checkpoint_file,
+)
+from vla_attention.capture.policies.hub import fetch_from_hub, in_hub_cache, split_hub_name
 from vla_attention.schemas.errors import BadArgument, listing
 
 POLICY_REPOSITORY = "nvidia/Cosmos-Policy-LIBERO-Predict2-2B"
@@ -19,39 +26,36 @@ T5_REPOSITORIES = ("google-t5/t5-11b", "google-t5/t5-small", "google-t5/t5-base"
 T5_TOKENIZER = "spiece.model"
 
 
-def in_hub_cache(repository: str, file: str) -> Path | None:
-    """Return a file of a repository that was downloaded before, or None."""
-    found = sorted(snapshots_folder(repository).glob(f"*/{file}"))
-    return found[-1] if found else None
-
-
 def find_checkpoint(name: str) -> Path:
-    """Return the folder (or the file of weights) that `--ckpt-path` names: a local path, or `ORG/NAME` of the hub.
+    """Return the folder (or the file of weights) that `--ckpt-path` names.
 
-    Files that are not in the hub's cache are downloaded; `CheckpointUnavailable` if that fails.
+    It is a local path, or `ORG/NAME` or `ORG/NAME@COMMIT` of the hub. Files that are not in the hub's cache
+    are downloaded; `CheckpointUnavailable` if that fails.
     """
     path = Path(name).expanduser()
     if path.exists():
         return path
-    if HUB_NAME.fullmatch(name):
-        return _from_hub(name, ["*.pt", STATISTICS_NAME, EMBEDDINGS_NAME])
+    on_hub = split_hub_name(name)
+    if on_hub is not None:
+        return _from_hub(on_hub[0], ["*.pt", STATISTICS_NAME, EMBEDDINGS_NAME], on_hub[1])
     raise CheckpointNotFound(
         f"There is no checkpoint at '{path}'; give a folder with a .pt file, {STATISTICS_NAME} and {EMBEDDINGS_NAME}, "
         f"or {POLICY_REPOSITORY}."
     )
 
 
-def _from_hub(repository: str, patterns: list[str]) -> Path:
+def _from_hub(repository: str, patterns: list[str], revision: str | None = None) -> Path:
     how = (
         f"fetch {listing(patterns)} of it where there is a network (`hf download {repository}`), copy the folder here "
         "and give its path (there is no such local folder)"
     )
-    return fetch_from_hub(repository, patterns, how)
+    return fetch_from_hub(repository, patterns, how, revision=revision)
 
 
 def find_weights(checkpoint: Path) -> Path:
     """Return the transformer's file of a checkpoint folder: the one `.pt` file in it."""
-    if checkpoint.is_file():
+    if not checkpoint.is_dir():
+        check_regular(checkpoint, UnreadableCheckpoint)
         return checkpoint
     if (checkpoint / "model").is_dir():
         raise UnsupportedCheckpoint(
@@ -66,6 +70,7 @@ def find_weights(checkpoint: Path) -> Path:
             f"The checkpoint '{checkpoint}' has {what}; expected one, and found {inside}."
             + (" Give one of them as --ckpt-path." if found else "")
         )
+    check_checkpoint_file(found[0])
     return found[0]
 
 
@@ -95,6 +100,8 @@ def find_beside(checkpoint: Path, given: str | None, name: str) -> Path:
     """Return a file of the checkpoint's folder, or the given one: a path, or ORG/NAME/FILE in the hub's cache."""
     folder = checkpoint if checkpoint.is_dir() else checkpoint.parent
     if given is None:
+        if os.path.lexists(folder / name):
+            check_checkpoint_file(folder / name)
         return folder / name
     path = Path(given).expanduser()
     if path.exists() or given.count("/") != 2:

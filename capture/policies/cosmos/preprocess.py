@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from vla_attention.capture.foreign_files.json_objects import read_object
 from vla_attention.schemas.errors import BadArgument, UserError
 
 JPEG_QUALITY = 95
@@ -112,7 +112,7 @@ def make_statistics(content: Mapping[str, object], where: str, action_dim: int, 
             raise BadStatistics(f"The dataset statistics {where} have no '{name}'.")
         try:
             array = np.asarray(content[name], dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise BadStatistics(f"'{name}' of the dataset statistics {where} is no list of numbers.") from None
         dim = action_dim if name.startswith("actions") else proprio_dim
         if array.shape != (dim,) or not np.isfinite(array).all():
@@ -130,17 +130,13 @@ def make_statistics(content: Mapping[str, object], where: str, action_dim: int, 
 def read_statistics(path: str | Path, action_dim: int = 7, proprio_dim: int = 9) -> Statistics:
     """Read a file of dataset statistics (JSON)."""
     path = Path(path)
-    if not path.is_file():
+    try:
+        content = read_object(path, BadStatistics)
+    except FileNotFoundError:
         raise StatisticsNotFound(
             f"There are no dataset statistics at '{path}'; give --dataset-stats-path (libero_dataset_statistics.json "
             "of the checkpoint)."
-        )
-    try:
-        content = json.loads(path.read_text())
-    except (ValueError, OSError) as error:
-        raise BadStatistics(f"'{path}' cannot be read as JSON ({error}).") from error
-    if not isinstance(content, dict):
-        raise BadStatistics(f"'{path}' holds no dataset statistics, but a {type(content).__name__}.")
+        ) from None
     return make_statistics(content, f"in '{path}'", action_dim, proprio_dim)
 
 

@@ -10,12 +10,21 @@ import pickle
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, BinaryIO, NoReturn
 
-import torch
 import torch._utils
 from torch import Tensor
 
+from vla_attention.capture.foreign_files.pickles import (
+    TENSORS,
+    Check,
+    PickleRefused,
+    anything,
+    check_pickle,
+    nothing,
+)
+from vla_attention.capture.foreign_files.regular_files import check_regular
+from vla_attention.capture.foreign_files.torch_files import check_tensors, load_torch
 from vla_attention.capture.policies.cosmos.tensor_files import RefusedPickle
 from vla_attention.schemas.errors import UnknownName, UserError, listing
 
@@ -30,7 +39,7 @@ class BadEmbeddings(UserError, ValueError):
 
 def _load_storage(content: bytes) -> Any:
     """Read a storage with PyTorch's own restricted reader, on the CPU; replaces the pickle's `_load_from_bytes`."""
-    return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    return load_torch(io.BytesIO(content), TENSORS)
 
 
 #: The only functions that such a file may call.
@@ -41,6 +50,12 @@ _ALLOWED: dict[tuple[str, str], Callable[..., Any]] = {
 }
 
 
+#: The same by their names in the pickle, with what their arguments have to be.
+_CALLS: dict[str, Check] = {".".join(name): nothing if name[1] == "OrderedDict" else anything for name in _ALLOWED}
+#: Bytes of a file. One embedding of T5-11b has 1 MB; LIBERO has 130 tasks.
+MAX_EMBEDDINGS_BYTES = 2_000_000_000
+
+
 class _RestrictedUnpickler(pickle.Unpickler):
     """Reads tensors only; any other object is refused before it is created."""
 
@@ -48,12 +63,12 @@ class _RestrictedUnpickler(pickle.Unpickler):
         """Return one of the allowed functions; `RefusedPickle` for any other."""
         allowed = _ALLOWED.get((module, name))
         if allowed is None:
-            raise RefusedPickle(f"it asks for {module}.{name}")
+            raise RefusedPickle(f"asks for {module}.{name}")
         return allowed
 
     def persistent_load(self, identifier: Any) -> NoReturn:
         """Raise `RefusedPickle`: a file of embeddings needs nothing outside itself."""
-        raise RefusedPickle("it refers to something outside itself")
+        raise RefusedPickle("refers to something outside itself")
 
 
 @dataclass(frozen=True)
@@ -90,22 +105,36 @@ def read_embeddings(path: str | Path) -> TextEmbeddings:
     tensors.
     """
     path = Path(path)
-    if not path.is_file():
+    try:
+        size = check_regular(path, BadEmbeddings)
+    except FileNotFoundError:
         raise EmbeddingsNotFound(
             f"There are no text embeddings at '{path}'; give --t5-text-embeddings-path (libero_t5_embeddings.pkl of "
             "the checkpoint)."
-        )
-    content = path.read_bytes()
+        ) from None
+    if size > MAX_EMBEDDINGS_BYTES:
+        raise BadEmbeddings(f"'{path}' has {size} bytes; text embeddings of {MAX_EMBEDDINGS_BYTES} at most are read.")
+    with path.open("rb") as file:
+        found = _read(file, path)
+        file.seek(0)
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return TextEmbeddings(str(path), _checked(found, path), digest)
+
+
+def _read(file: BinaryIO, path: Path) -> Any:
     try:
-        found = _RestrictedUnpickler(io.BytesIO(content)).load()
-    except RefusedPickle as error:
+        check_pickle(file, _CALLS, most_numbers=0)
+        file.seek(0)
+        return _RestrictedUnpickler(file).load()
+    except (PickleRefused, RefusedPickle) as error:
+        if str(error).startswith("is damaged"):
+            raise BadEmbeddings(f"'{path}' cannot be read as text embeddings: it {error}.") from error
         raise RefusedPickle(
-            f"'{path}' was refused: {error}, and text embeddings need tensors only; nothing of it was executed."
+            f"'{path}' was refused: it {error}, and text embeddings need tensors only; nothing of it was executed."
         ) from error
     except Exception as error:  # a damaged pickle raises almost anything
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise BadEmbeddings(f"'{path}' cannot be read as text embeddings ({first}).") from error
-    return TextEmbeddings(str(path), _checked(found, path), hashlib.sha256(content).hexdigest())
 
 
 def _checked(found: Any, path: Path) -> dict[str, Tensor]:
@@ -121,6 +150,10 @@ def _checked(found: Any, path: Path) -> dict[str, Tensor]:
                 f"is {tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__}."
             )
         shapes.add(tuple(value.shape))
+    try:
+        check_tensors(found.values())
+    except PickleRefused as error:
+        raise BadEmbeddings(f"'{path}' {error}.") from error
     if len(shapes) > 1:
         raise BadEmbeddings(f"The embeddings of '{path}' have different shapes: {listing(sorted(shapes))}.")
     return dict(found)

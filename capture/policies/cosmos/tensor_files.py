@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import _codecs
 import io
-import pickle
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor
 
+from vla_attention.capture.foreign_files.pickles import TENSORS, PickleRefused
+from vla_attention.capture.foreign_files.regular_files import check_regular
+from vla_attention.capture.foreign_files.torch_files import check_tensors, load_torch
+from vla_attention.capture.policies.safetensors_file import open_safetensors
 from vla_attention.schemas.errors import UserError
 
 
@@ -41,47 +41,39 @@ def read_tensors(path: str | Path) -> dict[str, Any]:
     Raises `TensorFileNotFound`, `UnreadableTensors`, or `RefusedPickle` if the file would execute code.
     """
     path = Path(path)
-    if not path.is_file():
-        raise TensorFileNotFound(f"There is no file of tensors at '{path}'.")
+    try:
+        check_regular(path, UnreadableTensors)
+    except FileNotFoundError:
+        raise TensorFileNotFound(f"There is no file of tensors at '{path}'.") from None
     content = _read_safetensors(path) if path.suffix == ".safetensors" else _read_torch(path)
     for wrapper in _WRAPPERS:
         if isinstance(content, Mapping) and isinstance(content.get(wrapper), Mapping):
             content = content[wrapper]
     if not isinstance(content, Mapping) or not any(isinstance(value, Tensor) for value in content.values()):
         raise UnreadableTensors(f"'{path}' holds no tensors by name, but {type(content).__name__}.")
-    return dict(content)
+    try:
+        check_tensors(content.values())
+    except PickleRefused as error:
+        raise UnreadableTensors(f"'{path}' was refused: it {error}.") from error
+    return {str(name): value for name, value in content.items()}
 
 
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
-    try:
-        return load_file(path)
-    except (SafetensorError, OSError) as error:
-        raise UnreadableTensors(f"'{path}' cannot be read ({error}): the file is damaged or incomplete.") from error
+    with open_safetensors(path) as stored:
+        return {name: stored.read(name) for name in stored.names()}
 
 
 def _read_torch(path: Path) -> Any:
-    with torch.serialization.safe_globals(_HARMLESS):
-        try:
-            return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-        except RuntimeError as error:  # files in PyTorch's old format cannot be mapped
-            if "mmap" not in str(error):
-                raise _unreadable(path, error) from error
-        except (pickle.UnpicklingError, EOFError, OSError, ValueError) as error:
-            raise _unreadable(path, error) from error
-        try:
-            return torch.load(path, map_location="cpu", weights_only=True)
-        except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError) as error:
-            raise _unreadable(path, error) from error
+    try:
+        return load_torch(path, TENSORS, _HARMLESS)
+    except PickleRefused as error:
+        raise refused(path, error) from error
+    except OSError as error:
+        raise UnreadableTensors(f"'{path}' cannot be read ({error.strerror or error}).") from error
 
 
-def _unreadable(path: Path, error: Exception) -> UnreadableTensors:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    # One line of PyTorch's message names what it refused; the others advise how to execute it nevertheless.
-    refused = [line for line in lines if "GLOBAL" in line]
-    if refused:
-        return RefusedPickle(
-            f"'{path}' was refused: it asks for more than tensors ({refused[0].rstrip('.')}), and nothing of it was "
-            "executed."
-        )
-    first = lines[0].rstrip(".") if lines else type(error).__name__
-    return UnreadableTensors(f"'{path}' cannot be read as tensors ({first}): the file is damaged or something else.")
+def refused(path: Path, error: PickleRefused) -> UnreadableTensors:
+    """Return the error for a pickle: `RefusedPickle` for one that is whole and asks for more than tensors."""
+    if str(error).startswith("is damaged"):
+        return UnreadableTensors(f"'{path}' cannot be read as tensors: it {error}, or it is something else.")
+    return RefusedPickle(f"'{path}' was refused: it {error}, and tensors do not; nothing of it was executed.")

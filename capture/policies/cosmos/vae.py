@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from vla_attention.capture.policies.checkpoints import check_size
 from vla_attention.capture.policies.cosmos.config import VaeConfig
 from vla_attention.capture.policies.strict_loading import Shapes, check_shapes, fill, make_empty, shapes_of
 from vla_attention.schemas.errors import MissingDependency
@@ -102,12 +103,16 @@ def infer_vae_config(state: Mapping[str, Any], base: VaeConfig | None = None) ->
     base = base or VaeConfig()
     first = state.get("encoder.conv1.weight")
     return VaeConfig(
-        base_dim=first.shape[0] if isinstance(first, Tensor) else base.base_dim,
+        base_dim=_base_dim(first) if isinstance(first, Tensor) else base.base_dim,
         latent_channels=base.latent_channels,
         dim_mult=base.dim_mult,
         num_res_blocks=base.num_res_blocks,
         temporal_downsample=base.temporal_downsample,
     )
+
+
+def _base_dim(weight: Tensor) -> int:
+    return check_size("The width of the image encoder's first layer", weight.shape[0] if weight.ndim else 0)
 
 
 class CausalEncoder(nn.Module):

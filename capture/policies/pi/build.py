@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from vla_attention.capture.policies.hub import downloads, hub_version
 from vla_attention.capture.policies.model_arguments import UNTRAINED, UNTRAINED_TINY, check_not_renamed
 from vla_attention.capture.policies.pi.compiled import compile_steps
 from vla_attention.capture.policies.pi.config import GEMMA_VARIANTS, GemmaConfig, find_config, find_variant
@@ -72,9 +73,13 @@ def build_pi_policy(
     else:
         path = SHIPPED[checkpoint] if checkpoint in SHIPPED else find_checkpoint(checkpoint)
         detect_format(path, options.checkpoint_format)  # a folder without a checkpoint is reported first
-        policy = load_pi_policy(
-            path, find_tokenizer(path, tokenizer), options=options, device=device, data=data, robot=robot
-        )
+        tokenizer_path = find_tokenizer(path, tokenizer)
+        policy = load_pi_policy(path, tokenizer_path, options=options, device=device, data=data, robot=robot)
+        policy.source = dataclasses.replace(policy.source, downloads=downloads(path, tokenizer_path))
+        version = hub_version(path)
+        if version is not None and not Path(checkpoint).expanduser().exists():
+            # A name on the hub stands for other files tomorrow; with the commit it does not.
+            policy.source = dataclasses.replace(policy.source, checkpoint=str(version))
         if checkpoint in SHIPPED:
             # Where the package is installed differs between machines; its name does not.
             policy.source = dataclasses.replace(policy.source, checkpoint=checkpoint)

@@ -13,12 +13,20 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from vla_attention.capture.policies.checkpoints import read_json_object
+from vla_attention.capture.policies.checkpoints import (
+    MAX_BLOCKS,
+    MAX_SIZE,
+    MAX_STEPS,
+    check_size,
+    read_json_object,
+)
 from vla_attention.capture.policies.parity_case import CASE_FILE, UnusableCase, read_arrays, read_case_file
 from vla_attention.capture.policies.pi.config import CAMERA_SLOTS, GemmaConfig, PiConfig, SiglipConfig
 from vla_attention.capture.policies.pi.formats import CheckpointFormat
+from vla_attention.capture.policies.pi.lerobot_config import MAX_CAMERAS
 from vla_attention.capture.policies.precision import DTYPES
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
+from vla_attention.schemas.safe_text import check_name
 
 #: File of a checkpoint in openpi's PyTorch format that may state the sizes, in the form of a case.json.
 CONFIG_FILE = "config.json"
@@ -79,8 +87,8 @@ def read_config(path: Path) -> PiConfig:
         raise UnusableCase(f"There is no '{path}', which states the sizes of the model.")
     content = read_json_object(path)
     try:
-        return _config(content)
-    except (KeyError, TypeError) as error:
+        return _config(content, path)
+    except (KeyError, TypeError, AttributeError) as error:
         raise UnusableCase(
             f"'{path}' does not state the sizes of a pi model: {error!s} is missing or wrong; expected 'model' (pi0 or "
             "pi05) and 'config' with paligemma, action_expert, siglip, vocab_size, action_dim, action_horizon, "
@@ -100,28 +108,38 @@ def stated_name(path: Path) -> str | None:
     return name if states_sizes(path) and isinstance(name, str) and name else None
 
 
-def _config(content: Mapping[str, Any]) -> PiConfig:
+def _config(content: Mapping[str, Any], path: Path) -> PiConfig:
     sizes: Mapping[str, Any] = content["config"]
     model = content["model"]
     if model not in ("pi0", "pi05"):
         raise BadArgument(f"A case is of model 'pi0' or 'pi05', not '{model}'.")
 
+    def size(name: str, value: object) -> int:
+        # Those of blocks and steps are in no tensor's shape.
+        most = {"depth": MAX_BLOCKS, "action_horizon": MAX_STEPS, "max_token_len": MAX_STEPS, "num_steps": MAX_STEPS}
+        return check_size(f"'{name}' of '{path}'", value, most.get(name, MAX_SIZE))
+
     def part(name: str, ignored: str) -> dict[str, int]:
-        return {key: value for key, value in sizes[name].items() if key != ignored}
+        return {key: size(key, value) for key, value in sizes[name].items() if key != ignored}
 
     layout: Mapping[str, Any] = content.get("layout", {})
+    cameras = layout.get("image_keys", CAMERA_SLOTS)
+    if not isinstance(cameras, (list, tuple)) or len(cameras) > MAX_CAMERAS:
+        raise TypeError("image_keys")
+    for camera in cameras:
+        check_name("camera", str(camera))
     return PiConfig(
         paligemma=GemmaConfig(**part("paligemma", "lora_configs")),
         action_expert=GemmaConfig(**part("action_expert", "lora_configs")),
         siglip=SiglipConfig(**part("siglip", "num_classes")),
-        vocab_size=sizes["vocab_size"],
-        action_dim=sizes["action_dim"],
-        action_horizon=sizes["action_horizon"],
-        max_token_len=sizes["max_token_len"],
-        num_denoise_steps=sizes["num_steps"],
+        vocab_size=size("vocab_size", sizes["vocab_size"]),
+        action_dim=size("action_dim", sizes["action_dim"]),
+        action_horizon=size("action_horizon", sizes["action_horizon"]),
+        max_token_len=size("max_token_len", sizes["max_token_len"]),
+        num_denoise_steps=size("num_steps", sizes["num_steps"]),
         pi05=model == "pi05",
         discrete_state_input=bool(sizes.get("discrete_state_input", False)),
-        cameras=tuple(layout.get("image_keys", CAMERA_SLOTS)),
+        cameras=tuple(map(str, cameras)),
     )
 
 

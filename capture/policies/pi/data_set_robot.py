@@ -8,7 +8,7 @@ from vla_attention.capture.policies.pi.config import CAMERA_SLOTS
 from vla_attention.capture.policies.pi.formats import CheckpointFormat
 from vla_attention.capture.policies.pi.lerobot_config import IMAGES, read_lerobot_config
 from vla_attention.capture.policies.pi.lerobot_pipeline import read_lerobot_pipeline
-from vla_attention.capture.policies.pi.preprocess import NormStats, read_norm_stats
+from vla_attention.capture.policies.pi.preprocess import NormStats, find_norm_stats, read_norm_stats
 from vla_attention.capture.policies.robot import Robot, RobotData
 from vla_attention.schemas.errors import BadArgument
 
@@ -114,5 +114,5 @@ def robot_for(folder: Path, found: CheckpointFormat, data: RobotData, *, relativ
 
 def asset_name(folder: Path) -> str | None:
     """Return the name under which an openpi checkpoint keeps its statistics, for instance droid; None for several."""
-    found = [path.parent for path in (folder / "assets").rglob("norm_stats.json")]
+    found = [path.parent for path in find_norm_stats(folder)]
     return found[0].relative_to(folder / "assets").as_posix() if len(found) == 1 else None

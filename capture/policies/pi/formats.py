@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnsupportedCheckpoint, read_json_object
+from vla_attention.capture.policies.checkpoints import (
+    CheckpointNotFound,
+    UnsupportedCheckpoint,
+    check_checkpoint_file,
+    read_json_object,
+)
 from vla_attention.schemas.errors import listing, unknown_name
 
 CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot"]
@@ -47,8 +53,8 @@ def detect_format(folder: str | Path, wanted: CheckpointFormat | None = None) ->
     folder = Path(folder)
     if not folder.is_dir():
         raise CheckpointNotFound(f"There is no checkpoint folder at '{folder}'.")
-    has_params = (folder / "params" / "_METADATA").is_file()
-    has_tensors = (folder / "config.json").is_file() and (folder / "model.safetensors").is_file()
+    has_params = _has(folder / "params" / "_METADATA")
+    has_tensors = _has(folder / "config.json") and _has(folder / "model.safetensors")
     if wanted is not None:
         if not (has_params if wanted == "openpi_jax" else has_tensors):
             content = listing(sorted(path.name for path in folder.iterdir()))
@@ -59,6 +65,14 @@ def detect_format(folder: str | Path, wanted: CheckpointFormat | None = None) ->
     if has_tensors:
         return _format_of_config(folder, read_json_object(folder / "config.json"))
     raise UnsupportedCheckpoint(_what_it_is(folder))
+
+
+def _has(file: Path) -> bool:
+    """Whether a checkpoint has a file; `UnreadableCheckpoint` for a pipe or a link in its place."""
+    if not os.path.lexists(file):
+        return False
+    check_checkpoint_file(file)
+    return True
 
 
 def _format_of_config(folder: Path, config: dict[str, Any]) -> CheckpointFormat:
@@ -79,7 +93,8 @@ def _transformers_family(config: dict[str, Any]) -> str | None:
     """Name the model of a transformers configuration, or None for a configuration of another kind."""
     if "model_type" not in config and "architectures" not in config:
         return None
-    named = [config.get("model_type"), *(config.get("architectures") or [])]
+    architectures = config.get("architectures")
+    named = [config.get("model_type"), *(architectures if isinstance(architectures, list) else [architectures])]
     words = [str(word) for word in named if word]
     for part, family in _OTHER_FAMILIES.items():
         if any(part in word.casefold() for word in words):

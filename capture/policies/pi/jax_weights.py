@@ -15,6 +15,7 @@ import numpy as np
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch
 from vla_attention.capture.policies.pi.jax_lora import LoraPair, find_lora_pairs
 from vla_attention.capture.policies.strict_loading import Shapes
+from vla_attention.schemas.errors import listing
 
 VISION = "paligemma_with_expert.paligemma.model.vision_tower.vision_model."
 PROJECTOR = "paligemma_with_expert.paligemma.model.multi_modal_projector.linear."
@@ -199,7 +200,7 @@ def plan_leaves(paths: Iterable[str]) -> tuple[dict[str, LeafPlan], dict[str, Lo
     if unknown:
         family = "" if any(path.startswith("action_in_proj/") for path in paths) else OTHER_OPENPI_MODEL
         raise CheckpointMismatch(
-            f"The checkpoint has {len(unknown)} arrays that a pi model does not have: {', '.join(unknown)}.{family}"
+            f"The checkpoint has {len(unknown)} arrays that a pi model does not have: {listing(unknown, 40)}.{family}"
         )
     if "action_in_proj/kernel" not in found:
         raise CheckpointMismatch(f"The checkpoint has no action_in_proj.{OTHER_OPENPI_MODEL}")

@@ -5,12 +5,19 @@ A feature that is switched on and unknown here is an error with its name: it cou
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vla_attention.capture.policies.checkpoints import UnsupportedCheckpoint, read_json_object
+from vla_attention.capture.policies.checkpoints import (
+    MAX_SIZE,
+    MAX_STEPS,
+    UnsupportedCheckpoint,
+    read_json_object,
+    values_of,
+)
 from vla_attention.capture.policies.pi.flow_time import MAX_PERIOD, MIN_PERIOD
 from vla_attention.capture.policies.pi.sizes import MAX_TOKEN_LEN
 from vla_attention.schemas.errors import listing
@@ -43,6 +50,8 @@ _HARMLESS = {
 }  # fmt: skip
 _HARMLESS_BEGINNINGS = ("optimizer_", "scheduler_", "time_sampling_")
 
+#: Cameras, with those that are always black. LeRobot's policies have up to five.
+MAX_CAMERAS = 64
 STATE_FEATURE, ACTION_FEATURE = "observation.state", "action"
 IMAGES = "observation.images."
 
@@ -78,12 +87,16 @@ def read_lerobot_config(folder: Path) -> LerobotConfig:
     """Read a checkpoint's config.json; `UnsupportedLerobotFeature` names an unsupported feature."""
     path = folder / "config.json"
     content = read_json_object(path)
-    where = f"'{path}'"
+    with values_of(path):
+        return _config(content, f"'{path}'")
+
+
+def _config(content: dict[str, Any], where: str) -> LerobotConfig:
     _refuse_unknown(content, where)
     pi05 = content.get("type") == "pi05"
     inputs, outputs = _features(content, "input_features", where), _features(content, "output_features", where)
-    chunk_size = _whole(content, "chunk_size", 50, where)
-    steps = _whole(content, "n_action_steps", 50, where)
+    chunk_size = _whole(content, "chunk_size", 50, where, most=MAX_STEPS)
+    steps = _whole(content, "n_action_steps", 50, where, most=MAX_STEPS)
     if steps > chunk_size:
         raise UnsupportedLerobotFeature(
             f"{where} executes n_action_steps {steps} of a chunk_size of {chunk_size}: more than there are."
@@ -92,9 +105,11 @@ def read_lerobot_config(folder: Path) -> LerobotConfig:
     if dtype not in ("float32", "bfloat16"):
         raise UnsupportedLerobotFeature(f"{where} has dtype '{dtype}'; supported are float32 and bfloat16.")
     cameras = [name for name, (kind, _) in inputs.items() if kind == "VISUAL"]
-    for i in range(_whole(content, "empty_cameras", 0, where, least=0)):
+    for i in range(_whole(content, "empty_cameras", 0, where, least=0, most=MAX_CAMERAS)):
         if (name := f"{IMAGES}empty_camera_{i}") not in cameras:
             cameras.append(name)
+    if len(cameras) > MAX_CAMERAS:
+        raise UnsupportedLerobotFeature(f"{where} has {len(cameras)} cameras; supported are at most {MAX_CAMERAS}.")
     others = [name for name, (kind, _) in inputs.items() if kind != "VISUAL" and name != STATE_FEATURE]
     others += [name for name in outputs if name != ACTION_FEATURE]
     if others:
@@ -114,15 +129,15 @@ def read_lerobot_config(folder: Path) -> LerobotConfig:
         n_action_steps=steps,
         max_state_dim=max_state_dim,
         max_action_dim=max_action_dim,
-        num_inference_steps=_whole(content, "num_inference_steps", 10, where),
-        min_period=float(content.get("min_period", MIN_PERIOD)),
-        max_period=float(content.get("max_period", MAX_PERIOD)),
+        num_inference_steps=_whole(content, "num_inference_steps", 10, where, most=MAX_STEPS),
+        min_period=_period(content, "min_period", MIN_PERIOD, where),
+        max_period=_period(content, "max_period", MAX_PERIOD, where),
         image_size=_image_size(content, where),
-        tokenizer_max_length=_whole(content, "tokenizer_max_length", MAX_TOKEN_LEN[pi05], where),
+        tokenizer_max_length=_whole(content, "tokenizer_max_length", MAX_TOKEN_LEN[pi05], where, most=MAX_STEPS),
         cameras=tuple(cameras),
         state_dim=inputs.get(STATE_FEATURE, ("STATE", max_state_dim))[1],
         action_dim=outputs.get(ACTION_FEATURE, ("ACTION", max_action_dim))[1],
-        normalization=dict(content.get("normalization_mapping") or {}),
+        normalization=texts_by_name(content.get("normalization_mapping"), f"{where} has normalization_mapping"),
         raw={"chunk_size": chunk_size, "max_action_dim": max_action_dim, **_variants(content)},
     )
 
@@ -151,10 +166,30 @@ def _refuse_unknown(content: Mapping[str, Any], where: str) -> None:
         )
 
 
-def _whole(content: Mapping[str, Any], name: str, default: int, where: str, least: int = 1) -> int:
+def _whole(
+    content: Mapping[str, Any], name: str, default: int, where: str, least: int = 1, most: int = MAX_SIZE
+) -> int:
     value = content.get(name, default)
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
-        raise UnsupportedLerobotFeature(f"{where} has {name} {value!r}; expected a whole number of at least {least}.")
+    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
+        raise UnsupportedLerobotFeature(
+            f"{where} has {name} {value!r}; expected a whole number of at least {least} and at most {most}."
+        )
+    return value
+
+
+def _period(content: Mapping[str, Any], name: str, default: float, where: str) -> float:
+    value = content.get(name, default)
+    if not isinstance(value, (int, float)) or isinstance(value, bool) or not 0 < value < math.inf:
+        raise UnsupportedLerobotFeature(f"{where} has {name} {value!r}; expected a number above 0.")
+    return float(value)
+
+
+def texts_by_name(value: object, what: str) -> dict[str, str]:
+    """Return a table of texts, empty if there is none; `UnsupportedLerobotFeature` begins with `what`."""
+    if value is None:
+        return {}
+    if not isinstance(value, dict) or not all(isinstance(text, str) for text in value.values()):
+        raise UnsupportedLerobotFeature(f"{what} {value!r}; expected a table of texts.")
     return value
 
 
@@ -162,13 +197,19 @@ def _features(content: Mapping[str, Any], name: str, where: str) -> dict[str, tu
     """Return feature -> (type, last size) of input_features or output_features, in their order."""
     features = content.get(name) or {}
     try:
-        return {key: (str(feature["type"]), int(feature["shape"][-1])) for key, feature in features.items()}
-    except (TypeError, KeyError, IndexError, ValueError, AttributeError):
+        found = {key: (str(feature["type"]), int(feature["shape"][-1])) for key, feature in features.items()}
+    except (TypeError, KeyError, IndexError, ValueError, AttributeError, OverflowError):
         raise UnsupportedLerobotFeature(f"{where} has {name} without types and shapes: {features!r}.") from None
+    for key, (_, size) in found.items():
+        if not 1 <= size <= MAX_SIZE:
+            raise UnsupportedLerobotFeature(
+                f"{where} has {name} with '{key}' of {size} numbers; expected 1 to {MAX_SIZE}."
+            )
+    return found
 
 
 def _image_size(content: Mapping[str, Any], where: str) -> int:
     resolution = content.get("image_resolution", [224, 224])
     if not isinstance(resolution, list) or len(resolution) != 2 or resolution[0] != resolution[1]:
         raise UnsupportedLerobotFeature(f"{where} has image_resolution {resolution!r}; supported are square images.")
-    return int(resolution[0])
+    return _whole({"image_resolution": resolution[0]}, "image_resolution", 224, where, most=MAX_STEPS)

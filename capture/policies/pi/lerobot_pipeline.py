@@ -6,6 +6,7 @@ unknown step is an error with its name: it could change the inputs or actions of
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,16 +14,21 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
 
-from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint, UnsupportedCheckpoint, read_json_object
+from vla_attention.capture.policies.checkpoints import (
+    UnsupportedCheckpoint,
+    read_json_object,
+    values_of,
+)
 from vla_attention.capture.policies.pi.lerobot_config import (
     ACTION_FEATURE,
     STATE_FEATURE,
     LerobotConfig,
     UnsupportedLerobotFeature,
+    texts_by_name,
 )
 from vla_attention.capture.policies.pi.preprocess import UnusableNormStats
+from vla_attention.capture.policies.safetensors_file import SafetensorsFile, open_safetensors
 from vla_attention.schemas.errors import listing
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
@@ -90,7 +96,7 @@ def read_lerobot_pipeline(folder: Path, config: LerobotConfig) -> LerobotPipelin
     """Read both pipelines of a checkpoint folder; an error names an unsupported step or setting."""
     before, after = _steps(folder, PREPROCESSOR, _BEFORE), _steps(folder, POSTPROCESSOR, _AFTER)
     for steps, name, where in ((before, _RELATIVE, PREPROCESSOR), (after, _ABSOLUTE, POSTPROCESSOR)):
-        if steps.get(name, {}).get("config", {}).get("enabled"):
+        if _settings(steps, name).get("enabled"):
             raise UnsupportedLerobotFeature(
                 f"'{folder / where}' has {name} enabled: actions relative to the state are not supported."
             )
@@ -102,7 +108,9 @@ def read_lerobot_pipeline(folder: Path, config: LerobotConfig) -> LerobotPipelin
             f"{'pi05' if config.pi05 else 'pi0'} policy has {_STATE_PROMPT if config.pi05 else _NEW_LINE}."
         )
     return LerobotPipeline(
-        rename=dict(before.get(_RENAME, {}).get("config", {}).get("rename_map") or {}),
+        rename=texts_by_name(
+            _settings(before, _RENAME).get("rename_map"), f"'{folder / PREPROCESSOR}' has the rename_map"
+        ),
         state_in_prompt=state_in_prompt,
         new_line=new_line,
         cut_long_prompts=_tokenizer_cuts(folder, before, config),
@@ -120,20 +128,27 @@ def _steps(folder: Path, name: str, known: set[str]) -> dict[str, dict[str, Any]
         )
     steps = read_json_object(path).get("steps")
     found: dict[str, dict[str, Any]] = {}
-    for step in steps if isinstance(steps, Sequence) else ():
+    for step in steps if isinstance(steps, list) else ():
         registered = step.get("registry_name") if isinstance(step, dict) else None
-        if registered not in known:
+        if not isinstance(registered, str) or registered not in known:
             called = registered or (step.get("class") if isinstance(step, dict) else step)
             raise UnsupportedLerobotFeature(f"'{path}' has a step that is not supported: {called!r}.")
         if registered in found and registered not in _NOTHING:
             raise UnsupportedLerobotFeature(f"'{path}' has the step {registered} twice.")
+        if not isinstance(step.get("config", {}), dict):
+            raise UnsupportedLerobotFeature(f"'{path}' has the step {registered} with settings that are no table.")
         found[registered] = step
     return found
 
 
+def _settings(steps: Mapping[str, Mapping[str, Any]], name: str) -> Mapping[str, Any]:
+    settings: Mapping[str, Any] = steps.get(name, {}).get("config", {})
+    return settings
+
+
 def _tokenizer_cuts(folder: Path, steps: Mapping[str, Mapping[str, Any]], config: LerobotConfig) -> bool:
     """Check the tokenizer step's settings; returns whether it cuts prompts that are too long."""
-    given = steps.get(_TOKENIZE, {}).get("config", {})
+    given = _settings(steps, _TOKENIZE)
     wanted = {
         "max_length": config.tokenizer_max_length,
         "padding_side": "right",
@@ -160,44 +175,47 @@ def _normaliser(
     path, step = folder / name, steps.get(registered)
     if step is None:
         raise UnsupportedCheckpoint(f"'{path}' has no step {registered}, so it does not say how to normalise.")
-    settings = step.get("config", {})
-    modes = {**config.normalization, **(settings.get("norm_map") or {})}
+    settings = _settings(steps, registered)
+    modes = {**config.normalization, **texts_by_name(settings.get("norm_map"), f"'{path}' has the norm_map")}
     if modes.get("VISUAL", "IDENTITY") != "IDENTITY":
         raise UnsupportedLerobotFeature(f"'{path}' normalises images by {modes['VISUAL']}; supported is IDENTITY.")
     keys = settings.get("normalize_observation_keys")
+    if keys is not None and not isinstance(keys, list):
+        raise UnsupportedLerobotFeature(f"'{path}' has normalize_observation_keys {keys!r}; expected a list.")
     mode = "IDENTITY" if keys is not None and kind == "STATE" and feature not in keys else modes.get(kind, "IDENTITY")
     if mode not in _NEEDED:
         raise UnsupportedLerobotFeature(f"'{path}' normalises {kind} by {mode}; supported are {listing(_NEEDED)}.")
-    statistics = _statistics(folder, step.get("state_file"), feature, _NEEDED[mode])
     dim = config.state_dim if kind == "STATE" else config.action_dim
-    for key, values in statistics.items():
-        if values.shape != (dim,):
-            raise UnusableNormStats(
-                f"The statistics '{feature}.{key}' of '{folder / str(step.get('state_file'))}' have shape "
-                f"{values.shape}; {dim} numbers are needed."
-            )
-    return LerobotNormaliser(mode, statistics, float(settings.get("eps", 1e-8)))
+    statistics = _statistics(folder, step.get("state_file"), feature, _NEEDED[mode], dim)
+    with values_of(path):
+        eps = float(settings.get("eps", 1e-8))
+    if not 0 <= eps < 1:
+        raise UnsupportedLerobotFeature(f"'{path}' has eps {eps}; expected a small number of at least 0.")
+    return LerobotNormaliser(mode, statistics, eps)
 
 
 def _statistics(
-    folder: Path, state_file: object, feature: str, needed: Sequence[str]
+    folder: Path, state_file: object, feature: str, needed: Sequence[str], dim: int
 ) -> dict[str, NDArray[np.float32]]:
     if not needed:
         return {}
     path = folder / str(state_file)
     # A name with folders in it could lead out of the checkpoint.
-    if not isinstance(state_file, str) or Path(state_file).name != state_file or not path.is_file():
+    if not isinstance(state_file, str) or Path(state_file).name != state_file or not os.path.lexists(path):
         raise UnusableNormStats(f"The statistics of '{feature}' should be in '{path}', which is not there.")
-    try:
-        with safe_open(path, framework="pt") as stored:
-            present = set(stored.keys())
-            missing = [f"{feature}.{key}" for key in needed if f"{feature}.{key}" not in present]
-            if missing:
-                raise UnusableNormStats(f"'{path}' lacks {listing(missing)}; it has {listing(sorted(present))}.")
-            return {key: stored.get_tensor(f"{feature}.{key}").float().numpy() for key in needed}
-    except (SafetensorError, OSError) as error:
-        if isinstance(error, UnusableNormStats):
-            raise
-        raise UnreadableCheckpoint(
-            f"'{path}' cannot be read ({error}): the file is damaged or its copy incomplete."
-        ) from error
+    with open_safetensors(path) as stored:
+        present = set(stored.names())
+        missing = [f"{feature}.{key}" for key in needed if f"{feature}.{key}" not in present]
+        if missing:
+            raise UnusableNormStats(f"'{path}' lacks {listing(missing)}; it has {listing(sorted(present))}.")
+        return {key: _vector(stored, path, f"{feature}.{key}", dim) for key in needed}
+
+
+def _vector(stored: SafetensorsFile, path: Path, name: str, dim: int) -> NDArray[np.float32]:
+    shape = stored.shape(name)
+    if shape != (dim,):
+        raise UnusableNormStats(f"The statistics '{name}' of '{path}' have shape {shape}; {dim} numbers are needed.")
+    values: NDArray[np.float32] = stored.read(name).float().numpy()
+    if not np.isfinite(values).all():
+        raise UnusableNormStats(f"The statistics '{name}' of '{path}' hold NaN or infinity.")
+    return values

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from vla_attention.capture.policies.hub import (
-    HUB_NAME,
     CheckpointUnavailable,
     fetch_from_hub,
     first_line,
+    in_hub_cache,
     snapshots_folder,
+    split_hub_name,
 )
 from vla_attention.schemas.errors import BadArgument, MissingDependency, listing
 
@@ -40,16 +41,16 @@ TOKENIZER_REPOSITORY = "google/paligemma-3b-pt-224"
 
 
 def find_checkpoint(name: str) -> Path:
-    """Return the folder of a checkpoint: a local folder, `gs://...` in openpi's cache, or `ORG/NAME` of the hub.
+    """Return the folder of a checkpoint.
 
-    A folder that is not in the cache is downloaded; `CheckpointUnavailable` or `MissingDependency` if that fails.
+    It is a local folder, `gs://...` in openpi's cache, or `ORG/NAME` or `ORG/NAME@COMMIT` of the hub. What is not in
+    the cache is downloaded; `CheckpointUnavailable` or `MissingDependency` if that fails.
     """
     if name.startswith("gs://"):
         return _from_openpi_cache(name.rstrip("/"))
     path = Path(name).expanduser()
-    if not path.exists() and HUB_NAME.fullmatch(name):
-        return _from_hub(name)
-    return path
+    on_hub = None if path.exists() else split_hub_name(name)
+    return path if on_hub is None else _from_hub(*on_hub)
 
 
 def openpi_cache() -> Path:
@@ -57,12 +58,12 @@ def openpi_cache() -> Path:
     return Path(os.environ.get("OPENPI_DATA_HOME", "~/.cache/openpi")).expanduser()
 
 
-def _from_hub(name: str) -> Path:
+def _from_hub(name: str, revision: str | None) -> Path:
     how = (
         f"fetch it where there is a network with `hf download {name}`, copy the folder here and give its path "
         "(there is no such local folder)"
     )
-    return fetch_from_hub(name, HUB_FILES, how)
+    return fetch_from_hub(name, HUB_FILES, how, revision=revision)
 
 
 def _from_openpi_cache(url: str) -> Path:
@@ -79,7 +80,7 @@ def _from_openpi_cache(url: str) -> Path:
         ) from error
     partial = target.with_name(target.name + ".partial")
     try:
-        _download(gcsfs.GCSFileSystem(token="anon"), url, partial)
+        _download(gcsfs.GCSFileSystem(token="anon"), url, partial)  # noqa: S106 - without an account
     except Exception as error:
         shutil.rmtree(partial, ignore_errors=True)
         raise CheckpointUnavailable(f"'{url}' could not be fetched ({first_line(error)}); {how}.") from error
@@ -109,11 +110,12 @@ def find_tokenizer(checkpoint: Path, given: str | None) -> Path:
         checkpoint / TOKENIZER_NAME,
         openpi_cache() / TOKENIZER_URL.removeprefix("gs://"),
     ]
-    snapshots = snapshots_folder(TOKENIZER_REPOSITORY)
-    places += sorted(snapshots.glob("*/tokenizer.model"))
+    cached = in_hub_cache(TOKENIZER_REPOSITORY, "tokenizer.model")
+    places += [cached] if cached is not None else []
     for place in places:
         if place.is_file():
             return place
+    snapshots = snapshots_folder(TOKENIZER_REPOSITORY)
     raise BadArgument(
         f"The checkpoint '{checkpoint}' needs PaliGemma's tokenizer and none was found at {listing(places)} or in "
         f"'{snapshots}'; fetch {TOKENIZER_NAME} ({TOKENIZER_URL}) or tokenizer.model of {TOKENIZER_REPOSITORY}, and "

@@ -17,7 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint, read_json_object
+from vla_attention.capture.foreign_files.regular_files import check_folder
+from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint, read_json_object
+from vla_attention.capture.policies.hub import first_line
 from vla_attention.capture.policies.pi.config import PiConfig, find_config
 from vla_attention.capture.policies.pi.formats import detect_format
 from vla_attention.capture.policies.pi.jax_lora import merge_lora
@@ -26,7 +28,12 @@ from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.model_weights import build_model, expected_shapes, expected_tensors
 from vla_attention.capture.policies.pi.sizes import check_jax_heads
 from vla_attention.capture.policies.strict_loading import Shapes, check_shapes
-from vla_attention.schemas.errors import MissingDependency
+from vla_attention.schemas.errors import MissingDependency, listing
+
+#: Arrays of a checkpoint; a pi model has about fifty.
+MAX_LEAVES = 10_000
+#: Types of weights. Whole numbers and 8 bits need scales, without which they would be other weights.
+_FLOATS = ("float64", "float32", "float16", "bfloat16")
 
 
 @dataclass(frozen=True)
@@ -53,6 +60,11 @@ def list_leaves(params: Path) -> list[Leaf]:
         keys = [[str(part["key"]) for part in leaf["key_metadata"]] for leaf in metadata["tree_metadata"].values()]
     except (KeyError, TypeError, AttributeError) as error:
         raise UnreadableCheckpoint(f"'{params / '_METADATA'}' does not describe a tree of arrays.") from error
+    if not all(keys) or len(keys) > MAX_LEAVES:
+        raise UnreadableCheckpoint(
+            f"'{params / '_METADATA'}' describes {len(keys)} arrays, {sum(not p for p in keys)} of them without "
+            f"a name; expected at most {MAX_LEAVES}, each with one."
+        )
     stored = [".".join(parts) for parts in keys]
     paths = [parts[1:] if parts[0] == "params" else parts for parts in keys]
     if all(path[-1:] == ["value"] for path in paths):
@@ -74,7 +86,16 @@ class OpenLeaf:
         }
         array = self._open(cache_bytes=0)
         self.shape: tuple[int, ...] = tuple(array.shape)
-        rows_of_a_chunk = array.chunk_layout.read_chunk.shape[0] if array.rank else 1
+        chunk = tuple(array.chunk_layout.read_chunk.shape)
+        # A chunk is decoded as a whole, however little of it is in the array.
+        if any(extent > max(1, size) for extent, size in zip(chunk, self.shape, strict=True)):
+            raise UnreadableCheckpoint(f"{self._what} (its chunks of {chunk} are larger than itself, {self.shape}).")
+        if str(array.dtype.name) not in _FLOATS:
+            raise CheckpointMismatch(
+                f"The array '{leaf.path}' of '{params}' has numbers of type {array.dtype.name}; expected one of "
+                f"{listing(_FLOATS)}: use the checkpoint before it was quantized."
+            )
+        rows_of_a_chunk = chunk[0] if array.rank else 1
         #: One chunk often holds all layers; it is kept while its layers are read one by one.
         self._cache_bytes = 0
         if self.shape and rows_of_a_chunk > 1:
@@ -103,14 +124,14 @@ class OpenLeaf:
         spec = {**self._spec, "recheck_cached_data": False}
         try:
             return tensorstore.open(spec, open=True, read=True, context=context).result()
-        except (ValueError, OSError) as error:
-            raise UnreadableCheckpoint(f"{self._what} ({str(error).splitlines()[0]}).") from error
+        except Exception as error:  # the library raises what the kind of the fault maps to, whatever it is
+            raise UnreadableCheckpoint(f"{self._what} ({first_line(error)}).") from error
 
     def _read(self, array: Any) -> np.ndarray:
         try:
             return np.asarray(array.read().result()).astype(np.float32, copy=False)
-        except (ValueError, OSError) as error:
-            raise UnreadableCheckpoint(f"{self._what} ({str(error).splitlines()[0]}).") from error
+        except Exception as error:  # as above
+            raise UnreadableCheckpoint(f"{self._what} ({first_line(error)}).") from error
 
 
 def import_tensorstore() -> Any:
@@ -143,6 +164,7 @@ def load_openpi_jax(
     params = folder / "params"
     leaves = list_leaves(params)
     plans, pairs = plan_leaves(leaf.path for leaf in leaves)
+    check_folder(params, UnreadableCheckpoint)  # the library opens the files by itself
     if config is None:
         config = find_config(implied_config_name(leaf.path for leaf in leaves))
     stored = {leaf.path: OpenLeaf(params, leaf) for leaf in leaves}

@@ -6,18 +6,17 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint, read_json_object
+from vla_attention.capture.policies.checkpoints import read_json_object
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.formats import detect_format
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.model_weights import build_model, expected_shapes
 from vla_attention.capture.policies.pi.sizes import PALIGEMMA, TABLE, infer_config
+from vla_attention.capture.policies.safetensors_file import SafetensorsFile, open_safetensors
 from vla_attention.capture.policies.strict_loading import Shapes, check_shapes
 
 #: The text table is tied to the language model's output layer. safetensors keeps one name of tied tensors, this one.
@@ -49,32 +48,25 @@ class TensorFile:
 
     names: dict[str, str]
     shapes: Shapes
-    stored: Any
+    stored: SafetensorsFile
 
     def read(self, name: str) -> Tensor:
         """Read one tensor by its name in the model."""
-        tensor: Tensor = self.stored.get_tensor(self.names[name])
-        return tensor
+        return self.stored.read(self.names[name])
 
     def build(self, config: PiConfig, *, dtype: torch.dtype, device: str | torch.device) -> PiModel:
         """Build the model strictly; `CheckpointMismatch` lists missing, extra and misshapen tensors."""
         check_shapes(self.shapes, expected_shapes(config))
+        self.stored.check_floats(self.names.values())
         return build_model(config, self.names, self.read, dtype=dtype, device=device)
 
 
 @contextmanager
 def open_tensors(folder: Path) -> Iterator[TensorFile]:
     """Open a checkpoint's model.safetensors; `UnreadableCheckpoint` for a damaged file, also later while reading."""
-    path = folder / "model.safetensors"
-    try:
-        with safe_open(path, framework="pt") as stored:
-            names = model_names(stored.keys())
-            shapes = {name: tuple(stored.get_slice(raw).get_shape()) for name, raw in names.items()}
-            yield TensorFile(names, shapes, stored)
-    except (SafetensorError, OSError) as error:
-        raise UnreadableCheckpoint(
-            f"'{path}' cannot be read ({error}): the file is damaged or its copy incomplete."
-        ) from error
+    with open_safetensors(folder / "model.safetensors") as stored:
+        names = model_names(stored.names())
+        yield TensorFile(names, {name: stored.shape(raw) for name, raw in names.items()}, stored)
 
 
 def load_openpi_torch(

@@ -6,8 +6,8 @@ and `transforms.py` (normalisation); each is checked against arrays that openpi 
 
 from __future__ import annotations
 
-import json
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,12 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from vla_attention.capture.foreign_files.json_objects import read_object
+from vla_attention.capture.foreign_files.regular_files import MAX_FILES
 from vla_attention.schemas.errors import UserError, listing
 
 NormalisationMode = Literal["quantile", "z-score"]
 
 #: Prevents a division by zero for constant dimensions (openpi's value).
 NORMALISATION_EPS = 1e-6
+
+#: Folders in one another in which statistics are looked for; asset ids are names such as `lerobot/droid`.
+_MAX_ASSET_DEPTH = 8
 
 #: Action dimensions that a LIBERO or robosuite arm takes: translation, rotation, gripper.
 ENVIRONMENT_ACTION_DIM = 7
@@ -185,8 +190,11 @@ def _statistics(groups: Mapping[str, Any], name: str, where: str) -> Statistics:
         given = numbers.get(key)
         try:
             arrays[key] = None if given is None else np.asarray(given, dtype=np.float64)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise UnusableNormStats(f"{where} has other values than numbers as '{key}' of '{name}'.") from error
+        array = arrays[key]
+        if array is not None and not np.isfinite(array).all():
+            raise UnusableNormStats(f"{where} has NaN or infinity in '{key}' of '{name}'.")
     lengths = {array.shape for array in arrays.values() if array is not None}
     if len(lengths) != 1 or len(next(iter(lengths))) != 1:
         raise UnusableNormStats(f"{where} has statistics of unequal lengths for '{name}': {listing(sorted(lengths))}.")
@@ -203,13 +211,33 @@ def read_norm_stats(checkpoint: str | Path) -> NormStats:
     The asset id may be several folders deep. No file, or more than one, is an error.
     """
     assets = Path(checkpoint) / "assets"
-    found = sorted(assets.rglob("norm_stats.json"))
+    found = find_norm_stats(Path(checkpoint))
     if not found:
         raise NormStatsNotFound(f"The checkpoint '{checkpoint}' has no norm_stats.json below '{assets}'.")
     if len(found) > 1:
         raise UnusableNormStats(f"The checkpoint '{checkpoint}' has more than one norm_stats.json: {listing(found)}.")
     try:
-        content = json.loads(found[0].read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise UnusableNormStats(f"'{found[0]}' is not valid JSON ({error}).") from error
+        content = read_object(found[0], UnusableNormStats, inside=Path(checkpoint))
+    except FileNotFoundError:
+        raise UnusableNormStats(f"'{found[0]}' is a link to a file that does not exist.") from None
     return parse_norm_stats(content, f"'{found[0]}'")
+
+
+def find_norm_stats(checkpoint: Path) -> list[Path]:
+    """Return the files norm_stats.json below the folder `assets` of a checkpoint, in the order of their paths."""
+    found, level = [], [checkpoint / "assets"]
+    for _ in range(_MAX_ASSET_DEPTH):
+        entries = [entry for folder in level for entry in _entries(folder)]
+        found += [Path(entry.path) for entry in entries if entry.name == "norm_stats.json" and not entry.is_dir()]
+        level = [Path(entry.path) for entry in entries if entry.is_dir(follow_symlinks=False)]
+        if len(entries) > MAX_FILES:
+            raise UnusableNormStats(f"'{checkpoint / 'assets'}' holds more than {MAX_FILES} files.")
+    return sorted(found)
+
+
+def _entries(folder: Path) -> list[os.DirEntry[str]]:
+    try:
+        with os.scandir(folder) as entries:
+            return list(entries)
+    except OSError:
+        return []

@@ -6,7 +6,13 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from vla_attention.capture.policies.checkpoints import CheckpointMismatch
+from vla_attention.capture.policies.checkpoints import (
+    MAX_BLOCKS,
+    MAX_SIZE,
+    MAX_STEPS,
+    CheckpointMismatch,
+    check_size,
+)
 from vla_attention.capture.policies.pi.config import GEMMA_VARIANTS, GemmaConfig, PiConfig, SiglipConfig
 from vla_attention.capture.policies.strict_loading import Shapes
 from vla_attention.schemas.errors import listing
@@ -57,6 +63,7 @@ def infer_config(
                 f"The checkpoint's config.json should state '{name}' as a whole number, but has "
                 f"{config_json.get(name)!r}."
             )
+        check_size(f"'{name}' of the checkpoint's config.json", config_json[name], MAX_STEPS)
     siglip = _siglip_sizes(shapes)
     variants = {key: _variant(config_json.get(key)) for key in _VARIANT_KEYS}
     heads_of = next((variant for variant in variants.values() if variant is not None), None)
@@ -85,11 +92,12 @@ def infer_config(
 def _size(shapes: Shapes, name: str, axis: int) -> int:
     if name not in shapes or len(shapes[name]) <= axis:
         raise CheckpointMismatch(f"The checkpoint lacks {name}, from which a size of the model would be read.")
-    return shapes[name][axis]
+    return check_size(f"Axis {axis} of the checkpoint's {name}", shapes[name][axis], MAX_SIZE)
 
 
 def _depth(shapes: Shapes, layers: str) -> int:
-    return len({name.removeprefix(layers).split(".")[0] for name in shapes if name.startswith(layers)})
+    found = {name.removeprefix(layers).split(".")[0] for name in shapes if name.startswith(layers)}
+    return check_size(f"The number of blocks of the checkpoint's {layers.rstrip('.')}", len(found), MAX_BLOCKS)
 
 
 def _variant(name: object) -> GemmaConfig | None:

@@ -293,11 +293,14 @@ def test_names_of_the_hub(tmp_path, monkeypatch):
 def test_only_the_files_of_the_wanted_episodes_are_fetched(tmp_path, monkeypatch):
     import huggingface_hub
 
-    folder = write_data_set(tmp_path / "hub", "v2.1", made_up_episodes((3, 3), CAMERAS), video=H264)
-    asked = []
+    commit = "c" * 40
+    snapshot = tmp_path / "hub" / "datasets--org--name" / "snapshots" / commit
+    folder = write_data_set(snapshot, "v2.1", made_up_episodes((3, 3), CAMERAS), video=H264)
+    asked, revisions = [], []
 
-    def snapshot_download(name, repo_type, allow_patterns):
+    def snapshot_download(name, repo_type, revision, allow_patterns):
         asked.append((name, repo_type, allow_patterns))
+        revisions.append(revision)
         return str(folder)
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
@@ -305,7 +308,12 @@ def test_only_the_files_of_the_wanted_episodes_are_fetched(tmp_path, monkeypatch
     data = open_dataset("org/name")
     list(data.episode(1).frames(cameras=CAMERAS[1:]))
     assert [(name, kind) for name, kind, _ in asked] == [("org/name", "dataset")] * 3
-    assert [path for _, _, paths in asked[1:] for path in paths] == [
+    # Whatever is uploaded meanwhile, the files of episodes are of the commit of the meta files.
+    assert revisions == [None, commit, commit]
+    assert data.downloads == {"hub org/name": commit}
+    assert open_dataset("org/name@v1").name == "org/name"
+    assert revisions[3:] == ["v1"]
+    assert [path for _, _, paths in asked[1:3] for path in paths] == [
         "data/chunk-000/episode_000001.parquet",
         f"videos/chunk-000/{CAMERAS[1]}/episode_000001.mp4",
     ]

@@ -76,10 +76,10 @@ def test_missing_or_broken_statistics(tmp_path):
     with pytest.raises(StatisticsNotFound, match="--dataset-stats-path"):
         read_statistics(tmp_path / "no.json")
     (tmp_path / "a.json").write_text("{")
-    with pytest.raises(BadStatistics, match="cannot be read as JSON"):
+    with pytest.raises(BadStatistics, match="is not valid JSON"):
         read_statistics(tmp_path / "a.json")
     (tmp_path / "a.json").write_text("[]")
-    with pytest.raises(BadStatistics, match="but a list"):
+    with pytest.raises(BadStatistics, match="holds a list"):
         read_statistics(tmp_path / "a.json")
 
 

@@ -109,7 +109,7 @@ def test_missing_and_damaged_files(tmp_path):
     with pytest.raises(TensorFileNotFound):
         read_tensors(tmp_path / "no.pt")
     (tmp_path / "bad.pt").write_bytes(b"nothing")
-    with pytest.raises(UnreadableTensors, match="damaged or something else"):
+    with pytest.raises(UnreadableTensors, match="damaged or no pickle"):
         read_tensors(tmp_path / "bad.pt")
     torch.save([1], tmp_path / "bad.pt")
     with pytest.raises(UnreadableTensors, match="holds no tensors by name, but list"):

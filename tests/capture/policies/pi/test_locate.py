@@ -1,12 +1,24 @@
 """Names on hubs: calls of the clients, and an error with instructions for every failure."""
 
+import shutil
 import sys
 import types
+from pathlib import Path
 
 import pytest
 
 from tests.kit.pi_golden import GOLDEN
-from vla_attention.capture.policies.hub import CheckpointUnavailable, hub_cache
+from tests.kit.small_tokenizer import train_small_tokenizer
+from vla_attention.capture.policies.hub import (
+    CheckpointUnavailable,
+    downloads,
+    hub_cache,
+    hub_version,
+    in_hub_cache,
+    split_hub_name,
+)
+from vla_attention.capture.policies.identity import downloads_of
+from vla_attention.capture.policies.pi.build import build_pi_policy
 from vla_attention.capture.policies.pi.locate import (
     HUB_FILES,
     find_checkpoint,
@@ -40,15 +52,82 @@ def test_local_folders_come_first(tmp_path, monkeypatch):
 def test_a_hub_name_is_downloaded_by_the_hub_s_client(monkeypatch, tmp_path):
     asked = []
 
-    def snapshot_download(name, repo_type, allow_patterns):
-        asked.append((name, allow_patterns))
+    def snapshot_download(name, repo_type, revision, allow_patterns):
+        asked.append((name, revision, allow_patterns))
         return str(tmp_path)
 
     module(monkeypatch, "huggingface_hub", snapshot_download=snapshot_download)
     assert find_checkpoint("lerobot/pi05_libero_finetuned") == tmp_path
-    assert asked == [("lerobot/pi05_libero_finetuned", list(HUB_FILES))]
+    assert find_checkpoint("lerobot/pi05_libero_finetuned@v1.0") == tmp_path
+    name = "lerobot/pi05_libero_finetuned"
+    assert asked == [(name, None, list(HUB_FILES)), (name, "v1.0", list(HUB_FILES))]
     # safetensors and JSON only: nothing that has to be unpickled is downloaded
     assert not [pattern for pattern in HUB_FILES if pattern.endswith((".bin", ".pt", ".pth", ".pkl"))]
+
+
+@pytest.mark.parametrize(
+    ("name", "split"),
+    [
+        ("org/name", ("org/name", None)),
+        ("org/name@v2", ("org/name", "v2")),
+        (f"org/na.me@{'0123456789' * 4}", ("org/na.me", "0123456789" * 4)),
+        ("org/name@refs/pr/1", ("org/name", "refs/pr/1")),
+        ("org/name@", None),
+        ("org/name@../x", None),
+        ("a/b/c", None),
+        ("name", None),
+        ("org/name\n", None),
+    ],
+)
+def test_names_and_revisions(name, split):
+    assert split_hub_name(name) == split
+
+
+COMMIT, OTHER = "a" * 40, "b" * 40
+
+
+def test_the_commit_of_a_file_is_read_from_the_cache():
+    snapshots = hub_cache() / "models--org--name" / "snapshots"
+    for commit in (COMMIT, OTHER):
+        (snapshots / commit / "tokenizer").mkdir(parents=True)
+        (snapshots / commit / "tokenizer" / "tokenizer.model").touch()
+    path = snapshots / COMMIT / "tokenizer" / "tokenizer.model"
+    assert str(hub_version(path)) == f"org/name@{COMMIT}"
+    assert downloads(path, None, Path("/elsewhere/snapshots/x")) == {"hub org/name": COMMIT}
+    assert hub_version(snapshots) is None
+    # Of two versions that are there, the one that `main` was at the last download, not the last by its letters.
+    assert in_hub_cache("org/name", "tokenizer/tokenizer.model") == path
+    (snapshots.parent / "refs").mkdir()
+    for commit in (OTHER, COMMIT):
+        (snapshots.parent / "refs" / "main").write_text(commit)
+        assert hub_version(in_hub_cache("org/name", "tokenizer/tokenizer.model")).commit == commit
+    assert in_hub_cache("org/name", "other") is None
+
+
+def test_a_policy_from_the_hub_says_its_commit_and_is_built_again_from_it(monkeypatch):
+    asked = []
+
+    def snapshot_download(name, repo_type, revision, allow_patterns):
+        asked.append((name, revision))
+        folder = hub_cache() / f"models--{name.replace('/', '--')}" / "snapshots" / COMMIT
+        if not folder.exists():
+            shutil.copytree(GOLDEN / "pi05_batch2" / "checkpoint_openpi_torch", folder)
+            # In the cache, files are links to the blobs of their repository.
+            blobs = folder.parents[1] / "blobs"
+            blobs.mkdir()
+            (folder / "model.safetensors").rename(blobs / "1")
+            (folder / "model.safetensors").symlink_to("../../blobs/1")
+            shutil.copyfile(GOLDEN / "pi05_batch2" / "case.json", folder.parent / "case.json")
+        return str(folder)
+
+    module(monkeypatch, "huggingface_hub", snapshot_download=snapshot_download)
+    tokenizer = train_small_tokenizer(hub_cache().parent / "small.model")
+    policy = build_pi_policy("org/name", tokenizer=str(tokenizer), device="cpu")
+    assert policy.identity().checkpoint == f"org/name@{COMMIT}"
+    assert downloads_of(policy) == {"hub org/name": COMMIT}
+    again = build_pi_policy(policy.identity().checkpoint, tokenizer=str(tokenizer), device="cpu")
+    assert again.identity() == policy.identity()
+    assert asked == [("org/name", None), ("org/name", COMMIT)]
 
 
 def test_the_real_client_without_a_network(monkeypatch):

@@ -144,7 +144,7 @@ def test_statistics_come_from_the_checkpoint_s_assets(tmp_path, stats):
     [
         ("{", "not valid JSON"),
         ("{}", "no 'norm_stats'"),
-        ("[]", "no 'norm_stats'"),
+        ("[]", "holds a list"),
         ('{"norm_stats": {"state": {"mean": [0], "std": [1]}}}', "no mean and std for 'actions'"),
         ('{"norm_stats": {"state": {"mean": [0], "std": [1, 1]}}}', "unequal lengths for 'state'"),
         ('{"norm_stats": {"state": {"mean": ["a"], "std": [1]}}}', "other values than numbers as 'mean'"),

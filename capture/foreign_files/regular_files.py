@@ -1,0 +1,91 @@
+"""Regular files only: no pipe on which a reader waits for ever, no device, no link that leads out of its folder."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Callable
+from pathlib import Path
+
+from vla_attention.schemas.errors import UserError
+
+#: What makes an error of a sentence: mostly a class of errors.
+Refuse = Callable[[str], UserError]
+
+#: Files and folders below one folder of a checkpoint. Those of openpi have some hundreds.
+MAX_FILES = 100_000
+
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+#: The folder of the hub's cache whose files are links to `blobs` beside it.
+_SNAPSHOTS = "snapshots"
+
+
+def check_regular(path: Path, refuse: Refuse, *, inside: Path | None = None) -> int:
+    """Return the size in bytes of a regular file.
+
+    inside: the folder that a link may not leave; None for a file that the user named. Links of the hub's cache lead
+    from a snapshot to the blobs of the same repository.
+
+    Raises:
+        FileNotFoundError: there is nothing, or a link to nothing.
+        What `refuse` makes: the path is no regular file, or a link that leads out of the folder.
+    """
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            kind = _KINDS.get(stat.S_IFMT(status.st_mode), "something else")
+            raise refuse(f"'{path}' is {kind}; expected a regular file.")
+        if inside is not None:
+            _check_inside(path, inside, refuse)
+    except FileNotFoundError:
+        raise
+    except (OSError, RuntimeError) as error:  # a circle of links is a RuntimeError of pathlib
+        if isinstance(error, UserError):
+            raise
+        raise refuse(f"'{path}' cannot be read ({getattr(error, 'strerror', None) or error}).") from error
+    return status.st_size
+
+
+def _check_inside(path: Path, folder: Path, refuse: Refuse) -> None:
+    real, home = path.resolve(), folder.resolve()
+    if real.is_relative_to(home):
+        return
+    repository = next((part.parent for part in home.parents if part.name == _SNAPSHOTS), None)
+    if repository is None or not real.is_relative_to(repository / "blobs"):
+        raise refuse(
+            f"'{path}' is a link that leads out of its folder, to '{real}'; put a copy of the file in its place."
+        )
+
+
+def check_folder(folder: Path, refuse: Refuse, *, inside: bool = True) -> None:
+    """Check every file below a folder, for a library that opens them by itself; see `check_regular`.
+
+    inside: whether links have to stay in it. Where they need not, one may lead to a folder, which is not searched.
+    """
+    waiting, seen = [folder], 0
+    while waiting:
+        here = waiting.pop()
+        try:
+            entries = list(os.scandir(here))
+        except OSError as error:
+            raise refuse(f"'{here}' cannot be read ({error.strerror or error}).") from error
+        seen += len(entries)
+        if seen > MAX_FILES:
+            raise refuse(f"'{folder}' holds more than {MAX_FILES} files; expected some hundreds.")
+        for entry in entries:
+            if entry.is_dir(follow_symlinks=not inside):
+                if not entry.is_symlink():
+                    waiting.append(Path(entry.path))
+                continue
+            try:
+                check_regular(Path(entry.path), refuse, inside=folder if inside else None)
+            except FileNotFoundError as error:
+                if isinstance(error, UserError):
+                    raise
+                raise refuse(f"'{entry.path}' is a link to a file that does not exist.") from None

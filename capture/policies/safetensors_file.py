@@ -1,0 +1,82 @@
+"""safetensors files: the length of the header is checked before it is read, and every error names the file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from safetensors import safe_open
+from torch import Tensor
+
+from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint, check_checkpoint_file
+from vla_attention.schemas.errors import listing
+
+#: Bytes of the header: names, shapes and places. A model of a thousand tensors has 0.15 MB; the format allows 100 MB,
+#: of which a reader makes some gigabytes.
+MAX_HEADER_BYTES = 8_000_000
+#: Types of weights. Whole numbers and 8 bits need scales, without which they would be other weights.
+_FLOATS = ("F64", "F32", "F16", "BF16")
+
+
+@dataclass(frozen=True)
+class SafetensorsFile:
+    """An open file: names and shapes are known, numbers are read when they are asked for."""
+
+    path: Path
+    stored: Any
+
+    def names(self) -> list[str]:
+        """Return the names of the tensors."""
+        return list(self.stored.keys())
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of a tensor."""
+        return tuple(self.stored.get_slice(name).get_shape())
+
+    def read(self, name: str) -> Tensor:
+        """Read one tensor."""
+        try:
+            tensor: Tensor = self.stored.get_tensor(name)
+        except Exception as error:  # the library's own, and PyTorch's for types and sizes that it does not know
+            raise _unreadable(self.path, error) from error
+        return tensor
+
+    def check_floats(self, names: Iterable[str]) -> None:
+        """Raise `CheckpointMismatch` for weights that are no floating point numbers of at least 16 bits."""
+        found = {name: str(self.stored.get_slice(name).get_dtype()) for name in names}
+        wrong = [f"{name} ({kind})" for name, kind in found.items() if kind not in _FLOATS]
+        if wrong:
+            raise CheckpointMismatch(
+                f"'{self.path}' has weights that are no floating point numbers of 16 bits or more: {listing(wrong)}; "
+                "use the checkpoint before it was quantized."
+            )
+
+
+@contextmanager
+def open_safetensors(path: Path) -> Iterator[SafetensorsFile]:
+    """Open a file; `UnreadableCheckpoint` for a damaged one, also later while it is read."""
+    size = check_checkpoint_file(path)
+    with path.open("rb") as file:
+        header = int.from_bytes(file.read(8), "little")
+    if size < 8 or header > size - 8:
+        raise UnreadableCheckpoint(
+            f"'{path}' has {size} bytes, of which its header would take {header}: the file is damaged or its copy "
+            "incomplete."
+        )
+    if header > MAX_HEADER_BYTES:
+        raise UnreadableCheckpoint(
+            f"'{path}' has a header of {header} bytes; a header of {MAX_HEADER_BYTES} at most is read."
+        )
+    try:
+        opened = safe_open(path, framework="pt")
+    except Exception as error:  # the library's own, and PyTorch's for a file that does not fit into memory
+        raise _unreadable(path, error) from error
+    with opened as stored:
+        yield SafetensorsFile(path, stored)
+
+
+def _unreadable(path: Path, error: Exception) -> UnreadableCheckpoint:
+    return UnreadableCheckpoint(f"'{path}' cannot be read ({error}): the file is damaged or its copy incomplete.")

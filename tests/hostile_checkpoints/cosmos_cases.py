@@ -1,0 +1,244 @@
+"""Hostile checkpoints of Cosmos Policy: files of torch.save, pickled text embeddings, statistics."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+import struct
+import zipfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
+
+import torch
+
+from tests.hostile_checkpoints.hostile_files import (
+    TRACE,
+    Case,
+    Execute,
+    Make,
+    call,
+    deep,
+    edit,
+    executing_pickle,
+    hash_bomb,
+    hash_bomb_with_table,
+    link,
+    old_torch,
+    pipe,
+    sparse,
+    table_bomb,
+    text,
+    torch_zip,
+)
+from tests.kit.cosmos_checkpoint import WEIGHTS_NAME, write_dummy_folder
+from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG
+from vla_attention.capture.policies.cosmos.locate import EMBEDDINGS_NAME, STATISTICS_NAME, VAE_NAME
+
+
+@cache
+def dummy() -> Path:
+    """A checkpoint of test size, written once in a process."""
+    return write_dummy_folder(Path(mkdtemp(prefix="hostile-")) / "dummy", DUMMY_CONFIG, ["lift the cube"])
+
+
+def made(change: Callable[[Path], object], folder: Path) -> list[str]:
+    checkpoint = folder / "checkpoint"
+    shutil.copytree(dummy(), checkpoint)
+    change(checkpoint)
+    arguments = ["cosmos", "--ckpt-path", str(checkpoint), "--device", "cpu", "--task-suite", "cubes", "--task-id", "0"]
+    return [*arguments, "--num-episodes", "1", "--store", str(folder / "store.zarr")]
+
+
+def weights(change: Callable[[Path], object]) -> Make:
+    return lambda folder: made(lambda checkpoint: change(checkpoint / WEIGHTS_NAME), folder)
+
+
+def embeddings(change: Callable[[Path], object]) -> Make:
+    return lambda folder: made(lambda checkpoint: change(checkpoint / EMBEDDINGS_NAME), folder)
+
+
+def statistics(change: Callable[[Path], object]) -> Make:
+    return lambda folder: made(lambda checkpoint: change(checkpoint / STATISTICS_NAME), folder)
+
+
+def pickled(content: bytes, method: int = zipfile.ZIP_STORED) -> Make:
+    return weights(lambda path: torch_zip(path, content, method))
+
+
+def saved(change: Callable[[dict[str, object]], object]) -> Make:
+    """Weights of the dummy with a change, as torch.save writes them."""
+
+    def save(path: Path) -> None:
+        state = dict(torch.load(path, weights_only=False))
+        change(state)
+        torch.save(state, path)
+
+    return weights(save)
+
+
+def execute_through_storage(path: Path) -> None:
+    """Text embeddings whose storage, a file of torch.save in the pickle, executes."""
+    inner = executing_pickle(path.parent.parent)
+    name = b"ctorch.storage\n_load_from_bytes\n"
+    path.write_bytes(b"\x80\x03}" + text("a") + name + b"B" + struct.pack("<I", len(inner)) + inner + b"\x85Rs.")
+
+
+def another_type(path: Path) -> None:
+    with open(path, "wb") as file:
+        pickle.dump({"a": [1, 2]}, file)
+
+
+def claims(path: Path) -> None:
+    """A file before 1.6 with a storage of 10^15 numbers."""
+    storage = (
+        b"("
+        + text("storage")
+        + b"ctorch\nFloatStorage\n"
+        + text("0")
+        + text("cpu")
+        + b"\x8a\x07"
+        + (10**15).to_bytes(7, "little")
+        + b"NtQ"
+    )
+    rebuilt = b"ctorch._utils\n_rebuild_tensor_v2\n(" + storage + b"K\x00))\x89}tR"
+    old_torch(path, b"\x80\x02}" + text("net.a") + rebuilt + b"s.")
+
+
+def directory_of_a_terabyte(path: Path) -> None:
+    """A zip whose end says that its directory has 2 GB, before which the file has zeros."""
+    end = struct.pack("<4s4H2LH", b"PK\x05\x06", 0, 0, 65535, 65535, 2_000_000_000, 4, 0)
+    sparse(path, 2_000_000_004, b"PK\x03\x04")
+    with path.open("ab") as file:
+        file.write(end)
+
+
+def huge_blocks(state: dict[str, object]) -> None:
+    state["net.blocks.999999999.self_attn.q_norm.weight"] = torch.zeros(1)
+
+
+def many_blocks(state: dict[str, object]) -> None:
+    state.update({f"net.blocks.{i}.x": torch.zeros(1) for i in range(1000)})
+
+
+def one_storage(state: dict[str, object]) -> None:
+    shared = torch.zeros(1_000_000)
+    state.update({f"net.shared{i}": shared for i in range(2000)})
+
+
+def claimed_width(state: dict[str, object]) -> None:
+    state["net.x_embedder.proj.1.weight"] = torch.zeros(1).expand(10**6, 10**6)
+
+
+def whole_numbers(state: dict[str, object]) -> None:
+    state["net.x_embedder.proj.1.weight"] = torch.zeros(8, 8, dtype=torch.int8)
+
+
+def sparse_tensor(state: dict[str, object]) -> None:
+    state["net.a"] = torch.sparse_coo_tensor(torch.zeros(1, 1, dtype=torch.int64), torch.ones(1), (10**12,))
+
+
+def without_numbers(state: dict[str, object]) -> None:
+    state["net.a"] = torch.empty(10**12, device="meta")
+
+
+def one_axis(state: dict[str, object]) -> None:
+    state["net.x_embedder.proj.1.weight"] = torch.zeros(8)
+
+
+EXECUTES = weights(lambda path: torch_zip(path, executing_pickle(path.parent.parent)))
+
+COSMOS: dict[str, Case] = {
+    # code
+    "weights that execute": Case(EXECUTES, r"it asks for \w+\.system.*nothing of it was executed"),
+    "old weights that execute": Case(
+        weights(lambda path: old_torch(path, executing_pickle(path.parent.parent))), r"asks for \w+\.system"
+    ),
+    "a bare pickle that executes": Case(
+        weights(lambda path: path.write_bytes(executing_pickle(path.parent.parent))), r"asks for \w+\.system"
+    ),
+    "an image encoder that executes": Case(
+        lambda folder: made(lambda path: torch_zip(path / VAE_NAME, executing_pickle(folder)), folder),
+        r"asks for \w+\.system",
+    ),
+    "text that executes": Case(
+        embeddings(lambda path: path.write_bytes(pickle.dumps({"a": Execute(path.parent.parent / TRACE)}))),
+        r"asks for \w+\.system.*nothing of it was executed",
+    ),
+    "text whose storage executes": Case(embeddings(execute_through_storage), r"asks for \w+\.system"),
+    "weights that call eval": Case(pickled(call("builtins", "eval", text("1") + b"\x85")), r"asks for builtins\.eval"),
+    "weights that open a file": Case(pickled(call("io", "open", text("/etc/passwd") + b"\x85")), r"asks for io\.open"),
+    # memory
+    "10 GB of zeros by a call": Case(
+        pickled(call("builtins", "bytearray", b"\x8a\x05" + (10**10).to_bytes(5, "little") + b"\x85")),
+        "asks for builtins.bytearray",
+    ),
+    "10 GB of bytes by a call": Case(
+        pickled(call("__builtin__", "bytes", b"\x8a\x05" + (10**10).to_bytes(5, "little") + b"\x85")),
+        "with other arguments",
+    ),
+    "entry 4 billion of a table": Case(
+        embeddings(lambda path: path.write_bytes(table_bomb())), "a table entry of number"
+    ),
+    "a text of 4 GB": Case(
+        embeddings(lambda path: sparse(path, 1_000_000_000, b"\x80\x04X\xff\xff\xff\x3a")),
+        "has an item of 989855743 bytes",
+    ),
+    "a compressed pickle": Case(pickled(b"\x80\x02" + b"0" * 50_000_000, zipfile.ZIP_DEFLATED), "compressed zip"),
+    "a directory of 2 GB": Case(weights(directory_of_a_terabyte), "has a directory of 2000000000 bytes"),
+    "a storage of 10^15 numbers": Case(weights(claims), "asks for 1000000000000000 numbers"),
+    "a tensor with a step of 0": Case(saved(claimed_width), "whose numbers it does not hold"),
+    "two thousand tensors of one storage": Case(saved(one_storage), "bytes of numbers for them"),
+    "a sparse tensor": Case(saved(sparse_tensor), "was refused"),
+    "a tensor without numbers": Case(saved(without_numbers), "was refused"),
+    "text embeddings of 5 GB": Case(
+        embeddings(lambda path: sparse(path, 5 * 10**9)), "text embeddings of 2000000000 at most"
+    ),
+    # time
+    "a key that is hashed for an hour": Case(
+        pickled(hash_bomb()), "instruction DUP|tuple of more than|a key that is no name"
+    ),
+    "the same with a table": Case(pickled(hash_bomb_with_table()), "tuple of more than 10000 items"),
+    "the same in text embeddings": Case(
+        embeddings(lambda path: path.write_bytes(hash_bomb_with_table())), "tuple of more than 10000 items"
+    ),
+    "a slow encoding": Case(
+        pickled(call("_codecs", "encode", b"(" + text("\u00e4" * 100_000) + text("punycode") + b"t")),
+        "with other arguments",
+    ),
+    "three million instructions": Case(
+        pickled(b"\x80\x02]" + b"N0" * 1_500_000 + b"."), "instruction POP|more than 2000000"
+    ),
+    "three million numbers": Case(pickled(b"\x80\x02](" + b"N" * 3_000_000 + b"e."), "more than 2000000 instructions"),
+    # sizes and types
+    "block 999,999,999": Case(saved(huge_blocks), "1 extra: blocks.999999999|missing"),
+    "a thousand blocks": Case(saved(many_blocks), "number of blocks of the checkpoint is 100"),
+    "weights of one axis": Case(saved(one_axis), r"has shape \(8,\), from which a size cannot be read"),
+    "quantized weights": Case(saved(whole_numbers), "numbers of type torch.int8"),
+    "text that is a list": Case(embeddings(another_type), "entry for 'a' that is list"),
+    "weights of other bytes": Case(weights(lambda path: path.write_bytes(b"\x00" * 999)), "damaged or no pickle"),
+    "weights that end early": Case(weights(lambda path: path.write_bytes(path.read_bytes()[:5000])), "damaged"),
+    "a zip without a pickle": Case(
+        weights(lambda path: zipfile.ZipFile(path, "w").writestr("a", "b")), "0 files data.pkl"
+    ),
+    # files
+    "a pipe for weights": Case(weights(pipe), "is a named pipe"),
+    "a device for weights": Case(weights(lambda path: link(path, "/dev/zero")), "is a device"),
+    "weights that are a link": Case(weights(lambda path: link(path, "/etc/hostname")), "leads out of its folder"),
+    "a pipe for text": Case(embeddings(pipe), "is a named pipe"),
+    "a pipe for statistics": Case(statistics(pipe), "is a named pipe"),
+    "deep statistics": Case(statistics(lambda path: path.write_text(deep())), "nested more than 64 deep"),
+    "a range of 5,000 digits": Case(
+        statistics(lambda path: path.write_text('{"actions_min": [' + "9" * 5000 + "]}")),
+        "a whole number of 5,?000 digits",
+    ),
+    "ranges with NaN": Case(
+        statistics(lambda path: edit(path, lambda content: content.update(actions_min=[float("nan")] * 7))),
+        "finite numbers",
+    ),
+    "ranges that are a table": Case(
+        statistics(lambda path: path.write_text(json.dumps({"actions_min": {"a": 1}}))), "no list of numbers"
+    ),
+}

@@ -1,0 +1,191 @@
+"""Hostile files of LIBERO (initial states, tasks, assets) and of parity cases."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shutil
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tests.hostile_checkpoints.hostile_files import (
+    TRACE,
+    Case,
+    Make,
+    executing_pickle,
+    hash_bomb_with_table,
+    pipe,
+    sparse,
+    torch_zip,
+)
+from tests.kit.paths import GOLDEN
+from vla_attention.capture.environments.libero_installation import ASSET_SUBFOLDERS
+
+#: The first task of the suite.
+SUITE, NUMBER = "libero_10", 0
+#: The folder in a case from which LIBERO is imported instead of the installed one.
+PACKAGES = "packages"
+
+
+def installed() -> Path:
+    spec = importlib.util.find_spec("libero")
+    assert spec is not None
+    return Path(next(iter(spec.submodule_search_locations or []))) / "libero"
+
+
+def task_name() -> str:
+    names: dict[str, object] = {}
+    exec((installed() / "benchmark" / "libero_suite_task_map.py").read_text(), names)
+    name: str = names["libero_task_map"][SUITE][NUMBER]  # type: ignore[index]
+    return name
+
+
+def package(folder: Path) -> Path:
+    """LIBERO as it is installed, by links, with folders of its own for the files of the task; returns the inner one."""
+    inner = folder / PACKAGES / "libero" / "libero"
+    inner.mkdir(parents=True)
+    (inner.parent / "__init__.py").write_text("")  # the installed package would win against a folder without
+    for entry in installed().iterdir():
+        if entry.name not in ("init_files", "bddl_files", "__pycache__"):
+            (inner / entry.name).symlink_to(entry)
+    for kind, ending in (("init_files", "pruned_init"), ("bddl_files", "bddl")):
+        (inner / kind / SUITE).mkdir(parents=True)
+        file = f"{kind}/{SUITE}/{task_name()}.{ending}"
+        shutil.copyfile(installed() / file, inner / file)
+    return inner
+
+
+def made(change: Callable[[Path, Path, Path], object], folder: Path) -> list[str]:
+    """A task of LIBERO; the change gets its initial states, its task file and the folder of assets."""
+    inner, assets = package(folder), folder / "assets"
+    for name in ASSET_SUBFOLDERS:
+        (assets / name).mkdir(parents=True)
+    states = inner / "init_files" / SUITE / f"{task_name()}.pruned_init"
+    change(states, inner / "bddl_files" / SUITE / f"{task_name()}.bddl", assets)
+    arguments = [
+        "pi",
+        "--checkpoint",
+        "untrained-tiny",
+        "--device",
+        "cpu",
+        "--task-suite",
+        SUITE,
+        "--task-id",
+        str(NUMBER),
+    ]
+    more = ["--num-episodes", "1", "--libero-assets", str(assets), "--store", str(folder / "store.zarr")]
+    return [*arguments, *more]
+
+
+def states(change: Callable[[Path], object]) -> Make:
+    return lambda folder: made(lambda path, task, assets: change(path), folder)
+
+
+def task(change: Callable[[Path], object]) -> Make:
+    return lambda folder: made(lambda path, task, assets: change(task), folder)
+
+
+def as_states(value: object) -> Make:
+    return states(lambda path: torch.save(value, path))
+
+
+def as_array(value: object) -> Callable[[Path], object]:
+    return lambda path: torch.save(value, path)
+
+
+def executing_task(path: Path) -> None:
+    trace = path.parents[5] / TRACE
+    call = f"__import__('pathlib').path('{trace}').touch()"  # the parser writes everything in small letters
+    path.write_text(path.read_text().replace("(0.0 0.0)", f"({call} 0.0)", 1))
+
+
+def parity(change: Callable[[Path], object]) -> Make:
+    def case(folder: Path) -> list[str]:
+        shutil.copytree(GOLDEN / "cosmos" / "dit_batch2_T5_rect", folder / "case")
+        change(folder / "case")
+        return ["parity", str(folder / "case")]
+
+    return case
+
+
+def array_bomb(case: Path) -> None:
+    header = {"descr": "<f4", "fortran_order": False, "shape": (150_000_000,)}
+    with (
+        zipfile.ZipFile(case / "inputs.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file,
+        file.open("latents.npy", "w", force_zip64=True) as member,
+    ):
+        np.lib.format.write_array_header_1_0(member, header)
+        for _ in range(600):
+            member.write(bytes(1_000_000))
+
+
+def array_that_claims(case: Path) -> None:
+    with zipfile.ZipFile(case / "inputs.npz", "w") as file, file.open("latents.npy", "w") as member:
+        np.lib.format.write_array_header_1_0(member, {"descr": "<f4", "fortran_order": False, "shape": (10**15,)})
+
+
+def objects(case: Path) -> None:
+    np.savez(case / "inputs.npz", latents=np.array([{"a": 1}], dtype=object))
+
+
+def facts(change: Callable[[dict[str, object]], object]) -> Make:
+    def edited(case: Path) -> None:
+        content = json.loads((case / "case.json").read_text())
+        change(content)
+        (case / "case.json").write_text(json.dumps(content))
+
+    return parity(edited)
+
+
+LIBERO: dict[str, Case] = {
+    "initial states that execute": Case(
+        states(lambda path: torch_zip(path, executing_pickle(path.parents[5]))), r"asks for \w+\.system; nothing of it"
+    ),
+    "initial states that are hashed for an hour": Case(
+        states(lambda path: torch_zip(path, hash_bomb_with_table())), "tuple of more than 10000 items"
+    ),
+    "initial states that are a table": Case(as_states({"a": 1}), "holds no initial states"),
+    "initial states that are a tensor": Case(as_states(torch.zeros(3)), "asks for torch._utils._rebuild_tensor_v2"),
+    "initial states with NaN": Case(as_states(np.full((50, 79), np.nan)), "or NaN"),
+    "initial states of one axis": Case(as_states(np.zeros(50)), r"of shape \(50,\)"),
+    "initial states that are objects": Case(
+        as_states(np.array([{"a": 1}], dtype=object)), "calls numpy.dtype with other"
+    ),
+    "initial states of another scene": Case(as_states(np.zeros((50, 3))), "do not belong together|cannot be built"),
+    "initial states cut off": Case(states(lambda path: path.write_bytes(path.read_bytes()[:3000])), "damaged"),
+    "no initial states": Case(states(os.remove), "There are no initial states"),
+    "a pipe for initial states": Case(states(pipe), "is a named pipe"),
+    "initial states of 5 GB": Case(states(lambda path: sparse(path, 5 * 10**9)), "initial states of 64000000 at most"),
+    "a task that executes": Case(task(executing_task), "as an angle .*Nothing of it was executed"),
+    "a task of parentheses": Case(task(lambda path: path.write_text("(" * 100_000 + ")" * 100_000)), "parentheses"),
+    "a task that is empty": Case(task(lambda path: path.write_text("")), "The task file .* cannot be read"),
+    "a task of an unknown problem": Case(
+        task(lambda path: path.write_text(path.read_text().replace("(problem ", "(problem x", 1))),
+        "The task file .* cannot be read",
+    ),
+    "a task that is no text": Case(task(lambda path: path.write_bytes(b"\xff\xfe")), "cannot be read"),
+    "a pipe for a task": Case(task(pipe), "is a named pipe"),
+    "assets that are empty": Case(states(lambda path: None), "cannot be built from"),
+    "a pipe among the assets": Case(
+        lambda folder: made(lambda path, file, assets: pipe(assets / "scenes" / "x.xml"), folder), "is a named pipe"
+    ),
+}
+PARITY: dict[str, Case] = {
+    "arrays of 600 MB in 0.6": Case(parity(array_bomb), "holds 600000128 bytes of arrays"),
+    "an array that claims 4 PB": Case(parity(array_that_claims), "cannot be read as arrays"),
+    "arrays of objects": Case(parity(objects), "cannot be read as arrays"),
+    "a pipe for arrays": Case(parity(lambda case: pipe(case / "inputs.npz")), "is a named pipe"),
+    "weights outside of the case": Case(
+        facts(lambda content: content.update(state_dict="../../x.pt")), "the name of a file beside"
+    ),
+    "weights without a name": Case(facts(lambda content: content.update(state_dict=5)), "the name of a file beside"),
+    "sizes that are a list": Case(facts(lambda content: content.update(net_config=[1])), "expected a table of sizes"),
+    "a deep case": Case(
+        parity(lambda case: (case / "case.json").write_text('{"a": ' + "[" * 5000 + "]" * 5000 + "}")), "nested"
+    ),
+}
