@@ -7,19 +7,15 @@ and the last, then the first, then layers between others, and heads last, becaus
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from vla_attention.capture.store.disk_estimate import DiskEstimate
+from vla_attention.schemas.byte_counts import parse_bytes
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, UserError, listing
 from vla_attention.schemas.precision import DEFAULT_MANTISSA_BITS, FLOAT32_MANTISSA_BITS
 from vla_attention.schemas.stores.store_format import Recording
-
-_UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
-_UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30, "TIB": 2**40}
-_SIZE = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]*)")
 
 #: Bits below the default that are tried: a ratio is within 0.8 % with 7 of them, and within 6 % with 4.
 _FEWER_BITS, _FEWEST_BITS = 7, 4
@@ -53,11 +49,10 @@ class Choice:
 
 def parse_budget(text: str) -> int:
     """Read `--budget`: a number of bytes with a unit, such as 20GB, 1.5TB or 500 MiB."""
-    match = _SIZE.fullmatch(text.strip())
-    unit = match[2].upper() if match else ""
-    if match is None or unit not in _UNITS or not float(match[1]) * _UNITS[unit] >= 1:
+    size = parse_bytes(text)
+    if not size:
         raise BadArgument(f"Cannot use --budget '{text}'; expected a size such as 20GB, 1.5TB or 500MiB.")
-    return int(float(match[1]) * _UNITS[unit])
+    return size
 
 
 def recordings_by_size(asked: Recording, num_denoise_steps: int, fixed: Fixed) -> tuple[Recording, ...]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from vla_attention.schemas.byte_counts import parse_bytes
 from vla_attention.schemas.errors import BadArgument
 
 #: The folder of the cache, relative to the working directory: beside the results, which are in results/STORE/GROUPING.
@@ -21,7 +21,6 @@ SIZE_VARIABLE = "VLA_CACHE_SIZE"
 _OFF = ("off", "0", "no", "false")
 #: Values with which it is where it is without the variable.
 _ON = ("on", "1", "yes", "true", "")
-_UNITS = {"": 1, "B": 1, "KB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}
 
 
 @dataclass(frozen=True)
@@ -62,17 +61,15 @@ def switched_off() -> Iterator[None]:
 
 
 def parse_size(text: str) -> int:
-    """A size such as "500MB" or "2 GB" in bytes (powers of ten).
+    """A size such as "500MB" or "2 GB" in bytes, as `parse_bytes` reads it.
 
     Raises:
         BadArgument: it is no size.
     """
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([kmgt]?b?)", text.strip(), re.IGNORECASE)
-    unit = match[2].upper() if match else ""
-    unit = f"{unit}B" if unit and not unit.endswith("B") else unit
-    if match is None:
+    size = parse_bytes(text)
+    if size is None:
         raise BadArgument(
             f"{SIZE_VARIABLE}={text} is no size; expected a number of bytes, or one with a unit, as in 500MB or 2GB. "
             f"To switch the cache off, set {FOLDER_VARIABLE}=off."
         )
-    return int(float(match[1]) * _UNITS[unit])
+    return size

@@ -6,9 +6,11 @@ OpenGL context does not survive a fork. Every process draws with a context and o
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import gc
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -39,8 +41,8 @@ _NICENESS = 5
 _END_WITHIN_S = 2.0
 #: The paths of modules are those of the first process, which may have got some while it ran.
 _BOOT = (
-    "import sys; sys.path[:] = sys.argv[2:]; "
-    "from vla_attention.capture.rollout.simulator_process import main; main(int(sys.argv[1]))"
+    "import sys; sys.path[:] = sys.argv[3:]; "
+    "from vla_attention.capture.rollout.simulator_process import main; main(int(sys.argv[1]), sys.argv[2])"
 )
 
 
@@ -103,13 +105,13 @@ class SimulatorProcess:
     def __init__(self, setup: SimulatorSetup) -> None:
         self.connection, theirs = Pipe()
         one_thread = dict.fromkeys(("OMP_NUM_THREADS", *OTHER_LIBRARIES), "1") | _DRAWS_ITSELF
-        # Its temporary files are removed here: it is killed, and removes none.
+        # Its temporary files are removed here: it is killed, and removes none. When this process is killed, it does.
         self._temporary = tempfile.TemporaryDirectory(prefix="vla-simulator-", ignore_cleanup_errors=True)
         with theirs:
             # A process group of its own: Ctrl-C reaches the policy's process alone, which ends this one. It also ends
             # when the other end of the connection closes, however the policy's process ended.
             self._process = subprocess.Popen(
-                [sys.executable, "-c", _BOOT, str(theirs.fileno()), *sys.path],
+                [sys.executable, "-c", _BOOT, str(theirs.fileno()), self._temporary.name, *sys.path],
                 stdin=subprocess.DEVNULL,
                 stdout=sys.stderr.fileno() if _has_descriptor(sys.stderr) else None,
                 pass_fds=[theirs.fileno()],
@@ -207,8 +209,14 @@ class _Server:
         return self.environment
 
 
-def main(descriptor: int) -> None:
-    """Simulate for the process at the other end of a connection, until that end closes."""
+def main(descriptor: int, temporary: str | None = None) -> None:
+    """Simulate for the process at the other end of a connection, until that end closes.
+
+    temporary: a folder of this process alone, which is removed when it ends by itself.
+    """
+    if temporary is not None:
+        # What is registered first is called last: others remove their files in it before.
+        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
     connection = Connection(descriptor)
     os.nice(_NICENESS)
     try:

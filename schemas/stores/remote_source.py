@@ -20,6 +20,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from vla_attention.schemas.byte_counts import parse_bytes
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder, Memory, copy_into, split
 from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
@@ -201,12 +202,12 @@ def kept_bytes() -> KeptBytes | None:
         return None
     home = Path(os.environ.get("XDG_CACHE_HOME", "") or Path.home() / ".cache")
     size = os.environ.get(SIZE_VARIABLE, "").strip()
-    try:
-        most = int(float(size)) if size else DEFAULT_BYTES
-    except ValueError:
+    most = parse_bytes(size) if size else DEFAULT_BYTES
+    if most is None:
         raise BadArgument(
-            f"{SIZE_VARIABLE}={size} is no number of bytes; {FOLDER_VARIABLE}=off keeps nothing."
-        ) from None
+            f"{SIZE_VARIABLE}={size} is no size; expected a number of bytes, or one with a unit, as in 500MB or 10GB. "
+            f"To keep nothing, set {FOLDER_VARIABLE}=off."
+        )
     return KeptBytes(Path(given).absolute() if given else home / "vla-attention" / "remote", most)
 
 

@@ -112,7 +112,7 @@ def test_sizes(text, size):
     assert parse_size(text) == size
 
 
-@pytest.mark.parametrize("text", ["much", "-1", "1 PB", "GB", "1,5GB"])
+@pytest.mark.parametrize("text", ["much", "-1", "1 PB", "GB", "1,5GB", "9" * 400])
 def test_what_is_no_size_is_one_sentence(text, cache, store, tmp_path, monkeypatch, capsys):
     with pytest.raises(BadArgument, match="is no size; expected"):
         parse_size(text)

@@ -555,6 +555,7 @@ def test_a_stopped_capture_leaves_no_half_episode_and_no_process(number, code, t
     while any(_is_simulator(child) for child in children):  # after SIGKILL they see that nobody listens
         assert time.monotonic() < until
         time.sleep(0.1)
+    assert list(run.temporary.glob("vla-*")) == []
     said = run.log.read_text()
     assert "Traceback" not in said
     if number != signal.SIGKILL:
