@@ -20,7 +20,7 @@ from pathlib import Path
 from vla_attention.analyze.copy.packing import Packing, lock_for_writing
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 from vla_attention.schemas.stores.digest import run_digest, with_digest
-from vla_attention.schemas.stores.episode_files import files_of_no_array
+from vla_attention.schemas.stores.episode_files import files_of_no_array, links_in_episode
 from vla_attention.schemas.stores.partial_folders import (
     make_partial,
     partial_folder,
@@ -182,6 +182,8 @@ def _copy_episode(
             f"Episode {episode.name} has files that belong to no array: {listing(beyond, 5)}. They are not copied, and "
             "without them its seal would not fit."
         )
+    for path in links_in_episode(episode):
+        raise CorruptEpisode(f"Episode {episode.name} is damaged: its {path} is a link, and no copy follows links.")
     for name in episode.attributes.arrays:
         if _part_of(name) not in without and f"{name}/zarr.json" not in episode.files.records:
             raise CorruptEpisode(f"Episode {episode.name} lacks the array {name}: its files are gone.")

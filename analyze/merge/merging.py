@@ -10,7 +10,6 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-import stat
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from pathlib import Path
 from vla_attention.analyze.stores.checking import reports_of_store
 from vla_attention.schemas.errors import BadArgument, UserError, listing
 from vla_attention.schemas.stores.digest import with_digest
+from vla_attention.schemas.stores.episode_files import links_in_episode
 from vla_attention.schemas.stores.partial_folders import (
     make_partial,
     partial_folder,
@@ -169,6 +169,8 @@ def _bring(episode: StoredEpisode, folder: Path, link: bool) -> tuple[int, int]:
     """Link or copy the files of an episode that its seal lists; returns the bytes that were linked and copied."""
     linked = copied = 0
     try:
+        for path in links_in_episode(episode):
+            raise CorruptEpisode(f"Episode {episode.name} is damaged: its {path} is a link, and no copy follows links.")
         files = [*episode.files.records, SEAL_FILE]
         for file in files:
             place = folder / file
@@ -188,18 +190,13 @@ def _linked(episode: StoredEpisode, file: str, place: Path) -> bool:
     """Link one file; False where the file system cannot. What the file holds is looked at when all is read back."""
     if episode.place is not None or isinstance(episode.folder, StoreUrl):
         return False  # in a zip, or elsewhere
-    folder = os.path.realpath(episode.folder)
-    path = os.path.join(folder, file)
-    try:
-        regular = stat.S_ISREG(os.lstat(path).st_mode)
-    except OSError as error:
-        raise CorruptEpisode(f"Episode {episode.name} has lost its {file} ({error.strerror or error}).") from None
-    if not regular or os.path.realpath(path) != path:
-        raise CorruptEpisode(f"The file {file} of episode {episode.name} is a link or no file; no link is followed.")
+    path = episode.folder / file
     try:
         os.link(path, place, follow_symlinks=False)
     except OSError as error:
         if error.errno in _NO_LINKS:
             return False
+        if isinstance(error, (FileNotFoundError, NotADirectoryError)):
+            raise CorruptEpisode(f"Episode {episode.name} has lost its {file} ({error.strerror}).") from None
         raise
     return True

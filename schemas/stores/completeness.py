@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from vla_attention.schemas.stores.episode_files import links_in_episode
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 
@@ -12,14 +13,15 @@ from vla_attention.schemas.stores.store_format import CorruptEpisode
 def check_presence(episode: StoredEpisode) -> list[str]:
     """What is wrong with an episode, one sentence each; an empty list means that it is present.
 
-    Looked at are the seal, the episode's name and run, every `zarr.json`, and the presence and size of every file; the
-    content of arrays is not read.
+    Looked at are the seal, the episode's name and run, every `zarr.json`, the presence and size of every file, and that
+    none is a link; the content of arrays is not read.
     """
     try:
         _ = episode.attributes
     except CorruptEpisode as error:
         return [str(error)]
-    problems = [f"Episode {episode.name} is damaged: {problem}." for problem in episode.files.problems()]
+    problems = [f"Episode {episode.name} is damaged: its {path} is a link." for path in links_in_episode(episode)]
+    problems += [f"Episode {episode.name} is damaged: {problem}." for problem in episode.files.problems()]
     for file in episode.files.records:
         if file.endswith("zarr.json") and not any(file in problem for problem in problems):
             try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -11,11 +12,12 @@ import pytest
 
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.copy.copying import PARTS, check_parts, copy_store, part_sizes
-from vla_attention.schemas.errors import UnknownName
+from vla_attention.analyze.copy.packing import lock_for_writing
+from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.schemas.stores.store_format import CorruptEpisode, RunMismatch
+from vla_attention.schemas.stores.store_format import CorruptEpisode, RunMismatch, StoreError
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.stores import StoreSpec, reseal, write_store
 
 SPEC = StoreSpec(tasks=(0,), episodes=2, replans=2, layers=(0,), heads=(0,), contributions=True)
 
@@ -170,3 +172,103 @@ def test_parts_are_checked():
     assert check_parts(["objects", "frames", "objects"]) == ("frames", "objects")
     with pytest.raises(UnknownName):
         check_parts(["rows"])
+
+
+def smuggled(episode: Path) -> None:
+    (episode / "payload.sh").write_text("rm -rf ~")
+    reseal(episode)
+
+
+def linked_file(episode: Path) -> None:
+    (episode / "state/zarr.json").rename(episode.parents[2] / "elsewhere")
+    (episode / "state/zarr.json").symlink_to(episode.parents[2] / "elsewhere")
+
+
+def linked_folder(episode: Path) -> None:
+    (episode / "joint").rename(episode.parents[2] / "elsewhere")
+    (episode / "joint").symlink_to(episode.parents[2] / "elsewhere")
+
+
+def linked_episode(episode: Path) -> None:
+    episode.rename(episode.parents[2] / "elsewhere")
+    episode.symlink_to(episode.parents[2] / "elsewhere")
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("without", [(), ("frames",)])
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (smuggled, r"has files that belong to no array: payload\.sh"),
+        (linked_file, r"its state/zarr\.json is a link"),
+        (linked_folder, "its joint is a link"),
+        (linked_episode, r"its \. is a link|task000_episode000"),
+    ],
+)
+def test_what_is_no_part_of_an_episode_is_refused(original, tmp_path, change, problem, without, packed):
+    path = tmp_path / "a.zarr"
+    shutil.copytree(original, path)
+    change(path / "episodes/task000_episode000")
+    with pytest.raises(StoreError, match=problem):
+        copy_store(open_store(path), tmp_path / "b.zarr", without, packed=packed)
+    assert not list((tmp_path / "b.zarr").rglob("*payload*"))
+    assert [episode.name for episode in open_store(tmp_path / "b.zarr").episodes] == []
+
+
+def edit(file: Path, change) -> None:
+    document = json.loads(file.read_text())
+    change(document)
+    file.write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_copy_has_nothing_but_what_the_format_names(original, tmp_path, packed):
+    path = tmp_path / "a.zarr"
+    shutil.copytree(original, path)
+    episode = path / "episodes/task000_episode000"
+    (path / "notes.txt").write_text("mine")
+    (path / "episodes/a.png").write_text("mine")
+    (episode / ".DS_Store").write_text("mine")
+    (episode / "joint/rows/c.9").write_text("mine")
+    (episode / "link").symlink_to(path / "notes.txt")
+    for group in (path, path / "episodes", episode / "seal"):
+        edit(group / "zarr.json", lambda document: document.update(payload="rm -rf ~"))
+    copy_store(open_store(path), tmp_path / "b.zarr", (), packed=packed)
+    copy_store(open_store(original), tmp_path / "expected.zarr", (), packed=packed)
+    copied, expected = all_bytes(tmp_path / "b.zarr"), all_bytes(tmp_path / "expected.zarr")
+    assert set(copied) == set(expected)
+    assert not any(b"rm -rf" in content or content == b"mine" for content in copied.values())
+    assert verify_store(open_store(tmp_path / "b.zarr")) == []
+
+
+@pytest.mark.parametrize("change", [Path.unlink, lambda file: file.write_text("{")])
+def test_a_lost_group_of_episodes_is_written_anew(original, tmp_path, change):
+    path = tmp_path / "a.zarr"
+    shutil.copytree(original, path)
+    change(path / "episodes/zarr.json")
+    copy_store(open_store(path), tmp_path / "b.zarr", ())
+    assert verify_store(open_store(tmp_path / "b.zarr")) == []
+    assert json.loads((tmp_path / "b.zarr/episodes/zarr.json").read_text())["node_type"] == "group"
+
+
+@pytest.mark.parametrize("packing", [True, False])
+def test_a_store_that_is_being_packed_is_no_target(original, tmp_path, packing):
+    """Neither before its index is there; and nobody packs where folders are being written."""
+    target = tmp_path / "b.zarr"
+    store = open_store(original)
+    copy_store(store, target, ())
+    for folder in (target / "episodes").glob("task*"):
+        shutil.rmtree(folder)
+    lock = lock_for_writing(target, packing=packing)
+    try:
+        with pytest.raises(BadArgument, match=f"another copy is {'packing' if packing else 'writing'} into it"):
+            copy_store(store, target, (), packed=not packing)
+        if not packing:
+            assert copy_store(store, target, ()).added == 2
+        assert not list(tmp_path.glob("*.partial"))
+    finally:
+        os.close(lock)
+    if packing:
+        assert copy_store(store, target, (), packed=True).added == 2
+        with pytest.raises(StoreError, match="is packed"):
+            copy_store(store, target, ())

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -343,3 +344,61 @@ def test_the_other_suites_do_not_wait_for_a_repair(tmp_path, monkeypatch, capsys
     assert evaluate_attention_ratio(arguments) == 2
     assert captured == ["libero_spatial", "libero_object", "libero_goal", "libero_10"]
     assert "damage in libero_spatial. damage in libero_goal." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("program", [main, analyze], ids=["vla-capture", "vla-analyze"])
+def test_leftovers_of_dead_processes_are_removed(store, capsys, program):
+    folder = store.with_name("a.zarr.partial")
+    host = os.uname().nodename
+    process = subprocess.Popen(["true"])
+    process.wait()
+    dead = [f"task000_episode003-{host}-{process.pid}-aaaa", f"copy-{host}-{process.pid}-aaaa"]
+    others = [f"task000_episode003-{host}x-{process.pid}-aaaa", f"x-{host}-{'9' * 40}-aaaa", "notes"]
+    living = [f"task000_episode004-{host}-{os.getpid()}-aaaa"]
+    for name in (*dead, *others, *living):
+        (folder / name / "deep").mkdir(parents=True)
+    assert program(["repair", str(store), "--dry-run"]) == 0
+    said = capsys.readouterr().out
+    assert all(f"would be removed: {folder / name}, left by a process that has ended" in said for name in dead)
+    assert all(f"left: {folder / name}, written by another machine" in said for name in others)
+    assert not any(name in said for name in living)
+    assert "Nothing was changed (--dry-run)." in said
+    assert len(list(folder.iterdir())) == 6
+    assert program(["repair", str(store)]) == 0
+    said = capsys.readouterr().out
+    assert all(f"  removed: {folder / name}" in said for name in dead)
+    assert sorted(entry.name for entry in folder.iterdir()) == sorted([*others, *living])
+    assert verify_store(open_store(store)) == []
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, lambda file: file.write_text("{")])
+def test_a_lost_group_of_episodes_is_written_again(store, original, capsys, damage):
+    damage(store / "episodes/zarr.json")
+    assert analyze(["verify", str(store), "--quick"]) == 1
+    assert analyze(["repair", str(store), "--dry-run"]) == 0
+    assert "would be written again: episodes/zarr.json, it is " in capsys.readouterr().out
+    assert analyze(["repair", str(store)]) == 0
+    assert "written again: episodes/zarr.json, it is " in capsys.readouterr().out
+    assert json.loads((store / "episodes/zarr.json").read_text()) == json.loads(
+        (original / "episodes/zarr.json").read_text()
+    )
+    assert verify_store(open_store(store)) == []
+    assert not list((store / "episodes").glob(".*"))
+
+
+def test_a_changed_record_of_the_root_is_named_and_left(store, capsys):
+    document = json.loads((store / "zarr.json").read_text())
+    document["attributes"]["provenance"]["numpy"] = "1.0"
+    (store / "zarr.json").write_text(json.dumps(document))
+    assert analyze(["repair", str(store)]) == 0
+    assert "left as it is: zarr.json, it was changed: its own digest does not fit" in capsys.readouterr().out
+
+
+def test_a_linked_episode_is_damaged(store, episode, tmp_path, capsys):
+    episode.rename(tmp_path / "elsewhere")
+    episode.symlink_to(tmp_path / "elsewhere")
+    assert analyze(["verify", str(store), "--quick"]) == 1
+    assert f"{DAMAGED}: Episode {DAMAGED} is damaged: its . is a link." in capsys.readouterr().out
+    assert analyze(["repair", str(store)]) == 0
+    assert names(store) == WHOLE
+    assert (tmp_path / "elsewhere/zarr.json").is_file()
