@@ -20,7 +20,7 @@ from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.stores import StoreSpec, reseal_root, write_store
 
 #: Both episodes of a task have arrays of the same shapes; rows are in three blocks.
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=9, contributions=True, prompts="same")
@@ -201,6 +201,10 @@ def test_the_records_of_a_job_may_differ(originals, stores, answers):
     edit_root(stores[0], ("provenance", "numpy"))
     edit_root(stores[0], ("policy", "checkpoint"))
     assert check_answers(stores, {name: answers[name] for name in ("ratios of spans", "episodes", "words")}) == []
+    # No number comes from them; that they were changed is found by the digest in the root alone.
+    (fault,) = verify_store(open_store(stores[0]))
+    assert fault.where == "zarr.json"
+    reseal_root(stores[0])
     assert verify_store(open_store(stores[0])) == []
 
 
