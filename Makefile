@@ -5,6 +5,7 @@
 #   make test        formatting, types, all tests, and the package as others install it
 #   make test-policies   policies of transformers 5 and LeRobot, in environments of their own (.venv-transformers, .venv-lerobot)
 #   make test-remote stores in S3, on moto's server on this machine, in an environment of its own (.venv-remote)
+#   make fuzz        made-up bytes for every parser of files, for SECONDS=3600, in an environment of its own (.venv-fuzz)
 #   make test-slurm  an array job on the SLURM that sbatch reaches from here (opt-in; installs nothing)
 #   make setup       the whole environment        make setup-analyze   the laptop's part of it
 #
@@ -36,7 +37,7 @@ WORKERS ?= 2
 # An empty PYTHONDONTWRITEBYTECODE: where it is set, both processes compile all tests anew at every run.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: capture analyze test test-policies test-remote test-slurm test-thorough check unit package audit setup setup-analyze schemas clean
+.PHONY: capture analyze test test-policies test-remote test-slurm fuzz test-thorough check unit package audit setup setup-analyze schemas clean
 
 capture: .venv/capture-installed
 	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --store $(STORE) \
@@ -74,6 +75,11 @@ test-policies: .venv-transformers/installed .venv-lerobot/installed
 # moto brings fifty packages, and nothing else needs them.
 test-remote: .venv-remote/installed
 	.venv-remote/bin/pytest tests/schemas/stores/test_remote.py tests/schemas/stores/test_remote_services.py $(ARGS)
+
+# What it finds is kept in results/reliability/fuzz; mended findings belong into tests/fuzz/corpus.
+SECONDS ?= 3600
+fuzz: .venv-fuzz/installed
+	nice .venv-fuzz/bin/python benchmarks/reliability.py fuzz --seconds $(SECONDS)
 
 # Takes about ten minutes, most of it waiting: SLURM holds a requeued job back for two. Works with any environment that is active.
 test-slurm:
@@ -135,5 +141,11 @@ setup-analyze: .venv/analyze-installed
 	.venv-audit/bin/python -m pip install --quiet --disable-pip-version-check 'pip-audit>=2.9'
 	@touch $@
 
+.venv-fuzz/installed: pyproject.toml constraints.txt
+	@echo "Installing atheris into .venv-fuzz ..."
+	$(PYTHON) -m venv .venv-fuzz
+	.venv-fuzz/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e . atheris
+	@touch $@
+
 clean:
-	rm -rf .venv .venv-transformers .venv-lerobot .venv-remote .venv-audit build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-transformers .venv-lerobot .venv-remote .venv-audit .venv-fuzz build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,44 @@
+"""Inputs that a fuzzer found (`make fuzz`), and valid ones: every parser takes them or refuses them in a sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.kit.fuzz_targets import TARGETS, run, seeds
+
+CORPUS = Path(__file__).with_name("corpus")
+FILES = sorted(CORPUS.glob("*/*"))
+
+
+def test_the_corpus_is_that_of_the_targets():
+    assert {path.parent.name for path in FILES} <= set(TARGETS)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}-{path.name}")
+def test_what_was_found_stays_mended(path):
+    run(path.parent.name, path.read_bytes())
+
+
+#: What no parser expects.
+ANYWHERE = {
+    "a large number": b"1e999",
+    "null": b"null",
+    "not a number": b"NaN",
+    "a field twice": b'{"a": 1, "a": 2}',
+    "half a character": b'"\\ud800"',
+    "a mark of the order of bytes": b"\xef\xbb\xbf{}",
+}
+
+
+@pytest.mark.parametrize("what", ANYWHERE)
+@pytest.mark.parametrize("target", TARGETS)
+def test_nonsense_is_refused(target, what):
+    run(target, ANYWHERE[what])
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_valid_inputs_are_taken(target):
+    for content in seeds(target):
+        TARGETS[target](content)

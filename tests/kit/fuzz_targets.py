@@ -1,0 +1,328 @@
+"""What is done with bytes from anywhere, a function for each parser: it returns, or raises a `UserError`.
+
+Any other exception is a finding. `benchmarks/reliability_fuzz.py` gives them bytes that atheris makes up, the tests in
+`tests/fuzz` the files of its corpus and documents that hypothesis changes. They need neither torch nor a simulator.
+Bytes that a checksum or a digest would refuse at once get the right one, so that what is behind it is reached.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import struct
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.kit.attacks import with_checksum
+from vla_attention.analyze.published.results_reader import read_results_file
+from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.groupings.grouping import Grouping, read_grouping_file
+from vla_attention.schemas.groupings.resolve import check_names, resolve
+from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vocabulary
+from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.stores.byte_source import Memory, copy_into
+from vla_attention.schemas.stores.digest import bytes_digest, crc32c, seal_digest
+from vla_attention.schemas.stores.episode_checks import content_problems
+from vla_attention.schemas.stores.packed_index import INDEX_FILE
+from vla_attention.schemas.stores.reader import StoredEpisode, open_store
+from vla_attention.schemas.stores.seal import SEAL_FILE, read_seal
+from vla_attention.schemas.stores.shards import SealedShard, ShardedLayers, chunks_of_a_shard, index_size
+from vla_attention.schemas.stores.store_format import FileRecord
+from vla_attention.schemas.stores.zip_members import ZipMembers
+from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.tokens import small_tokens
+
+SPEC = StoreSpec(tasks=(0,), episodes=1, replans=3, layers=(0, 2), heads=(0,), coverage=False, frames=False)
+_ROWS = "joint/rows"
+#: A pattern of bytes that no decoded chunk has; what was there before must never pass for attention.
+_UNTOUCHED = 0x7FC12345
+
+
+@dataclass(frozen=True)
+class InMemory:
+    """A file in memory, as a `ByteSource`, under whatever name it is asked for."""
+
+    content: bytes
+    remembers: bool = field(default=False, init=False)
+
+    def whole(self, file: str, *, fresh: bool = False) -> bytes:
+        return self.content
+
+    def parts(self, file: str, offset: int, lengths: Sequence[int], *, fresh: bool = False) -> list[bytes]:
+        found = []
+        for length in lengths:
+            found.append(self.content[offset : offset + length])
+            offset += length
+        return found
+
+    def read_into(self, memory: Memory, file: str, offset: int, *, fresh: bool = False) -> int:
+        return copy_into(memory, self.content[offset : offset + len(memory)])
+
+    def size(self, file: str) -> int:
+        return len(self.content)
+
+    def bound_to(self, digest: str) -> InMemory:
+        return self
+
+
+@cache
+def _folder() -> Path:
+    """A folder of this process, in memory where the system has one."""
+    shared = Path("/dev/shm")
+    found = tempfile.TemporaryDirectory(prefix="vla-fuzz-", dir=shared if shared.is_dir() else None)
+    _KEPT.append(found)
+    return Path(found.name)
+
+
+#: Folders that are removed at the end of the process.
+_KEPT: list[tempfile.TemporaryDirectory[str]] = []
+
+
+@cache
+def _store(name: str) -> Path:
+    """A small store of one episode that a target changes, and nobody else."""
+    return write_store(_folder() / name / "a.zarr", spec=SPEC)
+
+
+@cache
+def _tokens() -> EpisodeTokens:
+    return small_tokens(2, 0, 0)
+
+
+def _resolve(grouping: Grouping) -> None:
+    tokens = _tokens()
+    check_names(grouping, collect_vocabulary([tokens]), tokens.layout)
+    resolve(grouping, tokens)
+
+
+def selectors(content: bytes) -> None:
+    """A selector of a command line."""
+    text = content.decode("utf-8", "surrogateescape")
+    atoms_of(parse_selector(text))
+    _resolve(Grouping("fuzzed", {"a": (text,), "rest": ("*",)}))
+
+
+def groupings(content: bytes) -> None:
+    """A TOML file of groups, and its groups on an episode's keys."""
+    path = _folder() / "grouping.toml"
+    path.write_bytes(content)
+    _resolve(read_grouping_file(path))
+
+
+def results(content: bytes) -> None:
+    """A results file."""
+    path = _folder() / "attention_ratio_results_libero_10.json"
+    path.write_bytes(content)
+    read_results_file(path)
+
+
+def roots(content: bytes) -> None:
+    """The `zarr.json` of a store."""
+    store = _store("roots")
+    (store / "zarr.json").write_bytes(content)
+    for episode in open_store(store).episodes:
+        _ = episode.attributes
+
+
+def indexes(content: bytes) -> None:
+    """The index of a packed store, under its right digest and of the right run if it is JSON."""
+    store = _store("indexes")
+    if not (store / INDEX_FILE).exists():
+        shutil.rmtree(store)
+        shutil.copytree(_packed(), store)
+    with suppress(ValueError, RecursionError):
+        document = json.loads(content)
+        if isinstance(document, dict):
+            document |= {"run": _original("seeds").run}
+            content = json.dumps({**document, "digest": seal_digest(document)}).encode()
+    (store / INDEX_FILE).write_bytes(content)
+    for episode in open_store(store).episodes:
+        _ = episode.attributes
+
+
+def seals(content: bytes) -> None:
+    """A seal, under its right digest if it is JSON."""
+    with suppress(ValueError, RecursionError):
+        document = json.loads(content)
+        attributes = document.get("attributes") if isinstance(document, dict) else None
+        if isinstance(attributes, dict):
+            content = json.dumps({**document, "attributes": {**attributes, "digest": seal_digest(attributes)}}).encode()
+    _read("seals", SEAL_FILE, content)
+
+
+def attributes(content: bytes) -> None:
+    """The `zarr.json` of an episode, sealed."""
+    _read("attributes", "zarr.json", content)
+
+
+def arrays(content: bytes) -> None:
+    """The `zarr.json` of an array that is one chunk, sealed."""
+    _read("arrays", "joint/atoms/zarr.json", content)
+
+
+def sharded_arrays(content: bytes) -> None:
+    """The `zarr.json` of the rows, sealed."""
+    _read("sharded_arrays", f"{_ROWS}/zarr.json", content)
+
+
+@cache
+def _original(name: str) -> StoredEpisode:
+    return open_store(_store(name)).episodes[0]
+
+
+@cache
+def _sealed_as(name: str) -> dict[str, Any]:
+    """The seal of an episode before it is changed."""
+    found: dict[str, Any] = to_json(read_seal(_store(name) / "episodes" / _original(name).name))
+    return found
+
+
+def _read(name: str, file: str, content: bytes) -> None:
+    """Exchange a file of an episode, list it in the seal, and check the episode with everything that is in it."""
+    episode = _original(name)
+    folder, seal = _store(name) / "episodes" / episode.name, _sealed_as(name)
+    (folder / file).write_bytes(content)
+    if file != SEAL_FILE:
+        record = {**seal["files"][file], "size": len(content), "sha256": bytes_digest(content)}
+        seal = {**seal, "files": {**seal["files"], file: record}}
+        seal["digest"] = seal_digest(seal)
+        document = {"zarr_format": 3, "node_type": "group", "attributes": seal}
+        (folder / SEAL_FILE).write_text(json.dumps(document))
+    store = open_store(_store(name))
+    found = StoredEpisode(store.episodes[0].folder, episode.name, store.run)
+    list(content_problems(store.attributes, found))
+    found.tokens(store.attributes, "joint")
+    for array in found.attributes.arrays:
+        found.read(array)
+
+
+@cache
+def _rows_metadata() -> dict[str, Any]:
+    folder = _store("shards") / "episodes" / _original("shards").name
+    found: dict[str, Any] = json.loads((folder / _ROWS / "zarr.json").read_text())
+    return found
+
+
+def shards(content: bytes) -> None:
+    """A shard of rows, with the checksums that belong to its bytes, read with the fast reader."""
+    metadata = _rows_metadata()
+    count = chunks_of_a_shard(metadata)
+    assert count is not None
+    size = index_size(count)
+    if len(content) < size:
+        content = bytes(size - len(content)) + content
+    chunks, stored = bytearray(content[:-size]), content[-size:-4]
+    checksums = []
+    for offset, length in struct.iter_unpack("<QQ", stored):
+        end = offset + length
+        if length >= 4 and end <= len(chunks):
+            chunks[end - 4 : end] = crc32c(bytes(chunks[offset : end - 4])).to_bytes(4, "little")
+            checksums.append(bytes(chunks[end - 4 : end]))
+        else:
+            checksums.append(bytes(4))
+    index = with_checksum(stored)
+    content = bytes(chunks) + index
+    record = FileRecord(len(content), bytes_digest(content), bytes_digest(index), b"".join(checksums).hex())
+    shard = SealedShard.open(InMemory(content), "c.0", record)
+    layers = ShardedLayers.of(metadata, lambda file: shard)
+    assert layers is not None
+    for layer in range(layers.shape[1]):
+        for denoise in range(layers.shape[2]):
+            memory = layers.memory()
+            memory.values.view(np.uint32)[...] = _UNTOUCHED
+            with suppress(UserError):
+                found = layers.read(layer, denoise, memory)
+                if (found.view(np.uint32) == _UNTOUCHED).any():
+                    raise AssertionError("a chunk that was not decoded passed for attention")
+
+
+def zips(content: bytes) -> None:
+    """The zip of a packed episode; its index says the right length."""
+    tail = len(content) * 2 // 3
+    members = ZipMembers(InMemory(content), "a.zip", len(content), tail)
+    with suppress(OSError):  # what a reader turns into a sentence
+        for name in members.names():
+            members.whole(name)
+
+
+#: Every target by name.
+TARGETS: dict[str, Callable[[bytes], None]] = {
+    "selectors": selectors,
+    "groupings": groupings,
+    "results": results,
+    "roots": roots,
+    "indexes": indexes,
+    "seals": seals,
+    "attributes": attributes,
+    "arrays": arrays,
+    "sharded_arrays": sharded_arrays,
+    "shards": shards,
+    "zips": zips,
+}
+
+
+def run(target: str, content: bytes) -> None:
+    """Give bytes to a target; raises what must not be raised."""
+    with suppress(UserError):
+        TARGETS[target](content)
+
+
+def seeds(target: str) -> list[bytes]:
+    """Valid inputs, from which a fuzzer begins."""
+    if target in _TEXTS:
+        return [text.encode() for text in _TEXTS[target]]
+    store, packed = _store("seeds"), _packed()
+    episode = store / "episodes" / _original("seeds").name
+    return [
+        {
+            "roots": store / "zarr.json",
+            "seals": episode / SEAL_FILE,
+            "attributes": episode / "zarr.json",
+            "arrays": episode / "joint/atoms/zarr.json",
+            "sharded_arrays": episode / _ROWS / "zarr.json",
+            "shards": next((episode / _ROWS).glob("c.*")),
+            "indexes": packed / INDEX_FILE,
+            "zips": next(packed.rglob("*.zip")),
+        }[target].read_bytes()
+    ]
+
+
+@cache
+def _packed() -> Path:
+    from vla_attention.analyze.copy.copying import copy_store
+
+    packed = _store("seeds").with_name("packed.zarr")
+    copy_store(open_store(_store("seeds")), packed, (), packed=True)
+    return packed
+
+
+_STEP = {"step": 10, "visual_mass": 0.5, "linguistic_mass": 0.0, "visual_fraction": 1.0, "linguistic_fraction": 0.0}
+_EPISODE_OF_RESULTS = {
+    "task_id": 0,
+    "task_description": "put the bowl",
+    "episode_idx": 0,
+    "success": True,
+    "num_steps": 5,
+    "per_step_ratios": {"layer_0": [{**_STEP, "visual_linguistic_ratio": None}], "layers_avg": []},
+    "summary": {"layer_0": {"num_steps": 1}},
+}
+_TEXTS: dict[str, list[str]] = {
+    "selectors": [
+        'camera:base_0_rgb | (role:image & object:"plate_1") - keys:3-9',
+        "patch:base_0_rgb[0:2, 1:3] & * - word:bowl",
+        "span:prompt | word:'the bowl'",
+    ],
+    "groupings": [
+        'name = "n"\noverlap = true\nallow_empty = ["b"]\n[groups]\na = ["word:bowl", "role:bos"]\nb = "*"\n'
+        '[ratio]\nnumerator = ["a"]\ndenominator = ["b"]\n'
+    ],
+    "results": [json.dumps([_EPISODE_OF_RESULTS]), json.dumps(_EPISODE_OF_RESULTS)],
+}
