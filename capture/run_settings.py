@@ -20,6 +20,7 @@ from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.precision import DEFAULT_MANTISSA_BITS, parse_precision
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX
+from vla_attention.schemas.stores.store_place import check_place
 
 if TYPE_CHECKING:
     from vla_attention.capture.store.store_writer import WriteMode
@@ -91,6 +92,8 @@ def run_settings(arguments: argparse.Namespace) -> RunSettings:
         raise BadArgument(f"Cannot use --seed {arguments.seed}; expected 0 or more.")
     if arguments.verify and not arguments.resume:
         raise BadArgument("Cannot use --verify without --resume: a new store has no episodes that could be read.")
+    store = store_path(arguments)
+    check_place(store, "write a store at")
     return RunSettings(
         suite=suite,
         task_ids=None if arguments.task_id is None else tuple(sorted(set(arguments.task_id))),
@@ -99,7 +102,7 @@ def run_settings(arguments: argparse.Namespace) -> RunSettings:
         seed=arguments.seed,
         replan_steps=arguments.replan_steps,
         max_steps=arguments.max_steps,
-        store=store_path(arguments),
+        store=store,
         verify=arguments.verify,
         mode="overwrite" if arguments.overwrite else "resume" if arguments.resume else "new",
         libero_assets=arguments.libero_assets,

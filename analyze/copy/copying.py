@@ -13,7 +13,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,10 +35,10 @@ from vla_attention.schemas.stores.seal import SEAL_FILE, seal_episode
 from vla_attention.schemas.stores.store_format import (
     EPISODES_DOCUMENT,
     EPISODES_GROUP,
-    STORE_SUFFIX,
     CorruptEpisode,
     RunMismatch,
 )
+from vla_attention.schemas.stores.store_place import check_place
 
 
 @dataclass(frozen=True)
@@ -104,8 +104,7 @@ def copy_store(
         CorruptEpisode: an episode is damaged. Episodes that were copied before it stay.
     """
     without = check_parts(without)
-    if target.suffix != STORE_SUFFIX:
-        raise BadArgument(f"Cannot copy to {target}: expected a name that ends with '{STORE_SUFFIX}'.")
+    check_place(target, "copy to")
     if isinstance(store.path, Path) and target.resolve() == store.path.resolve():
         raise BadArgument(f"Cannot copy {store.path} to itself; give another name.")
     try:
@@ -132,6 +131,7 @@ def _copy(
         lock = lock_for_writing(target, packing=packed)
         pack = Packing(target, run, building) if packed else None
         present = {folder.name for folder in episode_folders(target)} if pack is None else pack.present()
+        _refuse_others(store, target, present)
         added = copied = left = 0
         for episode in store.episodes:
             if episode.name not in present:
@@ -173,6 +173,36 @@ def _ensure_root(store: Store, target: Path, root: bytes, building: Path) -> Non
         )
 
 
+def _refuse_others(store: Store, target: Path, present: Collection[str]) -> None:
+    """Raise `RunMismatch` where the copy has an episode by its name that is another recording than the store's.
+
+    One that was recorded again (`--overwrite`, after `repair`) has the name and the configuration of the first.
+    """
+    if not present:
+        return
+    there = {episode.name: episode for episode in open_store(target).episodes}
+    others = []
+    for episode in store.episodes:
+        if episode.name not in present:
+            continue
+        try:
+            captured = _captured(there[episode.name])
+        except CorruptEpisode as error:
+            raise CorruptEpisode(f"Cannot continue the copy {target}: {error}") from None
+        if captured != _captured(episode):
+            others.append(episode.name)
+    if others:
+        raise RunMismatch(
+            f"Cannot continue the copy {target}: {listing(others, 4)} in it {'is' if len(others) == 1 else 'are'} not "
+            f"what {store.path} has under the same name, which was recorded again since; give another name."
+        )
+
+
+def _captured(episode: StoredEpisode) -> str:
+    """The digest of the seal under which an episode was captured."""
+    return episode.seal.copied_from or episode.seal.digest
+
+
 def _copy_episode(
     store: Store, episode: StoredEpisode, folder: Path, without: tuple[str, ...], run: str
 ) -> tuple[int, int]:
@@ -201,7 +231,7 @@ def _copy_episode(
         copied += len(content)
     seal = folder / SEAL_FILE
     if without:
-        seal_episode(folder, episode.name, run, copied_from=episode.seal.copied_from or episode.seal.digest)
+        seal_episode(folder, episode.name, run, copied_from=_captured(episode))
     else:
         seal.parent.mkdir()
         seal.write_bytes(without_other_fields(episode.source.whole(SEAL_FILE)))

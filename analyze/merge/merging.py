@@ -33,11 +33,11 @@ from vla_attention.schemas.stores.seal import SEAL_FILE
 from vla_attention.schemas.stores.store_format import (
     EPISODES_DOCUMENT,
     EPISODES_GROUP,
-    STORE_SUFFIX,
     CorruptEpisode,
     RunMismatch,
     StoreExists,
 )
+from vla_attention.schemas.stores.store_place import check_place
 from vla_attention.schemas.stores.store_url import StoreUrl
 
 #: Differing fields that are named of two stores.
@@ -88,8 +88,7 @@ def merge_stores(
 def _check(stores: Sequence[Store], target: Path) -> None:
     if len(stores) < 2:
         raise BadArgument("One store cannot be merged; give two or more, and the new one with -o.")
-    if target.suffix != STORE_SUFFIX:
-        raise BadArgument(f"Cannot merge into {target}: expected a name that ends with '{STORE_SUFFIX}'.")
+    check_place(target, "merge into")
     if os.path.lexists(target):
         raise StoreExists(f"Cannot merge into {target}: it exists already; give another name.")
     for other in stores[1:]:

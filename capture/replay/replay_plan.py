@@ -35,6 +35,7 @@ from vla_attention.schemas.stores.store_format import (
     episode_name,
     parse_episode_name,
 )
+from vla_attention.schemas.stores.store_place import check_place
 
 
 @dataclass(frozen=True)
@@ -94,8 +95,7 @@ def plan_replay(arguments: argparse.Namespace, termination: Termination) -> Repl
         import_av()  # that PyAV is missing is said now, too
     wanted = chosen_episodes(data, arguments.episodes, arguments.num_episodes)
     store = arguments.store or Path("runs") / f"{file_part(suite_of(data))}{STORE_SUFFIX}"
-    if store.suffix != STORE_SUFFIX:
-        raise BadArgument(f"Cannot write a store at {store}: expected a name that ends with '{STORE_SUFFIX}'.")
+    check_place(store, "write a store at")
     mode: WriteMode = "overwrite" if arguments.overwrite else "resume" if arguments.resume else "new"
     # An existing store or an unwritable place is an error now, before the minutes for loading a model.
     if mode == "new" and store.exists():

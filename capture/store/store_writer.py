@@ -29,12 +29,12 @@ from vla_attention.schemas.stores.partial_folders import (
 from vla_attention.schemas.stores.root import episode_folders
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
-    STORE_SUFFIX,
     RootAttributes,
     StoreExists,
     episode_name,
     parse_episode_name,
 )
+from vla_attention.schemas.stores.store_place import check_place
 
 WriteMode = Literal["new", "resume", "overwrite"]
 
@@ -85,8 +85,7 @@ def open_run(path: Path, attributes: RootAttributes, mode: WriteMode, *, durable
         StoreExists: something is at `path` and the mode is `new`.
         RunMismatch: the mode is `resume` and the existing run differs; the first differing field is named.
     """
-    if path.suffix != STORE_SUFFIX:
-        raise BadArgument(f"Cannot write a store at {path}: expected a name that ends with '{STORE_SUFFIX}'.")
+    check_place(path, "write a store at")
     # Episodes are written beside the store itself; a link to it may be on another file system.
     path = path.resolve() if path.is_symlink() else path
     try:

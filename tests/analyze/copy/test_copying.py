@@ -97,6 +97,30 @@ def test_a_copy_is_brought_up_to_date(tmp_path):
         copy_store(open_store(other), tmp_path / "b.zarr", ("frames",))
 
 
+@pytest.mark.parametrize("words", [(), ("--packed",), ("--without", "frames"), ("--packed", "--without", "frames")])
+def test_an_episode_that_was_recorded_again_is_not_taken_for_the_copied_one(tmp_path, capsys, words):
+    path, target = write_store(tmp_path / "a.zarr", spec=SPEC), tmp_path / "b.zarr"
+    assert analyze(["copy", str(path), str(target), *words]) == 0
+    assert analyze(["copy", str(path), str(target), *words]) == 0
+    assert "0 episodes added (2 were there already)" in capsys.readouterr().out
+    shutil.rmtree(path / "episodes/task000_episode001")
+    write_store(path, mode="resume", spec=SPEC, plant_success=lambda *_: False)
+    before = all_bytes(target)
+    assert analyze(["copy", str(path), str(target), *words]) == 2
+    said = capsys.readouterr().err
+    assert "task000_episode001 in it is not what" in said
+    assert said.count("\n") == 1
+    assert all_bytes(target) == before
+
+
+def test_a_copy_with_a_damaged_seal_is_not_continued(original, tmp_path, capsys):
+    assert analyze(["copy", str(original), str(tmp_path / "b.zarr")]) == 0
+    seal = tmp_path / "b.zarr/episodes/task000_episode000/seal/zarr.json"
+    seal.write_bytes(seal.read_bytes().replace(b'"', b" ", 1))
+    assert analyze(["copy", str(original), str(tmp_path / "b.zarr")]) == 2
+    assert f"Cannot continue the copy {tmp_path}/b.zarr: Episode task000_episode000" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("file", ["zarr.json", "joint/rows/zarr.json", "seal/zarr.json"])
 def test_damaged_metadata_is_refused_and_never_sealed_anew(original, tmp_path, file):
     path = tmp_path / "a.zarr"
@@ -154,11 +178,14 @@ def test_command_line(original, tmp_path, capsys):
     assert "A copy without frames takes" in said
     assert analyze(["copy", str(original), str(tmp_path / "b.zarr"), "--without", "frames"]) == 0
     assert "2 episodes added" in capsys.readouterr().out
+    (tmp_path / "file").touch()
     for words, expected in (
         ([str(original), str(tmp_path / "x.zarr"), "--without", "frame"], "Did you mean 'frames'?"),
         ([str(original), str(tmp_path / "x")], "ends with '.zarr'"),
         ([str(original), str(original)], "to itself"),
-        ([str(original), str(original / "zarr.json" / "x.zarr")], "Cannot copy to"),
+        ([str(original), str(original / "episodes" / "x.zarr"), "--packed"], "it is inside of the store"),
+        ([str(original), str(original / "sub" / "more" / "x.zarr")], "it is inside of the store"),
+        ([str(original), str(tmp_path / "file" / "x.zarr")], "Cannot copy to"),
         ([str(tmp_path / "none.zarr")], "There is no store at"),
     ):
         assert analyze(["copy", *words]) == 2
