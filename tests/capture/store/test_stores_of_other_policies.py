@@ -13,7 +13,7 @@ from vla_attention.capture.store.disk_estimate import estimate_disk
 from vla_attention.capture.store.episode_writer import ReplanRecord, ReplanRefused
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.layout import Role, SiteLayout, prompt_at
-from vla_attention.schemas.stores import verify
+from vla_attention.schemas.stores import episode_checks
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 from vla_attention.schemas.stores.verify import verify_store
@@ -108,7 +108,7 @@ def test_replans_that_are_refused(tmp_path, spec, changes, says):
 def test_verify_reports_what_the_writer_let_through(tmp_path, monkeypatch, spec, changes, says):
     with monkeypatch.context() as patch:
         patch.setattr("vla_attention.capture.store.site_writer.absent_problems", lambda *_: iter(()))
-        patch.setattr(verify, "absent_problems", lambda *_: iter(()))
+        patch.setattr(episode_checks, "absent_problems", lambda *_: iter(()))
         append(tmp_path / "a.zarr", spec, changes)
     faults = verify_store(open_store(tmp_path / "a.zarr"))
     assert [says in fault.problem for fault in faults] == [True]
