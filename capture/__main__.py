@@ -1,27 +1,73 @@
-"""`vla-capture`: the command line of stage one."""
+"""`vla-capture` and the published scripts' commands: the command lines of stage one.
+
+What they need is imported inside of them, so that Ctrl-C is a sentence from the first moment on.
+"""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NoReturn
 
-from vla_attention.capture.command_line import run_capture_command
-from vla_attention.capture.jobs.termination import Termination
+from vla_attention.schemas.stop_signals import end_program, run_until_stopped
+
+if TYPE_CHECKING:
+    from vla_attention.capture.jobs.termination import Termination
+
+#: What is said after Ctrl-C.
+IF_STOPPED = "complete episodes are kept, continue with --resume."
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code, which is 2 after a mistake in the arguments."""
-    arguments = sys.argv[1:] if argv is None else argv
-    return run_capture_command("vla-capture", lambda termination: _run(arguments, termination), lambda: 0)
+    given = sys.argv[1:] if argv is None else list(argv)
+
+    def run() -> int:
+        from vla_attention.capture.command_line import run_capture_command
+
+        return run_capture_command("vla-capture", lambda termination: _run(given, termination), lambda: 0)
+
+    return run_until_stopped("vla-capture", run, IF_STOPPED)
 
 
-def _run(argv: Sequence[str], termination: Termination) -> int:
+def _run(given: Sequence[str], termination: Termination) -> int:
     from vla_attention.capture.arguments import build_parser
 
-    arguments = build_parser(argv).parse_args(argv)
+    arguments = build_parser(given).parse_args(given)
     exit_code: int = arguments.command(arguments, termination)
     return exit_code
 
 
+def program() -> NoReturn:
+    """The console script `vla-capture`."""
+    end_program(main())
+
+
+def evaluate_attention_ratio() -> NoReturn:
+    """The console script `evaluate-attention-ratio`."""
+
+    def run() -> int:
+        from vla_attention.capture.published.evaluate import evaluate_attention_ratio
+
+        return evaluate_attention_ratio()
+
+    _end_published("evaluate-attention-ratio", run)
+
+
+def evaluate_attention_ratio_cosmos() -> NoReturn:
+    """The console script `evaluate-attention-ratio-cosmos`."""
+
+    def run() -> int:
+        from vla_attention.capture.published.evaluate import evaluate_attention_ratio_cosmos
+
+        return evaluate_attention_ratio_cosmos()
+
+    _end_published("evaluate-attention-ratio-cosmos", run)
+
+
+def _end_published(name: str, run: Callable[[], int]) -> NoReturn:
+    end_program(run_until_stopped(name, run, IF_STOPPED))
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    program()

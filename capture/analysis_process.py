@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -22,4 +23,14 @@ def run_analysis(arguments: argparse.Namespace, store: Path, output: Path | None
         command += ["--output", str(output)]
     if arguments.save_viz:
         command += ["--save-viz"]
-    return subprocess.run([*command, *family.analysis_arguments(arguments), *more], check=False).returncode
+    process = subprocess.Popen([*command, *family.analysis_arguments(arguments), *more])
+    try:
+        return process.wait()
+    except KeyboardInterrupt:
+        # A terminal tells both processes, `kill` only this one. The analysis says that it was stopped.
+        process.send_signal(signal.SIGINT)
+        return process.wait()
+    except BaseException:
+        process.terminate()
+        process.wait()
+        raise

@@ -27,6 +27,7 @@ from vla_attention.capture.policies.identity import announcement, downloads_of
 from vla_attention.capture.policies.policy import BatchPolicy, Policy, is_compiled, stored_picture_sizes
 from vla_attention.capture.provenance import POLICY_BATCH, describe_machine
 from vla_attention.capture.rollout.episode import EpisodeResult, EpisodeRun, check_protocol, max_replans
+from vla_attention.capture.rollout.episode_faults import EpisodesMissing, Faults, describe_missing
 from vla_attention.capture.rollout.episode_loop import EpisodeLoop
 from vla_attention.capture.rollout.pipeline import PipelinedLoop, default_num_envs, default_policy_batch
 from vla_attention.capture.rollout.progress import say
@@ -120,11 +121,17 @@ def run_capture(
 
     Raises:
         Terminated: SIGTERM was received; the episode in progress was dropped.
+        EpisodesMissing: episodes were dropped, each after a fault of its own; all others were recorded.
         DamagedEpisodesLeft: all missing episodes were recorded, but the store holds damaged ones, which stay.
     """
-    results, damaged = _record_missing(settings, policy, device, termination or Termination())
-    say(f"{len(results)} episodes added, {sum(result.success for result in results)} solved. Store: {settings.store}")
+    results, damaged, faults = _record_missing(settings, policy, device, termination or Termination())
+    missing = f", {len(faults.dropped)} missing" if faults.dropped else ""
+    solved = sum(result.success for result in results)
+    say(f"{len(results)} episodes added, {solved} solved{missing}. Store: {settings.store}")
     left = find_damaged(settings.store, damaged, settings.verify) if damaged else []
+    if left and faults.dropped:
+        raise EpisodesMissing(f"{describe_missing(faults.dropped)} {what_to_do(settings.store, left)}")
+    faults.raise_missing()
     if left:
         raise DamagedEpisodesLeft(what_to_do(settings.store, left))
     return results
@@ -132,8 +139,8 @@ def run_capture(
 
 def _record_missing(
     settings: RunSettings, policy: Policy, device: str, termination: Termination
-) -> tuple[list[EpisodeResult], list[str]]:
-    """Record what is missing; also returns the names of the episodes that are in the store, but damaged."""
+) -> tuple[list[EpisodeResult], list[str], Faults]:
+    """Record what is missing; also returns the names of damaged episodes of the store, and the faults of this run."""
     evaluation = settings.protocol or policy.default_protocol
     protocol = plan_protocol(settings, evaluation, policy)
     check_protocol(protocol, policy)
@@ -193,7 +200,7 @@ def _record_missing(
     )
     known = planned_tasks(read_records(store.path))
     if not todo and all(task.task_id in known and known[task.task_id].episodes >= task.episodes for task in plan):
-        return [], damaged_names
+        return [], damaged_names, Faults()
     worker = this_worker()
     record = RecordWriter(store.path, worker, plan, torch.get_num_threads())
     num_envs = min(settings.num_envs or default_num_envs(), len(todo))
@@ -216,7 +223,7 @@ def _record_missing(
     results = loop.record_all(todo)
     if (empty := changes.describe_empty()) is not None:
         say(empty)
-    return results, damaged_names
+    return results, damaged_names, loop.faults
 
 
 def _policy_batch(settings: RunSettings, policy: Policy, device: str) -> int | None:

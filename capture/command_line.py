@@ -10,7 +10,11 @@ from pathlib import Path
 
 from vla_attention.capture.jobs.termination import EXIT_TERMINATED, Terminated, Termination, listening_for_sigterm
 from vla_attention.schemas.command_line import run_command
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument, UserError
+
+
+class GpuMemoryFull(UserError, MemoryError):
+    """The memory of the GPU does not suffice."""
 
 
 def run_capture_command(program: str, command: Callable[[Termination], int], max_requeues: Callable[[], int]) -> int:
@@ -23,18 +27,37 @@ def run_capture_command(program: str, command: Callable[[Termination], int], max
     with listening_for_sigterm() as termination:
         try:
             return run_command(
-                program, lambda: command(termination), "complete episodes are kept, continue with --resume."
+                program,
+                lambda: _until_terminated(command, termination),
+                "complete episodes are kept, continue with --resume.",
             )
         except Terminated:
+            # SLURM sends the signal again to a job that is being requeued.
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
             from vla_attention.capture.jobs.slurm import ask_for_requeue
             from vla_attention.schemas.stores.worker import this_worker
 
-            # SLURM sends the signal again to a job that is being requeued.
-            signal.signal(signal.SIGTERM, signal.SIG_IGN)
             requeued = ask_for_requeue(this_worker(), max_requeues()) if max_requeues() else ""
             what_next = requeued or "Complete episodes are kept; the same command with --resume goes on."
             print(f"{program}: stopped by SIGTERM. {what_next}", file=sys.stderr, flush=True)
             return EXIT_TERMINATED
+
+
+def _until_terminated(command: Callable[[Termination], int], termination: Termination) -> int:
+    try:
+        return command(termination)
+    except UserError:
+        raise
+    except Exception as error:
+        if termination.requested:  # a library made an error of its own out of the interruption
+            raise Terminated from None
+        if type(error).__name__ == "OutOfMemoryError":  # torch's, which is not imported for it
+            raise GpuMemoryFull(
+                "The memory of the GPU is full; use a smaller --policy-batch or --dtype bfloat16, or leave the GPU to "
+                "this program alone. Complete episodes are kept, go on with --resume."
+            ) from error
+        raise
 
 
 def check_writable(path: Path, option: str) -> None:

@@ -6,11 +6,14 @@ import argparse
 import os
 import sys
 import textwrap
-from collections.abc import Callable
-from typing import NoReturn
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, NoReturn
 
-from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.errors import Note, UserError
 from vla_attention.schemas.safe_text import visible, visible_output
+from vla_attention.schemas.stop_signals import run_until_stopped
 
 #: Columns of a help text's description.
 _HELP_WIDTH = 100
@@ -45,24 +48,67 @@ def format_bytes(count: float) -> str:
 
 
 def run_command(program: str, command: Callable[[], int], if_stopped: str) -> int:
-    """Run a command and return its exit code; a `UserError` becomes one sentence and 2, Ctrl-C a sentence and 130.
+    """Run a command and return its exit code; see `run_until_stopped` for signals.
 
-    Control characters in what it prints are made visible (`safe_text.visible_output`).
+    A `UserError` becomes one sentence and 2, and so does what the operating system refuses: a full disk, a missing
+    permission, no memory. Control characters in what the command prints are made visible
+    (`safe_text.visible_output`), and a `Note` is a line on stderr.
     """
-    with visible_output():
-        return _run(program, command, if_stopped)
+    with visible_output(), _notes_as_lines(program):
+        return run_until_stopped(program, lambda: _run(program, command), if_stopped)
 
 
-def _run(program: str, command: Callable[[], int], if_stopped: str) -> int:
+def _run(program: str, command: Callable[[], int]) -> int:
     try:
-        return command()
+        code = command()
+        sys.stdout.flush()  # what is left of the text may not fit on the disk
+        return code
     except UserError as error:
         # One line, whatever a name in it holds: a line of its own could pass for another message.
-        print(f"{program}: {visible(str(error))}", file=sys.stderr)
-        return 2
+        sentence = visible(str(error))
     except BrokenPipeError:  # `| head` has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter complains when it flushes
+        _drop_output()
         return 141
-    except KeyboardInterrupt:
-        print(f"\n{program}: stopped; {if_stopped}", file=sys.stderr)
-        return 130
+    except OSError as error:
+        sentence = visible(describe_os_error(error))
+    except MemoryError:
+        sentence = "The memory is full. Close other programs, or use a machine with more memory."
+    with suppress(OSError):
+        print(f"{program}: {sentence}", file=sys.stderr, flush=True)
+    try:
+        sys.stdout.flush()
+    except OSError:
+        _drop_output()
+    return 2
+
+
+def describe_os_error(error: OSError) -> str:
+    """What the operating system refused, in one sentence."""
+    named = [str(name) for name in (error.filename, error.filename2) if name is not None]
+    where = f" {' -> '.join(named)}" if named else ""
+    return f"The operating system refused{where or ' to go on'}: {error.strerror or error or type(error).__name__}."
+
+
+def _drop_output() -> None:
+    """Send the rest of stdout nowhere, or the interpreter complains when it flushes at its end."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@contextmanager
+def _notes_as_lines(program: str) -> Iterator[None]:
+    """Print each `Note` once, as a line of the program, instead of as Python's warnings with file and line."""
+    said: set[str] = set()
+    before = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        if not issubclass(category, Note):
+            before(message, category, *where, **more)
+        elif str(message) not in said:
+            said.add(str(message))
+            print(f"{program}: {visible(str(message))}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", Note)
+        warnings.showwarning = show
+        yield

@@ -31,6 +31,10 @@ class MissingDependency(UserError, ImportError):
     """An optional part of the installation is needed and absent."""
 
 
+class Note(UserWarning):
+    """Something that a user should know and that stops nothing. Command lines print it as a line on stderr."""
+
+
 def listing(names: Iterable[object], limit: int = 12) -> str:
     """Join names for a message: at most `limit` of them, then how many more there are."""
     items = [str(name) for name in names]

@@ -30,7 +30,8 @@ LEVELS = {
     "analyze.parse": 5,
     "analyze.report": 5,
     "analyze.api": 6,
-    "analyze.__main__": 7,
+    "analyze.command_line": 7,
+    "analyze.__main__": 8,
     "capture.environments": 1,
     "capture.store": 1,
     "capture.foreign_files": 1,
@@ -44,6 +45,7 @@ LEVELS = {
     "capture.rollout": 4,
     "capture": 5,
     "capture.published": 6,
+    "capture.__main__": 7,
     "capture.small_policy": 6,
     "testing": 2,
 }

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vla_attention.schemas.command_line import command_parser, run_command
 from vla_attention.schemas.safe_text import file_part
+from vla_attention.schemas.stop_signals import end_program
 
 if TYPE_CHECKING:
     from vla_attention.analyze.published.results_reader import ResultsFile
@@ -62,8 +62,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code (2: wrong input, which one sentence explains)."""
-    arguments = build_parser().parse_args(argv)
-    return run_command(PROGRAM, lambda: run(arguments), "nothing was left half written.")
+    return run_command(PROGRAM, lambda: run(build_parser().parse_args(argv)), "nothing was left half written.")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -161,4 +160,4 @@ def _draw_file(wanted: Sequence[str], folder: Path, label: str, table: ResultsTa
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end_program(main())

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,21 +18,41 @@ if TYPE_CHECKING:
     import polars as pl
 
 
+#: How libraries in other languages (polars, HDF5) write the number of an error of the operating system.
+_NUMBER_OF_OS_ERROR = re.compile(r"\bos error ([0-9]{1,4})\b|\berrno = ([0-9]{1,4})\b")
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; on success it replaces `path`, on an error it is removed.
 
     The folder is made if it is missing. The temporary name starts with a dot and holds the process id, so that two
     processes never write to the same file.
+
+    Raises:
+        OSError: the file cannot be written; also where a library has made an error of its own out of it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         yield temporary
         os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
+    except BaseException as error:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        refused = _refusal_in(error)
+        if refused is not None:
+            raise refused from error
         raise
+
+
+def _refusal_in(error: BaseException) -> OSError | None:
+    """What the operating system refused, where only the text of a library's error says so."""
+    if isinstance(error, (UserError, KeyboardInterrupt)) or (isinstance(error, OSError) and error.errno is not None):
+        return None
+    found = _NUMBER_OF_OS_ERROR.search(str(error))
+    number = 0 if found is None else int(found[1] or found[2])
+    return OSError(number, os.strerror(number)) if number else None
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import ParamSpec, TypeVar
 
 from vla_attention.analyze.stores.worker_processes import main_module_hidden, prepare_process
+from vla_attention.schemas.stop_signals import stops_kept_from_children
 from vla_attention.schemas.threads import threads_of_this_process
 
 Parameters = ParamSpec("Parameters")
@@ -37,7 +38,7 @@ class SecondProcess:
             # Forked copies of a process with threads may wait for locks that nobody holds.
             context = multiprocessing.get_context("spawn")
             self._executor = ProcessPoolExecutor(1, context, initializer=prepare_process)
-            with main_module_hidden():
+            with main_module_hidden(), stops_kept_from_children():
                 self._executor.submit(_load, modules)
         except (ImportError, OSError):  # no semaphores, no further process
             self._executor = None

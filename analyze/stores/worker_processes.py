@@ -17,6 +17,7 @@ from types import ModuleType
 from typing import Any
 
 from vla_attention.schemas.errors import BadArgument, UserError, listing
+from vla_attention.schemas.stop_signals import stops_kept_from_children
 from vla_attention.schemas.threads import use_threads
 
 #: Episodes that are begun beyond the one whose result is waited for, for each process.
@@ -92,7 +93,7 @@ class WorkerProcesses:
             context = multiprocessing.get_context("spawn")
             self._executor = ProcessPoolExecutor(self._number, context, initializer=prepare_process)
         try:
-            with main_module_hidden():  # here the executor starts processes
+            with main_module_hidden(), stops_kept_from_children():  # here the executor starts processes
                 return self._executor.submit(work, parcel.content, package_version())
         except BrokenProcessPool as error:  # a process died between two submissions
             future: Future[bytes] = Future()

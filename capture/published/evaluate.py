@@ -183,6 +183,7 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], threads: Threa
 
     from vla_attention.capture.capture_run import run_capture
     from vla_attention.capture.device import load_torch
+    from vla_attention.capture.rollout.episode_faults import EpisodesMissing
     from vla_attention.capture.rollout.progress import say
     from vla_attention.schemas.stores.damaged_episodes import DamagedEpisodesLeft
 
@@ -191,16 +192,16 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], threads: Threa
     policy = arguments.family.build(arguments, device)
     # A layer that does not exist is an error before the capture, not after it.
     select_layers(arguments.layers, policy.num_layers, policy.family)
-    damaged = []
+    missing = []
     for job in jobs:
         if len(jobs) > 1:
             say(f"Suite {job.settings.suite.name}:")
         try:
             run_capture(job.settings, policy, device, termination)
-        except DamagedEpisodesLeft as error:
-            damaged.append(str(error))  # the other suites do not wait for a repair
-    if damaged:
-        raise DamagedEpisodesLeft(" ".join(damaged))
+        except (DamagedEpisodesLeft, EpisodesMissing) as error:
+            missing.append(str(error))  # the other suites do not wait for a repair
+    if missing:
+        raise EpisodesMissing(" ".join(missing))
 
 
 def _analyze(job: _Job, script: PublishedScript) -> int:

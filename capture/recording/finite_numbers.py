@@ -22,7 +22,11 @@ from vla_attention.schemas.errors import UserError
 
 
 class NumbersNotFinite(UserError, ArithmeticError):
-    """The policy computed NaN or infinity."""
+    """The policy computed NaN or infinity. passing: the same call, made again, gave finite numbers."""
+
+    def __init__(self, sentence: str, *, passing: bool = False) -> None:
+        super().__init__(sentence)
+        self.passing = passing
 
 
 def all_finite(actions: NDArray[np.floating], recorded: Mapping[str, RecordedRows]) -> bool:
@@ -72,17 +76,30 @@ def _watched(network: nn.Module) -> Iterator[_Watch]:
 
 
 def describe_origin(
-    network: nn.Module, call: Callable[[Mapping[str, RowCollector]], object], sites: tuple[str, ...]
-) -> str:
+    network: nn.Module,
+    call: Callable[[Mapping[str, RowCollector]], NDArray[np.floating]],
+    sites: tuple[str, ...],
+) -> tuple[str, bool]:
     """Repeat a policy call, and say where its numbers stop being finite.
 
-    call: runs the policy on the same input and noise, with the given row collector of each site.
+    Args:
+        network: of the policy.
+        call: runs the policy on the same input and noise, with the given row collector of each site; returns actions.
+        sites: names of the sites.
+
+    Returns:
+        A sentence, and whether all numbers of the repeated call are finite.
     """
     with _watched(network) as watch:
-        call(dict.fromkeys(sites, watch))
-    if watch.origin is None:
-        return "All modules of the network give finite numbers: look at the normalisation statistics of the checkpoint"
-    return f"They begin {watch.origin}"
+        actions = call(dict.fromkeys(sites, watch))
+    if watch.origin is not None:
+        return f"They begin {watch.origin}", False
+    if np.isfinite(actions).all():
+        return "The same call, made again, gave finite numbers: the processor or its memory erred", True
+    return (
+        "All modules of the network give finite numbers: look at the normalisation statistics of the checkpoint",
+        False,
+    )
 
 
 def _finite(values: Any) -> bool:

@@ -28,6 +28,7 @@ def run_replay(arguments: argparse.Namespace, threads: Threads, termination: Ter
 
         added = replay_with_file(arguments, plan, load_policy_file(file, device))
     say(f"{added} episodes added. Store: {plan.store}")
+    plan.faults.raise_missing()
     base = getattr(arguments, "rerun_of", None)
     say(f"Next: vla-analyze {plan.store}" if base is None else f"Next: vla-analyze effects {base} {plan.store}")
     return 0

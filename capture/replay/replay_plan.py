@@ -5,21 +5,24 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from vla_attention.capture.command_line import check_writable
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.identity import announcement
 from vla_attention.capture.policies.robot import RobotData
+from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.replay.chosen_episodes import chosen_episodes
 from vla_attention.capture.replay.data_set_files import INDEX_COLUMNS
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, LeRobotDataset, open_dataset
 from vla_attention.capture.replay.replay_episodes import EpisodeReplay, num_calls, task_of
 from vla_attention.capture.replay.video import import_av
 from vla_attention.capture.rerun.progress import RerunProgress
+from vla_attention.capture.rollout.episode_faults import Faults
 from vla_attention.capture.rollout.progress import say
 from vla_attention.capture.store.disk_estimate import describe, estimate_disk
+from vla_attention.capture.store.episode_writer import ReplanRefused
 from vla_attention.capture.store.store_writer import WriteMode, refuse_existing
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.safe_text import file_part
@@ -44,6 +47,7 @@ class ReplayPlan:
 
     wanted: numbers of the episodes. every: a policy call at frame 0, every, 2 · every ...; None: as the policy says.
     instruction: what the policy reads instead of the data set's tasks; None: the tasks.
+    faults: of episodes that were left out.
     """
 
     data: LeRobotDataset
@@ -55,6 +59,7 @@ class ReplayPlan:
     instruction: str | None
     robot_data: RobotData
     termination: Termination
+    faults: Faults = field(default_factory=Faults)
 
     def protocol(self, every: int) -> Protocol:
         """Return the protocol of the run: without a simulator, numbers of one are 0."""
@@ -197,7 +202,7 @@ def announce(
 
 
 def record_episodes(plan: ReplayPlan, todo: Sequence[int], every: int, replay: EpisodeReplay) -> int:
-    """Make the calls of the episodes; returns how many were added, less than all where another process was first.
+    """Make the calls of the episodes; returns how many were added. One with a fault is left out, and noted in the plan.
 
     Raises:
         Terminated: SIGTERM was received; the episode in progress was dropped.
@@ -212,8 +217,16 @@ def record_episodes(plan: ReplayPlan, todo: Sequence[int], every: int, replay: E
             if (plan.store / EPISODES_GROUP / episode_name(task_of(episode), index)).is_dir():
                 continue
             progress.begin(f"episode {index}")
-            with plan.termination.only_at_checks():
-                added += _record_one(plan, episode, every, replay, progress)
+            again = True
+            while again:
+                again = False
+                try:
+                    with plan.termination.only_at_checks():
+                        added += _record_one(plan, episode, every, replay, progress)
+                except (NumbersNotFinite, ReplanRefused) as error:
+                    again = plan.faults.note(episode_name(task_of(episode), index), error)
+                    what_next = "It begins again." if again else "It is left out."
+                    progress.say(f"episode {index}: {error} {what_next}")
             progress.end(plan.calls(index, every))
     finally:
         progress.close()

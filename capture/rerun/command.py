@@ -41,6 +41,7 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
         series = SeriesRun.planned(arguments, base)
         rerun = _prepare(arguments, base, threads, termination)
         series.write(rerun, rerun.check(arguments.check))
+        rerun.faults.raise_missing()
         return 0
     _refuse_options_of_series(arguments)
     interventions = rerun_interventions(arguments)
@@ -69,6 +70,7 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
     say(rerun.describe_disk(target, [episode.attributes.num_replans for episode in base.episodes]))
     added = rerun.write(target, mode, interventions, allow_empty=arguments.allow_empty)
     say(f"{added} episodes added. Store: {target}")
+    rerun.faults.raise_missing()
     say(f"Next: vla-analyze {target}" if interventions.is_none else f"Next: vla-analyze effects {base.path} {target}")
     return 0
 

@@ -46,6 +46,10 @@ class RerunProgress:
         """Show that the current episode is committed."""
         self._calls_before += num_replans
 
+    def say(self, line: str) -> None:
+        """Print one line, above the bar if there is one."""
+        say(line) if self._bar.disable else self._bar.write(line)
+
     def close(self) -> None:
         """Remove the bar."""
         self._bar.close()

@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from vla_attention.capture.jobs.termination import Termination
+from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.rerun.calls import Repeater
 from vla_attention.capture.rerun.progress import RerunProgress
 from vla_attention.capture.rerun.stored_calls import StoredCalls, read_calls
+from vla_attention.capture.rollout.episode_faults import Faults
 from vla_attention.capture.rollout.policy_call import replan_record
-from vla_attention.capture.store.episode_writer import EpisodeStart
+from vla_attention.capture.store.episode_writer import EpisodeStart, ReplanRefused
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.store_format import StoreExists, parse_episode_name
@@ -26,8 +28,9 @@ def rerun_episodes(
     machine: Mapping[str, str],
     progress: RerunProgress,
     termination: Termination,
+    faults: Faults,
 ) -> int:
-    """Rerun the episodes that the store lacks; returns their number.
+    """Rerun the episodes that the store lacks; returns their number. An episode with a fault is left out and noted.
 
     Raises:
         Terminated: SIGTERM was received; the episode in progress was dropped.
@@ -35,13 +38,20 @@ def rerun_episodes(
     """
     added = 0
     for episode in episodes:
-        termination.check()
-        # Another process may run the same command, and have committed an episode meanwhile.
-        if store.has(*parse_episode_name(episode.name)):
-            continue
-        with termination.only_at_checks(), suppress(StoreExists):
-            rerun_episode(repeater, store, read_calls(episode), machine, progress, termination)
-            added += 1
+        again = True
+        while again:
+            again = False
+            termination.check()
+            # Another process may run the same command, and have committed an episode meanwhile.
+            if store.has(*parse_episode_name(episode.name)):
+                break
+            try:
+                with termination.only_at_checks(), suppress(StoreExists):
+                    rerun_episode(repeater, store, read_calls(episode), machine, progress, termination)
+                    added += 1
+            except (NumbersNotFinite, ReplanRefused) as error:
+                again = faults.note(episode.name, error)
+                progress.say(f"{episode.name}: {error} {'It begins again.' if again else 'It is left out.'}")
     return added
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from vla_attention.capture.rerun.fidelity import check_fidelity
 from vla_attention.capture.rerun.progress import RerunProgress
 from vla_attention.capture.rerun.rerun_episodes import rerun_episodes
 from vla_attention.capture.rerun.stored_calls import read_calls
+from vla_attention.capture.rollout.episode_faults import Faults
 from vla_attention.capture.rollout.progress import say
 from vla_attention.capture.store.disk_estimate import describe, estimate_disk
 from vla_attention.capture.store.store_writer import WriteMode, open_run
@@ -39,7 +40,7 @@ EpisodeFilter = Callable[[StoredEpisode], bool]
 class Rerun:
     """A loaded policy and the store whose calls it makes again.
 
-    recording: what is recorded of the calls. machine: provenance of this process.
+    recording: what is recorded of the calls. machine: provenance of this process. faults: of all stores that it wrote.
     """
 
     policy: Policy
@@ -47,6 +48,7 @@ class Rerun:
     recording: Recording
     machine: Mapping[str, str]
     termination: Termination
+    faults: Faults = field(default_factory=Faults)
 
     @cached_property
     def instructions(self) -> dict[int, str]:
@@ -98,7 +100,7 @@ class Rerun:
     ) -> int:
         """Make the calls again with interventions, or as they were, into a store; returns the number of new episodes.
 
-        A store that this made and that has no episode after an error is removed.
+        A store that this made and that has no episode in the end is removed after an error or faults.
 
         Args:
             target: the store.
@@ -123,13 +125,17 @@ class Rerun:
             repeater = Repeater(self.policy, self.recording, interventions, self.instructions, allow_empty)
         progress = RerunProgress(len(todo), sum(episode.attributes.num_replans for episode in todo))
         try:
-            added = rerun_episodes(repeater, store, todo, self.machine, progress, self.termination)
+            faults = Faults()
+            added = rerun_episodes(repeater, store, todo, self.machine, progress, self.termination, faults)
         except UserError:
             if is_new and not store.committed():
                 shutil.rmtree(store.path)
             raise
         finally:
             progress.close()
+        self.faults.dropped.update({f"{name} of {target}": fault for name, fault in faults.dropped.items()})
+        if faults.dropped and is_new and not store.committed():
+            shutil.rmtree(store.path)
         # With the stored prompts this was said before the first call.
         if interventions.prompt is not None and (line := repeater.attention.describe_empty()):
             say(line)

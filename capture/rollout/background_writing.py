@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
+from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord, ReplanRefused
 from vla_attention.capture.store.store_writer import RunStore
-from vla_attention.schemas.stores.store_format import StoreExists
+from vla_attention.schemas.stores.store_format import CorruptEpisode, StoreExists
 
 #: Bytes of rows and pictures that may wait for the thread. One replan may always wait.
 MOST_WAITING_BYTES = 256_000_000
@@ -30,10 +30,14 @@ _LOOK_EVERY_S = 0.5
 
 @dataclass(frozen=True)
 class Committed:
-    """The outcome of a commit: the episode's folder and its bytes, or the error that another process was faster."""
+    """The outcome of a commit: the episode's folder and its bytes, or an error of this episode alone.
+
+    `StoreExists`: another process was faster. `ReplanRefused`, which may come before a commit was asked for: numbers
+    that cannot be right. `CorruptEpisode`: what was read back is not what was written.
+    """
 
     episode: EpisodeInBackground
-    folder: Path | StoreExists
+    folder: Path | StoreExists | ReplanRefused | CorruptEpisode
     num_bytes: int
 
 
@@ -78,7 +82,10 @@ class EpisodeInBackground:
             self._writer = self._open.enter_context(
                 self.store.episode(self.start, self.denoise_times, self.max_replans)
             )
-        self._writer.append(record)
+        try:
+            self._writer.append(record)
+        except ReplanRefused as error:
+            self._end(error)
 
     def _commit(self, success: bool, num_steps: int) -> None:
         if self._dropped:
@@ -87,13 +94,18 @@ class EpisodeInBackground:
             raise ValueError("an episode without replans cannot be committed")
         try:
             folder = self._writer.commit(success, num_steps)
-        except StoreExists as error:
-            self.close()
-            self.writing.done(Committed(self, error, 0))
+        except (StoreExists, CorruptEpisode) as error:
+            self._end(error)
         else:
             self.close()
             size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
             self.writing.done(Committed(self, folder, size))
+
+    def _end(self, error: StoreExists | ReplanRefused | CorruptEpisode) -> None:
+        """End the episode with an error; what waits of it is skipped."""
+        self._dropped = True
+        self.close()
+        self.writing.done(Committed(self, error, 0))
 
     def close(self) -> None:
         """Close the writer; what was not committed is removed. For the thread."""

@@ -18,6 +18,8 @@ from vla_attention.capture.environments.base import Environment, Task
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.policies.policy import Policy, camera_grid
+from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
+from vla_attention.capture.rollout.observation_checks import ObservationChecks
 from vla_attention.capture.rollout.policy_call import PreparedCall, RecordedCall, record_calls, replan_record
 from vla_attention.capture.rollout.simulation import Advanced, Begun, CameraPatches, Seen, Simulation, StopCheck
 from vla_attention.capture.store.episode_writer import EpisodeStart, ReplanRecord
@@ -64,6 +66,7 @@ class EpisodeRun:
 
     machine: provenance that is stored with every episode. changes: the run's interventions; without any, nothing.
     check: called before every environment step and policy call; an exception that it raises drops the episode.
+    observed: what is checked of the simulator's pictures and states before every policy call.
     """
 
     policy: Policy
@@ -71,6 +74,7 @@ class EpisodeRun:
     machine: dict[str, str]
     changes: RunChanges = field(default_factory=lambda: RunChanges(Interventions(), {}))
     check: StopCheck = lambda: None
+    observed: ObservationChecks = field(default_factory=ObservationChecks)
 
 
 class ReplanWriter(Interface):
@@ -139,6 +143,9 @@ class EpisodeRecording:
         protocol, interventions, replan = self.run.store.attributes.protocol, changes.interventions, self.num_replans
         title = episode_title(self.run.store, self.task, start.episode_index)
         env_step = protocol.wait_steps + self.step
+        where = f"replan {replan} (environment step {env_step}) of {title}"
+        cameras = [camera.source for camera in policy.cameras]
+        self.run.observed.check(start.task_id, seen.observation, cameras, where)
         policy_input = policy.prepare(seen.observation, start.instruction)
         context = CallContext(
             start.task_id, start.episode_index, replan, changes.instructions, start.objects, seen.coverage
@@ -151,7 +158,7 @@ class EpisodeRecording:
         noise = protocol.seed if interventions.noise is None else interventions.noise.seed
         return PreparedCall(
             env_step=env_step,
-            where=f"replan {replan} (environment step {env_step}) of {title}",
+            where=where,
             policy_input=policy_input,
             noise_seed=policy.replan_noise_seed(noise, start.task_id, start.episode_index, replan),
             coverage=seen.coverage,
@@ -205,6 +212,8 @@ def record_episode(
                 raise ValueError("the environment gave no observation before a policy call")
             prepared = recording.prepare(result.seen)
             (call,) = record_calls(run.policy, [prepared], store.attributes.recording)
+            if isinstance(call, NumbersNotFinite):
+                raise call
             recording.keep(prepared, call, writer)
             result = simulation.advance(*recording.next_actions(call))
             recording.advanced(result)

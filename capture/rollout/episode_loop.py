@@ -1,18 +1,23 @@
-"""The loop over episodes: it claims, records and commits one after another. SIGTERM drops the unfinished one."""
+"""The loop over episodes: it claims, records and commits one after another. SIGTERM drops the unfinished one.
+
+A fault of one episode (`episode_faults.py`) drops that episode; the loop goes on with the others.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Suite, Task
 from vla_attention.capture.environments.suites import make_environment
 from vla_attention.capture.jobs.termination import Terminated, Termination
 from vla_attention.capture.jobs.worker_records import RecordWriter
-from vla_attention.capture.rollout.episode import EpisodeResult, EpisodeRun, record_episode
+from vla_attention.capture.rollout.episode import EpisodeResult, EpisodeRun, episode_title, record_episode
+from vla_attention.capture.rollout.episode_faults import EPISODE_FAULTS, Faults
 from vla_attention.capture.rollout.progress import EpisodeProgress, Progress
+from vla_attention.capture.rollout.simulation import SimulationFailed, naming_the_simulator
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.stores.claims import Claims, Holder
@@ -41,6 +46,7 @@ class EpisodeLoop:
     record: RecordWriter
     termination: Termination
     results: list[EpisodeResult] = field(default_factory=list, init=False)
+    faults: Faults = field(default_factory=Faults, init=False)
     claims: Claims = field(init=False)
     progress: Progress = field(init=False)
     #: The episodes in progress and their steps, for the message after SIGTERM.
@@ -51,11 +57,12 @@ class EpisodeLoop:
     def record_all(self, missing: Sequence[TaskEpisode]) -> list[EpisodeResult]:
         """Record the missing episodes, and return those that this process committed.
 
-        After the return the store holds every episode of `missing`: the loop waits for an episode that another process
-        is writing, and takes it over if that process dies.
+        After the return the store holds every episode of `missing` but those that `faults` names as dropped: the loop
+        waits for an episode that another process is writing, and takes it over if that process dies.
 
         Raises:
             Terminated: after SIGTERM; the episodes in progress were dropped.
+            MachineBroken: a fault came again and again that every episode would meet.
         """
         with ExitStack() as stack:
             self.claims = stack.enter_context(Claims(self.run.store.path, self.worker))
@@ -69,7 +76,7 @@ class EpisodeLoop:
                 if isinstance(error, Terminated):
                     self.progress.say(self._describe_stop(missing))
                 raise
-        self.record.end("finished")
+        self.record.end("failed" if self.faults.dropped else "finished")
         return self.results
 
     @contextmanager
@@ -113,29 +120,45 @@ class EpisodeLoop:
         return True
 
     def _attempt(self, task: Task, episode: int) -> Holder | None:
-        """Record an episode unless the store has it. If another process has claimed it, return that claim's holder."""
+        """Record an episode unless the store has it, or drop it after a fault.
+
+        If another process has claimed it, return that claim's holder.
+        """
         self.termination.check()
         claimed = self.claim(task, episode)
         if isinstance(claimed, Holder):
             return claimed
+        again = False
         if claimed:
             try:
-                self._record(task, episode)
+                again = self._record(task, episode)
             finally:
                 self.claims.release(episode_name(task.task_id, episode))
         self.termination.check()
-        return None
+        return self._attempt(task, episode) if again else None
 
-    def _record(self, task: Task, episode: int) -> None:
-        environment = self._environment_of(task)
-        name = episode_name(task.task_id, episode)
+    def _record(self, task: Task, episode: int) -> bool:
+        """Record an episode; returns whether it shall be tried again after a fault."""
         progress = self.progress.begin(task.task_id, episode)
+        try:
+            self._record_once(task, episode, progress)
+        except EPISODE_FAULTS as error:
+            if isinstance(error, SimulationFailed):  # what it has left is not to be trusted
+                with suppress(Exception):
+                    self._close_environment()
+            return self.note_fault(episode_name(task.task_id, episode), progress, error)
+        return False
+
+    def _record_once(self, task: Task, episode: int, progress: EpisodeProgress) -> None:
+        name = episode_name(task.task_id, episode)
+        with naming_the_simulator(episode_title(self.run.store, task, episode)):
+            environment = self._environment_of(task)
+            missing = environment.missing_resets(episode, self.run.store.attributes.protocol.seed)
 
         def report(step: int, replans: int) -> None:
             self.positions[name] = step
             progress.update(step, replans)
 
-        missing = environment.missing_resets(episode, self.run.store.attributes.protocol.seed)
         if missing:
             self.say_resets(name, missing)
         self.positions[name] = 0
@@ -160,6 +183,23 @@ class EpisodeLoop:
         self.positions.pop(result.folder.name, None)
         self.results.append(result)
         self.record.add_commit(result.folder.name)
+        self.faults.note_recorded()
+
+    def note_fault(self, name: str, progress: EpisodeProgress, error: Exception) -> bool:
+        """Note that an episode was dropped after a fault; returns whether it shall be tried again.
+
+        Raises:
+            MachineBroken: the fault came again and again, and every episode would meet it.
+        """
+        self.positions.pop(name, None)
+        again = self.faults.note(name, error)
+        if again:
+            progress.put_back()
+        else:
+            progress.drop()
+        what_next = "The episode begins again." if again else "The episode is left out, and the run goes on."
+        self.progress.say(f"{name}: {error} {what_next}")
+        return again
 
     def note_refused(self, name: str, progress: EpisodeProgress, error: StoreExists) -> None:
         """Note that another process has committed an episode while this one recorded it."""
@@ -176,8 +216,8 @@ class EpisodeLoop:
 
     def _close_environment(self) -> None:
         if self._environment is not None:
-            self._environment.close()
-            self._environment = None
+            environment, self._environment = self._environment, None
+            environment.close()
 
     def _describe_stop(self, missing: Sequence[TaskEpisode]) -> str:
         committed = listing([result.folder.name for result in self.results], 40)

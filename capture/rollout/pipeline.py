@@ -19,6 +19,7 @@ from multiprocessing.connection import Connection, wait
 
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.memory import memory_left
+from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.rollout.background_writing import BackgroundWriting, Committed, EpisodeInBackground
 from vla_attention.capture.rollout.episode import (
     EpisodeRecording,
@@ -29,10 +30,11 @@ from vla_attention.capture.rollout.episode import (
     policy_cameras,
     recorded_times,
 )
+from vla_attention.capture.rollout.episode_faults import EPISODE_FAULTS, SimulatorDied
 from vla_attention.capture.rollout.episode_loop import EpisodeLoop, TaskEpisode, describe_result
 from vla_attention.capture.rollout.policy_call import record_calls
 from vla_attention.capture.rollout.progress import EpisodeProgress
-from vla_attention.capture.rollout.simulation import Advanced, Begun, Seen
+from vla_attention.capture.rollout.simulation import Advanced, Begun, Seen, SimulationFailed
 from vla_attention.capture.rollout.simulator_process import (
     BeginEpisode,
     Execute,
@@ -77,15 +79,11 @@ def default_num_envs() -> int:
     return max(1, int(min(available_cores(), MOST_BY_DEFAULT, memory_left() / SIMULATOR_BYTES)))
 
 
-_WHY_KILLED = "Signal 9 mostly means that the memory was full. "
+_WHY_KILLED = "Signal 9 mostly means that the memory was full; a smaller --num-envs needs less. "
 
 
-class SimulationFailed(UserError):
-    """A simulator refused its work or failed, in one sentence."""
-
-
-class SimulatorDied(UserError, RuntimeError):
-    """The process of a simulator ended again and again in the same episode."""
+class SimulatorRefused(UserError):
+    """No simulator can do the work: what is needed is missing, or no process can be started."""
 
 
 @dataclass(eq=False)
@@ -137,6 +135,8 @@ class PipelinedLoop(EpisodeLoop):
     _writing: dict[EpisodeInBackground, tuple[EpisodeRecording, EpisodeProgress]] = field(
         default_factory=dict, init=False
     )
+    #: Episodes that are to be recorded and that no simulator has.
+    _left: list[TaskEpisode] = field(default_factory=list, init=False)
     _ready: deque[tuple[Simulator, Seen]] = field(default_factory=deque, init=False)
     #: What simulators of each task know of its resets, for the others.
     _resets: dict[int, Sequence[object]] = field(default_factory=dict, init=False)
@@ -164,13 +164,13 @@ class PipelinedLoop(EpisodeLoop):
     def attempt_all(self, missing: Sequence[TaskEpisode]) -> list[tuple[TaskEpisode, Holder]]:
         """Record every episode that nobody has; return those that other processes have claimed."""
         self.termination.check()
-        left = list(missing)
+        self._left = list(missing)
         elsewhere: list[tuple[TaskEpisode, Holder]] = []
         with self.termination.only_at_checks():
-            while left or self._running or self._writing:
+            while self._left or self._running or self._writing:
                 self.termination.check()
                 self._note_commits(self._thread.take_commits())
-                self._begin_episodes(left, elsewhere)
+                self._begin_episodes(self._left, elsewhere)
                 if self._running or self._writing:
                     self._receive()
                     self._call_policy()
@@ -202,7 +202,7 @@ class PipelinedLoop(EpisodeLoop):
         try:
             return SimulatorProcess(self._setup)
         except OSError as error:
-            raise SimulationFailed(
+            raise SimulatorRefused(
                 f"Cannot start a process for a simulator ({error.strerror or error}); use a smaller --num-envs, and "
                 "--resume for what is missing."
             ) from None
@@ -287,12 +287,8 @@ class PipelinedLoop(EpisodeLoop):
                 self._advanced(simulator, answer)
             case Failed(sentence, expected):
                 if expected:
-                    raise SimulationFailed(sentence)
-                title = episode_title(self.run.store, simulator.task, simulator.episode_index)
-                raise SimulationFailed(
-                    f"The simulator of {title} failed: {sentence}. Nothing of this episode was kept, and the episodes "
-                    "before it are unharmed; --num-envs 1 --resume shows the whole traceback."
-                )
+                    raise SimulatorRefused(sentence)
+                self._fail(simulator, SimulationFailed(sentence))
 
     def _advanced(self, simulator: Simulator, result: Advanced) -> None:
         simulator.asked_at = None
@@ -316,14 +312,25 @@ class PipelinedLoop(EpisodeLoop):
         if not self._ready:
             return
         batch = [self._ready.popleft() for _ in range(min(self.policy_batch, len(self._ready)))]
-        prepared = [simulator.in_episode[0].prepare(seen) for simulator, seen in batch]
-        calls = record_calls(self.run.policy, prepared, self.run.store.attributes.recording)
-        for (simulator, _), call in zip(batch, calls, strict=True):
-            simulator.asked_at = time.monotonic()
-            simulator.process.execute(Execute(*simulator.in_episode[0].next_actions(call)))
-        for (simulator, _), before, call in zip(batch, prepared, calls, strict=True):
-            recording, writer = simulator.in_episode
-            recording.keep(before, call, writer)
+        prepared = []
+        for simulator, seen in batch:
+            try:
+                prepared.append((simulator, simulator.in_episode[0].prepare(seen)))
+            except SimulationFailed as error:
+                self._fail(simulator, error)
+        if not prepared:
+            return
+        calls = record_calls(self.run.policy, [call for _, call in prepared], self.run.store.attributes.recording)
+        for (simulator, _), call in zip(prepared, calls, strict=True):
+            if isinstance(call, NumbersNotFinite):
+                self._fail(simulator, call)
+            else:
+                simulator.asked_at = time.monotonic()
+                simulator.process.execute(Execute(*simulator.in_episode[0].next_actions(call)))
+        for (simulator, before), call in zip(prepared, calls, strict=True):
+            if not isinstance(call, NumbersNotFinite):
+                recording, writer = simulator.in_episode
+                recording.keep(before, call, writer)
 
     def _begin_again(self, simulator: Simulator, how: str) -> None:
         """Begin the episode of a simulator that has died or hangs in a new one; how: in what way, for messages."""
@@ -334,19 +341,40 @@ class PipelinedLoop(EpisodeLoop):
             simulator.recording = simulator.writer = None
         title = episode_title(self.run.store, simulator.task, simulator.episode_index)
         if simulator.begun_times > MOST_RESTARTS:
-            raise SimulatorDied(
-                f"The simulator of {title} ended {simulator.begun_times} times, the last time {how}. Nothing of this "
-                f"episode was kept, and the episodes before it are unharmed. {_WHY_KILLED if 'signal 9' in how else ''}"
-                "Go on with --resume and a smaller --num-envs; 1 keeps the simulator in this process."
-            )
+            why = _WHY_KILLED if "signal 9" in how else ""
+            died = f"The simulator of {title} ended {simulator.begun_times} times, the last time {how}."
+            self._fail(simulator, SimulatorDied(f"{died} {why}Nothing of this episode was kept."))
+            return
         self.progress.say(f"{simulator.name}: its simulator ended ({how}); the episode begins again.")
         simulator.begun_times += 1
         simulator.progress.update(0, 0)
         simulator.process = self._start_simulator()
         self._begin(simulator)
 
+    def _fail(self, simulator: Simulator, error: Exception) -> None:
+        """Drop the episode of a simulator after a fault. If it shall be tried again, it waits for a simulator."""
+        self._ready = deque(entry for entry in self._ready if entry[0] is not simulator)
+        self._running.remove(simulator)
+        if simulator.writer is not None:
+            simulator.writer.drop()
+        # What raised an error is not to be trusted, and what owes an answer would give it to another episode.
+        if isinstance(error, SimulationFailed) or simulator.asked_at is not None:
+            simulator.process.close()
+        else:
+            self._idle.append((simulator.process, simulator.task.task_id))
+        self._after_fault(simulator.task, simulator.episode_index, simulator.progress, error)
+
+    def _after_fault(self, task: Task, episode: int, progress: EpisodeProgress, error: Exception) -> None:
+        name = episode_name(task.task_id, episode)
+        self.claims.release(name)
+        if self.note_fault(name, progress, error):
+            self._left.insert(0, (task, episode))
+
     def _note_commits(self, commits: Sequence[Committed]) -> None:
         for commit in commits:
+            if isinstance(commit.folder, EPISODE_FAULTS):
+                self._fail_in_writing(commit.episode, commit.folder)
+                continue
             recording, progress = self._writing.pop(commit.episode)
             start = recording.start
             name = episode_name(start.task_id, start.episode_index)
@@ -365,9 +393,19 @@ class PipelinedLoop(EpisodeLoop):
                 progress.end(describe_result(result, commit.num_bytes), start.instruction)
             self.claims.release(name)
 
+    def _fail_in_writing(self, writer: EpisodeInBackground, error: Exception) -> None:
+        """Drop an episode that the thread could not store; its simulator may be on the way to the next replan."""
+        if writer in self._writing:
+            recording, progress = self._writing.pop(writer)
+            self._after_fault(recording.task, recording.start.episode_index, progress, error)
+            return
+        for simulator in [each for each in self._running if each.writer is writer]:
+            self._fail(simulator, error)
+
     def _note_last_commits(self) -> None:
         """Note the commits that were completed while the thread ended."""
-        self._note_commits(self._thread.commits_before_end())
+        commits = self._thread.commits_before_end()
+        self._note_commits([commit for commit in commits if not isinstance(commit.folder, EPISODE_FAULTS)])
 
     def _end_simulators(self) -> None:
         for process in [*(simulator.process for simulator in self._running), *(process for process, _ in self._idle)]:

@@ -93,29 +93,34 @@ class PreparedCall:
     editors: Mapping[str, AttentionEditor] | None
 
 
-def record_calls(policy: Policy, calls: Sequence[PreparedCall], recording: Recording) -> list[RecordedCall]:
+def record_calls(
+    policy: Policy, calls: Sequence[PreparedCall], recording: Recording
+) -> list[RecordedCall | NumbersNotFinite]:
     """Make calls as one batch if the policy can, else one after the other, and record what `recording` says.
 
-    One call, and calls with editors, are made as `record_call` makes them, to the bit.
-
-    Raises:
-        NumbersNotFinite: as `record_call`.
+    One call, and calls with editors, are made as `record_call` makes them, to the bit. In the place of a call whose
+    actions or rows are NaN or infinite is the error that `record_call` raises: the others of a batch are not its fault.
     """
     if len(calls) == 1 or any(call.editors for call in calls) or not isinstance(policy, BatchPolicy):
-        return [
-            record_call(policy, call.policy_input, call.noise_seed, recording, call.where, call.editors)
-            for call in calls
-        ]
+        return [_recorded_or_error(policy, call, recording) for call in calls]
     pools = policy.query_pools() if recording.queries == "steps" else None
     recorders = [make_recorders(recording, policy.sites, call.policy_input.key_role, pools) for call in calls]
     inputs, seeds = [call.policy_input for call in calls], [call.noise_seed for call in calls]
-    made = []
+    made: list[RecordedCall | NumbersNotFinite] = []
     for call, actions, own in zip(calls, policy.act_batch(inputs, seeds, recorders), recorders, strict=True):
         rows = {site: recorder.finish() for site, recorder in own.items()}
-        if not all_finite(actions, rows):
-            raise _not_finite(policy, call.policy_input, call.noise_seed, call.where, None)
-        made.append(RecordedCall(actions, rows))
+        if all_finite(actions, rows):
+            made.append(RecordedCall(actions, rows))
+        else:
+            made.append(_not_finite(policy, call.policy_input, call.noise_seed, call.where, None))
     return made
+
+
+def _recorded_or_error(policy: Policy, call: PreparedCall, recording: Recording) -> RecordedCall | NumbersNotFinite:
+    try:
+        return record_call(policy, call.policy_input, call.noise_seed, recording, call.where, call.editors)
+    except NumbersNotFinite as error:
+        return error
 
 
 def _not_finite(
@@ -124,16 +129,18 @@ def _not_finite(
     """Return the error of a policy call whose results are not finite; it repeats the call to find where that began."""
     wrong_inputs = [name for name, values in policy_input.tensors.items() if not torch.isfinite(values).all()]
     if wrong_inputs:
-        origin = f"The policy's input is not finite already: {listing(wrong_inputs)}"
+        origin, passing = f"The policy's input is not finite already: {listing(wrong_inputs)}", False
     else:
-        origin = describe_origin(
+        origin, passing = describe_origin(
             policy.model,
             lambda watch: policy.act(policy_input, seed, watch, editors),
             tuple(site.name for site in policy.sites),
         )
+    sentence = f"The policy's numbers turned NaN or infinite at {where}. {origin}. Nothing of this episode was kept"
+    if passing:
+        return NumbersNotFinite(f"{sentence}.", passing=True)
     dtype = policy.identity().config.get("dtype")
     remedy = "use another checkpoint" if dtype == "float32" else "use --dtype float32, or another checkpoint"
     return NumbersNotFinite(
-        f"The policy's numbers turned NaN or infinite at {where}. {origin}. Nothing of this episode was kept, and the "
-        f"episodes before it are unharmed; {remedy}, and a new --store."
+        f"{sentence}, and the episodes before it are unharmed; {remedy}, and a new --store, if it comes again."
     )

@@ -45,6 +45,10 @@ class EpisodeProgress:
         """Show the episode no more: another process was faster, or this one stops."""
         self.progress.drop(self)
 
+    def put_back(self) -> None:
+        """Show the episode no more: it will begin again."""
+        self.progress.put_back(self)
+
     def describe(self, max_steps: int, now: float) -> str:
         """Return what is done as text for a log file."""
         return (
@@ -100,6 +104,13 @@ class Progress:
         """Count an episode as done, and show it no more."""
         self._running.remove(episode)
         self._num_done += 1
+        self._update_bar()
+        self._describe_bar()
+
+    def put_back(self, episode: EpisodeProgress) -> None:
+        """Show an episode no more, and count it as not begun."""
+        self._running.remove(episode)
+        self._num_begun -= 1
         self._update_bar()
         self._describe_bar()
 

@@ -5,8 +5,11 @@ It needs no torch, so that processes that only simulate start fast and stay smal
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +17,37 @@ from numpy.typing import NDArray
 from vla_attention.capture.environments.base import Environment, Observation, camera_frame
 from vla_attention.capture.environments.coverage import patch_coverage
 from vla_attention.capture.environments.episode_protocol import WAIT_ACTION
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.stores.store_format import PolicyCameraView, Protocol
 
 #: Raises an exception when the process shall stop.
 StopCheck = Callable[[], None]
+
+
+class SimulationFailed(UserError, RuntimeError):
+    """A simulator raised an error, or gave what cannot be. Its episode is lost; a new simulator may do better."""
+
+
+@contextmanager
+def naming_the_simulator(title: str) -> Iterator[None]:
+    """Turn an error of a simulator into `SimulationFailed`, with the episode's title; mistakes of users stay."""
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        raise SimulationFailed(describe_failure(title, error)) from error
+
+
+def describe_failure(title: str, error: Exception) -> str:
+    """Return an error of a simulator in one sentence: the episode's title, the error, and the line that raised it."""
+    at = traceback.extract_tb(error.__traceback__)[-1]
+    text = " ".join(str(error).split())
+    return (
+        f"The simulator of {title} failed: {type(error).__name__}: {text} ({Path(at.filename).name}:{at.lineno}). "
+        "Nothing of this episode was kept."
+    )
 
 
 @dataclass(frozen=True)
@@ -73,22 +101,28 @@ class Simulation:
     check: StopCheck = lambda: None
 
     def begin(self, episode_index: int, what: str) -> Begun:
-        """Reset to the stored initial state of that index; what: the episode's name in messages."""
+        """Reset to the stored initial state of that index; what: the episode's title in messages.
+
+        Raises:
+            SimulationFailed: the simulator raised an error; `wait` and `advance` do the same.
+        """
         self._what, self._step, self._replan = what, 0, 0
-        self.environment.reset(episode_index, self.protocol.seed)
-        return Begun(self.environment.initial_state_digest, tuple(self.environment.objects))
+        with naming_the_simulator(what):
+            self.environment.reset(episode_index, self.protocol.seed)
+            return Begun(self.environment.initial_state_digest, tuple(self.environment.objects))
 
     def wait(self) -> Advanced:
         """Make the waiting steps, in which objects come to rest; only the last one is observed."""
-        action, observation = np.array(WAIT_ACTION), None
-        for i in range(self.protocol.wait_steps):
-            self.check()
-            observation = self.environment.step(action, observe=i == self.protocol.wait_steps - 1).observation
-        if observation is None:
+        if self.protocol.wait_steps < 1:
             raise ValueError(
                 "an episode needs at least one waiting step: the first picture is the one after the last of them"
             )
-        return Advanced(0, False, self._seen(observation))
+        action = np.array(WAIT_ACTION)
+        with naming_the_simulator(self._what):
+            for i in range(self.protocol.wait_steps):
+                self.check()
+                observation = self.environment.step(action, observe=i == self.protocol.wait_steps - 1).observation
+            return Advanced(0, False, None if observation is None else self._seen(observation))
 
     def advance(self, actions: NDArray[np.float64], observe: bool) -> Advanced:
         """Execute actions (step, 7) until the task is solved; with `observe` the last one is observed.
@@ -96,15 +130,16 @@ class Simulation:
         Only the picture before the next replan is drawn, because the policy sees no other.
         """
         observation = None
-        for i, action in enumerate(actions):
-            self.check()
-            result = self.environment.step(action, observe=observe and i == len(actions) - 1)
-            self._step += 1
-            observation = result.observation
-            if result.success:
-                return Advanced(i + 1, True, None)
-        self._replan += 1
-        return Advanced(len(actions), False, None if observation is None else self._seen(observation))
+        with naming_the_simulator(self._what):
+            for i, action in enumerate(actions):
+                self.check()
+                result = self.environment.step(action, observe=observe and i == len(actions) - 1)
+                self._step += 1
+                observation = result.observation
+                if result.success:
+                    return Advanced(i + 1, True, None)
+            self._replan += 1
+            return Advanced(len(actions), False, None if observation is None else self._seen(observation))
 
     def _seen(self, observation: Observation) -> Seen:
         return Seen(observation, {camera.view.name: self._coverage(camera, observation) for camera in self.cameras})

@@ -14,12 +14,10 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,7 +25,12 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, SharesResets, Suite
 from vla_attention.capture.environments.suites import make_environment
-from vla_attention.capture.rollout.simulation import CameraPatches, Simulation
+from vla_attention.capture.rollout.simulation import (
+    CameraPatches,
+    Simulation,
+    SimulationFailed,
+    describe_failure,
+)
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.store_format import Protocol
 from vla_attention.schemas.threads import OTHER_LIBRARIES
@@ -93,7 +96,7 @@ class KnownResets:
 
 @dataclass(frozen=True)
 class Failed:
-    """Tells that the simulator failed, in one sentence, which is whole if it is `expected`: a mistake of the user."""
+    """Tells that the simulator failed, in one sentence. expected: a mistake of the user, which all episodes meet."""
 
     sentence: str
     expected: bool
@@ -171,6 +174,8 @@ class _Server:
         self.setup = setup
         self.environment: Environment | None = None
         self.task_id: int | None = None
+        #: The title of the episode, for messages.
+        self.title = "an episode"
 
     def serve(self) -> None:
         """Answer until the other end closes."""
@@ -182,6 +187,7 @@ class _Server:
                 self.connection.send(self.simulation.advance(message.actions, message.observe))
 
     def _begin(self, request: BeginEpisode) -> None:
+        self.title = request.title
         environment, seed = self._environment_of(request.task_id), self.setup.protocol.seed
         shared = environment if isinstance(environment, SharesResets) else None
         if shared is not None and request.resets is not None:
@@ -225,11 +231,11 @@ def main(descriptor: int, temporary: str | None = None) -> None:
             server.serve()
         except (EOFError, ConnectionError):
             raise
+        except SimulationFailed as error:
+            connection.send(Failed(str(error), expected=False))
         except UserError as error:
             connection.send(Failed(str(error), expected=True))
         except Exception as error:
-            at = traceback.extract_tb(error.__traceback__)[-1]
-            text = " ".join(str(error).split())
-            connection.send(Failed(f"{type(error).__name__}: {text} ({Path(at.filename).name}:{at.lineno})", False))
+            connection.send(Failed(describe_failure(server.title, error), expected=False))
     except (EOFError, ConnectionError):
         return  # the policy's process has ended, or needs this one no more

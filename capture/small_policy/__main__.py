@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from vla_attention.schemas.command_line import OneSentenceParser, command_parser, run_command
+from vla_attention.schemas.stop_signals import end_program, run_until_stopped
 
 PROGRAM = "python -m vla_attention.capture.small_policy"
 
@@ -37,6 +38,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Set before MuJoCo is imported, because GPU nodes and CI have no display.
     os.environ.setdefault("MUJOCO_GL", "egl")
     given = list(sys.argv[1:] if argv is None else argv)
+    return run_until_stopped(PROGRAM, lambda: _run(given), "what is whole is kept.")
+
+
+def _run(given: list[str]) -> int:
     parser = command_parser(PROGRAM, "Make the small pi0.5 of the suite cubes.")
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=OneSentenceParser)
     # Only the chosen command's module is imported, because they need different parts of the installation.
@@ -57,4 +62,4 @@ def _module(name: str) -> Any:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end_program(main())

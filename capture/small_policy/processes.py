@@ -11,6 +11,7 @@ from typing import Any
 from tqdm import tqdm
 
 from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.stop_signals import stops_kept_from_children
 
 #: Takes the jobs of one process and the queue of its results.
 Work = Callable[[Sequence[Any], "multiprocessing.Queue[Any]"], None]
@@ -52,8 +53,9 @@ def share_among_processes(
     results = context.Queue()
     shares = [jobs[first::workers] for first in range(workers)]
     processes = [context.Process(target=_run, args=(work, share, results), daemon=True) for share in shares if share]
-    for process in processes:
-        process.start()
+    with stops_kept_from_children():
+        for process in processes:
+            process.start()
     while any(process.is_alive() for process in processes) or not results.empty():
         while not results.empty():
             result = results.get()

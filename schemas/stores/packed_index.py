@@ -7,6 +7,7 @@ spares one that can from listing thousands of files. An index that was damaged, 
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass, replace
 
 from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
@@ -20,6 +21,7 @@ INDEX_FORMAT = "vla-attention-index"
 INDEX_VERSION = 1
 #: Episodes of one task in one folder: a hub takes at most 10,000 files in one.
 _IN_A_FOLDER = 1000
+_PACK_FOLDER = re.compile(r"task[0-9]{3,}_[0-9]{3,}")
 #: An episode's tail has some hundred kilobytes; an index that says more than this is not believed.
 _MOST_TAIL_BYTES = 256_000_000
 
@@ -72,6 +74,11 @@ def packed_file(name: str) -> str:
     """The path of an episode's zip in a packed store."""
     task, index = parse_episode_name(name)
     return f"{EPISODES_GROUP}/task{task:03d}_{index // _IN_A_FOLDER:03d}/{name}.zip"
+
+
+def is_pack_folder(name: str) -> bool:
+    """Whether a folder beside the episodes has the name of one that holds zips."""
+    return _PACK_FOLDER.fullmatch(name) is not None
 
 
 def read_index(source: ByteSource, store: object, run: str) -> PackedIndex | None:

@@ -7,6 +7,7 @@ is opened.
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,14 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.schemas.cached_property import cached_property
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.errors import Note, listing
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.jsonable import from_json
 from vla_attention.schemas.layout import Prompt, prompt_at
+from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.byte_source import ByteSource
 from vla_attention.schemas.stores.packed_index import INDEX_FILE, PackedEpisode, read_index
 from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
-from vla_attention.schemas.stores.root import episode_folders, group_attributes, read_run
+from vla_attention.schemas.stores.root import group_attributes, list_episodes, read_run
 from vla_attention.schemas.stores.seal import identity_problem, read_seal
 from vla_attention.schemas.stores.sealed_files import SealedFiles
 from vla_attention.schemas.stores.store_format import (
@@ -32,7 +34,6 @@ from vla_attention.schemas.stores.store_format import (
     EpisodeAttributes,
     EpisodeSeal,
     RootAttributes,
-    StoreError,
     episode_name,
     parse_episode_name,
 )
@@ -331,6 +332,8 @@ class Store:
 def open_store(path: str | StorePlace) -> Store:
     """Open a store for reading, at a path or an address; its episodes are in the order of task id and episode index.
 
+    What lies among the episodes and is none is named in a `Note` and ignored.
+
     Raises:
         StoreNotFound: nothing is there; the error lists the stores nearby.
         StoreError: something else is there, or its attributes cannot be read.
@@ -343,10 +346,15 @@ def open_store(path: str | StorePlace) -> Store:
     if index is not None:
         in_order = sorted(index.episodes.items(), key=lambda item: parse_episode_name(item[0]))
         return Store(path, root, run, tuple(_packed(path, source, run, *item) for item in in_order))
-    try:
-        folders = sorted(episode_folders(path), key=lambda folder: parse_episode_name(folder.name))
-    except BadArgument as error:
-        raise StoreError(f"The store {path} cannot be read: {error}") from None
+    folders, strays = list_episodes(path)
+    if strays:
+        warnings.warn(
+            f"Ignored in {path}, among its episodes: {visible(listing(strays))}; they are no episodes. Move them out "
+            "of the store.",
+            Note,
+            stacklevel=2,
+        )
+    folders.sort(key=lambda folder: parse_episode_name(folder.name))
     return Store(path, root, run, tuple(StoredEpisode(folder, folder.name, run) for folder in folders))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
 from vla_attention.schemas.jsonable import MalformedDocument
 from vla_attention.schemas.stores.digest import run_digest
-from vla_attention.schemas.stores.packed_index import INDEX_FILE
+from vla_attention.schemas.stores.packed_index import INDEX_FILE, is_pack_folder
 from vla_attention.schemas.stores.remote_source import RemoteFailure, RemoteFolder, source_of
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
@@ -17,6 +17,7 @@ from vla_attention.schemas.stores.store_format import (
     RootAttributes,
     StoreError,
     StoreNotFound,
+    is_episode_name,
 )
 from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
 from vla_attention.schemas.stores.versions import decode_root
@@ -82,6 +83,14 @@ def _refuse_inside(path: Path, attributes: dict[str, Any]) -> None:
 
 def episode_folders(path: StorePlace) -> list[StorePlace]:
     """Folders of the complete episodes of the store at `path`, in no particular order; none of them is packed."""
+    return list_episodes(path)[0]
+
+
+def list_episodes(path: StorePlace) -> tuple[list[StorePlace], list[str]]:
+    """Folders of the complete episodes of a store, as `episode_folders`, and names of what lies among them and is none.
+
+    Readers ignore the latter: files, and folders with other names.
+    """
     if isinstance(path, StoreUrl):
         try:
             names = RemoteFolder(path.url).names(EPISODES_GROUP)
@@ -90,18 +99,26 @@ def episode_folders(path: StorePlace) -> list[StorePlace]:
                 f"The episodes of {path} cannot be listed ({error}), and it has no index; vla-analyze copy --packed "
                 "makes a store that is read without listing."
             ) from None
-        return [path / EPISODES_GROUP / name for name in names if name != "zarr.json"]
-    if (path / INDEX_FILE).is_file():
+        found = {name: is_episode_name(name) for name in names}
+    elif (path / INDEX_FILE).is_file():
         raise StoreError(
             f"{path} is packed: its episodes are zip files, and nothing is added to them or moved. vla-analyze copy "
             f"{path} NAME.zarr makes a store of folders."
         )
-    try:
-        return [entry for entry in (path / EPISODES_GROUP).iterdir() if entry.is_dir()]
-    except OSError as error:
+    else:
+        try:
+            entries = (path / EPISODES_GROUP).iterdir()
+            found = {entry.name: is_episode_name(entry.name) and entry.is_dir() for entry in entries}
+        except OSError as error:
+            raise StoreError(
+                f"The store {path} cannot be read: its group '{EPISODES_GROUP}': {error.strerror or error}."
+            ) from None
+    if any(map(is_pack_folder, found)):
         raise StoreError(
-            f"The store {path} cannot be read: its group '{EPISODES_GROUP}': {error.strerror or error}."
-        ) from None
+            f"The store {path} cannot be read: it is packed, and its {INDEX_FILE} is lost; make the packed copy again."
+        )
+    strays = sorted(name for name, is_episode in found.items() if not is_episode and name != "zarr.json")
+    return [path / EPISODES_GROUP / name for name, is_episode in found.items() if is_episode], strays
 
 
 def group_attributes(document: bytes) -> dict[str, Any]:

@@ -422,3 +422,11 @@ def parse_episode_name(name: str) -> tuple[int, int]:
     if match is None:
         raise BadArgument(f"'{name}' is no episode name; expected for instance {episode_name(3, 7)}.")
     return int(match[1]), int(match[2])
+
+
+def is_episode_name(name: str) -> bool:
+    """Whether a name is that of an episode's group, written as `episode_name` writes it."""
+    try:
+        return name == episode_name(*parse_episode_name(name))
+    except ValueError:
+        return False

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 import tomllib
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 
 from tests.analyze.published.test_results_reader import ours
 from tests.kit.published_results import cosmos_episodes, pi_episodes, write_published
-from vla_attention.analyze.parse.command import main
+from vla_attention.analyze.parse.command import build_parser, main
 from vla_attention.analyze.parse.plot_results_comparison import row_names
 from vla_attention.analyze.show.numbers import format_number
 
@@ -226,7 +227,14 @@ def test_a_file_written_from_a_table_and_its_table_say_the_same(tmp_path, capsys
 def test_the_command_is_registered_under_its_published_name():
     project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     module, _, function = project["scripts"]["parse-attention-ratio-results"].partition(":")
-    assert getattr(import_module(module), function) is main
+    assert (module, function) == ("vla_attention.analyze.__main__", "parse_attention_ratio_results")
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys; from {module} import {function} as run; sys.argv[1:] = ['--help']; run()"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == build_parser().format_help()
 
 
 @pytest.mark.parametrize("few", [True, False])

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import threading
 import time
-from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
@@ -20,6 +19,7 @@ import numpy as np
 import pytest
 import zarr
 
+from tests.kit.simulators_in_threads import TINY, ThreadOfTests, assert_same_episodes, record
 from tests.kit.still_scene import StillScene
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
@@ -35,57 +35,9 @@ from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.worker import Worker
 
 NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2")
-TINY = ["pi", "--checkpoint", "untrained-tiny", "--replan-steps", "4", "--max-steps", "8"]
-
-
-def assert_same_episodes(one: Path, other: Path) -> None:
-    """Compare two stores array by array, with types, shapes and attributes."""
-    first, second = (zarr.open_group(store, mode="r")["episodes"] for store in (one, other))
-    assert sorted(first.keys()) == sorted(second.keys())
-    for name in first:
-        assert dict(first[name].attrs) == dict(second[name].attrs)
-        arrays, others = (
-            {path: array for path, array in group[name].members(max_depth=None) if isinstance(array, zarr.Array)}
-            for group in (first, second)
-        )
-        assert arrays.keys() == others.keys()
-        assert "joint/rows" in arrays
-        for path, array in arrays.items():
-            mine, its = array[:], others[path][:]
-            assert (mine.dtype, mine.shape) == (its.dtype, its.shape)
-            assert mine.tobytes() == its.tobytes(), f"{name}/{path}"
 
 
 # ---------------------------------------------------------------- simulators in threads, for what needs no simulator
-
-
-class ThreadOfTests:
-    """Stands for a `SimulatorProcess`: its own side runs in a thread of this process, in a `StillScene`."""
-
-    started: list[ThreadOfTests]
-
-    def __init__(self, setup: simulator_process.SimulatorSetup) -> None:
-        self.connection, theirs = Pipe()
-        self.code = -signal.SIGKILL
-        self._theirs = theirs
-        self._thread = threading.Thread(target=simulator_process.main, args=(os.dup(theirs.fileno()),), daemon=True)
-        theirs.close()
-        self._thread.start()
-        self.connection.send(setup)
-        self.started.append(self)
-
-    def begin(self, request: simulator_process.BeginEpisode) -> None:
-        self.connection.send(request)
-
-    def execute(self, request: simulator_process.Execute) -> None:
-        self.connection.send(request)
-
-    def how_it_ended(self) -> str:
-        return "killed by signal 9"
-
-    def close(self) -> None:
-        self.connection.close()
-        self._thread.join()
 
 
 class Deadly(StillScene):
@@ -101,25 +53,8 @@ class Deadly(StillScene):
         self.steps += 1
         if self.index == 1 and self.steps == 12 and self.lives[0] > 0:
             self.lives[0] -= 1
-            raise EOFError  # as if the process ended: its end of the connection closes without an answer
+            raise SystemExit  # as if the process ended: its end of the connection closes without an answer
         return super().step(action, observe)
-
-
-@pytest.fixture
-def scene(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
-    """Simulators are threads; `scene.make` makes the environment of each."""
-    made = SimpleNamespace(make=StillScene)
-    monkeypatch.setattr(ThreadOfTests, "started", [], raising=False)
-    monkeypatch.setattr(simulator_process, "make_environment", lambda suite, task_id, settings: made.make())
-    monkeypatch.setattr(
-        "vla_attention.capture.rollout.episode_loop.make_environment", lambda suite, task_id, settings: made.make()
-    )
-    monkeypatch.setattr(pipeline, "SimulatorProcess", ThreadOfTests)
-    return made
-
-
-def record(store: Path, num_envs: int, *words: str) -> int:
-    return capture([*TINY, "--task-suite", "robosuite", "--store", str(store), "--num-envs", str(num_envs), *words])
 
 
 def test_more_simulators_give_the_same_episodes(scene, tmp_path, capsys):
@@ -195,7 +130,9 @@ def test_an_episode_begins_again_at_most_twice(scene, tmp_path, capsys):
         f"The simulator of episode task000_episode001 of {tmp_path}/a.zarr ended 3 times, the last time killed" in said
     )
     assert "a smaller --num-envs" in said
+    assert "is missing: task000_episode001. " in said
     assert said.count("\n") == 1
+    assert len(open_store(tmp_path / "a.zarr").episodes) == 2
     assert not (tmp_path / "a.zarr.partial").exists()
     assert holders(tmp_path / "a.zarr") == []
     assert analyze(["verify", str(tmp_path / "a.zarr")]) == 0
@@ -220,7 +157,7 @@ class Hanging(StillScene):
             self.hangs[0] -= 1
             self.clock.now += 10 * pipeline.NO_ANSWER_S
             assert self.ended.wait(60)
-            raise EOFError
+            raise SystemExit
         return super().step(action, observe)
 
 
@@ -316,22 +253,6 @@ def test_an_error_of_a_simulator_is_one_sentence(scene, tmp_path, capsys, error,
     for part in said.split(".*"):
         assert part in printed
     assert "Traceback" not in printed
-
-
-def test_an_error_of_the_policy_ends_everything(scene, tmp_path, monkeypatch, capsys):
-    from vla_attention.capture.policies.pi.policy import PiPolicy
-
-    act, calls = PiPolicy.act, []
-
-    def sometimes(self: Any, *given: Any) -> Any:
-        calls.append(given)
-        return act(self, *given) * (np.nan if len(calls) == 3 else 1)
-
-    monkeypatch.setattr(PiPolicy, "act", sometimes)
-    assert record(tmp_path / "a.zarr", 2, "--task-id", "0", "--num-episodes", "4") == 2
-    assert "The policy's numbers turned NaN or infinite at replan" in capsys.readouterr().err
-    assert not (tmp_path / "a.zarr.partial").exists()
-    assert holders(tmp_path / "a.zarr") == []
 
 
 def test_an_error_of_the_writing_ends_everything(scene, tmp_path, monkeypatch, capsys):

@@ -14,6 +14,7 @@ from numcodecs import blosc
 from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
 
 from tests.kit.attacks import exchange, files_of, with_checksum
+from vla_attention.schemas.errors import Note
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import (
     CorruptEpisode,
@@ -239,10 +240,10 @@ def test_a_truncated_root(path, share):
         open_store(path)
 
 
-def test_a_folder_that_is_no_episode(path):
+def test_a_folder_that_is_no_episode_is_named_and_ignored(path):
     (path / "episodes" / "my notes").mkdir()
-    with pytest.raises(StoreError, match="'my notes' is no episode name"):
-        open_store(path)
+    with pytest.warns(Note, match="Ignored in .*, among its episodes: my notes; they are no episodes"):
+        assert len(open_store(path).episodes) == 4
 
 
 def test_a_store_without_its_episodes_group(path):
@@ -251,6 +252,7 @@ def test_a_store_without_its_episodes_group(path):
         open_store(path)
 
 
-def test_files_beside_the_episodes_are_of_no_interest(path):
+def test_files_beside_the_episodes_are_named_and_ignored(path):
     (path / "episodes" / "README").write_text("mine")
-    assert len(open_store(path).episodes) == 4
+    with pytest.warns(Note, match="among its episodes: README"):
+        assert len(open_store(path).episodes) == 4

@@ -1,0 +1,110 @@
+"""Running one command of `vla-analyze`: which one it is, and what all of them share."""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from importlib import import_module
+from pathlib import Path
+
+from vla_attention.analyze.commands import COMMANDS, DEFAULT_COMMAND
+from vla_attention.schemas.command_line import run_command
+from vla_attention.schemas.errors import BadArgument, UnknownName, UserError, did_you_mean, listing
+from vla_attention.schemas.threads import use_threads
+
+#: Episodes are measured in threads (`stores.parallel`); matrix products that start threads too make them slower.
+_ONE_THREAD_EACH = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+#: Objects made between two runs of the garbage collector. Token pieces and steps are tens of thousands, without cycles;
+#: Python's default of 700 would search them again and again.
+_OBJECTS_BETWEEN_COLLECTIONS = 5_000_000
+
+
+def run_command_line(given: Sequence[str], if_stopped: str) -> int:
+    """Run the command that the arguments name; returns the exit code. if_stopped: what is said after a stop."""
+    gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
+    name = given[0] if given[:1] and given[0] in COMMANDS else ""
+    prog = f"vla-analyze {name}".strip()
+    return run_command(prog, lambda: _run(name, given[1:] if name else given), if_stopped)
+
+
+def _run(name: str, arguments: Sequence[str]) -> int:
+    if any(argument.partition("=")[0] == "--seed" for argument in arguments):
+        raise BadArgument("Intervals have no random draws any more: leave --seed out.")
+    if not name:
+        _refuse_misspelt_command(arguments)
+    command = import_module(f"vla_attention.analyze.{name or DEFAULT_COMMAND}.command")
+    parser = command.build_parser(prog=f"vla-analyze {name}") if name == DEFAULT_COMMAND else command.build_parser()
+    parser.add_argument(
+        "--threads",
+        type=int,
+        metavar="N",
+        help="threads that measure episodes, at most 4 (default: OMP_NUM_THREADS, else the cores of this process)",
+    )
+    if name != "cache":
+        parser.add_argument(
+            "--no-cache",
+            action="store_true",
+            help="measure again what was measured before (see vla-analyze cache; VLA_CACHE=off does the same)",
+        )
+    parsed = parser.parse_args(arguments)
+    # The libraries read the numbers when they are imported, which the command does.
+    use_threads(parsed.threads)
+    os.environ.update(dict.fromkeys(_ONE_THREAD_EACH, "1"))
+    try:
+        with _cache_of(parsed), _engine(parsed), _pictures(parsed):
+            code: int = command.run(parsed)
+        return code
+    except UserError as error:
+        raise _with_way_out(error, can_skip=hasattr(parsed, "skip_corrupt")) from error.__cause__
+
+
+def _cache_of(parsed: argparse.Namespace) -> AbstractContextManager[None]:
+    """The cache that the arguments leave to the command."""
+    if not getattr(parsed, "no_cache", False):
+        return nullcontext()
+    from vla_attention.analyze.cache.places import switched_off
+
+    return switched_off()
+
+
+def _pictures(parsed: argparse.Namespace) -> AbstractContextManager[None]:
+    """The formats of pictures: a PDF takes longer than its PNG, and most are never opened."""
+    if getattr(parsed, "pdf", True):
+        return nullcontext()
+    from vla_attention.analyze.show.picture_formats import pictures_saved_as
+
+    return pictures_saved_as(("png",))
+
+
+def _engine(parsed: argparse.Namespace) -> AbstractContextManager[object]:
+    """Where `arguments.add_workers` says that episodes are worked on; nothing is imported for the default."""
+    where = getattr(parsed, "scheduler", None)
+    where = getattr(parsed, "workers", None) if where is None else where
+    if where is None:
+        return nullcontext()
+    from vla_attention.analyze.stores.parallel import workers
+
+    return workers(where)
+
+
+def _with_way_out(error: UserError, can_skip: bool) -> UserError:
+    """Add to the error of a damaged episode what the user can do."""
+    from vla_attention.schemas.stores.store_format import CorruptEpisode
+
+    if not isinstance(error, CorruptEpisode):
+        return error
+    skip = "; leave such episodes out with --skip-corrupt" if can_skip else ""
+    return CorruptEpisode(f"{error} See all faults with vla-analyze verify{skip}.")
+
+
+def _refuse_misspelt_command(arguments: Sequence[str]) -> None:
+    """Raise `UnknownName` for a first argument that resembles a command and is no path."""
+    if len(arguments) > 1 and not arguments[0].startswith("-") and not Path(arguments[0]).exists():
+        near = did_you_mean(arguments[0], COMMANDS)
+        if near:
+            raise UnknownName(
+                f"There is neither a command nor a store '{arguments[0]}'.{near} Commands: {listing(COMMANDS, 40)}."
+            )

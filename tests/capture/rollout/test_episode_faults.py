@@ -1,0 +1,360 @@
+"""Faults of one episode: it is dropped and named, tried once more where that can help, and the run goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from vla_attention.capture.jobs.claims import holders
+
+from tests.kit.policy_inputs import make_observation
+from tests.kit.simulators_in_threads import ThreadOfTests, assert_same_episodes, record
+from tests.kit.still_scene import StillScene
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.capture.environments.base import Observation, StepResult
+from vla_attention.capture.jobs.status import store_status
+from vla_attention.capture.policies.pi.policy import PiPolicy
+from vla_attention.capture.store import episode_writer
+from vla_attention.capture.store.episode_writer import EpisodeWriter, ReplanRefused
+from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.stores.reader import open_store
+
+WORDS = ["--task-id", "0", "--num-episodes", "3"]
+#: The waiting steps of the protocol; the step after them is the policy's first.
+WAITING = 10
+both = pytest.mark.parametrize("num_envs", [1, 2], ids=["serial", "pipelined"])
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Iterator[Path]:
+    """The store of three episodes without a fault."""
+    with pytest.MonkeyPatch.context() as patch:
+        from tests.kit.simulators_in_threads import simulators_in_threads
+
+        simulators_in_threads(patch)
+        store = tmp_path_factory.mktemp("whole") / "a.zarr"
+        assert record(store, 1, *WORDS) == 0
+        yield store
+
+
+class Faulty(StillScene):
+    """Does in episode 1, as often as `faults` says, at the step `at` what `act` says."""
+
+    faults: list[int]
+    episodes: tuple[int, ...] = (1,)
+    at: int = WAITING + 2
+
+    def reset(self, initial_state_index: int, seed: int) -> None:
+        super().reset(initial_state_index, seed)
+        self.index, self.steps = initial_state_index, 0
+
+    def step(self, action: np.ndarray, observe: bool) -> StepResult:
+        self.steps += 1
+        result = super().step(action, observe)
+        if self.index in self.episodes and self.steps >= self.at and self.faults[0] > 0:
+            changed = self.act(result)
+            if changed is not result:
+                self.faults[0] -= 1
+            return changed
+        return result
+
+    def act(self, result: StepResult) -> StepResult:
+        raise NotImplementedError
+
+
+class Raising(Faulty):
+    def act(self, result: StepResult) -> StepResult:
+        self.faults[0] -= 1
+        raise RuntimeError("the context\nis lost")
+
+
+class RaisingInReset(StillScene):
+    faults: list[int]
+
+    def reset(self, initial_state_index: int, seed: int) -> None:
+        super().reset(initial_state_index, seed)
+        if initial_state_index == 1 and self.faults[0] > 0:
+            self.faults[0] -= 1
+            raise ValueError("no such state")
+
+
+class NotMade(StillScene):
+    """Cannot be made at the second time and later, as often as `faults` says."""
+
+    faults: list[int]
+    made: list[int]
+
+    def __init__(self) -> None:
+        self.made[0] += 1
+        if self.made[0] > 1 and self.faults[0] > 0:
+            self.faults[0] -= 1
+            raise OSError("no scene")
+
+
+def changed_pictures(result: StepResult, **changes: Any) -> StepResult:
+    if result.observation is None:
+        return result
+    return StepResult(result.success, Observation(**{**vars(result.observation), **changes}))
+
+
+class Black(Faulty):
+    def act(self, result: StepResult) -> StepResult:
+        if result.observation is None:
+            return result
+        images = {**result.observation.images}
+        images["agentview"] = np.zeros_like(images["agentview"])
+        return changed_pictures(result, images=images)
+
+
+class StateIsNan(Faulty):
+    def act(self, result: StepResult) -> StepResult:
+        return changed_pictures(result, eef_pos=np.array([0.1, np.nan, 0.3]))
+
+
+FAULTS = {
+    "raises in a step": (Raising, "RuntimeError: the context is lost (test_episode_faults.py:"),
+    "raises in a reset": (RaisingInReset, "ValueError: no such state (test_episode_faults.py:"),
+    "black picture": (
+        Black,
+        "The picture of agentview at replan 1 (environment step 14) of episode task000_episode001",
+    ),
+    "state": (StateIsNan, "The simulator gave NaN or infinity as eef_pos at replan 1 (environment step 14) of episode"),
+}
+
+
+def spoil(scene: Any, kind: type[Any], times: int) -> list[int]:
+    kind.faults = [times]
+    scene.make = kind
+    return kind.faults
+
+
+def check_nothing_is_left(store: Path) -> None:
+    assert not store.with_name(f"{store.name}.partial").exists()
+    assert holders(store) == []
+    assert analyze(["verify", str(store)]) == 0
+
+
+@both
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_that_passes_costs_an_attempt(scene, whole, tmp_path, capsys, num_envs, name):
+    kind, sentence = FAULTS[name]
+    faults = spoil(scene, kind, 1)
+    assert record(tmp_path / "a.zarr", num_envs, *WORDS) == 0
+    assert faults == [0]
+    said = capsys.readouterr()
+    (line,) = [line for line in said.out.split("\n") if sentence in line]
+    assert line.startswith("task000_episode001: ")
+    assert line.endswith("Nothing of this episode was kept. The episode begins again.")
+    assert said.err == ""
+    assert "3 episodes added, 0 solved. Store:" in said.out
+    assert_same_episodes(whole, tmp_path / "a.zarr")
+    assert store_status(tmp_path / "a.zarr").complete
+    check_nothing_is_left(tmp_path / "a.zarr")
+
+
+@both
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_that_stays_costs_the_episode_and_resuming_records_it(scene, whole, tmp_path, capsys, num_envs, name):
+    kind, sentence = FAULTS[name]
+    store, faults = tmp_path / "a.zarr", spoil(scene, kind, 2)
+    assert record(store, num_envs, *WORDS) == 2
+    assert faults == [0]
+    said = capsys.readouterr()
+    assert said.err.startswith("vla-capture: 1 of the episodes asked for is missing: task000_episode001. ")
+    assert sentence in said.err
+    assert said.err.endswith(
+        "All other episodes are whole; the same command with --resume tries what is missing again.\n"
+    )
+    assert said.err.count("\n") == 1
+    assert "2 episodes added, 0 solved, 1 missing. Store:" in said.out
+    assert [episode.name for episode in open_store(store).episodes] == ["task000_episode000", "task000_episode002"]
+    check_nothing_is_left(store)
+    assert record(store, num_envs, *WORDS, "--resume") == 0
+    assert_same_episodes(whole, store)
+
+
+@both
+def test_a_scene_that_cannot_be_made_is_a_fault(scene, whole, tmp_path, capsys, num_envs):
+    class Worse(NotMade):
+        """Loses its first scene, so that another one is made."""
+
+        def reset(self, initial_state_index: int, seed: int) -> None:
+            super().reset(initial_state_index, seed)
+            if self.made[0] == 1:
+                raise RuntimeError("lost")
+
+    Worse.made = [0]
+    spoil(scene, Worse, 1)
+    assert record(tmp_path / "a.zarr", num_envs, *WORDS) in (0, 2)
+    assert "OSError: no scene (test_episode_faults.py:" in capsys.readouterr().out
+    check_nothing_is_left(tmp_path / "a.zarr")
+
+
+class AlwaysBlack(Black):
+    """Black in every episode after its first picture; the task's first picture is not."""
+
+    episodes = (0, 1, 2)
+
+
+@both
+def test_black_pictures_again_and_again_end_the_run(scene, tmp_path, capsys, num_envs):
+    faults = spoil(scene, AlwaysBlack, 100)
+    assert record(tmp_path / "a.zarr", num_envs, *WORDS) == 2
+    assert faults[0] <= 97
+    said = capsys.readouterr().err
+    assert "This was the 3rd time in a row, so that the run ends; drawing fails on this machine" in said
+    assert said.count("\n") == 1
+    check_nothing_is_left(tmp_path / "a.zarr")
+
+
+def test_pictures_that_are_black_from_the_beginning_are_no_fault(scene, tmp_path):
+    """A camera may look at nothing: the task's first picture decides."""
+    spoil(scene, AlwaysBlack, 100)
+    AlwaysBlack.at, before = 0, AlwaysBlack.at
+    try:
+        assert record(tmp_path / "a.zarr", 1, *WORDS) == 0
+    finally:
+        AlwaysBlack.at = before
+
+
+def spoil_policy(monkeypatch: pytest.MonkeyPatch, times: int, value: float = np.nan) -> list[int]:
+    """The actions of replan 1 of episode 1 hold NaN, at so many calls."""
+    act, left = PiPolicy.act, [times]
+
+    def spoiled(self: PiPolicy, policy_input: Any, noise_seed: int, *given: Any) -> Any:
+        actions = act(self, policy_input, noise_seed, *given)
+        if noise_seed == self.replan_noise_seed(7, 0, 1, 1) and left[0]:
+            left[0] -= 1
+            actions = actions.copy()
+            actions[0, 2] = value
+        return actions
+
+    monkeypatch.setattr(PiPolicy, "act", spoiled)
+    return left
+
+
+@both
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_numbers_that_turn_nan_cost_their_episode_only(scene, whole, tmp_path, monkeypatch, capsys, num_envs, value):
+    store = tmp_path / "a.zarr"
+    spoil_policy(monkeypatch, 100, value)
+    assert record(store, num_envs, *WORDS) == 2
+    said = capsys.readouterr()
+    assert (
+        "1 of the episodes asked for is missing: task000_episode001. The policy's numbers turned NaN or infinite at "
+        f"replan 1 (environment step 14) of episode task000_episode001 of {store}. All modules of the network give "
+    ) in said.err
+    assert said.err.count("\n") == 1
+    assert "begins again" not in said.out  # the same input gives the same numbers
+    check_nothing_is_left(store)
+    monkeypatch.undo()
+
+
+@both
+def test_numbers_that_are_finite_the_second_time_cost_an_attempt(scene, whole, tmp_path, monkeypatch, capsys, num_envs):
+    left = spoil_policy(monkeypatch, 1)
+    assert record(tmp_path / "a.zarr", num_envs, *WORDS) == 0
+    assert left == [0]
+    said = capsys.readouterr().out
+    assert "The same call, made again, gave finite numbers: the processor or its memory erred." in said
+    assert_same_episodes(whole, tmp_path / "a.zarr")
+
+
+def test_a_call_of_a_batch_that_turns_nan_costs_its_own_episode(scene, tmp_path, monkeypatch, capsys):
+    act = PiPolicy.act_batch
+    sizes = []
+
+    def spoiled(self: PiPolicy, inputs: Any, seeds: Any, recorders: Any) -> Any:
+        made = [actions.copy() for actions in act(self, inputs, seeds, recorders)]
+        sizes.append(len(made))
+        for actions, seed in zip(made, seeds, strict=True):
+            if seed == self.replan_noise_seed(7, 0, 1, 0):
+                actions[0, 0] = np.nan
+        return made
+
+    monkeypatch.setattr(PiPolicy, "act_batch", spoiled)
+    spoil_policy_at = PiPolicy.act
+
+    def alone(self: PiPolicy, policy_input: Any, noise_seed: int, *given: Any) -> Any:
+        actions = spoil_policy_at(self, policy_input, noise_seed, *given).copy()
+        if noise_seed == self.replan_noise_seed(7, 0, 1, 0):
+            actions[0, 0] = np.nan
+        return actions
+
+    monkeypatch.setattr(PiPolicy, "act", alone)
+    store = tmp_path / "a.zarr"
+    assert record(store, 3, "--task-id", "0", "--num-episodes", "6", "--policy-batch", "3") == 2
+    assert "is missing: task000_episode001. The policy's numbers turned NaN" in capsys.readouterr().err
+    assert [episode.name for episode in open_store(store).episodes] == [
+        f"task000_episode00{episode}" for episode in (0, 2, 3, 4, 5)
+    ]
+    check_nothing_is_left(store)
+
+
+@both
+def test_a_replan_that_is_refused_costs_its_episode(scene, whole, tmp_path, monkeypatch, capsys, num_envs):
+    append = EpisodeWriter.append
+
+    def refuse(self: EpisodeWriter, record: Any) -> None:
+        if self.name == "task000_episode001":
+            raise ReplanRefused(f"Cannot store replan 0 of {self.what}: it is wrong.")
+        append(self, record)
+
+    monkeypatch.setattr(EpisodeWriter, "append", refuse)
+    store = tmp_path / "a.zarr"
+    assert record(store, num_envs, *WORDS) == 2
+    said = capsys.readouterr()
+    assert f"is missing: task000_episode001. Cannot store replan 0 of episode task000_episode001 of {store}" in said.err
+    assert "begins again" not in said.out
+    assert len(open_store(store).episodes) == 2
+    check_nothing_is_left(store)
+    monkeypatch.setattr(EpisodeWriter, "append", append)
+    assert record(store, num_envs, *WORDS, "--resume") == 0
+    assert_same_episodes(whole, store)
+
+
+@both
+@pytest.mark.parametrize(("times", "code"), [(1, 0), (2, 2)])
+def test_an_episode_that_comes_back_wrong_from_the_disk_is_written_again(
+    scene, tmp_path, monkeypatch, capsys, num_envs, times, code
+):
+    problems, left = episode_writer.content_problems, [times]
+
+    def damaged(run: Any, episode: Any) -> Iterator[Any]:
+        if episode.name == "task000_episode001" and left[0]:
+            left[0] -= 1
+            yield "a bit flipped"
+        yield from problems(run, episode)
+
+    monkeypatch.setattr(episode_writer, "content_problems", damaged)
+    assert record(tmp_path / "a.zarr", num_envs, *WORDS) == code
+    assert left == [0]
+    said = capsys.readouterr()
+    assert said.out.count("is damaged: a bit flipped. The episode begins again.") == 1
+    assert ("is missing: task000_episode001." in said.err) is (code == 2)
+    assert len(open_store(tmp_path / "a.zarr").episodes) == 3 - (code == 2)
+    check_nothing_is_left(tmp_path / "a.zarr")
+
+
+@both
+def test_a_mistake_of_the_user_ends_the_run(scene, tmp_path, capsys, num_envs):
+    class Refusing(StillScene):
+        def reset(self, initial_state_index: int, seed: int) -> None:
+            raise UserError("The assets are missing; set VLA_LIBERO_ASSETS.")
+
+    scene.make = Refusing
+    assert record(tmp_path / "a.zarr", num_envs, *WORDS) == 2
+    assert capsys.readouterr().err == "vla-capture: The assets are missing; set VLA_LIBERO_ASSETS.\n"
+
+
+def test_a_simulator_that_failed_is_replaced(scene, tmp_path):
+    spoil(scene, Raising, 1)
+    assert record(tmp_path / "a.zarr", 2, *WORDS) == 0
+    assert len(ThreadOfTests.started) == 3
+
+
+def test_pictures_of_the_still_scene_are_not_black():
+    assert all(image.any() for image in make_observation(1).images.values())
