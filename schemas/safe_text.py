@@ -10,8 +10,10 @@ from __future__ import annotations
 import functools
 import re
 import sys
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import TracebackType
 from typing import IO, Any
 from urllib.parse import quote
 
@@ -71,6 +73,11 @@ def file_part(name: str) -> str:
     return f"%2E{plain[1:]}" if plain.startswith(".") else plain
 
 
+def print_line(text: str) -> None:
+    """Print one line at once, also into a file that somebody follows; a line end in it is visible and ends no line."""
+    print(visible(text), flush=True)
+
+
 class _VisibleStream:
     """An output stream that writes text `visible`, line ends apart. Everything else is the wrapped stream's."""
 
@@ -91,13 +98,22 @@ class _VisibleStream:
 
 @contextmanager
 def visible_output() -> Iterator[None]:
-    """Whatever the block prints on stdout and stderr is `visible`, line ends apart."""
+    """What the block prints on stdout and stderr is `visible`, line ends apart, and so is the traceback of an error."""
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = (_VisibleStream(stream) for stream in before)
     try:
         yield
+    except Exception:
+        # Printed by the interpreter when it ends; a name from a file may be part of the error's text.
+        sys.excepthook = _print_visible_traceback
+        raise
     finally:
         sys.stdout, sys.stderr = before
+
+
+def _print_visible_traceback(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    lines = traceback.format_exception(kind, error, trace)
+    sys.stderr.write(visible("".join(lines), keep=_LINE_END))
 
 
 def plain_stderr() -> IO[str]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import subprocess
 import sys
 import tempfile
@@ -24,8 +23,13 @@ SERVICES = ("pypi", "osv")
 #: Asked first, to learn whether a database answers; pip-audit itself tries every package in vain.
 _PROBE = "pip==24.0"
 _SECONDS = 600
-#: A line of `pip freeze` that is neither a comment nor a folder or an address.
-_PINNED = re.compile(r"[\w.-]+==[\w.!+-]+")
+#: What lists the packages of a Python; one that was installed from a folder or an address has a direct_url.json.
+_LIST = """
+from importlib.metadata import distributions
+for found in distributions():
+    if found.metadata["Name"] and not found.read_text("direct_url.json"):
+        print(f"{found.metadata['Name']}=={found.version}")
+"""
 
 
 def installed(python: str) -> list[str]:
@@ -33,8 +37,8 @@ def installed(python: str) -> list[str]:
 
     The part of a version after + names a build (torch 2.9.0+cpu), which no database lists.
     """
-    frozen = subprocess.run([python, "-m", "pip", "freeze"], capture_output=True, text=True, check=True).stdout
-    return [line.partition("+")[0] for line in frozen.splitlines() if _PINNED.fullmatch(line)]
+    listed = subprocess.run([python, "-c", _LIST], capture_output=True, text=True, check=True).stdout
+    return sorted({line.partition("+")[0] for line in listed.splitlines()})
 
 
 def ask(program: str, service: str, packages: Sequence[str], folder: Path) -> list[dict[str, Any]] | str:
@@ -84,6 +88,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as folder:
         for service in SERVICES:
             answer = ask(arguments.program, service, [_PROBE], Path(folder))
+            if not isinstance(answer, str) and any(entry.get("skip_reason") for entry in answer):
+                answer = f"it does not know {_PROBE}"  # a mirror of the packages alone
             if not isinstance(answer, str):
                 answer = ask(arguments.program, service, installed(arguments.packages), Path(folder))
             if not isinstance(answer, str):

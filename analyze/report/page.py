@@ -131,7 +131,7 @@ def templates() -> jinja2.Environment:
         loader=jinja2.PackageLoader("vla_attention.analyze.report"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
-        finalize=lambda value: visible(value, keep="\n") if type(value) is str else value,
+        finalize=lambda value: visible(value) if type(value) is str else value,
         trim_blocks=True,
         lstrip_blocks=True,
     )

@@ -30,6 +30,7 @@ from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.run_settings import RecordingSettings, RunSettings, run_settings
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.safe_text import print_line
 from vla_attention.schemas.threads import use_threads
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ def run_doctor(arguments: argparse.Namespace, termination: Termination) -> int:
     findings = []
     for finding in _findings(arguments, settings, termination):
         findings.append(finding)
-        print(finding.describe(), flush=True)
+        print_line(finding.describe())
     if something_missing(findings):
         missing = ", ".join(finding.what for finding in findings if finding.status == "missing")
         print(f"\nThe run cannot be made as described: {missing}.")

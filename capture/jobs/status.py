@@ -211,4 +211,4 @@ def _text(status: StoreStatus) -> str:
     elif status.complete:
         lines.append("complete: the store has every expected episode.")
     lines += [f"being written: {holder.describe()}" for holder in status.writing]
-    return "\n".join(lines)
+    return "\n".join(map(visible, lines))

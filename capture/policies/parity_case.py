@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 from zipfile import ZipFile
@@ -13,8 +13,11 @@ import numpy as np
 from vla_attention.capture.foreign_files.regular_files import check_regular
 from vla_attention.capture.policies.checkpoints import read_json_object
 from vla_attention.schemas.errors import UserError, listing
+from vla_attention.schemas.safe_text import visible
 
 CASE_FILE = "case.json"
+#: Characters of a case's name.
+_NAME_LENGTH = 100
 #: Bytes of the arrays in one file of a case; the largest case here has 20 MB.
 MAX_ARRAYS_BYTES = 400_000_000
 
@@ -70,6 +73,11 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 def json_number(x: float) -> float | None:
     """Return a number for JSON; None for NaN and infinity, which JSON does not have."""
     return float(x) if np.isfinite(x) else None
+
+
+def case_name(content: Mapping[str, Any], folder: Path) -> str:
+    """Return the name that a case.json gives its case, visible and short, else that of its folder."""
+    return visible(str(content.get("name", folder.name)))[:_NAME_LENGTH]
 
 
 def print_results(results: Iterable[Result], as_text: Callable[[Result], str], *, as_json: bool) -> int:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from tqdm import tqdm
 
-from vla_attention.schemas.safe_text import plain_stderr
+from vla_attention.schemas.safe_text import plain_stderr, print_line, visible
 
 #: Seconds between two lines about episodes in progress in a log file. A GPU completes several replans a second.
 _LOG_EVERY_S = 30.0
@@ -17,8 +17,8 @@ _MOST_SHOWN = 4
 
 
 def say(line: str) -> None:
-    """Print one line immediately, also into a file that somebody follows."""
-    print(line, flush=True)
+    """Print one line immediately, also into a file that somebody follows; see `safe_text.print_line`."""
+    print_line(line)
 
 
 @dataclass(eq=False)
@@ -121,7 +121,7 @@ class Progress:
 
     def say(self, line: str) -> None:
         """Print one line, above the bar if there is one."""
-        say(line) if self._bar.disable else self._bar.write(line)
+        say(line) if self._bar.disable else self._bar.write(visible(line))
 
     def close(self) -> None:
         """Remove the bar."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vla_attention.schemas.safe_text import visible
+from vla_attention.schemas.safe_text import print_line, visible
 
 if TYPE_CHECKING:
     from vla_attention.schemas.stores.repair import Finding
@@ -46,9 +46,9 @@ def run_repair(stores: Sequence[Path], *, verify: bool, dry_run: bool) -> int:
         findings = repair_store(path, verify, dry_run)
         mended = repair_groups(path, dry_run)
         total = len(open_store(path).episodes) + sum(finding.moved_to is not None for finding in findings)
-        print("\n".join(_lines(path, findings, total, verify, dry_run)), flush=True)
+        print("\n".join(map(visible, _lines(path, findings, total, verify, dry_run))), flush=True)
         for line in (*mended, *_leftovers(path, dry_run)):
-            print(line, flush=True)
+            print_line(line)
         if dry_run:
             print("Nothing was changed (--dry-run).", flush=True)
         left += sum(finding.moved_to is None for finding in findings)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.jsonable import to_json
-from vla_attention.schemas.safe_text import plain_stderr, visible
+from vla_attention.schemas.safe_text import plain_stderr, print_line, visible
 from vla_attention.schemas.stores.store_url import StorePlace, store_place
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def run_verify(
 
 def _print_faults(path: StorePlace, faults: Iterable[Fault]) -> None:
     for fault in faults:
-        print(f"{path}: {fault.where}: {fault.problem}", flush=True)
+        print_line(f"{path}: {fault.where}: {fault.problem}")
 
 
 def _print_episode(path: StorePlace, report: EpisodeReport) -> None:

@@ -28,6 +28,9 @@ from vla_attention.testing.stores import StoreSpec, rerun_source, reseal, reseal
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, contributions=True)
 #: Clears a screen, moves the cursor, reverses the direction of writing, begins a line, is markup, and is a formula.
 INSTRUCTION = "put\x1b[2J the\u202e bowl\r\non the plate\x9b31m\u2028 <script>alert('bowl')</script> $x^{$ & \"it\""
+#: What a text with line ends tries to add as a line of its own.
+FORGED = "FORGED: all whole"
+INSTRUCTION += f"\n{FORGED}\x85{FORGED}\x0b{FORGED}"
 MARKUP = "<img src=x onerror=alert(1)>"
 FORMULA = "$x^{$ <b>%2E"
 
@@ -63,11 +66,14 @@ def hostile_texts(store: Path) -> None:
     def root(attributes: dict[str, Any]) -> None:
         attributes["protocol"]["suite"] = FORMULA
         attributes["policy"] |= {"name": MARKUP, "checkpoint": f"https://x/{MARKUP}"}
-        attributes["provenance"] = {"code": f"\x1b[2J{MARKUP}\n\u202e", f"numpy\x1b{MARKUP}": "1\x07"}
+        attributes["provenance"] = {
+            "code": f"\x1b[2J{MARKUP}\n{FORGED}\n\u202e",
+            f"numpy\x1b{MARKUP}\n{FORGED}": "1\x07",
+        }
 
     def episode(attributes: dict[str, Any]) -> None:
         attributes["instruction"] = INSTRUCTION
-        attributes["provenance"] = {"host": "\x1b[2J"}
+        attributes["provenance"] = {"host": f"\x1b[2J\n{FORGED}"}
         for prompt in attributes["prompts"]:
             prompt["text"] = prompt["text"].replace("the", "t\x1b\u202e")
         attributes["objects"][0]["name"] = MARKUP
@@ -96,6 +102,7 @@ def check_output(capsys: pytest.CaptureFixture[str]) -> str:
     captured = capsys.readouterr()
     for line in (captured.out + captured.err).split("\n"):
         assert line.isprintable(), repr(line)
+        assert not line.strip().startswith(FORGED), captured
     return captured.out + captured.err
 
 
@@ -181,6 +188,7 @@ def test_hostile_texts_are_printed_visibly_and_nothing_is_written_elsewhere(
         if path.suffix in (".txt", ".csv", ".html"):
             for line in path.read_text(encoding="utf-8").split("\n"):
                 assert line.isprintable(), (path.name, line)
+                assert not line.strip().startswith(FORGED), (path.name, line)
     if command == "ratios":
         for text in ((out / "summary.txt").read_text(), printed):
             assert r"put\x1b[2J the\u202e" in text

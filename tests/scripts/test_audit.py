@@ -19,7 +19,11 @@ if given[given.index("--vulnerability-service") + 1] != (here / "answers").read_
     sys.exit("ERROR:pip_audit: no connection")
 names = pathlib.Path(given[given.index("--requirement") + 1]).read_text().split()
 known = json.loads((here / "known.json").read_text())
-entries = [dict(name=n.split("==")[0], version=n.split("==")[1], vulns=known.get(n.split("==")[0], [])) for n in names]
+if "skip" in known:
+    entries = [dict(name="pip", skip_reason="not found")]
+else:
+    pairs = [name.split("==") for name in names]
+    entries = [dict(name=name, version=version, vulns=known.get(name, [])) for name, version in pairs]
 pathlib.Path(given[given.index("--output") + 1]).write_text(json.dumps(dict(dependencies=entries)))
 sys.exit(1 if known else 0)
 """
@@ -46,6 +50,9 @@ def test_without_a_database_nothing_was_compared(audit):
     assert ran.stdout == ""
     assert ran.stderr.startswith("No advisory service is reachable from here, so nothing was compared (pypi: ")
     assert "no connection" in ran.stderr
+    ran = audit("pypi", {"skip": []})
+    assert ran.returncode == 2
+    assert "pypi: it does not know pip==" in ran.stderr
 
 
 @pytest.mark.parametrize("service", ["pypi", "osv"])

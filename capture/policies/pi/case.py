@@ -20,13 +20,13 @@ from vla_attention.capture.policies.checkpoints import (
     check_size,
     read_json_object,
 )
-from vla_attention.capture.policies.parity_case import CASE_FILE, UnusableCase, read_arrays, read_case_file
+from vla_attention.capture.policies.parity_case import CASE_FILE, UnusableCase, case_name, read_arrays, read_case_file
 from vla_attention.capture.policies.pi.config import CAMERA_SLOTS, GemmaConfig, PiConfig, SiglipConfig
 from vla_attention.capture.policies.pi.formats import CheckpointFormat
 from vla_attention.capture.policies.pi.lerobot_config import MAX_CAMERAS
 from vla_attention.capture.policies.precision import DTYPES
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
-from vla_attention.schemas.safe_text import check_name
+from vla_attention.schemas.safe_text import check_name, check_text
 
 #: File of a checkpoint in openpi's PyTorch format that may state the sizes, in the form of a case.json.
 CONFIG_FILE = "config.json"
@@ -105,7 +105,10 @@ def states_sizes(path: Path) -> bool:
 def stated_name(path: Path) -> str | None:
     """Return the name that a checkpoint's config.json gives its policy, if its sizes are stated there, too."""
     name = read_json_object(path).get("name")
-    return name if states_sizes(path) and isinstance(name, str) and name else None
+    if not states_sizes(path) or not isinstance(name, str) or not name:
+        return None
+    check_text("policy", name)
+    return name
 
 
 def _config(content: Mapping[str, Any], path: Path) -> PiConfig:
@@ -154,7 +157,7 @@ def read_case(folder: str | Path) -> Case:
     inputs, expected = read_arrays(folder / "inputs.npz"), read_arrays(folder / "expected.npz")
     _check_shapes(folder / "inputs.npz", inputs, _input_shapes(config, inputs))
     _check_shapes(folder / "expected.npz", expected, _expected_shapes(config, inputs))
-    return Case(str(content.get("name", folder.name)), folder, config, DTYPES[computed], inputs, expected)
+    return Case(case_name(content, folder), folder, config, DTYPES[computed], inputs, expected)
 
 
 Wanted = dict[str, tuple[int, ...]]

@@ -29,6 +29,7 @@ from vla_attention.capture.recording.batches import BatchCollector
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, roles_from_spans
+from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.store_format import PolicyCameraView, PolicyIdentity
 
 PROMPT_SPAN, STATE_SPAN, ACTION_SPAN = "prompt", "state", "actions"
@@ -224,7 +225,7 @@ class PiPolicy:
         pieces = tokenized.prompt.pieces
         lost = tokenized.prompt.text[pieces[-1].stop if pieces else 0 :]
         print(
-            f"Warning: the prompt of '{instruction}' has {tokenized.num_cut} tokens more than the policy's "
+            f"Warning: the prompt of '{visible(instruction)}' has {tokenized.num_cut} tokens more than the policy's "
             f"{len(tokenized.ids)} slots; they are cut as the reference implementation does, and the policy never "
             f"reads {lost!r}.",
             file=sys.stderr,

@@ -1,0 +1,224 @@
+"""Text of stores, data sets, checkpoints and files beside them stays text in whatever the capture commands print.
+
+What is printed is printable, and no line of it is one that a text with a line end made up.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.kit.lerobot_data_sets import made_up_episodes, write_data_set
+from tests.kit.paths import GOLDEN
+from tests.kit.still_scene import capture_without_simulator
+from vla_attention.capture import capture_run
+from vla_attention.capture.__main__ import main as capture
+from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
+from vla_attention.capture.rollout.progress import Progress
+from vla_attention.schemas.command_line import run_command
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.testing.stores import StoreSpec, reseal, reseal_root, write_store
+
+FORGED = "FORGED: all whole"
+#: Clears a screen, reverses the direction of writing, sets a title (C1), ends a line in five ways.
+HOSTILE = f"x\x1b[2J\u202e\x9d0;t\x07\u200e\r\n{FORGED}\u2028{FORGED}\x85{FORGED}\x0b{FORGED}\n{FORGED}"
+TINY = ("--checkpoint", "untrained-tiny", "--device", "cpu")
+
+
+def check_output(capsys: pytest.CaptureFixture[str]) -> str:
+    captured = capsys.readouterr()
+    said = captured.out + captured.err
+    for line in said.split("\n"):
+        assert line.isprintable(), repr(line)
+        assert not line.strip().startswith(FORGED), said
+    return said
+
+
+def run(*arguments: object) -> int:
+    return capture([str(argument) for argument in arguments])
+
+
+def change(document: Path, make: Callable[[dict[str, Any]], object]) -> None:
+    content = json.loads(document.read_text())
+    make(content["attributes"])
+    document.write_text(json.dumps(content))
+
+
+def with_hostile_texts(store: Path) -> Path:
+    """Texts of every kind that a store may hold and that are refused nowhere, and files beside them."""
+
+    def root(attributes: dict[str, Any]) -> None:
+        attributes["provenance"] = {"torch": HOSTILE, HOSTILE: "1"}
+
+    def episode(attributes: dict[str, Any]) -> None:
+        attributes["instruction"] = HOSTILE
+        attributes["provenance"] |= {"torch": HOSTILE, HOSTILE: "1"}
+
+    change(store / "zarr.json", root)
+    reseal_root(store)
+    for folder in sorted((store / "episodes").glob("task*")):
+        change(folder / "zarr.json", episode)
+        reseal(folder)
+    (store / f"a\x1b[2J\n{FORGED}").write_text("foreign")
+    (store / "episodes" / "task001_episode000" / f"b\x1b[2J\n{FORGED}").mkdir()
+    claim = store.with_name(f"{store.name}.jobs") / "claims" / "task000_episode000.1"
+    claim.mkdir(parents=True)
+    worker = {"tag": HOSTILE, "host": HOSTILE, "process": 1, "process_start": "1", "process_space": "1"}
+    (claim / "owner.json").write_text(json.dumps(worker | {"slurm_job": "1", "job_name": HOSTILE}))
+    partial = store.with_name(f"{store.name}.partial")
+    (partial / f"c\x1b[2J\n{FORGED}").mkdir(parents=True)
+    return store
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    spec = StoreSpec(tasks=(0, 1), episodes=2, replans=2)
+    return with_hostile_texts(write_store(tmp_path_factory.mktemp("stores") / "a.zarr", spec=spec))
+
+
+@pytest.fixture
+def store(original: Path, tmp_path: Path) -> Path:
+    shutil.copytree(original.parent, tmp_path / "stores")
+    return tmp_path / "stores" / "a.zarr"
+
+
+def damage(store: Path) -> None:
+    change(store / "episodes" / "task000_episode001" / "zarr.json", lambda root: root.update({HOSTILE: HOSTILE}))
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("status",), ("status", "--verify"), ("verify",), ("verify", "--quick"), ("repair",), ("repair", "--dry-run")],
+)
+@pytest.mark.parametrize("damaged", [False, True])
+def test_what_looks_at_a_store(
+    store: Path, capsys: pytest.CaptureFixture[str], command: tuple[str, ...], damaged: bool
+):
+    if damaged:
+        damage(store)
+    assert run(*command, store) in (0, 1)
+    said = check_output(capsys)
+    if command[0] == "verify" and not damaged:
+        assert r"a\x1b[2J\nFORGED" in said
+    if command[0] == "status":
+        assert r"x\x1b[2J\u202e" in said
+
+
+@pytest.mark.parametrize("command", ["status", "verify"])
+def test_json_stays_json(store: Path, capsys: pytest.CaptureFixture[str], command: str):
+    assert run(command, "--json", store) == 0
+    json.loads(check_output(capsys))
+
+
+def test_a_store_of_another_run_is_named_visibly(store: Path, capsys: pytest.CaptureFixture[str]):
+    assert run("pi", *TINY, "--task-suite", "cubes", "--store", store, "--resume") == 2
+    check_output(capsys)
+    assert run("rerun", store, "--device", "cpu") == 2
+    check_output(capsys)
+
+
+def test_a_data_set_and_the_rerun_of_its_store(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    columns = {"observation.images.image": "image"}
+    made = made_up_episodes((3, 3), tuple(columns), state=8, action=7, tasks=(HOSTILE,))
+    refused = write_data_set(tmp_path / "refused", "v2.1", made, robot_type=HOSTILE)
+    assert run("replay", refused, *TINY, "--store", tmp_path / "other.zarr") == 2
+    check_output(capsys)
+    data = write_data_set(tmp_path / "data", "v2.1", made)
+    cameras = ("--camera", "left_wrist_0_rgb=none")
+    base = tmp_path / "base.zarr"
+    assert run("replay", data, *TINY, *cameras, "--store", base) == 0, check_output(capsys)
+    check_output(capsys)
+    for folder in sorted((base / "episodes").glob("task*")):
+        change(folder / "zarr.json", lambda attributes: attributes["provenance"].update(torch=HOSTILE))
+        reseal(folder)
+    assert run("rerun", base, "--device", "cpu", "--knockout", "role:image", "--store", tmp_path / "again.zarr") == 0
+    check_output(capsys)
+    for wrong in (("--episodes", "99"), ("--camera", "x=y"), ("--state", "x")):
+        assert run("replay", data, *TINY, *wrong, "--store", tmp_path / "other.zarr") == 2
+        check_output(capsys)
+
+
+@pytest.mark.parametrize("command", ["pi", "doctor"])
+def test_a_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str):
+    checkpoint = tmp_path / f"c\x1b[2J\n{FORGED}"
+    shutil.copytree(GOLDEN / "pi" / "pi05_batch2" / "checkpoint_lerobot", checkpoint)
+    config = checkpoint / "config.json"
+    config.write_text(json.dumps(json.loads(config.read_text()) | {HOSTILE: HOSTILE}))
+    words = ("pi",) if command == "doctor" else ()
+    model = ("--checkpoint", checkpoint, "--tokenizer", EMBEDDED_TOKENIZER, "--device", "cpu")
+    code = run(command, *words, *model, "--task-suite", "cubes")
+    assert code == (1 if command == "doctor" else 2)
+    assert r"\x1b[2J\u202e" in check_output(capsys)
+
+
+def test_a_parity_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    case = tmp_path / "case"
+    shutil.copytree(GOLDEN / "pi" / "pi05_batch2", case)
+    content = json.loads((case / "case.json").read_text())
+    (case / "case.json").write_text(json.dumps(content | {"name": HOSTILE}))
+    assert run("parity", case, "--device", "cpu", "--format", "openpi") == 0
+    assert r"x\x1b[2J\u202e" in check_output(capsys)
+
+
+def test_a_run_whose_instruction_is_hostile(tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]):
+    capture_without_simulator(monkeypatch)
+    tasks = capture_run.list_tasks
+    hostile = lambda suite: tuple(replace(task, instruction=HOSTILE) for task in tasks(suite))  # noqa: E731
+    monkeypatch.setattr(capture_run, "list_tasks", hostile)
+    where = ("--task-suite", "robosuite", "--task-id", "0", "--num-episodes", "1", "--max-steps", "3")
+    assert run("pi", *TINY, *where, "--store", tmp_path / "a.zarr") in (0, 2)
+    check_output(capsys)
+
+
+def test_progress_lines(capsys: pytest.CaptureFixture[str]):
+    def show() -> int:
+        progress = Progress(2, 5)
+        episode = progress.begin(0, 0)
+        episode.update(1, 1)
+        episode.end("solved", HOSTILE)
+        progress.skip(HOSTILE)
+        progress.say(HOSTILE)
+        progress.close()
+        return 0
+
+    assert run_command("program", show, "") == 0
+    assert check_output(capsys).count(r"x\x1b[2J\u202e") == 3
+
+
+def test_errors_warnings_and_log_lines(capsys: pytest.CaptureFixture[str]):
+    def fail() -> int:
+        warnings.warn(HOSTILE, stacklevel=1)
+        logging.getLogger(HOSTILE).warning("%s", HOSTILE.partition("\r")[0])
+        raise BadArgument(HOSTILE)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        assert run_command("program", fail, "") == 2
+    captured = capsys.readouterr().err
+    assert all(line.isprintable() for line in captured.split("\n"))
+    refusal = next(line for line in captured.split("\n") if line.startswith("program: "))
+    assert refusal.count(FORGED) == HOSTILE.count(FORGED)
+
+
+def test_the_traceback_of_a_defect(tmp_path: Path):
+    program = (
+        "from vla_attention.schemas.command_line import run_command\n"
+        "def fail():\n"
+        "    raise KeyError('x\\x1b[2J\\u202e') from ValueError('a\\x9bb')\n"
+        "run_command('program', fail, '')\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert ran.returncode == 1
+    assert "Traceback" in ran.stderr
+    assert r"a\x9bb" in ran.stderr
+    assert all(line.isprintable() for line in ran.stderr.split("\n"))
