@@ -7,8 +7,8 @@ chunks of an array. `verify` names them, and no copy takes them along.
 from __future__ import annotations
 
 import os
-import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path, PurePosixPath
 
@@ -37,7 +37,7 @@ def foreign_in_episode(episode: StoredEpisode) -> tuple[str, ...]:
     if isinstance(episode.folder, StoreUrl):
         return ()
     folders = {str(parent) for file in known for parent in PurePosixPath(file).parents}
-    return tuple(islice(_beyond(episode.folder, "", known, folders), MOST_NAMED))
+    return _beyond(episode.folder, known, folders)
 
 
 def foreign_in_store(store: Store) -> tuple[str, ...]:
@@ -56,7 +56,7 @@ def foreign_in_store(store: Store) -> tuple[str, ...]:
         folders |= {str(PurePosixPath(file).parent) for file in packed}
     else:
         known |= {f"{EPISODES_GROUP}/{name}" for name in _episode_names(store.path / EPISODES_GROUP)}
-    return tuple(islice(_beyond(store.path, "", known, folders), MOST_NAMED))
+    return _beyond(store.path, known, folders)
 
 
 def _episode_names(folder: Path) -> Iterator[str]:
@@ -71,17 +71,29 @@ def _episode_names(folder: Path) -> Iterator[str]:
                 yield entry.name
 
 
-def _beyond(folder: Path, inside: str, known: set[str], folders: set[str]) -> Iterator[str]:
-    """Paths below a folder that are neither known files nor lead to one. Links are followed nowhere."""
-    with os.scandir(folder) as entries:
-        found = sorted(entries, key=lambda entry: entry.name)
-    for entry in found:
+def _beyond(place: Path, known: set[str], folders: set[str]) -> tuple[str, ...]:
+    """Paths in the known folders below a place that are neither known nor lead to a known file; at most `MOST_NAMED`.
+
+    Links are followed nowhere, and no other folder is looked into.
+    """
+    found: list[str] = []
+    for folder in sorted(folders):
+        above = [folder, *map(str, PurePosixPath(folder).parents)]
+        if len(found) >= MOST_NAMED or any(os.path.islink(place / one) for one in above if one != "."):
+            continue
+        with suppress(OSError), os.scandir(place / folder) as entries:  # one that is lost is a fault, found elsewhere
+            found += islice(_unknown(entries, "" if folder == "." else f"{folder}/", known, folders), MOST_NAMED)
+    return tuple(sorted(found)[:MOST_NAMED])
+
+
+def _unknown(entries: Iterable[os.DirEntry[str]], inside: str, known: set[str], folders: set[str]) -> Iterator[str]:
+    for entry in entries:
         path = f"{inside}{entry.name}"
-        mode = entry.stat(follow_symlinks=False).st_mode
-        if stat.S_ISDIR(mode):
-            if path in folders:
-                yield from _beyond(folder / entry.name, f"{path}/", known, folders)
-            elif path not in known:
-                yield f"{path}/"
-        elif path not in known:
-            yield f"{path} (a link)" if stat.S_ISLNK(mode) else path
+        if path in known:
+            continue
+        if entry.is_symlink():
+            yield f"{path} (a link)"
+        elif not entry.is_dir(follow_symlinks=False):
+            yield path
+        elif path not in folders:
+            yield f"{path}/"

@@ -16,6 +16,7 @@ COMMANDS = [
     ["rerun"],
     ["status"],
     ["tasks"],
+    ["verify"],
 ]
 
 

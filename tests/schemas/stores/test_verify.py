@@ -18,7 +18,7 @@ from vla_attention.analyze.__main__ import main
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
-from vla_attention.schemas.stores.verify import Fault, verify_store
+from vla_attention.schemas.stores.verify import Fault, episode_report, verify_store
 from vla_attention.testing.stores import StoreSpec, reseal, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=1, replans=3, heads=(0,))
@@ -427,3 +427,24 @@ def test_bytes_of_a_shard_that_are_in_no_chunk_are_compared_too(path):
     assert faults(path) == []
     flip(file, 3)
     assert "its joint/rows/c.0.0.0.0.0.0 does not agree with its seal" in only_fault_of(path)
+
+
+def test_a_hundred_foreign_files_are_named_of_many(path, capsys):
+    for folder in (path, path / "episodes" / EPISODE / "joint/rows"):
+        for number in range(120):
+            (folder / f"x{number:03d}").write_text("")
+    assert main(["verify", str(path), "--quick"]) == 0
+    said = capsys.readouterr().out
+    assert said.count("is no part of the store") == 200
+    assert f"{path}: there may be more of them; 100 are named" in said
+    assert f"{path}: {EPISODE}: there may be more of them; 100 are named" in said
+
+
+def test_foreign_files_behind_a_link_are_not_looked_at(path, tmp_path):
+    rows = path / "episodes" / EPISODE / "joint/rows"
+    rows.rename(tmp_path / "rows")
+    (tmp_path / "rows/mine").write_text("")
+    rows.symlink_to(tmp_path / "rows")
+    report = episode_report(store := open_store(path), store.episodes[0], quick=True)
+    assert report.foreign == ("joint/rows (a link)",)
+    assert any("its joint/rows is a link" in problem for problem in report.problems)
