@@ -17,7 +17,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from vla_attention.analyze.copy.packing import Packing, lock_for_writing
+from vla_attention.analyze.copy.packing import Packing
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 from vla_attention.schemas.stores.digest import run_digest, with_digest
 from vla_attention.schemas.stores.episode_files import files_of_no_array, links_in_episode
@@ -38,6 +38,7 @@ from vla_attention.schemas.stores.store_format import (
     CorruptEpisode,
     RunMismatch,
 )
+from vla_attention.schemas.stores.store_lock import lock_for_writing
 from vla_attention.schemas.stores.store_place import check_place
 
 

@@ -7,9 +7,6 @@ the episode.
 
 from __future__ import annotations
 
-import errno
-import fcntl
-import os
 import zipfile
 from pathlib import Path
 
@@ -40,7 +37,7 @@ class Packing:
     """A packed store that episodes are added to. The index lists whole zips only, and is written now and then.
 
     It is there before the first zip: a copy that ends early is a packed store of the episodes that it has. The caller
-    holds the lock of the store (`lock_for_writing`), and calls `write_index` when it has ended.
+    holds the lock of the store (`store_lock.py`), and calls `write_index` when it has ended.
     """
 
     def __init__(self, target: Path, run: str, building: Path) -> None:
@@ -92,31 +89,6 @@ class Packing:
         building = self.building / INDEX_FILE
         building.write_bytes(index.document())
         building.replace(self.target / INDEX_FILE)
-
-
-def lock_for_writing(target: Path, *, packing: bool) -> int:
-    """Open and lock the `zarr.json` of a copy that is written; closing it, or the end of the process, unlocks it.
-
-    One process at a time packs into a store, because the index that is written last would lack the zips of the other,
-    and nobody writes folders into it meanwhile. Several may write folders.
-
-    Raises:
-        BadArgument: another copy holds a lock that forbids this one.
-    """
-    # Locks of NFS need a file that may be written.
-    handle = os.open(target / "zarr.json", os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
-    try:
-        fcntl.flock(handle, (fcntl.LOCK_EX if packing else fcntl.LOCK_SH) | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno in (errno.EAGAIN, errno.EACCES):
-            os.close(handle)
-            raise BadArgument(
-                f"Cannot {'pack into' if packing else 'copy to'} {target}: another copy is "
-                f"{'writing' if packing else 'packing'} into it; run the same command again when that has ended, or "
-                "give another name."
-            ) from None
-        # A file system without locks: there, nothing but the user keeps two copies apart.
-    return handle
 
 
 def write_zip(folder: Path, path: Path) -> int:

@@ -290,12 +290,11 @@ def test_folders_and_zips_are_not_mixed(original, packed, tmp_path, capsys):
 def test_capture_refuses_a_packed_store_with_a_sentence(packed, tmp_path, capsys):
     shutil.copytree(packed, tmp_path / "b.zarr")
     before = all_bytes(tmp_path)
-    for words in (["status"], ["repair"], ["repair", "--verify"]):
-        assert capture([words[0], str(tmp_path / "b.zarr"), *words[1:]]) == 2, words
-        said = capsys.readouterr().err
-        assert "is packed" in said
-        assert "vla-analyze copy" in said
-        assert said.count("\n") == 1
+    assert capture(["status", str(tmp_path / "b.zarr")]) == 2
+    said = capsys.readouterr().err
+    assert "is packed" in said
+    assert "vla-analyze copy" in said
+    assert said.count("\n") == 1
     with pytest.raises(Exception, match="is packed") as caught:
         write_store(tmp_path / "b.zarr", mode="resume", spec=SPEC)
     assert "\n" not in str(caught.value)

@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 import subprocess
+import zipfile
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -27,6 +28,7 @@ from vla_attention.schemas.stores.damaged_episodes import DamagedEpisodesLeft
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.repair import damaged_folder, repair_store
 from vla_attention.schemas.stores.store_format import StoreError
+from vla_attention.schemas.stores.store_lock import lock_for_writing
 from vla_attention.schemas.stores.verify import verify_store
 from vla_attention.schemas.stores.worker import Worker, this_worker
 from vla_attention.testing.stores import StoreSpec, write_store
@@ -402,3 +404,60 @@ def test_a_linked_episode_is_damaged(store, episode, tmp_path, capsys):
     assert analyze(["repair", str(store)]) == 0
     assert names(store) == WHOLE
     assert (tmp_path / "elsewhere/zarr.json").is_file()
+
+
+def zip_of(packed: Path) -> Path:
+    (found,) = packed.rglob(f"{DAMAGED}.zip")
+    return found
+
+
+def flipped(file: Path) -> None:
+    with zipfile.ZipFile(file) as found:
+        rows = next(one for one in found.infolist() if "joint/rows/c" in one.filename)
+    content = bytearray(file.read_bytes())
+    content[rows.header_offset + 30 + len(rows.filename) + 20] ^= 1
+    file.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("damage", "options"),
+    [
+        (lambda file: os.truncate(file, 100), []),
+        (Path.unlink, []),
+        (lambda file: shutil.copy(file.with_name(f"{WHOLE[0]}.zip"), file), []),
+        (flipped, ["--verify"]),
+    ],
+)
+def test_damaged_zips_are_moved_aside_and_packed_again(store, tmp_path, capsys, damage, options):
+    packed, words = tmp_path / "packed.zarr", ["copy", str(store), str(tmp_path / "packed.zarr"), "--packed"]
+    assert analyze(words) == 0
+    whole = files(packed)
+    damage(zip_of(packed))
+    assert main(["repair", str(packed), *options, "--dry-run"]) == 1
+    assert names(packed) == sorted([*WHOLE, DAMAGED])
+    capsys.readouterr()
+    assert main(["repair", str(packed), *options]) == 0
+    said = capsys.readouterr().out
+    assert f"{packed}: 1 of 4 episodes is damaged." in said
+    assert "Run the same vla-analyze copy --packed to pack what was moved aside again." in said
+    (entry,) = damaged_folder(packed).iterdir()
+    assert json.loads((entry / "reason.json").read_text())["episode"] == DAMAGED
+    assert names(packed) == WHOLE
+    assert verify_store(open_store(packed)) == []
+    assert main(["repair", str(packed), "--verify"]) == 0
+    assert analyze(words) == 0
+    assert files(packed) == whole
+
+
+def test_nothing_is_repaired_while_a_copy_packs(store, tmp_path, capsys):
+    packed = tmp_path / "packed.zarr"
+    assert analyze(["copy", str(store), str(packed), "--packed"]) == 0
+    zip_of(packed).unlink()
+    before = files(packed)
+    lock = lock_for_writing(packed, packing=True)
+    try:
+        assert main(["repair", str(packed)]) == 2
+    finally:
+        os.close(lock)
+    assert "another copy is writing into it" in capsys.readouterr().err
+    assert files(packed) == before

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import shutil
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +13,14 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
 
 from tests.kit.attacks import files_of
 from tests.kit.crashes import before_call, die, run_child
@@ -50,6 +58,24 @@ def flip(store: Path, episode: int) -> None:
     file.write_bytes(content)
 
 
+def flip_in_zip(store: Path, episode: int) -> None:
+    file = zip_of(store, episode)
+    with zipfile.ZipFile(file) as found:
+        rows = next(one for one in found.infolist() if "joint/rows/c" in one.filename)
+    content = bytearray(file.read_bytes())
+    content[rows.header_offset + 30 + len(rows.filename) + rows.file_size // 3] ^= 4
+    file.write_bytes(content)
+
+
+def zips_of(store: Path, episode: int) -> list[Path]:
+    return list(store.rglob(f"{episode_name(0, episode)}.zip"))
+
+
+def zip_of(store: Path, episode: int) -> Path:
+    (file,) = zips_of(store, episode)
+    return file
+
+
 def edit(store: Path, episode: int) -> None:
     file = store / "episodes" / episode_name(0, episode) / "zarr.json"
     file.write_text(file.read_text().replace("bowl", "bowk"))
@@ -62,6 +88,16 @@ DAMAGE: dict[str, tuple[Callable[[Path, int], object], bool]] = {
     "cut": (lambda store, episode: os.truncate(rows_of(store, episode), 20), True),
     "lose": (lambda store, episode: rows_of(store, episode).unlink(), True),
 }
+
+#: The same for zips. A copy packs again what has another size than its index says.
+DAMAGE_OF_ZIPS: dict[str, tuple[Callable[[Path, int], object], bool]] = {
+    "flip": (flip_in_zip, False),
+    "cut": (lambda store, episode: os.truncate(zip_of(store, episode), 100), True),
+}
+
+
+def kinds_of(store: str) -> dict[str, tuple[Callable[[Path, int], object], bool]]:
+    return DAMAGE_OF_ZIPS if store.startswith("packed") else DAMAGE
 
 
 def write(path: Path, episode: int) -> None:
@@ -95,7 +131,7 @@ class StoreLife(RuleBasedStateMachine):
     stores = st.sampled_from(STORES)
     episodes = st.sampled_from(EPISODES)
     kinds = st.sampled_from(["rename", "renamed"])
-    numbers = st.integers(0, 4)
+    numbers = st.integers(0, 3)
 
     @initialize()
     def begin(self) -> None:
@@ -105,6 +141,9 @@ class StoreLife(RuleBasedStateMachine):
         for name in STORES:
             open_run(self.folder / name, root_attributes(SPEC), "new", durable=False)
             self.model[name] = {}
+        # Neither empty nor with a common episode: so they can be merged at once.
+        for name, episode in zip(STORES, (0, 2), strict=True):
+            self.write(name, episode)
 
     @rule(store=stores, episode=episodes)
     def write(self, store: str, episode: int) -> None:
@@ -125,21 +164,26 @@ class StoreLife(RuleBasedStateMachine):
             assert set(before) <= listed <= {*before, episode}
             self.model[store] = before | dict.fromkeys(listed - set(before))
 
-    @rule(store=stores, episode=episodes, damage=st.sampled_from(sorted(DAMAGE)))
-    def damage(self, store: str, episode: int, damage: str) -> None:
-        if self.model[store].get(episode, "absent") is None:
-            DAMAGE[damage][0](self.folder / store, episode)
-            self.model[store][episode] = damage
+    @precondition(lambda self: self.undamaged())
+    @rule(data=st.data())
+    def damage(self, data: st.DataObject) -> None:
+        store, episode = data.draw(st.sampled_from(self.undamaged()))
+        kinds = kinds_of(store)
+        damage = data.draw(st.sampled_from(sorted(kinds)))
+        kinds[damage][0](self.folder / store, episode)
+        self.model[store][episode] = damage
 
-    @rule(store=stores, quick=st.booleans())
-    def verify(self, store: str, quick: bool) -> None:
+    @rule(data=st.data(), quick=st.booleans())
+    def verify(self, data: st.DataObject, quick: bool) -> None:
+        store = data.draw(st.sampled_from(sorted(self.model)))
         opened = open_store(self.folder / store)
         found = {episode.name for episode in opened.episodes if episode_report(opened, episode, quick=quick).problems}
         assert found == {episode_name(0, number) for number in self.damaged(store, quick)}
         assert store_faults(opened) == []
 
-    @rule(store=stores, verify=st.booleans())
-    def repair(self, store: str, verify: bool) -> None:
+    @rule(data=st.data(), verify=st.booleans())
+    def repair(self, data: st.DataObject, verify: bool) -> None:
+        store = data.draw(st.sampled_from(sorted(self.model)))
         damaged = self.damaged(store, not verify)
         kept = self.kept_aside(store)
         findings = repair_store(self.folder / store, verify=verify)
@@ -149,12 +193,19 @@ class StoreLife(RuleBasedStateMachine):
         for number in damaged:
             del self.model[store][number]
 
-    @rule(store=stores, verify=st.booleans(), kind=kinds, number=numbers)
-    def die_repairing(self, store: str, verify: bool, kind: str, number: int) -> None:
+    @rule(data=st.data(), verify=st.booleans(), kind=kinds, number=numbers)
+    def die_repairing(self, data: st.DataObject, verify: bool, kind: str, number: int) -> None:
+        store = data.draw(st.sampled_from(sorted(self.model)))
         before, kept = self.model[store], self.kept_aside(store)
         run_child(act_and_die, kind, number, repair, self.folder / store, verify)
         listed = self.listed(store)
         gone = set(before) - listed
+        if store.startswith("packed"):  # the index is written when all zips have been moved
+            lost = {
+                number for number in listed if not list((self.folder / store).rglob(f"{episode_name(0, number)}.zip"))
+            }
+            gone |= lost
+            before |= dict.fromkeys(lost, "cut")
         assert listed <= set(before)
         assert gone <= set(self.damaged(store, not verify))
         assert self.kept_aside(store) == kept + len(gone)
@@ -163,7 +214,7 @@ class StoreLife(RuleBasedStateMachine):
     @rule(store=stores, packed=st.booleans())
     def copy(self, store: str, packed: bool) -> None:
         target = self.copy_of(store, packed)
-        there = self.model.get(target, {})
+        there = {number: damage for number, damage in self.model.get(target, {}).items() if damage != "cut"}
         damaged = [number for number in self.damaged(store, False) if number not in there]
         if damaged:
             with pytest.raises(CorruptEpisode, match=episode_name(0, damaged[0])):
@@ -176,9 +227,9 @@ class StoreLife(RuleBasedStateMachine):
 
     @rule(store=stores, packed=st.booleans(), kind=kinds, number=numbers)
     def die_copying(self, store: str, packed: bool, kind: str, number: int) -> None:
-        if self.damaged(store, False):
-            return
         target = self.copy_of(store, packed)
+        if self.damaged(store, False) or any(self.model.get(target, {}).values()):
+            return
         kind = {"rename": "replace", "renamed": "replaced"}[kind] if packed else kind
         run_child(act_and_die, kind, number, copy, self.folder / store, self.folder / target, packed)
         if (self.folder / target).exists():
@@ -236,7 +287,10 @@ class StoreLife(RuleBasedStateMachine):
 
     def damaged(self, store: str, quick: bool) -> list[int]:
         found = {number: damage for number, damage in self.model[store].items() if damage is not None}
-        return sorted(number for number, damage in found.items() if DAMAGE[damage][1] or not quick)
+        return sorted(number for number, damage in found.items() if kinds_of(store)[damage][1] or not quick)
+
+    def undamaged(self) -> list[tuple[str, int]]:
+        return [(store, number) for store, held in self.model.items() for number, damage in held.items() if not damage]
 
     def kept_aside(self, store: str) -> int:
         return len(list(damaged_folder(self.folder / store).glob("*/task*")))
