@@ -12,11 +12,10 @@ from contextlib import suppress
 from itertools import islice
 from pathlib import Path, PurePosixPath
 
-from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.packed_index import INDEX_FILE
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.seal import SEAL_FILE
-from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, EPISODES_GROUP, parse_episode_name
+from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, EPISODES_GROUP, is_episode_name
 from vla_attention.schemas.stores.store_url import StoreUrl
 from vla_attention.schemas.stores.zip_members import ZipMembers
 
@@ -63,11 +62,7 @@ def _episode_names(folder: Path) -> Iterator[str]:
     """Names of the folders of episodes; a link is none."""
     with os.scandir(folder) as entries:
         for entry in entries:
-            try:
-                parse_episode_name(entry.name)
-            except BadArgument:
-                continue
-            if entry.is_dir(follow_symlinks=False):
+            if is_episode_name(entry.name) and entry.is_dir(follow_symlinks=False):
                 yield entry.name
 
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from vla_attention.schemas.command_line import format_bytes
+from vla_attention.schemas.errors import Note
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.safe_text import plain_stderr, print_line, visible
 from vla_attention.schemas.stores.store_url import StorePlace, store_place
@@ -59,7 +61,9 @@ def run_verify(
 
     documents, wrong = [], False
     for path in stores:
-        store = open_store(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Note)  # what lies among the episodes is named below
+            store = open_store(path)
         faults = store_faults(store)
         foreign = foreign_in_store(store)
         found = []

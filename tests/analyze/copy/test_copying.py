@@ -248,6 +248,7 @@ def edit(file: Path, change) -> None:
     file.write_text(json.dumps(document))
 
 
+@pytest.mark.filterwarnings("ignore:Ignored in")
 @pytest.mark.parametrize("packed", [False, True])
 def test_a_copy_has_nothing_but_what_the_format_names(original, tmp_path, packed):
     path = tmp_path / "a.zarr"

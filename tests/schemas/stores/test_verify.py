@@ -354,14 +354,15 @@ def foreign_things(path: Path) -> list[str]:
     """Put things into a store that nobody reads; returns the lines about them."""
     episode = path / "episodes" / EPISODE
     (path / "notes.txt").write_text("mine")
-    (path / "episodes/a.png").write_text("")
+    (path / "episodes/thumbnails").mkdir()
+    (path / "episodes/thumbnails/a.png").write_text("")
     (episode / ".DS_Store").write_text("")
     (episode / "joint/rows/c.9.9.9.9.9.9").write_text("")
     (episode / "joint/rows/link").symlink_to(path / "notes.txt")
     return [
         f"{path}: {name} is no part of the store; nothing reads it"
         for name in (
-            "episodes/a.png",
+            "episodes/thumbnails/",
             "notes.txt",
             f"{EPISODE}: .DS_Store",
             f"{EPISODE}: joint/rows/c.9.9.9.9.9.9",
@@ -382,8 +383,10 @@ def test_a_line_for_every_episode_and_foreign_file(path, capsys, program):
     shutil.rmtree(path / "episodes/task001_episode000/actions")
     foreign = [] if program is capture else foreign_things(path)
     assert program(["verify", str(path), "--quick"]) == 1
-    found = capsys.readouterr().out.splitlines()
+    captured = capsys.readouterr()
+    found = captured.out.splitlines()
     assert found[0] == lines[0]
+    assert captured.err == ""  # named once
     assert all(line.startswith(f"{path}: task001_episode000: Episode task001") for line in found[1:3])
     assert found[3:-1] == foreign
     assert found[-1].startswith(f"{path}: 2 episodes, 2 faults (seals, metadata, presence and sizes;")
@@ -400,7 +403,7 @@ def test_verify_for_programs(path, capsys):
         False,
         False,
     )
-    assert (report["faults"], report["foreign"]) == ([], ["episodes/a.png", "notes.txt"])
+    assert (report["faults"], report["foreign"]) == ([], ["episodes/thumbnails/", "notes.txt"])
     first, second = report["episodes"]
     assert first["episode"] == EPISODE
     assert "joint/rows" in first["problems"][0]
