@@ -30,6 +30,9 @@ SIZE_VARIABLE = "VLA_REMOTE_CACHE_SIZE"
 DEFAULT_BYTES = 10_000_000_000
 _OFF = ("off", "0", "no", "false")
 _DIGEST_BYTES = 32
+#: Seconds without a connection, or without a further byte, after which a web server counts as silent. aiohttp's own
+#: limit is five minutes for a whole answer: too long for a server that hangs, and too short for a large file.
+ANSWER_WITHIN_S = 60.0
 #: The cache is searched for what to remove after every so many bytes that were added to it.
 _LOOK_EVERY = 64_000_000
 
@@ -229,13 +232,21 @@ def _file_system_of(url: str, _process: int, *_hub_variables: str | None) -> tup
     try:
         if url.startswith("hf://"):
             endpoint, headers = _hub()
-            return fsspec.filesystem("https", client_kwargs={"headers": headers}), _hub_address(endpoint, url)
-        files, path = url_to_fs(url)
+            options = {"headers": headers, "timeout": _time_limits()}
+            return fsspec.filesystem("https", client_kwargs=options), _hub_address(endpoint, url)
+        is_web = url.startswith(("http://", "https://"))
+        files, path = url_to_fs(url, **({"client_kwargs": {"timeout": _time_limits()}} if is_web else {}))
     except ImportError as error:
         raise _missing(url, error) from None
     except ValueError as error:
         raise BadArgument(f"The address {url} cannot be read: {error}.") from None
     return files, path.rstrip("/")
+
+
+def _time_limits() -> Any:
+    import aiohttp
+
+    return aiohttp.ClientTimeout(total=None, sock_connect=ANSWER_WITHIN_S, sock_read=ANSWER_WITHIN_S)
 
 
 def _hub() -> tuple[str, dict[str, str]]:
@@ -287,6 +298,8 @@ def _asked(url: str, ask: Any) -> Any:
         return ask()
     except FileNotFoundError:
         raise
+    except TimeoutError:
+        raise RemoteFailure(f"{url} cannot be read: its server sent nothing for {ANSWER_WITHIN_S:g} s.") from None
     except OSError as error:
         raise RemoteFailure(f"{url} cannot be read: {error.strerror or error}.") from None
     except Exception as error:  # aiohttp, botocore and others have classes of their own

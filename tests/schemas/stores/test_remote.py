@@ -18,6 +18,7 @@ from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.words.word_study import study_words
 from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.stores import remote_source
 from vla_attention.schemas.stores.digest import seal_digest
 from vla_attention.schemas.stores.packed_index import INDEX_FILE
 from vla_attention.schemas.stores.reader import open_store
@@ -309,6 +310,29 @@ def test_a_network_that_fails_later_leaves_no_episode_out(server, tmp_path, caps
     assert analyze([f"{server.url}/a.zarr", "--no-plots", "--skip-corrupt", "--output", str(tmp_path / "out")]) == 2
     assert "cannot be read" in capsys.readouterr().err
     assert not results(tmp_path / "out")
+
+
+def test_a_server_that_hangs_is_a_sentence(server, monkeypatch, capsys):
+    """Not after aiohttp's five minutes: whoever asks, and whoever stops the command, would wait for so long."""
+    monkeypatch.setattr(remote_source, "ANSWER_WITHIN_S", 0.5)
+    remote_source._file_system_of.cache_clear()
+    ended = threading.Event()
+
+    def hang(path: str, content: bytes) -> bytes:
+        if path.endswith(".zip"):
+            ended.wait(60)
+        return content
+
+    server.change = hang
+    try:
+        assert analyze([f"{server.url}/a.zarr", "--no-plots"]) == 2
+        assert not ended.is_set()
+    finally:
+        ended.set()
+        remote_source._file_system_of.cache_clear()
+    said = capsys.readouterr().err
+    assert f"{server.url}/a.zarr cannot be read: its server sent nothing for 0.5 s." in said
+    assert said.count("\n") == 1
 
 
 def test_nobody_there_is_a_sentence(capsys):
