@@ -19,7 +19,7 @@ COMMANDS: dict[str, str] = {
     "overlay": "attention on the stored pictures: strips, GIF or MP4",
     "report": "one self-contained HTML file",
     "export": "tables as CSV or Parquet, masses or rows as NetCDF",
-    "copy": "a smaller copy of a store, for instance without frames",
+    "copy": "a copy of a store: smaller, or packed into few files, or from or to elsewhere",
     "merge": "one store of the episodes of several stores of one run",
     "verify": "read everything back and check it; --quick looks at presence and sizes",
     "repair": "move damaged episodes aside, and remove what killed processes left",
