@@ -155,6 +155,16 @@ def first_leaf(change: Callable[[dict[str, Any]], object]) -> Make:
     return jax(made)
 
 
+def chunk_of_gigabytes(checkpoint: Path) -> None:
+    """3 GB of zeros in 90 kB, in place of a chunk of 6 kB."""
+    import numcodecs
+    import tensorstore
+
+    store = tensorstore.KvStore.open({"driver": "ocdbt", "base": f"file://{checkpoint / 'params'}/"}).result()
+    key = next(key for key in store.list().result() if b"action_in_proj.kernel" in key and key.endswith(b"/0.0"))
+    store[key] = 30 * numcodecs.Zstd(level=1).encode(bytes(100_000_000))
+
+
 def manifest(change: Callable[[Path], object]) -> Make:
     return jax(lambda checkpoint: change(checkpoint / "params" / "manifest.ocdbt"))
 
@@ -296,6 +306,7 @@ PI: dict[str, Case] = {
     "chunks larger than their array": Case(
         first_leaf(lambda leaf: leaf.update(chunks=[10**9, 10**9])), "its chunks of .* are larger than itself"
     ),
+    "a chunk of 3 GB in 90 kB": Case(jax(chunk_of_gigabytes), "cannot be read"),
     "an array of whole numbers": Case(first_leaf(lambda leaf: leaf.update(dtype="|i1")), "numbers of type int8"),
     "an array without a shape": Case(first_leaf(lambda leaf: leaf.pop("shape")), "cannot be read"),
     # tokenizers

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,6 +27,7 @@ from vla_attention.capture.policies.cosmos.locate import (
 from vla_attention.capture.policies.cosmos.preprocess import StatisticsNotFound
 from vla_attention.capture.policies.cosmos.t5_pickle import EmbeddingsNotFound
 from vla_attention.capture.policies.hub import CheckpointUnavailable
+from vla_attention.capture.policies.identity import downloads_of
 from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.layout import Role
@@ -160,6 +163,30 @@ def test_a_name_on_the_hub_without_a_network(monkeypatch):
         load_cosmos_policy(POLICY_REPOSITORY)
     with pytest.raises(CheckpointNotFound, match="There is no checkpoint at 'no/such/folder'"):
         load_cosmos_policy("no/such/folder")
+
+
+def test_every_file_from_the_hub_is_of_a_commit_that_is_kept(folder, tmp_path, monkeypatch):
+    commits = {POLICY_REPOSITORY: "a" * 40, VAE_REPOSITORY: "b" * 40}
+    asked = []
+
+    def snapshot_download(name, repo_type, revision, allow_patterns):
+        asked.append((name, revision))
+        snapshot = tmp_path / "hub" / f"models--{name.replace('/', '--')}" / "snapshots" / commits[name]
+        if not snapshot.exists():
+            (snapshot / VAE_NAME).parent.mkdir(parents=True)
+            if name == VAE_REPOSITORY:
+                shutil.move(folder / VAE_NAME, snapshot / VAE_NAME)
+            else:
+                for file in (WEIGHTS_NAME, STATISTICS_NAME, EMBEDDINGS_NAME):
+                    shutil.copyfile(folder / file, snapshot / file)
+        return str(snapshot)
+
+    monkeypatch.setitem(sys.modules, "huggingface_hub", SimpleNamespace(snapshot_download=snapshot_download))
+    policy = load_cosmos_policy(POLICY_REPOSITORY, options=SMALL)
+    assert policy.identity().checkpoint == f"{POLICY_REPOSITORY}@{'a' * 40}"
+    assert downloads_of(policy) == {f"hub {name}": commit for name, commit in commits.items()}
+    assert load_cosmos_policy(policy.identity().checkpoint, options=SMALL).identity() == policy.identity()
+    assert [revision for name, revision in asked if name == POLICY_REPOSITORY] == [None, "a" * 40]
 
 
 def test_untrained_policies_of_one_seed_are_the_same():

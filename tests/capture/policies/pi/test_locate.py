@@ -1,5 +1,6 @@
 """Names on hubs: calls of the clients, and an error with instructions for every failure."""
 
+import json
 import shutil
 import sys
 import types
@@ -9,6 +10,8 @@ import pytest
 
 from tests.kit.pi_golden import GOLDEN
 from tests.kit.small_tokenizer import train_small_tokenizer
+from tests.kit.still_scene import capture_without_simulator
+from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.policies.hub import (
     CheckpointUnavailable,
     downloads,
@@ -104,7 +107,9 @@ def test_the_commit_of_a_file_is_read_from_the_cache():
     assert in_hub_cache("org/name", "other") is None
 
 
-def test_a_policy_from_the_hub_says_its_commit_and_is_built_again_from_it(monkeypatch):
+@pytest.fixture
+def asked(monkeypatch) -> list[tuple[str, str | None]]:
+    """What a client is asked for that gives the golden checkpoint, at one commit."""
     asked = []
 
     def snapshot_download(name, repo_type, revision, allow_patterns):
@@ -121,12 +126,33 @@ def test_a_policy_from_the_hub_says_its_commit_and_is_built_again_from_it(monkey
         return str(folder)
 
     module(monkeypatch, "huggingface_hub", snapshot_download=snapshot_download)
+    return asked
+
+
+def test_a_policy_from_the_hub_says_its_commit_and_is_built_again_from_it(asked):
     tokenizer = train_small_tokenizer(hub_cache().parent / "small.model")
     policy = build_pi_policy("org/name", tokenizer=str(tokenizer), device="cpu")
     assert policy.identity().checkpoint == f"org/name@{COMMIT}"
     assert downloads_of(policy) == {"hub org/name": COMMIT}
     again = build_pi_policy(policy.identity().checkpoint, tokenizer=str(tokenizer), device="cpu")
     assert again.identity() == policy.identity()
+    assert asked == [("org/name", None), ("org/name", COMMIT)]
+
+
+def test_a_store_keeps_the_commit_and_a_rerun_asks_for_it(asked, tmp_path, monkeypatch):
+    capture_without_simulator(monkeypatch)
+    tokenizer = train_small_tokenizer(tmp_path / "small.model")
+    store = tmp_path / "run.zarr"
+    model = ["--checkpoint", "org/name", "--tokenizer", str(tokenizer), "--device", "cpu"]
+    where = ["--task-suite", "robosuite", "--task-id", "0", "--num-episodes", "1", "--max-steps", "3"]
+    assert capture(["pi", *model, *where, "--store", str(store)]) == 0
+    root = json.loads((store / "zarr.json").read_text())["attributes"]
+    assert root["policy"]["checkpoint"] == f"org/name@{COMMIT}"
+    assert root["provenance"]["hub org/name"] == COMMIT
+    episode = json.loads((store / "episodes" / "task000_episode000" / "zarr.json").read_text())["attributes"]
+    assert episode["provenance"]["hub org/name"] == COMMIT
+    again = tmp_path / "again.zarr"
+    assert capture(["rerun", str(store), "--tokenizer", str(tokenizer), "--device", "cpu", "--store", str(again)]) == 0
     assert asked == [("org/name", None), ("org/name", COMMIT)]
 
 
