@@ -91,7 +91,7 @@ def read_records(store: Path) -> list[WorkerRecord]:
     for file in sorted(records_folder(store).glob("*.json")):
         try:
             record = from_json(WorkerRecord, json.loads(file.read_text(encoding="utf-8")))
-        except (OSError, ValueError, MalformedDocument):
+        except (OSError, ValueError, RecursionError, MalformedDocument):
             continue  # an unreadable record is no damage of the store
         if record.store == identity:
             records.append(record)

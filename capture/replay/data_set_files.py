@@ -17,6 +17,7 @@ from typing import Any
 
 import polars as pl
 
+from vla_attention.capture.foreign_files.json_objects import read_object
 from vla_attention.capture.replay.data_set_errors import (
     DamagedDataSet,
     DataSetError,
@@ -115,7 +116,7 @@ def read_info(folder: Path) -> DataSetInfo:
         fps = float(content["fps"])
         videos = [name for name, feature in features.items() if feature.dtype == "video"]
         paths = _Paths(folder, content, videos)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         if isinstance(error, DataSetError):
             raise
         raise DamagedDataSet(f"'{path}' lacks what a data set of {version} says ({error!r}).") from error
@@ -199,12 +200,9 @@ class _Paths:
 
 def _json_object(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError, RecursionError) as error:
-        raise DamagedDataSet(f"'{path}' is not valid JSON ({error}).") from error
-    if not isinstance(content, dict):
-        raise DamagedDataSet(f"'{path}' should hold a JSON object, but holds a {type(content).__name__}.")
-    return content
+        return read_object(path, DamagedDataSet)
+    except FileNotFoundError:
+        raise DamagedDataSet(f"There is no '{path}', which the data set needs.") from None
 
 
 def _lines(folder: Path, name: str) -> list[dict[str, Any]]:
@@ -221,7 +219,7 @@ def _tasks_of_lines(folder: Path) -> dict[int, str]:
     name = "meta/tasks.jsonl"
     try:
         return {int(line["task_index"]): str(line["task"]) for line in _lines(folder, name)}
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         if isinstance(error, DataSetError):
             raise
         raise DamagedDataSet(f"'{folder / name}' has a line without task_index and task.") from error
@@ -233,7 +231,7 @@ def _episodes_of_lines(folder: Path, paths: _Paths) -> dict[int, EpisodeEntry]:
         try:
             index, length = int(line["episode_index"]), int(line["length"])
             tasks = tuple(str(task) for task in line.get("tasks") or ())
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise DamagedDataSet(f"'{folder / name}' has a line without episode_index and length.") from error
         _check_episode(folder / name, index, length)
         data, videos = paths.of_episode(index)
@@ -277,7 +275,7 @@ def _episodes_of_tables(folder: Path, paths: _Paths) -> dict[int, EpisodeEntry]:
             try:
                 data, videos = paths.of_row(row)
                 index, length = int(row["episode_index"]), int(row["length"])
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, OverflowError) as error:
                 if isinstance(error, (DataSetError, BadArgument)):
                     raise
                 raise DamagedDataSet(f"'{path}' has an episode without the numbers of its files.") from error

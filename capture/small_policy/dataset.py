@@ -127,7 +127,7 @@ def read_demonstrations(folder: str | Path, say: Callable[[str], None] = lambda 
 def _opened(part: Path) -> np.lib.npyio.NpzFile:
     try:
         opened: np.lib.npyio.NpzFile = np.load(part, allow_pickle=False)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except Exception as error:  # a damaged zip raises almost anything
         raise UnusableDemonstrations(f"'{part}' cannot be read ({error}); make it again.") from error
     return opened
 

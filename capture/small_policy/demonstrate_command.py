@@ -11,6 +11,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from vla_attention.capture.foreign_files.json_objects import read_object
 from vla_attention.capture.small_policy.dataset import INDEX_FILE
 from vla_attention.capture.small_policy.demonstrations import (
     DemonstrationSettings,
@@ -76,7 +77,7 @@ def _check_same(folder: Path, settings: DemonstrationSettings) -> None:
     if not path.exists():
         path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
         return
-    if json.loads(path.read_text(encoding="utf-8")) != json.loads(json.dumps(content)):
+    if read_object(path, BadArgument) != json.loads(json.dumps(content)):
         raise BadArgument(
             f"'{folder}' has demonstrations with other settings than these (seed {settings.seed}); give the --seed of "
             f"its {INDEX_FILE}, or another folder."

@@ -17,6 +17,7 @@ from vla_attention.capture.environments.base import EnvironmentSettings, Suite, 
 from vla_attention.capture.environments.cubes.environment import CubesEnvironment
 from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS
 from vla_attention.capture.environments.suites import SUITES, find_suite, list_tasks
+from vla_attention.capture.foreign_files.json_objects import read_object
 from vla_attention.capture.small_policy.processes import share_among_processes
 from vla_attention.capture.small_policy.rollouts import (
     CONDITIONS,
@@ -206,9 +207,9 @@ def _read(path: Path | None, evaluation: Evaluation) -> list[Outcome]:
     if path is None or not path.exists():
         return []
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_object(path, BadArgument)
         of, episodes = dict(content["evaluation"]), [Outcome(**entry) for entry in content["episodes"]]
-    except (OSError, ValueError, TypeError, KeyError):
+    except (OSError, ValueError, TypeError, KeyError):  # BadArgument is a ValueError, too
         raise BadArgument(
             f"Cannot go on with '{path}': it is no file of this command, or of a version that did not say what its "
             "episodes are of; give another --output."

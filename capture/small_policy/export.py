@@ -19,7 +19,7 @@ from vla_attention.capture.policies.pi.preprocess import ENVIRONMENT_ACTION_DIM
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
 from vla_attention.capture.small_policy.network import small_config
 from vla_attention.capture.small_policy.processes import new_folder
-from vla_attention.capture.small_policy.training import SETTINGS, TOKENIZER, read_average
+from vla_attention.capture.small_policy.training import TOKENIZER, read_average, read_settings
 from vla_attention.schemas.errors import BadArgument
 
 CARD = "card.json"
@@ -50,7 +50,7 @@ def export(training: Path, folder: Path, name: str) -> dict[str, Any]:
     if folder.exists():
         raise BadArgument(f"'{folder}' exists already; give another folder for the checkpoint.")
     weights, step, seconds, schedule = read_average(training)
-    facts = json.loads((training / SETTINGS).read_text(encoding="utf-8"))["training"]
+    facts = read_settings(training)
     config = small_config(PromptTokenizer(training / TOKENIZER).vocab_size)
     card = {
         "name": name,

@@ -16,6 +16,10 @@ import torch
 from torch import Tensor, nn
 
 from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS
+from vla_attention.capture.foreign_files.json_objects import read_object
+from vla_attention.capture.foreign_files.pickles import TENSORS, PickleRefused
+from vla_attention.capture.foreign_files.regular_files import check_regular
+from vla_attention.capture.foreign_files.torch_files import load_torch
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.preprocess import Statistics
@@ -266,7 +270,7 @@ def _begin(
     if checkpoint.is_file() and not resume:
         raise BadArgument(f"'{output}' already has a training; go on with --resume, or give another folder.")
     if resume and checkpoint.is_file():
-        before = json.loads(settings_file.read_text(encoding="utf-8"))["training"]
+        before = read_settings(output)
         fixed = (*training.settings.identity, "instructions")
         changed = [f"{name} was {before.get(name)!r}" for name in fixed if before.get(name) != facts[name]]
         if changed:
@@ -274,7 +278,7 @@ def _begin(
                 f"The training in '{output}' had other settings than these: {'; '.join(changed)[:600]}; give the same "
                 "ones, or another folder."
             )
-        training.load(torch.load(checkpoint, weights_only=True))
+        training.load(_read_checkpoint(checkpoint))
         if before["demonstrations"] != facts["demonstrations"]:
             if not new_demonstrations:
                 raise UnusableTraining(
@@ -294,6 +298,32 @@ def _begin(
     return facts
 
 
+def read_settings(output: Path) -> dict[str, Any]:
+    """Return the settings of a training; `UnusableTraining` if its folder does not have them."""
+    path = output / SETTINGS
+    try:
+        found = read_object(path, UnusableTraining)["training"]
+    except (FileNotFoundError, KeyError):
+        found = None
+    if not isinstance(found, dict):
+        raise UnusableTraining(f"There are no settings of a training in '{path}'.")
+    return found
+
+
+def _read_checkpoint(path: Path) -> dict[str, Any]:
+    """Read a checkpoint of a training; `UnusableTraining` for one that is damaged or something else."""
+    try:
+        check_regular(path, UnusableTraining)
+        state = load_torch(path, TENSORS)
+    except PickleRefused as error:
+        raise UnusableTraining(
+            f"The checkpoint '{path}' was refused: it {error}; nothing of it was executed."
+        ) from error
+    if not isinstance(state, dict) or not {"average", "step", "seconds", "schedule"} <= state.keys():
+        raise UnusableTraining(f"'{path}' is no checkpoint of a training.")
+    return state
+
+
 def save(training: Training, output: Path) -> None:
     """Write the checkpoint: complete or not at all."""
     partial = output / f"{CHECKPOINT}.partial"
@@ -306,5 +336,5 @@ def read_average(output: Path) -> tuple[dict[str, Tensor], int, float, list[list
     checkpoint = output / CHECKPOINT
     if not checkpoint.is_file():
         raise UnusableTraining(f"'{output}' has no {CHECKPOINT}; train with `train DEMONSTRATIONS {output}` first.")
-    state = torch.load(checkpoint, weights_only=True)
+    state = _read_checkpoint(checkpoint)
     return state["average"], state["step"], state["seconds"], state["schedule"]

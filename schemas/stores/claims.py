@@ -234,7 +234,7 @@ def _generations(folder: Path, episode: str) -> list[int]:
 def _owner(claim: Path) -> Worker | None:
     try:
         return from_json(Worker, json.loads((claim / _OWNER).read_text()))
-    except (OSError, ValueError, MalformedDocument):
+    except (OSError, ValueError, RecursionError, MalformedDocument):
         return None
 
 

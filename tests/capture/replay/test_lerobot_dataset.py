@@ -196,7 +196,21 @@ def test_meta_files_that_nest_too_deep_are_refused(tmp_path):
     with pytest.raises(DamagedDataSet, match=r"tasks\.jsonl"):
         open_dataset(folder)
     (folder / "meta" / "info.json").write_text("[" * 100_000)
-    with pytest.raises(DamagedDataSet, match="not valid JSON"):
+    with pytest.raises(DamagedDataSet, match="nested more than 64 deep"):
+        open_dataset(folder)
+
+
+@pytest.mark.parametrize("value", ["1e999", "9" * 5000, "NaN", '"x"', "[1]", "null"])
+@pytest.mark.parametrize("field", ["fps", "chunks_size", "features"])
+def test_meta_files_with_other_numbers_are_refused(tmp_path, field, value):
+    folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3,)))
+    info = folder / "meta" / "info.json"
+    content = json.loads(info.read_text()) | {field: "HERE"}
+    info.write_text(json.dumps(content).replace('"HERE"', value))
+    if (field, value) == ("chunks_size", "null"):  # as good as not stated
+        assert open_dataset(folder).name == "robot"
+        return
+    with pytest.raises(DamagedDataSet, match=r"info\.json"):
         open_dataset(folder)
 
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests.capture.small_policy.test_dataset import make_batches
+from tests.hostile_checkpoints.hostile_files import TRACE, executing_pickle, pipe, torch_zip
 from tests.kit.made_up_demonstrations import INSTRUCTIONS, write_demonstrations
 from vla_attention.capture.policies.pi.build import build_pi_policy
 from vla_attention.capture.policies.pi.flow_time import denoise_times
@@ -163,6 +164,22 @@ def test_a_folder_in_use_and_other_settings_are_refused(demonstrations, whole):
     other = TrainingSettings(steps=8, batch_size=4, seed=1)
     with pytest.raises(UnusableTraining, match="seed was 0"):
         train(demonstrations, INSTRUCTIONS, folder, other, resume=True, say=quiet)
+
+
+def test_a_checkpoint_that_executes_or_is_damaged_is_refused(tmp_path):
+    for content, said in (
+        (executing_pickle(tmp_path), r"asks for posix\.system; nothing of it was executed"),
+        (b"\x80\x02}.", "is no checkpoint of a training"),
+        (b"\x80", "was refused: it is damaged"),
+    ):
+        torch_zip(tmp_path / "checkpoint.pt", content)
+        with pytest.raises(UnusableTraining, match=said):
+            export(tmp_path, tmp_path / "out", "name")
+    pipe(tmp_path / "checkpoint.pt")
+    with pytest.raises(UnusableTraining, match=r"no checkpoint|named pipe"):
+        export(tmp_path, tmp_path / "out", "name")
+    assert not (tmp_path / TRACE).exists()
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_rate_warms_up_and_falls():
