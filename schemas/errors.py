@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from itertools import islice
+
+from vla_attention.schemas.limits import COMPARED_NAMES, NAME_CHARACTERS, SENTENCE_CHARACTERS, SHOWN_CHARACTERS
 
 
 class UserError(Exception):
@@ -16,7 +19,7 @@ class UserError(Exception):
     def __str__(self) -> str:
         # KeyError and FileNotFoundError format their arguments in their own ways; this class always gives the sentence
         # itself.
-        return str(self.args[0]) if self.args else type(self).__name__
+        return shortened(str(self.args[0]), SENTENCE_CHARACTERS) if self.args else type(self).__name__
 
 
 class BadArgument(UserError, ValueError):
@@ -35,9 +38,17 @@ class Note(UserWarning):
     """Something that a user should know and that stops nothing. Command lines print it as a line on stderr."""
 
 
+def shortened(text: str, most: int = SHOWN_CHARACTERS) -> str:
+    """A text of at most about `most` characters: a longer one without its middle, and how much that is."""
+    if len(text) <= most:
+        return text
+    first, last = most * 2 // 3, most // 3
+    return f"{text[:first]} [... {len(text) - first - last:,} characters ...] {text[-last:]}"
+
+
 def listing(names: Iterable[object], limit: int = 12) -> str:
     """Join names for a message: at most `limit` of them, then how many more there are."""
-    items = [str(name) for name in names]
+    items = [shortened(str(name)) for name in names]
     if not items:
         return "none"
     shown = ", ".join(items[:limit])
@@ -46,7 +57,9 @@ def listing(names: Iterable[object], limit: int = 12) -> str:
 
 def did_you_mean(given: str, existing: Iterable[str]) -> str:
     """Return " Did you mean 'x'?" for the nearest existing name, or an empty string when nothing is near."""
-    by_folded = {name.casefold(): name for name in existing}
+    if len(given) > NAME_CHARACTERS:
+        return ""
+    by_folded = {name.casefold(): name for name in islice(existing, COMPARED_NAMES) if len(name) <= NAME_CHARACTERS}
     folded = given.casefold()
     # The most frequent mistake is half a name ('base' for 'base_0_rgb'), which is too short for the similarity measure.
     near = [name for name in by_folded if len(folded) > 2 and name.startswith(folded)]
@@ -58,4 +71,4 @@ def did_you_mean(given: str, existing: Iterable[str]) -> str:
 def unknown_name(kind: str, given: str, existing: Iterable[str]) -> UnknownName:
     """Build the error for a name that does not exist: what was given, the nearest name, and what exists."""
     names = list(existing)
-    return UnknownName(f"Unknown {kind} '{given}'.{did_you_mean(given, names)} Existing: {listing(names)}.")
+    return UnknownName(f"Unknown {kind} '{shortened(given)}'.{did_you_mean(given, names)} Existing: {listing(names)}.")

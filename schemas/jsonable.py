@@ -21,7 +21,8 @@ import typing
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
-from vla_attention.schemas.errors import UserError, did_you_mean, listing
+from vla_attention.schemas.errors import UserError, did_you_mean, listing, shortened
+from vla_attention.schemas.limits import WHOLE_NUMBER
 
 T = TypeVar("T")
 #: Plain objects of one class that are kept to be given out again, at most.
@@ -141,7 +142,7 @@ def _literal_decoder(arguments: tuple[Any, ...]) -> Callable[[Any], Any]:
     def decode(data: Any) -> Any:
         if data in arguments:
             return data
-        raise _Misfit(f"is {data!r}; expected one of {listing(map(repr, arguments))}.")
+        raise _Misfit(f"is {shortened(repr(data))}; expected one of {listing(map(repr, arguments))}.")
 
     return decode
 
@@ -152,7 +153,7 @@ def _sequence_decoder(made: type, declared: Any) -> Callable[[Any], Any]:
 
     def decode(data: Any) -> Any:
         # Shapes and axes: that each item is of its type is all there is to check.
-        if plain is not None and type(data) is list and plain.issuperset(map(type, data)):
+        if plain is not None and type(data) is list and plain.issuperset(map(type, data)) and _are_bounded(data):
             return made(data)
         items: list[Any] = []
         try:
@@ -188,7 +189,7 @@ def _dict_decoder(declared: Any) -> Callable[[Any], Any]:
             try:
                 values[key] = decoder(item)
             except _Misfit as misfit:
-                raise misfit.inside(f".{key}") from None
+                raise misfit.inside(f".{shortened(key)}") from None
         return values
 
     return decode
@@ -213,7 +214,10 @@ def _dataclass_decoder(declared: type) -> Callable[[Any], Any]:
             items = tuple(given.values())
             if tuple(map(type, items)) == kinds:
                 found = known.get(items)
-                return remember(items) if found is None else found
+                if found is not None:
+                    return found
+                if all(type(item) is not int or -WHOLE_NUMBER <= item < WHOLE_NUMBER for item in items):
+                    return remember(items)
         if not decoders:
             decoders.update({name: _decoder(kind) for name, (kind, _) in fields.items()})
         values = {}
@@ -221,7 +225,8 @@ def _dataclass_decoder(declared: type) -> Callable[[Any], Any]:
             decoder = decoders.get(name)
             if decoder is None:
                 raise _Misfit(
-                    f"has an unknown field '{name}'.{did_you_mean(name, fields)} Existing: {listing(fields)}."
+                    f"has an unknown field '{shortened(name)}'.{did_you_mean(name, fields)} "
+                    f"Existing: {listing(fields)}."
                 )
             try:
                 values[name] = decoder(item)
@@ -243,13 +248,32 @@ def _dataclass_decoder(declared: type) -> Callable[[Any], Any]:
 
 
 def _primitive_decoder(declared: type) -> Callable[[Any], Any]:
+    if declared is int:
+        return lambda data: (
+            data if type(data) is int and -WHOLE_NUMBER <= data < WHOLE_NUMBER else _bounded(_expect(int, data))
+        )
     if declared is not float:
         return lambda data: _expect(declared, data)
 
     def decode(data: Any) -> float:
-        return float(data) if isinstance(data, int) and not isinstance(data, bool) else _expect(float, data)
+        if isinstance(data, int) and not isinstance(data, bool):
+            return float(_bounded(data))
+        if not math.isfinite(_expect(float, data)):
+            raise _Misfit(f"is {data!r}; expected a finite number.")
+        return typing.cast(float, data)
 
     return decode
+
+
+def _bounded(number: int) -> int:
+    if not -WHOLE_NUMBER <= number < WHOLE_NUMBER:
+        raise _Misfit("is a whole number that does not fit into 64 bits.")
+    return number
+
+
+def _are_bounded(items: list[Any]) -> bool:
+    """Whether items, which are all of one plain type, have no whole number that does not fit into 64 bits."""
+    return not items or type(items[0]) is not int or (max(items) < WHOLE_NUMBER and min(items) >= -WHOLE_NUMBER)
 
 
 def _at(part: str, decoder: Callable[[Any], Any], data: Any) -> Any:

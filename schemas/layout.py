@@ -16,7 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
-from vla_attention.schemas.safe_text import check_name
+from vla_attention.schemas.limit_checks import check_at_most
+from vla_attention.schemas.limits import AXIS, KEYS, PICTURE_PIXELS, PICTURE_SIDE, QUERIES, SPANS, TEXT_CHARACTERS
+from vla_attention.schemas.safe_text import check_free_text, check_name
 
 #: Any name that `check_site_name` accepts. `joint`: prefix and suffix keys together (pi). `self` and `cross`: the
 #: query's own tokens, and the text or prefix.
@@ -89,6 +91,14 @@ class PatchGrid:
     image_height: int
     image_width: int
 
+    def __post_init__(self) -> None:
+        """Check that the grid and the picture have a size."""
+        check_at_most("The number of rows of a patch grid", self.rows, KEYS, least=1)
+        check_at_most("The number of columns of a patch grid", self.columns, KEYS, least=1)
+        check_at_most("The height of a picture", self.image_height, PICTURE_SIDE, least=1)
+        check_at_most("The width of a picture", self.image_width, PICTURE_SIDE, least=1)
+        check_at_most("The number of pixels of a picture", self.image_height * self.image_width, PICTURE_PIXELS)
+
     @property
     def num_patches(self) -> int:
         """Number of keys that the grid covers."""
@@ -150,6 +160,7 @@ class SiteLayout:
         """Check the name and the numbers, and that the spans tile [0, num_keys)."""
         check_site_name(self.name)
         self._check_numbers()
+        check_at_most(f"The number of spans of site '{self.name}'", len(self.spans), SPANS, least=1)
         position = 0
         seen: set[str] = set()
         for span in self.spans:
@@ -167,8 +178,10 @@ class SiteLayout:
                 )
             seen.add(span.name)
             position = span.stop
+        check_at_most(f"The number of keys of site '{self.name}'", position, KEYS)
 
     def _check_numbers(self) -> None:
+        check_at_most(f"The number of layers of site '{self.name}'", len(self.layers), AXIS)
         if list(self.layers) != sorted(set(self.layers)) or min(self.layers, default=0) < 0:
             raise BadArgument(
                 f"Site '{self.name}' has the layers {listing(self.layers, 40)}; expected different block indices from "
@@ -179,6 +192,9 @@ class SiteLayout:
                 f"Site '{self.name}' has {self.heads} heads and {self.num_action_queries} action queries; expected 0 "
                 "(those of the policy) or more."
             )
+        check_at_most(f"The highest layer of site '{self.name}'", max(self.layers, default=0), AXIS)
+        check_at_most(f"The number of heads of site '{self.name}'", self.heads, AXIS)
+        check_at_most(f"The number of action queries of site '{self.name}'", self.num_action_queries, QUERIES)
         growing = [span.name for span in self.spans if span.growing]
         if len(growing) > 1:
             raise BadArgument(f"Site '{self.name}' has the growing spans {listing(growing)}; expected at most one.")
@@ -222,7 +238,7 @@ class SiteLayout:
             if span.name == name:
                 return span
         number = name.removeprefix("frame")
-        if name.startswith("frame") and number.isdigit() and int(number) < len(frames):
+        if name.startswith("frame") and number.isdecimal() and len(number) < 9 and int(number) < len(frames):
             return frames[int(number)]
         seen = [span for span in frames if span.camera is not None]
         if name == "curr_last" and seen:
@@ -257,6 +273,11 @@ class Prompt:
     text: str
     pieces: tuple[Piece, ...]
     instruction: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        """Check the length of the text."""
+        if len(self.text) > TEXT_CHARACTERS:  # asked here: an episode has a prompt for each replan
+            check_free_text("prompt", self.text)
 
     @property
     def instruction_text(self) -> str:

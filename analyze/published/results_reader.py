@@ -17,7 +17,6 @@ points, and in no other:
 from __future__ import annotations
 
 import glob
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -28,7 +27,10 @@ from typing import Any, get_args
 import polars as pl
 
 from vla_attention.analyze.measures.frames import LAYERS_AVG
-from vla_attention.schemas.errors import listing
+from vla_attention.schemas.documents import decode_json
+from vla_attention.schemas.errors import listing, shortened
+from vla_attention.schemas.limits import RESULTS_BYTES, RESULTS_NESTS
+from vla_attention.schemas.regular_files import read_regular
 from vla_attention.schemas.results import (
     RESULTS_PREFIX,
     EpisodeResult,
@@ -41,7 +43,11 @@ from vla_attention.schemas.results import (
 )
 from vla_attention.schemas.safe_text import visible
 
-_LAYER = re.compile(r"layer_(\d+)$")
+_LAYER = re.compile(r"layer_([0-9]{1,6})")
+#: Whole numbers are at most this: tasks, episodes and steps are counted.
+_MOST_COUNTED = 10**12
+#: Masses and ratios are at most this, unless they are infinite.
+_MOST_MEASURED = 1e300
 #: The published scripts treat a mass of up to this as zero, and write a ratio of 0 where both masses are zero.
 NO_MASS = 1e-8
 #: The fields of the Cosmos scripts that name the latent frames of the queries, the visual and the text side.
@@ -175,14 +181,15 @@ def read_results_file(path: Path) -> ResultsFile:
         ResultsError: it is no results file, or a field is wrong; names the file, the episode and the field.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ResultsNotFound(f"Cannot read results file {path}: {error}.") from None
+        content = read_regular(path, RESULTS_BYTES)
+    except OSError as error:
+        raise ResultsNotFound(f"Cannot read results file {path}: {error.strerror or error}.") from None
     try:
-        document = json.loads(text)
-        return _Reading(path).read(document)
-    except (json.JSONDecodeError, RecursionError) as error:
+        document = decode_json(content, RESULTS_BYTES, RESULTS_NESTS)
+    except ValueError as error:
         raise ResultsError(f"{path} is not a results file: not valid JSON ({error}).") from None
+    try:
+        return _Reading(path).read(document)
     except _Problem as problem:
         raise ResultsError(f"{path}: {problem}") from None
 
@@ -274,7 +281,7 @@ class _Reading:
         stated = episode.get("num_steps_definition")
         if stated not in (None, *get_args(NumStepsDefinition)):
             known = listing(map(repr, get_args(NumStepsDefinition)))
-            raise _Problem(f"{where}, num_steps_definition is {stated!r}; expected {known}, or nothing.")
+            raise _Problem(f"{where}, num_steps_definition is {shortened(repr(stated))}; expected {known}, or nothing.")
         grouping, steps = None, None
         if episode.get("grouping") is not None:
             texts = (episode["grouping"], episode.get("grouping_description") or "")
@@ -340,7 +347,7 @@ class _Reading:
         for name in masses:
             row[name] = _number(step[name], f"{where}.{name}", math.inf)
             if not _is_finite(row[name]):
-                raise _Problem(f"{where}.{name} is {step[name]!r}; expected a finite mass.")
+                raise _Problem(f"{where}.{name} is {shortened(repr(step[name]))}; expected a finite mass.")
         for name in fractions:
             row[name] = _number(step[name], f"{where}.{name}", _ONE)
         for name, column in _COUNTS.items():
@@ -380,9 +387,9 @@ class _Reading:
 def _layer_of(name: str, where: str) -> tuple[str, int | None]:
     if name == LAYERS_AVG:
         return LAYERS_AVG, None
-    match = _LAYER.match(name)
+    match = _LAYER.fullmatch(name)
     if match is None:
-        raise _Problem(f"{where} has '{name}'; expected layer_N or {LAYERS_AVG}.")
+        raise _Problem(f"{where} has '{visible(shortened(name))}'; expected layer_N or {LAYERS_AVG}.")
     return match[1], int(match[1])
 
 
@@ -395,6 +402,8 @@ def _expect(value: Any, kind: type, where: str) -> Any:
 def _whole(value: Any, where: str) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise _Problem(f"{where} is {_kind_of(value)}; expected a whole number from 0.")
+    if value > _MOST_COUNTED:
+        raise _Problem(f"{where} is a whole number above {_MOST_COUNTED:,}; expected a smaller one.")
     return value
 
 
@@ -404,6 +413,8 @@ def _number(value: Any, where: str, most: float) -> float | None:
         return None
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise _Problem(f"{where} is {_kind_of(value)}; expected a number.")
+    if isinstance(value, int) and abs(value) > _MOST_MEASURED:
+        raise _Problem(f"{where} is a whole number of more than 300 digits; expected a smaller one.")
     if not 0 <= value <= most:
         raise _Problem(f"{where} is {value}; expected a number from 0{'' if math.isinf(most) else ' to 1'}.")
     return float(value)

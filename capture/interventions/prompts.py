@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from vla_attention.schemas.documents import decode_json, decode_toml
 from vla_attention.schemas.errors import BadArgument, UserError, listing
 from vla_attention.schemas.groupings.words import split_words
 from vla_attention.schemas.interventions import PromptChange
+from vla_attention.schemas.limits import WRITTEN_FILE_BYTES
+from vla_attention.schemas.regular_files import read_regular
 
 
 class SynonymsUnreadable(UserError, ValueError):
@@ -86,8 +87,8 @@ def check_synonyms(change: PromptChange, instructions: Iterable[str]) -> None:
 def read_synonyms(path: Path) -> dict[str, str]:
     """Read a JSON object or a TOML table of words and what replaces them; the ending of the name says which."""
     try:
-        text = path.read_text(encoding="utf-8")
-        content = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+        given = read_regular(path, WRITTEN_FILE_BYTES)
+        content = decode_toml(given.decode()) if path.suffix == ".toml" else decode_json(given)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise SynonymsUnreadable(f"Cannot read the synonyms '{path}' ({reason}); expected JSON or TOML.") from None

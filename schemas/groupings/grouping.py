@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from vla_attention.schemas.errors import UserError, did_you_mean, listing
+from vla_attention.schemas.documents import decode_toml
+from vla_attention.schemas.errors import BadArgument, UserError, did_you_mean, listing, shortened
 from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
 from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.jsonable import MalformedDocument, from_json
+from vla_attention.schemas.limits import GROUPS, NAME_CHARACTERS, WRITTEN_FILE_BYTES
+from vla_attention.schemas.regular_files import read_regular
+from vla_attention.schemas.safe_text import check_text, visible
 
 #: The selector that, alone, means: whatever no other group of the grouping takes.
 REST = "*"
@@ -20,7 +23,7 @@ REST = "*"
 
 #: Column names of tables begin with group names; these are taken by the ratio.
 _RESERVED_NAMES = ("numerator", "denominator", "ratio")
-_GROUP_NAME = re.compile(r"[A-Za-z0-9_][\w.@-]*$")
+_GROUP_NAME = re.compile(r"[A-Za-z0-9_][\w.@-]*")
 
 
 class GroupingError(UserError, ValueError):
@@ -74,11 +77,13 @@ class Grouping:
         """Check everything that can be checked without a layout."""
         if not self.groups:
             raise GroupingError(f"Grouping '{self.name}' has no groups; expected at least one NAME = SELECTOR.")
+        if len(self.groups) > GROUPS:
+            raise GroupingError(f"Grouping '{self.name}' has {len(self.groups)} groups; expected at most {GROUPS:,}.")
         for group, selectors in self.groups.items():
-            if group in _RESERVED_NAMES or not _GROUP_NAME.match(group):
+            if group in _RESERVED_NAMES or not _GROUP_NAME.fullmatch(group) or len(group) > NAME_CHARACTERS:
                 raise GroupingError(
-                    f"'{group}' cannot name a group: expected letters, digits, '_', '.', '-', and none of "
-                    f"{listing(_RESERVED_NAMES)}."
+                    f"'{visible(shortened(group))}' cannot name a group: expected letters, digits, '_', '.', '-', and "
+                    f"none of {listing(_RESERVED_NAMES)}."
                 )
             if not selectors:
                 raise GroupingError(f"Group '{group}' of grouping '{self.name}' has no selector.")
@@ -122,13 +127,15 @@ class Grouping:
 def read_grouping_file(path: Path) -> Grouping:
     """Read a TOML grouping; every error names the file."""
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        document = decode_toml(read_regular(path, WRITTEN_FILE_BYTES).decode())
     except (OSError, UnicodeDecodeError) as error:
-        raise GroupingNotFound(f"Cannot read grouping file {path}: {error}.") from None
-    except tomllib.TOMLDecodeError as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise GroupingNotFound(f"Cannot read grouping file {path}: {reason}.") from None
+    except ValueError as error:
         raise GroupingError(f"Grouping file {path} is not valid TOML: {error}.") from None
     try:
         content = from_json(GroupingFile, document)
+        check_text("grouping's name", content.name or path.stem)
         groups = {
             name: (selectors,) if isinstance(selectors, str) else tuple(selectors)
             for name, selectors in content.groups.items()
@@ -143,6 +150,8 @@ def read_grouping_file(path: Path) -> Grouping:
         )
     except (MalformedDocument, GroupingError, SelectorError) as error:
         raise type(error)(f"Grouping file {path}: {error}") from None
+    except BadArgument as error:
+        raise GroupingError(f"Grouping file {path}: {error}") from None
 
 
 def conventional_ratio(groups: Iterable[str]) -> Ratio | None:

@@ -13,12 +13,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.schemas.errors import shortened
 from vla_attention.schemas.groupings.grouping import REST, Grouping, GroupingError
 from vla_attention.schemas.groupings.key_counts import num_valid_keys
-from vla_attention.schemas.groupings.selector_parser import Atom, Everything, Selector, atoms_of, parse_selector
+from vla_attention.schemas.groupings.selector_parser import (
+    Atom,
+    Everything,
+    Selector,
+    atoms_of,
+    folded,
+    parse_selector,
+)
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS, Membership, SelectorError, no_keys
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
 from vla_attention.schemas.layout import SiteLayout
+from vla_attention.schemas.limits import CLAIMED_BYTES, EXPANSION
 
 
 class OverlappingGroups(GroupingError):
@@ -51,10 +60,10 @@ def check_names(grouping: Grouping, vocabulary: Vocabulary, layout: SiteLayout) 
     """Raise `SelectorError` or `UnknownName` for the first selector with a name that no selected episode has."""
     for group, selectors in grouping.groups.items():
         for text in selectors:
-            for atom in atoms_of(parse_selector(text)):
+            for atom in dict.fromkeys(atoms_of(parse_selector(text))):
                 problem = SELECTOR_KINDS[atom.kind].problem(atom.argument, vocabulary, layout)
                 if problem:
-                    raise SelectorError(f"Group '{group}', selector '{text}': {problem}")
+                    raise SelectorError(f"Group '{group}', selector '{shortened(text)}': {problem}")
 
 
 def resolve(grouping: Grouping, tokens: EpisodeTokens) -> ResolvedGrouping:
@@ -162,6 +171,13 @@ def describe_key(key: int, tokens: EpisodeTokens) -> str:
 def cell_coverage(tokens: EpisodeTokens) -> NDArray[np.float32]:
     """Area of each key's cells, shape (replan, key, 1 + object); they sum to 1. Cell 0 is what no object covers."""
     replans, keys, things = tokens.num_replans, tokens.layout.num_keys, len(tokens.objects)
+    covered = sum(coverage.nbytes for coverage in (tokens.coverage or {}).values())
+    cells = 4 * replans * keys * (1 + things)
+    if cells > max(2 * CLAIMED_BYTES, EXPANSION * covered):
+        raise GroupingError(
+            f"The coverage of {things} objects on {keys} keys at {replans} replans takes {cells:,} bytes, of which "
+            f"{covered:,} are stored: the store has more objects and keys than its pictures show."
+        )
     area = np.zeros((replans, keys, 1 + things), dtype=np.float32)
     for camera, coverage in (tokens.coverage or {}).items():
         span = tokens.layout.camera_span(camera)
@@ -185,11 +201,18 @@ def _weights(member: Membership, cells: NDArray[np.float32] | None) -> NDArray[n
 
 
 def _evaluate(selector: Selector, tokens: EpisodeTokens) -> Membership:
-    if isinstance(selector, Everything):
-        return np.ones((1, tokens.layout.num_keys, 1), dtype=bool)
-    if isinstance(selector, Atom):
-        return SELECTOR_KINDS[selector.kind].keys(selector.argument, tokens)
-    left, right = _evaluate(selector.left, tokens), _evaluate(selector.right, tokens)
-    if selector.operator == "&":
-        return left & right
-    return left | right if selector.operator == "|" else left & ~right
+    found: dict[Atom, Membership] = {}  # long unions say the same more than once
+
+    def keys(part: Atom | Everything) -> Membership:
+        if isinstance(part, Everything):
+            return np.ones((1, tokens.layout.num_keys, 1), dtype=bool)
+        if part not in found:
+            found[part] = SELECTOR_KINDS[part.kind].keys(part.argument, tokens)
+        return found[part]
+
+    def join(operator: str, left: Membership, right: Membership) -> Membership:
+        if operator == "&":
+            return left & right
+        return left | right if operator == "|" else left & ~right
+
+    return folded(selector, keys, join)

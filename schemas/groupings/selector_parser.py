@@ -10,11 +10,15 @@
 
 from __future__ import annotations
 
+import functools
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
-from vla_attention.schemas.errors import did_you_mean, listing
+from vla_attention.schemas.errors import did_you_mean, listing, shortened
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS, SelectorError
+from vla_attention.schemas.limits import PARENTHESES
 
 
 @dataclass(frozen=True)
@@ -40,26 +44,64 @@ class Operation:
 
 
 Selector = Atom | Everything | Operation
+Value = TypeVar("Value")
 
 _TOKEN = re.compile(
     r"""\s*(?:
-      (?P<open>\() | (?P<close>\)) | (?P<and>&) | (?P<or>\|) | (?P<minus>-(?=\s|$)) | (?P<star>\*)
+      (?P<open>\() | (?P<close>\)) | (?P<and>&) | (?P<or>\|) | (?P<minus>-(?=\s|\Z)) | (?P<star>\*)
       | (?P<kind>[A-Za-z_]+):(?P<argument>"[^"]*" | '[^']*' | [^\s&|()\[\]"']+[^\s&|()\[\]"]*(?:\[[^\]]*\])? | )
     )""",
     re.VERBOSE,
 )
 
 
+@functools.lru_cache(maxsize=1024)  # a grouping is looked at when it is read, and in every episode
 def parse_selector(text: str) -> Selector:
-    """Parse one selector; raises `SelectorError` that quotes it and says what was expected where."""
+    """Parse one selector in linear time; raises `SelectorError` that quotes it and says what was expected where."""
     return _Parser(text).parse()
+
+
+def folded(
+    selector: Selector,
+    leaf: Callable[[Atom | Everything], Value],
+    join: Callable[[str, Value, Value], Value],
+) -> Value:
+    """The value of a selector from those of its parts, left to right.
+
+    A union of a hundred thousand words is a tree as deep, so that no function of it may call itself.
+
+    Args:
+        selector: the tree.
+        leaf: the value of a part.
+        join: the value of an operator and the values on its left and right.
+    """
+    pending: list[Selector | str] = [selector]
+    values: list[Value] = []
+    while pending:
+        part = pending.pop()
+        if isinstance(part, Operation):
+            pending += [part.operator, part.right, part.left]
+        elif isinstance(part, str):
+            right = values.pop()
+            values.append(join(part, values.pop(), right))
+        else:
+            values.append(leaf(part))
+    return values.pop()
 
 
 def atoms_of(selector: Selector) -> tuple[Atom, ...]:
     """All `kind:argument` parts of a selector, left to right."""
-    if isinstance(selector, Operation):
-        return atoms_of(selector.left) + atoms_of(selector.right)
-    return (selector,) if isinstance(selector, Atom) else ()
+    atoms: list[Atom] = []
+
+    def note(part: Atom | Everything) -> None:
+        if isinstance(part, Atom):
+            atoms.append(part)
+
+    folded(selector, note, lambda operator, left, right: None)
+    return tuple(atoms)
+
+
+_SPACE = re.compile(r"\s*")
 
 
 def _unquoted(argument: str) -> str:
@@ -71,16 +113,18 @@ class _Parser:
         self.text = text
         self.tokens = self._tokenise()
         self.next = 0
+        self.depth = 0
 
     def _fail(self, position: int, problem: str) -> SelectorError:
-        return SelectorError(f"Cannot read selector '{self.text}' at character {position + 1}: {problem}.")
+        return SelectorError(f"Cannot read selector '{shortened(self.text)}' at character {position + 1}: {problem}.")
 
     def _tokenise(self) -> list[tuple[str, str, int]]:
         tokens: list[tuple[str, str, int]] = []
         position, end = 0, len(self.text.rstrip())
         while position < end:
             match = _TOKEN.match(self.text, position)
-            start = position + len(self.text[position:]) - len(self.text[position:].lstrip())
+            space = _SPACE.match(self.text, position)
+            start = position if space is None else space.end()
             if match is None:
                 raise self._fail(start, f"expected KIND:NAME, where KIND is one of {listing(SELECTOR_KINDS)}")
             kind = match.lastgroup or ""
@@ -96,7 +140,7 @@ class _Parser:
         if match["kind"] not in SELECTOR_KINDS:
             raise self._fail(
                 start,
-                f"unknown kind '{match['kind']}:';{did_you_mean(match['kind'], SELECTOR_KINDS).lower()} "
+                f"unknown kind '{shortened(match['kind'])}:';{did_you_mean(match['kind'], SELECTOR_KINDS).lower()} "
                 f"existing kinds: {listing(SELECTOR_KINDS)}",
             )
         if not _unquoted(match["argument"]).strip():
@@ -131,7 +175,11 @@ class _Parser:
         kind, word, position = self._peek()
         self.next += 1
         if kind == "open":
+            self.depth += 1
+            if self.depth > PARENTHESES:
+                raise self._fail(position, f"it has more than {PARENTHESES} parentheses in one another")
             tree = self._selector()
+            self.depth -= 1
             if self._peek()[0] != "close":
                 raise self._fail(self._peek()[2], "expected ')'")
             self.next += 1

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.errors import UserError, shortened
 from vla_attention.schemas.groupings.resolve import weights_of
 from vla_attention.schemas.groupings.selector_parser import (
     Atom,
@@ -19,6 +19,7 @@ from vla_attention.schemas.groupings.selector_parser import (
     Operation,
     Selector,
     atoms_of,
+    folded,
     parse_selector,
 )
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS, SelectorError
@@ -35,13 +36,13 @@ def check_selector(text: str, vocabularies: Mapping[str, Vocabulary]) -> None:
 
     vocabularies: site -> the names at that site.
     """
-    for atom in atoms_of(parse_selector(text)):
+    for atom in dict.fromkeys(atoms_of(parse_selector(text))):
         problems = [_problem(atom, vocabulary) for vocabulary in vocabularies.values()]
         found = [problem for problem in problems if problem]
         if len(found) == len(problems):
             # A site with such keys says which names exist; the others only that they have none.
             telling = [problem for problem in found if not any(words in problem for words in _NO_SUCH_KEYS)]
-            raise SelectorError(f"Selector '{text}': {(telling or found)[0]}")
+            raise SelectorError(f"Selector '{shortened(text)}': {(telling or found)[0]}")
 
 
 def selector_weights(
@@ -79,6 +80,9 @@ def _problem(atom: Atom, vocabulary: Vocabulary) -> str | None:
 
 def _only(selector: Selector, known: list[Atom]) -> Selector:
     """The selector with `_NOTHING` in place of the parts that are not known."""
-    if isinstance(selector, Operation):
-        return Operation(selector.operator, _only(selector.left, known), _only(selector.right, known))
-    return selector if isinstance(selector, Everything) or selector in known else _NOTHING
+    there = set(known)
+
+    def leaf(part: Atom | Everything) -> Selector:
+        return part if isinstance(part, Everything) or part in there else _NOTHING
+
+    return folded(selector, leaf, Operation)

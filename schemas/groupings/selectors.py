@@ -21,8 +21,10 @@ from vla_attention.schemas.layout import SiteLayout, find_role
 #: The (key, cell) pairs that a selector takes, axes (replan or 1, key, cell or 1). `resolve` says what a cell is.
 Membership = NDArray[np.bool_]
 
-_PATCH = re.compile(r"(?P<camera>.+?)\[(?P<r0>\d*):(?P<r1>\d*)\s*,\s*(?P<c0>\d*):(?P<c1>\d*)\]$")
-_KEYS = re.compile(r"(\d+)(?:-(\d+))?$")
+_PATCH = re.compile(
+    r"(?P<camera>[^\[]+)\[(?P<r0>[0-9]{0,9}):(?P<r1>[0-9]{0,9})\s*,\s*(?P<c0>[0-9]{0,9}):(?P<c1>[0-9]{0,9})\]"
+)
+_KEYS = re.compile(r"([0-9]{1,9})(?:-([0-9]{1,9}))?")
 _OBJECT_CLASSES = ("@interest", "@robot", "@background")
 _WORD_CLASSES = ("content", "stop", "all")
 
@@ -192,7 +194,7 @@ def _object_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -
 
 
 def _patch_keys(argument: str, tokens: EpisodeTokens) -> Membership:
-    match = _PATCH.match(argument)
+    match = _PATCH.fullmatch(argument)
     if match is None:
         raise SelectorError(f"Cannot read selector 'patch:{argument}'; expected patch:CAMERA[r0:r1,c0:c1].")
     span = tokens.layout.camera_span(match["camera"])
@@ -221,7 +223,7 @@ def _patch_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) ->
 
 
 def _number_keys(argument: str, tokens: EpisodeTokens) -> Membership:
-    match = _KEYS.match(argument)
+    match = _KEYS.fullmatch(argument)
     if match is None:
         raise SelectorError(f"Cannot read selector 'keys:{argument}'; expected keys:a or keys:a-b.")
     first, last = int(match[1]), int(match[2] or match[1])

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.schemas.cached_property import cached_property
+from vla_attention.schemas.errors import BadArgument, listing, shortened
 from vla_attention.schemas.groupings.key_counts import key_counts
 from vla_attention.schemas.groupings.words import Word, words_of
 from vla_attention.schemas.layout import INVALID_ROLES, Prompt, Role, SiteLayout
-from vla_attention.schemas.safe_text import check_name
+from vla_attention.schemas.safe_text import check_name, visible
 
 ObjectKind = Literal["object", "fixture", "robot", "background"]
 
@@ -79,8 +80,16 @@ class EpisodeTokens:
 
     @cached_property
     def words(self) -> tuple[tuple[Word, ...], ...]:
-        """The instruction's words for each of `prompts`."""
-        return tuple(words_of(prompt) for prompt in self.prompts)
+        """The instruction's words for each of `prompts`; raises `BadArgument` for words at keys that do not exist."""
+        words = tuple(words_of(prompt) for prompt in self.prompts)
+        for line in {id(line): line for line in words}.values():  # prompts that differ in their state share them
+            for word in line:
+                if word.keys and not 0 <= min(word.keys) <= max(word.keys) < self.layout.num_keys:
+                    raise BadArgument(
+                        f"The word '{visible(shortened(word.text))}' has the keys {listing(word.keys)}; the site has "
+                        f"{self.layout.num_keys}."
+                    )
+        return words
 
     @cached_property
     def valid(self) -> NDArray[np.bool_]:

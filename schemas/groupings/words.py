@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import functools
 import re
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Literal
 
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import Piece, Prompt
 
 WordClass = Literal["content", "stop"]
@@ -41,11 +43,12 @@ def words_of(prompt: Prompt) -> tuple[Word, ...]:
 @functools.lru_cache(maxsize=4096)
 def _words_in(text: str, first: int, pieces: tuple[Piece, ...]) -> tuple[Word, ...]:
     """The words of an instruction that begins at a character of its prompt. Prompts of a task differ in their state."""
-    words = []
-    for start, stop in split_words(text):
-        begin, end = first + start, first + stop
-        words.append(Word(text[start:stop], begin, end, _keys_between(pieces, begin, end)))
-    return tuple(words)
+    places = [(first + start, first + stop) for start, stop in split_words(text)]
+    keys = _keys_between(pieces, places)
+    return tuple(
+        Word(text[start - first : stop - first], start, stop, tuple(own))
+        for (start, stop), own in zip(places, keys, strict=True)
+    )
 
 
 def find_phrase(words: Sequence[Word], phrase: str) -> tuple[Word, ...]:
@@ -86,5 +89,20 @@ def _occurrences(given: Sequence[str], wanted: Sequence[str]) -> Iterator[int]:
                 yield first
 
 
-def _keys_between(pieces: Sequence[Piece], begin: int, end: int) -> tuple[int, ...]:
-    return tuple([piece.key for piece in pieces if piece.start < end and piece.stop > begin])
+def _keys_between(pieces: Sequence[Piece], places: Sequence[tuple[int, int]]) -> list[list[int]]:
+    """The keys of the pieces that touch each of the places, which are in order and do not overlap.
+
+    Raises:
+        BadArgument: pieces touch more words than a tokenizer's can, which have few characters each.
+    """
+    starts, stops = [start for start, _ in places], [stop for _, stop in places]
+    keys: list[list[int]] = [[] for _ in places]
+    most, touched = 10 * (len(pieces) + len(places)) + 1000, 0
+    for piece in pieces:
+        there = range(bisect_right(stops, piece.start), bisect_left(starts, piece.stop))
+        touched += len(there)
+        if touched > most:
+            raise BadArgument(f"The pieces of a prompt overlap: {len(pieces)} touch the {len(places)} words too often.")
+        for i in there:
+            keys[i].append(piece.key)
+    return keys

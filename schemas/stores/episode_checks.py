@@ -29,12 +29,12 @@ from vla_attention.schemas.stores.content_rules import (
 )
 from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.episode_files import files_of_no_array
+from vla_attention.schemas.stores.episode_shapes import expected_shapes
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.root import group_attributes
 from vla_attention.schemas.stores.store_format import (
     NUMBERS,
     CorruptEpisode,
-    EpisodeAttributes,
     RootAttributes,
 )
 
@@ -52,7 +52,7 @@ def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[s
     for file in episode.files.records:
         if file.endswith("zarr.json"):
             yield from _guarded(_metadata_problems(episode, file))
-    shapes = _expected_shapes(root, attributes)
+    shapes = expected_shapes(root, attributes)
     numbers = {name: (len(given),) for name in NUMBERS if (given := getattr(attributes, name))}
     listed = {name: record.shape for name, record in attributes.arrays.items()} | numbers
     for name in sorted(set(shapes) - set(listed)):
@@ -75,36 +75,6 @@ def _guarded(check: Iterator[str]) -> Iterator[str]:
         yield str(error)
 
 
-def _expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dict[str, tuple[int, ...]]:
-    """First axes of every array that must be there; arrays that are not named here begin with the replans."""
-    replans = attributes.num_replans
-    shapes: dict[str, tuple[int, ...]] = {"denoise_time": (len(root.recording.denoise_steps),)}
-    shapes |= dict.fromkeys(("env_step", "prompt_index"), (replans,))
-    if not root.protocol.of_other_loop:
-        shapes |= dict.fromkeys(("noise_seed", "state", "actions"), (replans,))
-    if "dataset_actions" in attributes.arrays:
-        shapes["dataset_action_count"] = (replans,)
-    for site in root.sites:
-        recording = root.recording.of_site(site)
-        cells = (
-            replans,
-            len(recording.layers),
-            len(recording.denoise_steps),
-            len(recording.heads),
-            recording.num_queries,
-        )
-        shapes[f"{site.name}/rows"] = (*cells, site.num_keys)
-        shapes[f"{site.name}/row_sum"] = cells
-        shapes[f"{site.name}/atoms"] = (*cells, len(attributes.segments.get(site.name, ())))
-        shapes[f"{site.name}/key_role"] = (replans, site.num_keys)
-        if recording.contributions:
-            parts = len(attributes.segments.get(site.name, ())) + 1
-            shapes[f"{site.name}/contribution"] = (*cells[:3], parts, parts)
-        if root.numbers_in_arrays:
-            shapes |= {f"{site.name}/{axis}": (len(given),) for axis, given in recording.axis_numbers.items()}
-    return shapes
-
-
 def _metadata_problems(episode: StoredEpisode, file: str) -> Iterator[str]:
     episode.sealed(file)
     yield from ()
@@ -118,7 +88,7 @@ def _array_problems(root: RootAttributes, episode: StoredEpisode, name: str, sha
     recording = root.recording if site is None else root.recording.of_site(site)
     sums = _row_sums(episode, name, array.shape[:-1]) if kind in ("rows", "atoms") else None
     digest, problems = ArrayDigest(), list[str]()
-    step = max(1, (array.shards or array.chunks)[0])
+    step = episode.reading_step(name)
     for first in range(0, array.shape[0], step):
         values = episode.read(name, slice(first, first + step))
         digest.update(values)

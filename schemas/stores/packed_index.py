@@ -10,10 +10,13 @@ import json
 import re
 from dataclasses import dataclass, replace
 
+from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
+from vla_attention.schemas.limits import DOCUMENT_BYTES, ZIP_TAIL_BYTES
 from vla_attention.schemas.safe_text import check_inner_path
 from vla_attention.schemas.stores.byte_source import ByteSource
 from vla_attention.schemas.stores.digest import seal_digest
+from vla_attention.schemas.stores.remote_source import RemoteFailure
 from vla_attention.schemas.stores.store_format import EPISODES_GROUP, StoreError, parse_episode_name
 
 INDEX_FILE = "index.json"
@@ -22,8 +25,6 @@ INDEX_VERSION = 1
 #: Episodes of one task in one folder: a hub takes at most 10,000 files in one.
 _IN_A_FOLDER = 1000
 _PACK_FOLDER = re.compile(r"task[0-9]{3,}_[0-9]{3,}")
-#: An episode's tail has some hundred kilobytes; an index that says more than this is not believed.
-_MOST_TAIL_BYTES = 256_000_000
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class PackedEpisode:
 
     def __post_init__(self) -> None:
         """Check the numbers: the tail is read into memory."""
-        if not (0 <= self.tail < self.bytes < 2**53 and self.bytes - self.tail <= _MOST_TAIL_BYTES):
+        if not (0 <= self.tail < self.bytes < 2**53 and self.bytes - self.tail <= ZIP_TAIL_BYTES):
             raise ValueError(f"a zip of {self.bytes} bytes cannot have its small files from {self.tail} on")
 
 
@@ -88,11 +89,15 @@ def read_index(source: ByteSource, store: object, run: str) -> PackedIndex | Non
         StoreError: it cannot be read, was damaged, or belongs to another run.
     """
     try:
-        content = source.whole(INDEX_FILE)
+        content = source.whole(INDEX_FILE, most=DOCUMENT_BYTES)
+    except RemoteFailure:
+        raise
     except (FileNotFoundError, NotADirectoryError):
         return None
+    except OSError as error:
+        raise StoreError(f"The store {store} cannot be read: its {INDEX_FILE}: {error.strerror or error}.") from None
     try:
-        document = json.loads(content)
+        document = decode_json(content)
         if not isinstance(document, dict) or document.get("format") != INDEX_FORMAT:
             raise ValueError(f"its 'format' is not '{INDEX_FORMAT}'")
         if document.get("version") != INDEX_VERSION:
@@ -100,7 +105,7 @@ def read_index(source: ByteSource, store: object, run: str) -> PackedIndex | Non
         if document.get("digest") != seal_digest(document):
             raise ValueError("its own digest does not fit")
         index = from_json(PackedIndex, document)
-    except (MalformedDocument, ValueError, RecursionError) as error:
+    except (MalformedDocument, ValueError) as error:
         raise StoreError(
             f"The store {store} cannot be read: its {INDEX_FILE} is damaged ({error}). vla-analyze copy --packed "
             "writes it again."

@@ -6,11 +6,12 @@ is opened.
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
@@ -20,15 +21,17 @@ from vla_attention.schemas.cached_property import cached_property
 from vla_attention.schemas.errors import Note, listing
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.jsonable import from_json
-from vla_attention.schemas.layout import Prompt, prompt_at
+from vla_attention.schemas.layout import Prompt, Role, prompt_at
 from vla_attention.schemas.safe_text import visible
-from vla_attention.schemas.stores.byte_source import ByteSource
+from vla_attention.schemas.stores.byte_source import ByteSource, Folder
+from vla_attention.schemas.stores.episode_shapes import misfits
 from vla_attention.schemas.stores.packed_index import INDEX_FILE, PackedEpisode, read_index
 from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
 from vla_attention.schemas.stores.root import group_attributes, list_episodes, read_run
 from vla_attention.schemas.stores.seal import identity_problem, read_seal
 from vla_attention.schemas.stores.sealed_files import SealedFiles
 from vla_attention.schemas.stores.store_format import (
+    EPISODES_GROUP,
     NUMBERS,
     CorruptEpisode,
     EpisodeAttributes,
@@ -43,6 +46,7 @@ from vla_attention.schemas.stores.zip_members import DamagedZip, ZipMembers
 if TYPE_CHECKING:
     import zarr
 
+    from vla_attention.schemas.stores.array_metadata import ArrayMetadata
     from vla_attention.schemas.stores.shards import ShardedLayers
     from vla_attention.schemas.stores.single_chunks import SingleChunk
 
@@ -72,7 +76,11 @@ class StoredEpisode:
         """The episode's files as they are found, not yet compared with the seal."""
         if isinstance(self.place, ZipMembers):
             return replace(self.place)  # what it keeps of the zip goes when this object goes
-        return source_of(self.folder) if self.place is None else self.place
+        if self.place is not None:
+            return self.place
+        if isinstance(self.folder, Path) and self.folder.parent.name == EPISODES_GROUP:
+            return Folder(self.folder, within=self.folder.parents[1])
+        return source_of(self.folder)
 
     @cached_property
     def attributes(self) -> EpisodeAttributes:
@@ -138,6 +146,10 @@ class StoredEpisode:
         return {}
 
     @cached_property
+    def _described(self) -> dict[str, ArrayMetadata]:
+        return {}
+
+    @cached_property
     def _layers(self) -> dict[str, ShardedLayers | None]:
         return {}
 
@@ -165,18 +177,35 @@ class StoredEpisode:
         try:
             # Opened from the bytes that were checked against the seal: zarr does not read the file a second time.
             place = StorePath(SealedArrayStore(self.files, name, metadata))
-            array: zarr.Array[Any] = zarr.Array(zarr.AsyncArray(metadata=cast(Any, metadata), store_path=place))
-        except (KeyError, TypeError, ValueError) as error:
+            document = cast(Any, deepcopy(metadata.document))
+            array: zarr.Array[Any] = zarr.Array(zarr.AsyncArray(metadata=document, store_path=place))
+        except Exception as error:  # zarr has errors of its own for what a zarr.json may say
             raise CorruptEpisode(f"Episode {self.name} lacks the array {name} ({error}).") from None
         return array
 
-    def _metadata(self, name: str) -> dict[str, Any]:
-        """An array's `zarr.json`, which must have the shape that the attributes list."""
-        shape = self.shape_of(name)
-        document = json.loads(self.sealed(f"{name}/zarr.json"))
-        if not isinstance(document, dict) or document.get("shape") != list(shape):
-            raise CorruptEpisode(f"Array {name} of episode {self.name} has another shape than its attributes say.")
-        return document
+    def _metadata(self, name: str) -> ArrayMetadata:
+        """What an array's `zarr.json` says, checked against the attributes, the seal and the format."""
+        if name not in self._described:
+            from vla_attention.schemas.stores.array_metadata import array_metadata
+
+            shape, content = self._listed_shape(name), self.sealed(f"{name}/zarr.json")
+            self._described[name] = self._readable(
+                name, lambda: array_metadata(content, shape, name, self.files.records)
+            )
+        return self._described[name]
+
+    def reading_step(self, name: str) -> int:
+        """Indices along the first axis of an array that are read at once without more memory than is stored for them.
+
+        They are those of a file. A file of which each chunk holds nothing but one number is read chunk by chunk.
+        """
+        metadata = self._metadata(name)
+        step = max(1, metadata.file_shape[0])
+        try:
+            metadata.check_reading((min(step, metadata.shape[0]), *metadata.shape[1:]))
+        except CorruptEpisode:
+            return metadata.chunk_shape[0]
+        return step
 
     def read(self, name: str, index: Any = ...) -> NDArray[Any]:
         """Values of one array, or numbers of the attributes (`NUMBERS`) as one.
@@ -186,7 +215,10 @@ class StoredEpisode:
         """
         stored = self._numbers(name)
         if stored is None:
-            stored = self._single_chunk(name) or self.array(name)
+            stored = self._single_chunk(name)
+            if stored is None:
+                self._check_reading(name, index)
+                stored = self.array(name)
         try:
             values = np.asarray(stored[index])
         except (IndexError, RemoteFailure):
@@ -214,10 +246,14 @@ class StoredEpisode:
         if name not in self._single_chunks:
             from vla_attention.schemas.stores.single_chunks import SingleChunk
 
-            self._single_chunks[name] = SingleChunk.of(self._metadata(name), self.files, name)
+            self._single_chunks[name] = SingleChunk.of(self._metadata(name).document, self.files, name)
         return self._single_chunks[name]
 
     def shape_of(self, name: str) -> tuple[int, ...]:
+        """Shape of one array; raises `CorruptEpisode` for one that its files cannot have."""
+        return self._metadata(name).shape
+
+    def _listed_shape(self, name: str) -> tuple[int, ...]:
         """Shape of one array, as the attributes list it; `CorruptEpisode` when they do not."""
         recorded = self.attributes.arrays.get(name)
         if recorded is None:
@@ -249,8 +285,16 @@ class StoredEpisode:
             from vla_attention.schemas.stores.shards import ShardedLayers
 
             files = self.files
-            self._layers[name] = ShardedLayers.of(self._metadata(name), lambda file: files.shard(f"{name}/{file}"))
+            metadata = self._metadata(name).document
+            self._layers[name] = ShardedLayers.of(metadata, lambda file: files.shard(f"{name}/{file}"))
         return self._layers[name]
+
+    def _check_reading(self, name: str, index: Any) -> None:
+        """Raise `CorruptEpisode` before more memory is taken than the files of an array can hold."""
+        metadata = self._metadata(name)
+        # A view of one number in the array's shape takes no memory.
+        shape = np.broadcast_to(np.empty((), metadata.dtype), metadata.shape)[index].shape
+        self._readable(name, lambda: metadata.check_reading(shape))
 
     def _readable(self, name: str, read: Callable[[], Read]) -> Read:
         try:
@@ -266,9 +310,14 @@ class StoredEpisode:
     def tokens(self, root: RootAttributes, site: str) -> EpisodeTokens:
         """What every key of a site is in this episode."""
         layout = root.site(site)
+        for problem in misfits(root, self.attributes):
+            raise CorruptEpisode(f"Episode {self.name} is damaged: {problem}.")
+        roles = self.read(f"{site}/key_role")
+        if roles.max(initial=0) > max(Role):
+            raise CorruptEpisode(f"Array {site}/key_role of episode {self.name} has codes that are no roles.")
         return EpisodeTokens(
             layout=layout,
-            key_role=_once_if_same(self.read(f"{site}/key_role")),
+            key_role=_once_if_same(roles),
             prompts=self.prompts(root, site),
             prompt_index=self.read("prompt_index"),
             objects=self.attributes.objects,

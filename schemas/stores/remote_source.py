@@ -22,6 +22,8 @@ from typing import Any
 
 from vla_attention.schemas.byte_counts import parse_bytes
 from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.limits import WHOLE_FILE_BYTES
+from vla_attention.schemas.stores.bounded_fetch import fetched
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder, Memory, copy_into, split
 from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
 
@@ -75,14 +77,14 @@ class RemoteFolder:
         """See `ByteSource`."""
         return bool(self.digest) and kept_bytes() is not None
 
-    def whole(self, file: str, *, fresh: bool = False) -> bytes:
+    def whole(self, file: str, *, most: int = WHOLE_FILE_BYTES, fresh: bool = False) -> bytes:
         """See `ByteSource`."""
-        return self._get(file, None, None, fresh)
+        return self._get(file, None, None, fresh, most)
 
     def parts(self, file: str, offset: int, lengths: Sequence[int], *, fresh: bool = False) -> list[bytes]:
         """See `ByteSource`; one request."""
         length = sum(lengths)
-        return split(self._get(file, offset, offset + length, fresh) if length else b"", lengths)
+        return split(self._get(file, offset, offset + length, fresh, length) if length else b"", lengths)
 
     def read_into(self, memory: Memory, file: str, offset: int, *, fresh: bool = False) -> int:
         """See `ByteSource`; one request."""
@@ -106,27 +108,29 @@ class RemoteFolder:
         """See `ByteSource`."""
         return RemoteFolder(self.url, digest)
 
-    def _get(self, file: str, start: int | None, end: int | None, fresh: bool) -> bytes:
+    def _get(self, file: str, start: int | None, end: int | None, fresh: bool, most: int) -> bytes:
         kept = kept_bytes() if self.digest else None
         key = f"{self.digest}\n{file}\n{start}\n{end}"
         if kept is not None and not fresh:
             found = kept.get(key)
             if found is not None:
                 return found
-        content = self._fetch(file, start, end)
+        content = self._fetch(file, start, end, most)
         if kept is not None:
             kept.put(key, content)
         return content
 
-    def _fetch(self, file: str, start: int | None, end: int | None) -> bytes:
+    def _fetch(self, file: str, start: int | None, end: int | None, most: int) -> bytes:
         files, path = _file_system(self.url)
-        content: bytes = _asked(self.url, lambda: files.cat_file(f"{path}/{file}", start=start, end=end))
-        if start is not None and end is not None and len(content) > end - start:
+        content: bytes = _asked(self.url, lambda: fetched(files, f"{path}/{file}", start, end, most))
+        if len(content) <= most:
+            return content
+        if start is not None:
             raise RemoteFailure(
                 f"The server of {self.url} sends whole files where a part was asked for (no range requests), so that "
                 "every number would cost a whole episode; copy the store here, or use a server that has them."
             )
-        return content
+        raise RemoteFailure(f"{self.url}/{file} has more than the {most:,} bytes that such a file has at most.")
 
 
 @dataclass(frozen=True)

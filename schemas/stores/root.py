@@ -6,8 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
+from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
 from vla_attention.schemas.jsonable import MalformedDocument
+from vla_attention.schemas.limits import ROOT_BYTES
+from vla_attention.schemas.regular_files import read_regular
 from vla_attention.schemas.stores.digest import run_digest
 from vla_attention.schemas.stores.packed_index import INDEX_FILE, is_pack_folder
 from vla_attention.schemas.stores.remote_source import RemoteFailure, RemoteFolder, source_of
@@ -46,7 +49,7 @@ def read_run(path: StorePlace) -> tuple[RootAttributes, str]:
             f"Stores in {path.parent}: {listing(nearby, 5)}. Make one with vla-capture."
         )
     try:
-        attributes = group_attributes(source_of(path).whole("zarr.json"))
+        attributes = group_attributes(source_of(path).whole("zarr.json", most=ROOT_BYTES))
     except (RemoteFailure, BadArgument):
         raise
     except (FileNotFoundError, NotADirectoryError):
@@ -57,7 +60,8 @@ def read_run(path: StorePlace) -> tuple[RootAttributes, str]:
             ) from None
         raise StoreError(f"{path} is not a store: it has no zarr.json.") from None
     except (OSError, ValueError) as error:
-        raise StoreError(f"The store {path} cannot be read: {error}.") from None
+        reason = f"its zarr.json: {error.strerror or error}" if isinstance(error, OSError) else error
+        raise StoreError(f"The store {path} cannot be read: {reason}.") from None
     if isinstance(path, Path):
         _refuse_inside(path, attributes)
     try:
@@ -74,7 +78,7 @@ def _refuse_inside(path: Path, attributes: dict[str, Any]) -> None:
         return
     for above in path.absolute().parents:
         try:
-            found = group_attributes((above / "zarr.json").read_bytes())
+            found = group_attributes(read_regular(above / "zarr.json", ROOT_BYTES))
         except (OSError, ValueError):
             return  # the store's groups are all above one another
         if found.get("format") == FORMAT_NAME:
@@ -124,9 +128,9 @@ def list_episodes(path: StorePlace) -> tuple[list[StorePlace], list[str]]:
 def group_attributes(document: bytes) -> dict[str, Any]:
     """The attributes in the `zarr.json` of a Zarr v3 group; raises `ValueError` when the bytes are anything else."""
     try:
-        content = json.loads(document)
-    except RecursionError:
-        raise ValueError("zarr.json is nested too deeply") from None
+        content = decode_json(document)
+    except ValueError as error:
+        raise ValueError(f"zarr.json cannot be decoded: {error}") from None
     if not isinstance(content, dict) or (content.get("zarr_format"), content.get("node_type")) != (3, "group"):
         raise ValueError("zarr.json does not describe a group of Zarr format 3")
     attributes = content.get("attributes", {})
@@ -144,7 +148,7 @@ def fields_beyond(document: dict[str, Any]) -> list[str]:
 def without_other_fields(content: bytes) -> bytes:
     """A group's `zarr.json` as it is, or a new one with its attributes only where it says more (`fields_beyond`)."""
     attributes = group_attributes(content)
-    if not fields_beyond(json.loads(content)):
+    if not fields_beyond(decode_json(content)):
         return content
     return group_document(attributes)
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from vla_attention.schemas.jsonable import from_json, to_json
+from vla_attention.schemas.limits import DOCUMENT_BYTES
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder
 from vla_attention.schemas.stores.digest import bytes_digest, seal_digest
 from vla_attention.schemas.stores.root import group_attributes
@@ -57,7 +58,7 @@ def read_seal(place: Path | ByteSource, *, fresh: bool = False) -> EpisodeSeal:
         ValueError: it is no seal, or its own digest does not fit.
     """
     source = Folder(place) if isinstance(place, Path) else place
-    attributes = group_attributes(source.whole(SEAL_FILE, fresh=fresh))
+    attributes = group_attributes(source.whole(SEAL_FILE, most=DOCUMENT_BYTES, fresh=fresh))
     if attributes.get("digest") != seal_digest(attributes):
         raise ValueError("its own digest does not fit")
     return from_json(EpisodeSeal, attributes)

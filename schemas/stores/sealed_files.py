@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from vla_attention.schemas.limits import DOCUMENT_BYTES
+from vla_attention.schemas.regular_files import NotRegular
 from vla_attention.schemas.stores.byte_source import ByteSource
 from vla_attention.schemas.stores.digest import bytes_digest
 from vla_attention.schemas.stores.remote_source import RemoteFailure
@@ -21,17 +23,23 @@ class SealedFiles:
     records: Mapping[str, FileRecord]
     _shards: dict[str, SealedShard] = field(default_factory=dict, repr=False, compare=False)
 
-    def whole(self, file: str) -> bytes:
+    def whole(self, file: str, most: int | None = None) -> bytes:
         """All bytes of a file.
+
+        most: bytes that it may have; without, as many as the seal says, and no more than documents have at most.
 
         Raises:
             CorruptEpisode: the file is missing, not in the seal, or not the one that was sealed.
         """
         record = self._record(file)
+        if most is None:
+            most = DOCUMENT_BYTES if file.endswith("zarr.json") else record.size
+        if record.size > most:
+            raise CorruptEpisode(f"its {file} has {record.size:,} bytes; expected at most {most:,}")
         # A cache may have kept damaged bytes: they are asked for anew once.
         for fresh in (False, True) if self.source.remembers else (False,):
             try:
-                content = self.source.whole(file, fresh=fresh)
+                content = self.source.whole(file, most=most, fresh=fresh)
             except RemoteFailure:
                 raise
             except OSError as error:
@@ -79,4 +87,6 @@ class SealedFiles:
 def _lost(file: str, error: OSError) -> str:
     if isinstance(error, DamagedZip):
         return str(error)
+    if isinstance(error, NotRegular):
+        return f"its {file} cannot be read: {error.strerror}"
     return f"it has lost its {file} ({error.strerror or error})"

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import AsyncIterator, Iterable
-from typing import Any
 
 import numpy as np
 from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Store, SuffixByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype
 
+from vla_attention.schemas.limits import WHOLE_FILE_BYTES
+from vla_attention.schemas.stores.array_metadata import ArrayMetadata, check_shard, inner_codecs
 from vla_attention.schemas.stores.sealed_files import SealedFiles
 from vla_attention.schemas.stores.shards import CHECKSUM_BYTES, SealedShard, check_blosc_frame
 from vla_attention.schemas.stores.store_format import CorruptEpisode
@@ -27,12 +27,13 @@ class SealedArrayStore(Store):
     supports_deletes = False
     supports_listing = False
 
-    def __init__(self, files: SealedFiles, name: str, metadata: dict[str, Any]) -> None:
-        """Serve the array `name`; `metadata` is its checked `zarr.json`."""
+    def __init__(self, files: SealedFiles, name: str, metadata: ArrayMetadata) -> None:
+        """Serve the array `name`; `metadata` are those of its checked `zarr.json`."""
         super().__init__(read_only=True)
         self._files = files
         self._name = name
-        self._expected = _frame_sizes(metadata)
+        self._metadata = metadata
+        self._codecs = inner_codecs(metadata.document)
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         """The bytes of a file of the array, or of a part of it."""
@@ -45,19 +46,30 @@ class SealedArrayStore(Store):
         return [await self.get(key, prototype, byte_range) for key, byte_range in key_ranges]
 
     def _bytes(self, file: str, byte_range: ByteRequest | None) -> bytes:
-        shard = self._files.shard(file)
+        shard = self._shard(file)
         if shard is not None and byte_range is not None:
             part = self._part(shard, byte_range)
             if part is not None:
                 return part
-        content = self._files.whole(file)
+        content = self._files.whole(file, WHOLE_FILE_BYTES if shard is None else None)
         if shard is None:
-            self._check_frame(content[:-CHECKSUM_BYTES], file)
+            self._check_frame(content[:-CHECKSUM_BYTES] if self._codecs[-1] == "crc32c" else content, file)
         else:
             for offset, length in shard.index.tolist():
                 if length:
                     self._check_frame(content[offset : offset + length - CHECKSUM_BYTES], file)
         return _cut(content, byte_range)
+
+    def _shard(self, file: str) -> SealedShard | None:
+        """The shard in a file; None for a file of one chunk, and for shards whose chunks have no checksums."""
+        record = self._files.records.get(file)
+        if record is None:
+            return None  # `whole` says so
+        check_shard(self._metadata, record, file)
+        shard = None if self._metadata.shard_chunks is None else self._files.shard(file)
+        if shard is None and self._metadata.shard_chunks is not None:
+            raise CorruptEpisode(f"the seal does not list the chunks of its {file}")
+        return shard
 
     def _part(self, shard: SealedShard, wanted: ByteRequest) -> bytes | None:
         """The shard's index or one of its chunks; None when the wanted part is something else."""
@@ -74,10 +86,10 @@ class SealedArrayStore(Store):
 
     def _check_frame(self, frame: bytes, file: str) -> None:
         """Compare the sizes in the header of an encoded chunk, without its checksum, with those of the array."""
-        if self._expected is None:
+        if "blosc" not in self._codecs:
             return
         try:
-            check_blosc_frame(frame, *self._expected)
+            check_blosc_frame(frame, self._metadata.chunk_bytes, self._metadata.typesize)
         except CorruptEpisode as error:
             raise CorruptEpisode(f"a chunk of its {file} cannot be decoded: {error}") from None
 
@@ -128,13 +140,3 @@ def _cut(content: bytes, byte_range: ByteRequest | None) -> bytes:
     if isinstance(byte_range, SuffixByteRequest):
         return content[max(0, len(content) - byte_range.suffix) :]
     return content
-
-
-def _frame_sizes(metadata: dict[str, Any]) -> tuple[int, int] | None:
-    """Decoded bytes of a chunk and bytes a number of its Blosc frame; None when chunks are encoded in another way."""
-    codecs, shape = metadata["codecs"], metadata["chunk_grid"]["configuration"]["chunk_shape"]
-    if codecs[0]["name"] == "sharding_indexed":
-        codecs, shape = codecs[0]["configuration"]["codecs"], codecs[0]["configuration"]["chunk_shape"]
-    if [codec["name"] for codec in codecs] != ["bytes", "blosc", "crc32c"]:
-        return None
-    return math.prod(shape) * np.dtype(metadata["data_type"]).itemsize, codecs[1]["configuration"]["typesize"]

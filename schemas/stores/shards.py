@@ -13,6 +13,7 @@ was: bytes of the process, which would pass for attention.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.schemas.cached_property import cached_property
+from vla_attention.schemas.limit_checks import TooLarge, check_decoded
 from vla_attention.schemas.stores.byte_source import ByteSource, Memory
 from vla_attention.schemas.stores.digest import bytes_digest, crc32c
 from vla_attention.schemas.stores.remote_source import RemoteFailure
@@ -40,19 +42,22 @@ def chunks_of_a_shard(metadata: dict[str, Any]) -> int | None:
     They can when every chunk ends with its crc32c, and the file with its index. `metadata` is the array's `zarr.json`;
     that of a group gives None, too.
     """
-    codecs = metadata.get("codecs", [])
-    if [codec["name"] for codec in codecs] != ["sharding_indexed"]:
-        return None
-    inner = codecs[0]["configuration"]
-    shard = metadata["chunk_grid"]["configuration"]["chunk_shape"]
-    bound = (
-        inner["codecs"][-1]["name"] == "crc32c"
-        and inner.get("index_location", "end") == "end"
-        and [codec["name"] for codec in inner["index_codecs"]] == ["bytes", "crc32c"]
-        and inner["index_codecs"][0]["configuration"]["endian"] == "little"
-    )
-    counts = (extent // chunk for extent, chunk in zip(shard, inner["chunk_shape"], strict=True))
-    return int(np.prod(list(counts))) if bound else None
+    try:
+        codecs = metadata.get("codecs", [])
+        if [codec["name"] for codec in codecs] != ["sharding_indexed"]:
+            return None
+        inner = codecs[0]["configuration"]
+        shard = metadata["chunk_grid"]["configuration"]["chunk_shape"]
+        bound = (
+            inner["codecs"][-1]["name"] == "crc32c"
+            and inner.get("index_location", "end") == "end"
+            and [codec["name"] for codec in inner["index_codecs"]] == ["bytes", "crc32c"]
+            and inner["index_codecs"][0]["configuration"]["endian"] == "little"
+        )
+        counts = [extent // chunk for extent, chunk in zip(shard, inner["chunk_shape"], strict=True)]
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None  # whoever reads the array says what is wrong with it
+    return math.prod(counts) if bound else None
 
 
 def chunk_file(keys: Mapping[str, Any], place: Sequence[int]) -> str:
@@ -116,6 +121,8 @@ class SealedShard:
         """Read the index; raises `CorruptEpisode` unless it is the one in the seal, and `OSError` without the file."""
         checksums = bytes.fromhex(record.chunks)
         size = index_size(len(checksums) // CHECKSUM_BYTES)
+        if record.size < size:
+            raise CorruptEpisode(f"its {file} has {record.size} bytes in the seal, and an index of {size}")
         for fresh in (False, True) if source.remembers else (False,):
             # One byte more: a file that has grown is not the one that was sealed.
             stored, more = source.parts(file, max(0, record.size - size), (size, 1), fresh=fresh)
@@ -133,6 +140,10 @@ class SealedShard:
     def longest(self) -> int:
         """Bytes of the longest chunk, with its checksum."""
         return int(self.index[:, 1].max(initial=0))
+
+    def stored(self) -> int:
+        """Bytes of all chunks."""
+        return int(self.index[:, 1].sum())
 
     def chunk(self, number: int, memory: Memory | None = None) -> Memory:
         """The encoded bytes of one chunk, without the checksum that follows them in the file.
@@ -239,7 +250,7 @@ class ShardedLayers:
                 and [codec["name"] for codec in inner["codecs"]] == ["bytes", "blosc", "crc32c"]
                 and inner["codecs"][0]["configuration"]["endian"] == "little"
             )
-        except (AttributeError, KeyError, TypeError, ValueError, ZeroDivisionError):
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError, ZeroDivisionError):
             return None  # zarr says what is wrong with them
         return cls(shape, block, shard[0] // block, metadata["chunk_key_encoding"], shard_in) if known else None
 
@@ -258,12 +269,23 @@ class ShardedLayers:
         shard = self.shard(file)
         if shard is None:
             raise CorruptEpisode(f"the seal does not list the chunks of its {file}")
+        expected = self.blocks_per_shard * self.shape[1] * self.shape[2]
+        if len(shard.index) != expected:
+            raise CorruptEpisode(f"its {file} has {expected} chunks, and its seal lists {len(shard.index)}")
         return shard
 
     def memory(self) -> LayerMemory:
-        """Memory for `read`."""
-        values = np.empty((self.num_blocks * self.block, *self.shape[3:]), dtype="<f4")
-        return LayerMemory(values, np.empty(max(shard.longest() for shard in self._shards), np.uint8))
+        """Memory for `read`; raises `CorruptEpisode` for more than the shards can hold."""
+        shape = (self.num_blocks * self.block, *self.shape[3:])
+        longest = max((shard.longest() for shard in self._shards), default=0)
+        try:
+            check_decoded("a layer of it", 4 * math.prod(shape), sum(shard.stored() for shard in self._shards))
+        except TooLarge as error:
+            raise CorruptEpisode(str(error)) from None
+        most = 4 * math.prod((self.block, *self.shape[3:])) + _BLOSC_HEADER.size + CHECKSUM_BYTES
+        if longest > most:
+            raise CorruptEpisode(f"its index names a chunk of {longest} bytes; expected at most {most}")
+        return LayerMemory(np.empty(shape, dtype="<f4"), np.empty(longest, np.uint8))
 
     def read(self, layer: int, denoise: int, memory: LayerMemory | None = None) -> NDArray[np.float32]:
         """Values (replan, ...) of one layer and denoise step, both positions along their axes.

@@ -14,12 +14,12 @@ import numpy as np
 from numcodecs import blosc
 from numpy.typing import NDArray
 
+from vla_attention.schemas.limits import WHOLE_FILE_BYTES
+from vla_attention.schemas.stores.array_metadata import TYPES
 from vla_attention.schemas.stores.digest import crc32c
 from vla_attention.schemas.stores.sealed_files import SealedFiles
 from vla_attention.schemas.stores.shards import CHECKSUM_BYTES, check_blosc_frame, chunk_file
 from vla_attention.schemas.stores.store_format import CorruptEpisode
-
-_TYPES = ("uint8", "int32", "int64", "float32", "float64")
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class SingleChunk:
         try:
             shape, codecs = tuple(metadata["shape"]), metadata["codecs"]
             known = (
-                metadata["data_type"] in _TYPES
+                metadata["data_type"] in TYPES
                 and tuple(metadata["chunk_grid"]["configuration"]["chunk_shape"]) == shape
                 and not metadata.get("storage_transformers")
                 and [codec["name"] for codec in codecs] == ["bytes", "blosc", "crc32c"]
@@ -56,14 +56,14 @@ class SingleChunk:
                 return None
             typesize = codecs[1]["configuration"]["typesize"]
             file = chunk_file(metadata["chunk_key_encoding"], (0,) * len(shape))
-        except (AttributeError, KeyError, TypeError, ValueError):
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError):
             return None  # zarr says what is wrong with them
         dtype = np.dtype(metadata["data_type"]).newbyteorder("<")
         return cls(files, f"{name}/{file}", shape, dtype, typesize)
 
     def __getitem__(self, index: Any) -> NDArray[Any]:
         """Values at a numpy index; raises `CorruptEpisode` for other bytes than were sealed, and for other sizes."""
-        content = self.files.whole(self.file)
+        content = self.files.whole(self.file, WHOLE_FILE_BYTES)
         frame, checksum = content[:-CHECKSUM_BYTES], content[-CHECKSUM_BYTES:]
         if crc32c(frame) != int.from_bytes(checksum, "little"):
             raise CorruptEpisode(f"the checksum of its {self.file} does not fit")

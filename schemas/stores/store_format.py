@@ -31,7 +31,20 @@ from vla_attention.schemas.errors import BadArgument, UserError, listing, unknow
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.layout import Prompt, SiteLayout
-from vla_attention.schemas.safe_text import check_inner_path, check_name, check_text
+from vla_attention.schemas.limit_checks import check_at_most
+from vla_attention.schemas.limits import (
+    AXIS,
+    EPISODE_FILES,
+    GROWING_CELLS,
+    KEYS,
+    PLACES,
+    QUERIES,
+    REPLANS,
+    SITES,
+    SPANS,
+)
+from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
+from vla_attention.schemas.safe_text import check_free_text, check_inner_path, check_name, check_text
 from vla_attention.schemas.segments import Segment
 
 FORMAT_NAME = "vla-attention"
@@ -61,7 +74,9 @@ NUMBERS = {
 #: The group of an episode whose attributes are an `EpisodeSeal`.
 SEAL_GROUP = "seal"
 
-_EPISODE_NAME = re.compile(r"task([0-9]{3,})_episode([0-9]{3,})")
+#: Numbers of up to twelve digits.
+_EPISODE_NAME = re.compile(r"task([0-9]{3,12})_episode([0-9]{3,12})")
+_CHECKSUMS = re.compile(r"([0-9a-fA-F]{8})*")
 
 
 class StoreError(UserError, ValueError):
@@ -109,6 +124,19 @@ class Recording:
     frames: bool = True
     contributions: bool = False
     num_pools: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the numbers: arrays have axes of these lengths."""
+        for what, numbers in self.axis_numbers.items():
+            name = "denoise steps" if what == "denoise" else f"{what}s"
+            check_at_most(f"The number of recorded {name}", len(numbers), AXIS, least=1)
+            check_at_most(f"The lowest of the recorded {name}", min(numbers), AXIS)
+            check_at_most(f"The highest of the recorded {name}", max(numbers), AXIS)
+        check_at_most("The number of action queries", self.num_action_queries, QUERIES)
+        check_at_most("The number of pools of action queries", self.num_pools, QUERIES)
+        check_at_most("The number of mantissa bits", self.mantissa_bits, FLOAT32_MANTISSA_BITS)
+        places = len(self.layers) * len(self.denoise_steps) * len(self.heads) * self.num_queries
+        check_at_most("The number of layers x denoise steps x heads x queries", places, PLACES)
 
     @property
     def num_queries(self) -> int:
@@ -228,6 +256,8 @@ class PolicyIdentity:
         """Check that names and addresses are text of one line."""
         for name in ("name", "family", "checkpoint", "checkpoint_format", "digest"):
             check_text(f"policy's {name}", getattr(self, name))
+        for name in ("num_layers", "num_heads", "num_denoise_steps", "action_horizon"):
+            check_at_most(f"The policy's {name}", getattr(self, name), AXIS)
 
 
 @dataclass(frozen=True)
@@ -283,11 +313,15 @@ class RootAttributes:
 
     def __post_init__(self) -> None:
         """Check that sites have different names, and that something of each is recorded."""
+        check_at_most("The number of sites of the run", len(self.sites), SITES, least=1)
         names = [site.name for site in self.sites]
         if len(set(names)) != len(names):
             raise BadArgument(f"The sites {listing(names)} do not have different names.")
         for site in self.sites:
-            self.recording.of_site(site)
+            recording, growing = self.recording.of_site(site), site.growing_span
+            if growing is not None:
+                cells = recording.num_action_queries * growing.num_keys
+                check_at_most(f"The number of queries x generated keys of site '{site.name}'", cells, GROWING_CELLS)
 
     @property
     def version_text(self) -> str:
@@ -344,6 +378,13 @@ class FileRecord:
     index: str = ""
     chunks: str = ""
 
+    def __post_init__(self) -> None:
+        """Check the size and the form of the checksums."""
+        if self.size < 0:
+            raise BadArgument(f"a file of {self.size} bytes")
+        if self.chunks and not _CHECKSUMS.fullmatch(self.chunks):
+            raise BadArgument("the checksums of the chunks of a file are not 8 hexadecimal digits each")
+
 
 @dataclass(frozen=True)
 class EpisodeSeal:
@@ -362,6 +403,7 @@ class EpisodeSeal:
 
     def __post_init__(self) -> None:
         """Check the paths: a seal lists files inside of its episode's folder."""
+        check_at_most("The number of files", len(self.files), EPISODE_FILES)
         for path in self.files:
             check_inner_path(path)
 
@@ -400,8 +442,15 @@ class EpisodeAttributes:
     denoise_time: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check the task's name, and the names of arrays, which are paths."""
+        """Check the task's name, the names of arrays, which are paths, and the lengths."""
         check_name("task", self.task_name)
+        check_free_text("instruction", self.instruction)
+        check_at_most("The number of replans", self.num_replans, REPLANS)
+        check_at_most("The number of prompts", len(self.prompts), REPLANS)
+        check_at_most("The number of objects", len(self.objects), KEYS)
+        check_at_most("The number of arrays", len(self.arrays), EPISODE_FILES)
+        for site, segments in self.segments.items():
+            check_at_most(f"The number of segments of site '{site}'", len(segments), 16 * SPANS)
         for path in self.arrays:
             check_inner_path(path)
 

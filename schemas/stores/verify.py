@@ -6,11 +6,12 @@ everything is read (`episode_checks.py`). Foreign files are named and are no fau
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
+from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import listing
+from vla_attention.schemas.limits import ROOT_BYTES
 from vla_attention.schemas.stores.completeness import check_presence
 from vla_attention.schemas.stores.digest import seal_digest
 from vla_attention.schemas.stores.episode_checks import content_problems
@@ -100,9 +101,9 @@ def store_faults(store: Store) -> list[Fault]:
 
 
 def _group_problems(store: Store, file: str) -> Iterator[str]:
-    content = source_of(store.path).whole(file)
+    content = source_of(store.path).whole(file, most=ROOT_BYTES)
     attributes = group_attributes(content)
-    if others := fields_beyond(json.loads(content)):
+    if others := fields_beyond(decode_json(content)):
         yield f"it says more than that it is a group with attributes: {listing(others, 5)}"
     if file == EPISODES_DOCUMENT:
         if attributes:

@@ -17,11 +17,16 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+from vla_attention.schemas.limits import EPISODE_FILES, WHOLE_FILE_BYTES
 from vla_attention.schemas.stores.byte_source import ByteSource, Memory, copy_into, split
 
 #: Bytes of a local header before the file's name.
 LOCAL_HEADER_BYTES = 30
 _ENCRYPTED, _DESCRIPTOR = 0x1, 0x8
+#: Bytes between files that are read at once; zips of ours have some hundred.
+_BYTES_AT_ONCE = 16_000_000
+#: What every entry of a zip's directory begins with.
+_ENTRY = b"PK\x01\x02"
 
 
 class DamagedZip(OSError):
@@ -51,9 +56,12 @@ class ZipMembers:
         """See `ByteSource`."""
         return self.source.remembers
 
-    def whole(self, file: str, *, fresh: bool = False) -> bytes:
+    def whole(self, file: str, *, most: int = WHOLE_FILE_BYTES, fresh: bool = False) -> bytes:
         """See `ByteSource`."""
-        return self.parts(file, 0, (self.size(file),), fresh=fresh)[0]
+        size = self.size(file)
+        if size > most:
+            raise DamagedZip(f"its {file} has {size:,} bytes; expected at most {most:,}")
+        return self.parts(file, 0, (size,), fresh=fresh)[0]
 
     def parts(self, file: str, offset: int, lengths: Sequence[int], *, fresh: bool = False) -> list[bytes]:
         """See `ByteSource`."""
@@ -94,9 +102,9 @@ class ZipMembers:
         members, tail = self._opened()
         digest, at = hashlib.sha256(), 0
         for first, size in [*sorted(members.values()), (self.length, 0)]:
-            before = max(0, min(first, self.tail) - at)
-            if before:
-                digest.update(self.source.parts(self.file, at, (before,))[0])
+            for start in range(at, min(first, self.tail), _BYTES_AT_ONCE):
+                length = min(_BYTES_AT_ONCE, min(first, self.tail) - start)
+                digest.update(self.source.parts(self.file, start, (length,))[0])
             if first > self.tail:
                 digest.update(tail[max(at, self.tail) - self.tail : first - self.tail])
             at = first + size
@@ -138,6 +146,8 @@ class ZipMembers:
         tail, more = self.source.parts(self.file, self.tail, (wanted, 0 if self.remembers else 1), fresh=fresh)
         if len(tail) != wanted or more:
             raise DamagedZip(f"its zip {self.file} has not the {self.length} bytes that the index says")
+        if tail.count(_ENTRY) > EPISODE_FILES:  # before an object is made of each
+            raise DamagedZip(f"its zip {self.file} has more than {EPISODE_FILES:,} files")
         try:
             with zipfile.ZipFile(_Tail(tail, self.tail)) as opened:
                 members, end = opened.infolist(), opened.start_dir

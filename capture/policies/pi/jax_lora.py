@@ -15,7 +15,7 @@ import numpy as np
 
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch
 
-_LORA = re.compile(r"(.*[/_])lora_([ab])$")
+_LORA = re.compile(r"(.*[/_])lora_([ab])\Z")
 
 
 @dataclass(frozen=True)

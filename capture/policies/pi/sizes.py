@@ -144,7 +144,7 @@ _HEAD_AXES = {
     "qkv_einsum": (("num_heads", 2), ("num_kv_heads", 2), ("head_dim", 4)),
     "attn_vec_einsum": (("num_heads", 1), ("head_dim", 2)),
 }
-_HEAD_LEAF = re.compile(r"PaliGemma/llm/layers/attn/(\w+?)(_1)?/w$")
+_HEAD_LEAF = re.compile(r"PaliGemma/llm/layers/attn/(\w+?)(_1)?/w\Z")
 
 
 def check_jax_heads(shapes: Mapping[str, tuple[int, ...]], config: PiConfig) -> None:

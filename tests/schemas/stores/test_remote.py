@@ -257,6 +257,14 @@ def test_an_answer_of_another_place_is_never_a_number(server, packed):
     assert read_all(f"{server.url}/a.zarr", packed)
 
 
+@pytest.mark.parametrize(("file", "most"), [("zarr.json", "4,000,000"), ("index.json", "32,000,000")])
+def test_no_more_is_read_than_a_file_may_have(server, packed, file, most):
+    """A server that goes on sending; it is not asked how much there is."""
+    server.change = lambda path, content: b" " * 40_000_000 if path.endswith(f"a.zarr/{file}") else content
+    (problem,) = read_all(f"{server.url}/a.zarr", packed)
+    assert f"a.zarr/{file} has more than the {most} bytes that such a file has at most" in problem
+
+
 def test_a_server_without_ranges_is_refused_with_a_sentence(server, packed, capsys):
     server.ranges = False
     assert "range requests" in " ".join(read_all(f"{server.url}/a.zarr", packed))

@@ -1,0 +1,105 @@
+"""Reading JSON and TOML that somebody else may have written: size, nesting and numbers are bounded.
+
+Every problem is a `ValueError` with a sentence: not a traceback of Python's recursion, of its limit of digits, or of
+memory. `jsonable.py` decodes what comes out into dataclasses.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from typing import Any
+
+from vla_attention.schemas.limits import DOCUMENT_BYTES, DOCUMENT_NESTS, NESTING
+
+_OTHER_BYTES = bytes(set(range(256)) - set(b"[]{}"))
+#: Strings of JSON, in which brackets mean nothing. The quantifier gives nothing back, so that the time is linear.
+_STRING = re.compile(rb'"(?:[^"\\]|\\.)*+"', re.DOTALL)
+#: An escaped part of a surrogate pair; half a pair can be neither printed nor written to a file.
+_SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
+#: Strings and comments of TOML, likewise.
+_TOML_TEXT = re.compile(r'"""(?:[^\\]|\\.)*?"""|\'\'\'.*?\'\'\'|"(?:[^"\\\n]|\\.)*+"|\'[^\'\n]*+\'|#[^\n]*+', re.DOTALL)
+
+
+def decode_json(content: bytes, most: int = DOCUMENT_BYTES, nests: int = DOCUMENT_NESTS) -> Any:
+    """The value of a JSON document; `NaN` and `Infinity` are numbers, as Python's json reads them.
+
+    Args:
+        content: the document, in UTF-8.
+        most: bytes that it may have.
+        nests: lists and objects that it may have.
+
+    Raises:
+        ValueError: it is no JSON, or larger, nested deeper or with longer numbers than any that we read.
+    """
+    if len(content) > most:
+        raise ValueError(f"it has {len(content):,} bytes; expected at most {most:,}")
+    _check_brackets(content, nests)
+    try:
+        document = json.loads(content)
+        if _SURROGATE.search(content):
+            json.dumps(document, ensure_ascii=False).encode()
+        return document
+    except RecursionError:
+        raise ValueError(_too_deep()) from None
+    except json.JSONDecodeError:
+        raise
+    except UnicodeEncodeError:
+        raise ValueError("it has half a surrogate pair, which is no character") from None
+    except UnicodeDecodeError as error:
+        raise ValueError(f"it is no text in UTF-8: {error.reason} at byte {error.start}") from None
+    except ValueError:
+        raise ValueError("it has a whole number of more than 4,000 digits") from None
+
+
+def _check_brackets(content: bytes, nests: int) -> None:
+    """Raise `ValueError` for more lists and objects, or for more of them in one another, than we read."""
+    brackets = content.translate(None, _OTHER_BYTES)
+    if len(brackets) > 2 * nests:
+        raise ValueError(f"it has more than {nests:,} lists and objects")
+    if _is_flat(brackets):
+        return
+    # Texts may hold brackets that are never closed.
+    if not _is_flat(_STRING.sub(b"", content).translate(None, _OTHER_BYTES)):
+        raise ValueError(_too_deep())
+
+
+def _is_flat(brackets: bytes) -> bool:
+    """Whether brackets, with nothing between them, are at most `NESTING` deep; false where they do not match."""
+    for _ in range(NESTING):
+        if not brackets:
+            return True
+        shorter = brackets.replace(b"[]", b"").replace(b"{}", b"")
+        if len(shorter) == len(brackets):
+            return len(brackets) <= NESTING  # unbalanced: the parser says where
+        brackets = shorter
+    return not brackets
+
+
+def _too_deep() -> str:
+    return f"its lists and objects are nested more than {NESTING} deep"
+
+
+def decode_toml(text: str) -> dict[str, Any]:
+    """The table of a TOML document.
+
+    Raises:
+        ValueError: it is no TOML, or nested deeper or with longer numbers than any that we read. tomllib takes time in
+            the square of the parts of a dotted key.
+    """
+    # Texts without their content: no bracket, dot or line end in them counts.
+    bare = _TOML_TEXT.sub("_", text)
+    dots = max((line.partition("=")[0].count(".") for line in bare.split("\n")), default=0)
+    inline = max((line.count(".") for line in bare.split("\n") if "{" in line), default=0)
+    if dots > NESTING or inline > 10 * NESTING or not _is_flat(re.sub(r"[^][{}]", "", bare).encode()):
+        raise ValueError(f"its tables and lists are nested more than {NESTING} deep")
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        raise
+    except RecursionError:
+        raise ValueError(f"its tables and lists are nested more than {NESTING} deep") from None
+    except (ValueError, OverflowError) as error:
+        reason = "it has a whole number of more than 4,000 digits" if "digits" in str(error) else str(error)
+        raise ValueError(reason) from None

@@ -1,0 +1,70 @@
+"""Whether the arrays, numbers and names of an episode are those that its run has: looked at before any is read.
+
+An analysis takes its axes from the run and its numbers from the episode. Each of them may be whole and sealed, and the
+two not belong together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from vla_attention.schemas.layout import Role
+from vla_attention.schemas.stores.store_format import (
+    NUMBERS,
+    EpisodeAttributes,
+    RootAttributes,
+)
+
+_ROLES = frozenset(role.label for role in Role)
+
+
+def expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dict[str, tuple[int, ...]]:
+    """First axes of every array that must be there; arrays that are not named here begin with the replans."""
+    replans = attributes.num_replans
+    shapes: dict[str, tuple[int, ...]] = {"denoise_time": (len(root.recording.denoise_steps),)}
+    shapes |= dict.fromkeys(("env_step", "prompt_index"), (replans,))
+    if not root.protocol.of_other_loop:
+        shapes |= dict.fromkeys(("noise_seed", "state", "actions"), (replans,))
+    if "dataset_actions" in attributes.arrays:
+        shapes["dataset_action_count"] = (replans,)
+    for site in root.sites:
+        recording = root.recording.of_site(site)
+        cells = (
+            replans,
+            len(recording.layers),
+            len(recording.denoise_steps),
+            len(recording.heads),
+            recording.num_queries,
+        )
+        shapes[f"{site.name}/rows"] = (*cells, site.num_keys)
+        shapes[f"{site.name}/row_sum"] = cells
+        shapes[f"{site.name}/atoms"] = (*cells, len(attributes.segments.get(site.name, ())))
+        shapes[f"{site.name}/key_role"] = (replans, site.num_keys)
+        if recording.contributions:
+            parts = len(attributes.segments.get(site.name, ())) + 1
+            shapes[f"{site.name}/contribution"] = (*cells[:3], parts, parts)
+        if root.numbers_in_arrays:
+            shapes |= {f"{site.name}/{axis}": (len(given),) for axis, given in recording.axis_numbers.items()}
+    return shapes
+
+
+def misfits(root: RootAttributes, attributes: EpisodeAttributes) -> Iterator[str]:
+    """What of an episode's attributes does not belong to its run, as sentences without a full stop. Reads no array."""
+    replans = attributes.num_replans
+    listed = {name: record.shape for name, record in attributes.arrays.items()}
+    listed |= {name: (len(numbers),) for name in NUMBERS if (numbers := getattr(attributes, name))}
+    shapes = expected_shapes(root, attributes)
+    for site in root.sites:
+        spans = {span.name for span in site.spans}
+        for segment in attributes.segments.get(site.name, ()):
+            if segment.span not in spans or segment.role not in _ROLES:
+                yield f"its segment '{segment.role}' of span '{segment.span}' is none of site '{site.name}'"
+        for span in site.spans:
+            if span.camera is not None:
+                shapes[f"objects/{span.camera}"] = (replans, span.num_keys, len(attributes.objects))
+    for name, shape in listed.items():
+        expected = shapes.get(name, (replans,))
+        if shape[: len(expected)] != expected:
+            yield f"{name} has the shape {shape}; expected {expected}"
+    if not all(0 <= number < len(attributes.prompts) for number in attributes.prompt_index):
+        yield "prompt_index names prompts that the attributes do not have"

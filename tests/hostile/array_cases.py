@@ -1,0 +1,255 @@
+"""Arrays of stores: what their zarr.json claims, and bytes that decode to more than they may."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numcodecs import blosc
+from zarr.codecs import BloscCodec, Crc32cCodec
+
+from tests.hostile.changes import (
+    VERIFY,
+    Case,
+    change_index,
+    edit_array,
+    edit_episode,
+    episode_of,
+    replace_chunk,
+    rows_file,
+    seal_again,
+)
+from tests.kit.attacks import files_of, with_checksum
+from vla_attention.schemas.stores.digest import bytes_digest
+from vla_attention.testing.stores import reseal
+
+ROWS = "Array joint/rows of episode task000_episode000 cannot be read: "
+ATOMS = "Array joint/atoms of episode task000_episode000 cannot be read: "
+STATE = "Array state of episode task000_episode000 cannot be read: "
+#: Zeros that take some kilobytes of a file.
+BOMB = 96_000_000
+
+
+def _rows(change: Callable[[dict[str, Any]], object], shape: Any = None) -> Callable[[Path], None]:
+    return lambda store: edit_array(store, "joint/rows", change, shape)
+
+
+def _atoms(change: Callable[[dict[str, Any]], object], shape: Any = None) -> Callable[[Path], None]:
+    return lambda store: edit_array(store, "joint/atoms", change, shape)
+
+
+def _state(change: Callable[[dict[str, Any]], object], shape: Any) -> Callable[[Path], None]:
+    """Of the state an analysis knows the number of replans only."""
+    return lambda store: edit_array(store, "state", change, shape)
+
+
+def _codecs(codecs: list[Any]) -> Callable[[Path], None]:
+    return _atoms(lambda content: content.update(codecs=codecs))
+
+
+def _chunks(content: dict[str, Any]) -> list[int]:
+    extents: list[int] = content["chunk_grid"]["configuration"]["chunk_shape"]
+    return extents
+
+
+def _inner(content: dict[str, Any]) -> dict[str, Any]:
+    settings: dict[str, Any] = content["codecs"][0]["configuration"]
+    return settings
+
+
+def _blosc_bomb(name: bytes) -> Callable[[Path], None]:
+    """One chunk of states that is what it says: zeros, in a file of a hundredth or less."""
+
+    def make(store: Path) -> None:
+        frame = blosc.compress(np.zeros(BOMB // 8), name, 9, blosc.SHUFFLE, typesize=8)
+        replace_chunk(store, "state", frame)
+        shape = [2, BOMB // 16]
+        edit_array(store, "state", lambda content: _chunks(content).__setitem__(slice(None), shape), shape=shape)
+
+    return make
+
+
+def _lying_frame(store: Path) -> None:
+    """A frame whose header says that it decodes to 2 GB."""
+    (file,) = files_of(episode_of(store), "joint/atoms")
+    frame = bytearray(file.read_bytes()[:-4])
+    frame[4:8] = (2_000_000_000).to_bytes(4, "little")
+    replace_chunk(store, "joint/atoms", bytes(frame))
+
+
+def _large_pictures(store: Path) -> None:
+    """Pictures of zeros that take 96 MB, in chunks of 3 MB, which only a reading of all would need at once."""
+    folder = episode_of(store) / "frames" / "base_0_rgb"
+    shape = (32, 1000, 1000, 3)
+    settings: dict[str, Any] = {"chunks": (1, 1000, 1000, 3), "shards": shape, "fill_value": 0}
+    compressors = (BloscCodec(cname="zstd", clevel=3, shuffle="shuffle", typesize=1), Crc32cCodec())
+    keys: dict[str, Any] = {"name": "default", "configuration": {"separator": "."}}
+    array = zarr.create_array(
+        folder,
+        shape=shape,
+        dtype="uint8",
+        compressors=compressors,
+        chunk_key_encoding=keys,
+        overwrite=True,
+        config={"write_empty_chunks": True},
+        **settings,
+    )
+    array[...] = np.zeros(shape, np.uint8)
+    reseal(episode_of(store))
+    edit_episode(store, lambda attributes: attributes["arrays"]["frames/base_0_rgb"].update(shape=list(shape)))
+
+
+def _offsets(change: Callable[[np.ndarray], np.ndarray | None]) -> Callable[[Path], None]:
+    return lambda store: change_index(store, change)
+
+
+def _entry(offset: int, length: int) -> Callable[[np.ndarray], None]:
+    def change(index: np.ndarray) -> None:
+        index[0] = offset, length
+
+    return change
+
+
+def _sparse_shard(store: Path) -> None:
+    """A shard of a terabyte of holes, whose first chunk takes nearly all of it."""
+    file = rows_file(store)
+    content, size = file.read_bytes(), 68
+    with file.open("r+b") as shard:
+        shard.truncate(10**12)
+        shard.seek(10**12 - size)
+        shard.write(content[-size:])
+    seal_again(store, lambda files: files[f"joint/rows/{file.name}"].update(size=10**12))
+    change = np.frombuffer(content[-size:-4], dtype="<u8").reshape(-1, 2).copy()
+    change[0] = 0, 10**11
+    change[1:, 0] += 10**11
+    stored = with_checksum(change.tobytes())
+    with file.open("r+b") as shard:
+        shard.seek(10**12 - size)
+        shard.write(stored)
+    seal_again(store, lambda files: files[f"joint/rows/{file.name}"].update(size=10**12, index=bytes_digest(stored)))
+
+
+CHUNK = {"name": "bytes", "configuration": {"endian": "little"}}
+BLOSC = {"typesize": 4, "cname": "lz4", "clevel": 5, "shuffle": "bitshuffle", "blocksize": 0}
+
+
+def _array_document(text: str) -> Callable[[Path], None]:
+    def make(store: Path) -> None:
+        (episode_of(store) / "joint/atoms/zarr.json").write_text(text)
+        seal_again(store)
+
+    return make
+
+
+ARRAY_CASES = [
+    Case("array: no JSON", _array_document("["), ATOMS + r"its zarr\.json is damaged"),
+    Case("array: deep JSON", _array_document("[" * 10**6), ATOMS + r"its zarr\.json is damaged .*nested more than 64"),
+    Case("array: a list", _array_document("[]"), ATOMS + r"its zarr\.json does not describe an array"),
+    Case("array: 40 MB", _array_document(f'{{"x": "{"y" * 40_000_000}"}}'), r"expected at most 32,000,000"),
+    Case("array: a group", _atoms(lambda content: content.update(node_type="group")), ATOMS + ".*not describe an arr"),
+    Case("array: no codecs", _codecs([]), ATOMS + "it has no codecs"),
+    Case("array: codecs of texts", _codecs(["bytes"]), ATOMS + "it has the codec None; expected one of bytes, blosc"),
+    Case(
+        "array: the codec zstd", _codecs([CHUNK, {"name": "zstd"}]), ATOMS + "it has the codec 'zstd'; expected one o"
+    ),
+    Case("array: the codec gzip", _codecs([CHUNK, {"name": "gzip"}]), ATOMS + "it has the codec 'gzip'"),
+    Case("array: the codec pickle", _codecs([{"name": "numcodecs.pickle"}]), ATOMS + "it has the codec 'numcodecs.pi"),
+    Case("array: a thousand codecs", _codecs([CHUNK] * 1000), ATOMS + "it has no codecs"),
+    Case("array: codecs in another order", _codecs([{"name": "crc32c"}, CHUNK]), ATOMS + "it has the codecs crc32c, b"),
+    Case(
+        "array: compressed by snappy",
+        _codecs([CHUNK, {"name": "blosc", "configuration": BLOSC | {"cname": "snappy"}}, {"name": "crc32c"}]),
+        ATOMS + "it is compressed by 'snappy'; expected one of lz4, zstd",
+    ),
+    Case(
+        "array: a typesize of 10^9",
+        _codecs([CHUNK, {"name": "blosc", "configuration": BLOSC | {"typesize": 10**9}}, {"name": "crc32c"}]),
+        ATOMS + "its codec blosc has the typesize 1000000000",
+    ),
+    Case("array: objects", _atoms(lambda content: content.update(data_type="object")), ATOMS + ".*the type 'object'"),
+    Case("array: texts", _atoms(lambda content: content.update(data_type="string")), ATOMS + ".*the type 'string'"),
+    Case("array: bytes of 10^9", _atoms(lambda content: content.update(data_type="r8000000000")), ATOMS + ".*the type"),
+    Case("array: names of 1 MB", _atoms(lambda content: content.update(data_type="x" * 10**6)), ATOMS + ".*the type"),
+    Case("array: transformers", _atoms(lambda c: c.update(storage_transformers=[{"name": "x"}])), ATOMS + ".*transfor"),
+    Case(
+        "array: other keys", _atoms(lambda c: c.update(chunk_key_encoding={"name": "x"})), ATOMS + "its chunk_key_enc"
+    ),
+    Case(
+        "array: no grid", _atoms(lambda content: content.update(chunk_grid=[])), ATOMS + "its chunk_grid is not regul"
+    ),
+    Case("array: chunks of nothing", _atoms(lambda c: _chunks(c).__setitem__(0, 0)), ATOMS + "its chunks have the ext"),
+    Case(
+        "array: chunks below 0", _atoms(lambda c: _chunks(c).__setitem__(0, -4)), ATOMS + "its chunks have the extents"
+    ),
+    Case(
+        "array: chunks of 2 axes", _atoms(lambda c: _chunks(c).__delitem__(0)), ATOMS + "its chunks have 5 axes; expec"
+    ),
+    Case(
+        "array: chunks of 10^12", _atoms(lambda c: _chunks(c).__setitem__(0, 10**12)), ATOMS + "a chunk of it would ta"
+    ),
+    Case("array: 10^8 chunks", _state(lambda c: None, [2, 10**8]), STATE + ".*files of chunks, and", VERIFY, 1),
+    Case("array: a petabyte", _state(lambda c: None, [2, 10**15]), STATE + "its shape is .*bytes", VERIFY, 1),
+    Case("array: 9 axes", _state(lambda c: None, [2, *[1] * 8]), STATE + ".*expected 1 to 8 axes", VERIFY, 1),
+    Case("array: a length below 0", _state(lambda c: None, [2, -1]), STATE + "its shape is .*expected", VERIFY, 1),
+    Case(
+        "array: masses of another shape", _atoms(lambda c: None, [2, 2, 2, 2, 1, 8]), r"expected \(2, 2, 2, 2, 1, 9\)"
+    ),
+    Case(
+        "array: a terabyte in one chunk",
+        _state(lambda c: _chunks(c).__setitem__(1, 10**11), [2, 10**11]),
+        STATE + "a chunk of it would take 1,600,000,000,000 bytes of memory, from",
+        VERIFY,
+        1,
+    ),
+    Case(
+        "rows: chunks of nothing", _rows(lambda c: _inner(c)["chunk_shape"].__setitem__(0, 0)), ROWS + "its chunks have"
+    ),
+    Case(
+        "rows: chunks that do not fit",
+        _rows(lambda c: _inner(c)["chunk_shape"].__setitem__(0, 3)),
+        ROWS + ".*do not div",
+    ),
+    Case(
+        "rows: a shard in a shard",
+        _rows(lambda c: _inner(c).update(codecs=deepcopy(c["codecs"]))),
+        ROWS + "it has the codecs shar",
+    ),
+    Case(
+        "rows: the codec zstd", _rows(lambda c: _inner(c).update(codecs=[CHUNK, {"name": "zstd"}])), ROWS + ".*'zstd'"
+    ),
+    Case(
+        "rows: the index at the start",
+        _rows(lambda c: _inner(c).update(index_location="start")),
+        ROWS + ".*index elsewh",
+    ),
+    Case(
+        "rows: an index of another codec",
+        _rows(lambda c: _inner(c).update(index_codecs=[CHUNK])),
+        ROWS + "the index of",
+    ),
+    Case("rows: chunks without checksums", _rows(lambda c: _inner(c)["codecs"].pop()), ROWS + ".*without checksums"),
+    Case(
+        "rows: keys of a gigabyte",
+        _rows(
+            lambda c: [extents.__setitem__(5, 10**8) for extents in (_chunks(c), _inner(c)["chunk_shape"])],
+        ),
+        ROWS + "a chunk of it would take",
+    ),
+    Case("shard: an offset of 2^63", _offsets(_entry(2**63, 100)), ROWS + ".*overlap or lie outside"),
+    Case("shard: an offset of 2^64 - 8", _offsets(_entry(2**64 - 8, 16)), ROWS + ".*overlap or lie outside"),
+    Case("shard: a length of 2^63", _offsets(_entry(0, 2**63)), ROWS + ".*overlap or lie outside"),
+    Case("shard: no chunks", _offsets(_entry(2**64 - 1, 2**64 - 1)), ROWS + ".*lacks chunk 0: it is missing"),
+    Case("shard: chunks of 3 bytes", _offsets(_entry(0, 3)), ROWS + ".*lacks chunk 0"),
+    Case(
+        "shard: two chunks at one place", _offsets(lambda index: index[[0, 0, 2, 3]]), ROWS + ".*overlap or lie outside"
+    ),
+    Case("shard: a chunk of 100 GB", _sparse_shard, ROWS + "its index names a chunk of 100000000000 bytes"),
+    Case("bomb: zstd", _blosc_bomb(b"zstd"), STATE + "a chunk of it would take 96,000,000 bytes", VERIFY, 1),
+    Case("bomb: lz4", _blosc_bomb(b"lz4"), STATE + "a chunk of it would take 96,000,000 bytes", VERIFY, 1),
+    Case("bomb: a header of 2 GB", _lying_frame, ATOMS + ".*its header says 2000000000 decoded bytes; expected"),
+    Case("bomb: pictures in many chunks", _large_pictures, "frames/base_0_rgb", VERIFY, 1),
+]

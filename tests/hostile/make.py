@@ -1,0 +1,65 @@
+"""Writes the hostile stores, results files and groupings: `python -m tests.hostile.make FOLDER`."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from tests.hostile.array_cases import ARRAY_CASES
+from tests.hostile.changes import Case
+from tests.hostile.document_cases import GROUPING_CASES, RESULTS_CASES
+from tests.hostile.episode_cases import EPISODE_CASES
+from tests.hostile.packed_cases import PACKED_CASES
+from tests.hostile.root_cases import ROOT_CASES
+from vla_attention.analyze.copy.copying import copy_store
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.testing.stores import write_store
+
+#: Cases by what they change: a store of folders, a packed store, or nothing but a file.
+CASES: dict[str, list[Case]] = {
+    "roots": ROOT_CASES,
+    "episodes": EPISODE_CASES,
+    "arrays": ARRAY_CASES,
+    "packed": PACKED_CASES,
+    "results": RESULTS_CASES,
+    "groupings": GROUPING_CASES,
+}
+_FILE_NAMES = {"results": "attention_ratio_results_x.json", "groupings": "grouping.toml"}
+
+
+def originals(folder: Path) -> dict[str, Path]:
+    """Write the store that is changed, as folders and packed; it is of one episode."""
+    plain = write_store(folder / "plain" / "a.zarr", tasks=(0,), episodes=1, replans=2, contributions=True)
+    packed = folder / "packed" / "a.zarr"
+    copy_store(open_store(plain), packed, (), packed=True)
+    return {"packed": packed, **dict.fromkeys(("roots", "episodes", "arrays", "results", "groupings"), plain)}
+
+
+def make_case(kind: str, case: Case, original: Path, folder: Path) -> list[str]:
+    """Write what one case needs below a folder; returns the words of its command."""
+    store, file = folder / "a.zarr", folder / _FILE_NAMES.get(kind, "file")
+    if kind in _FILE_NAMES:
+        folder.mkdir(parents=True)
+        store = original
+        case.make(file)
+    else:
+        shutil.copytree(original, store)
+        case.make(store)
+    places = {"STORE": store, "FILE": file, "OUT": folder / ("out.txt" if kind == "results" else "out")}
+    return [str(places.get(word, word)) for word in case.words]
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Write every case into a folder of its own, and print its command."""
+    (folder,) = map(Path, arguments)
+    made = originals(folder / "originals")
+    for kind, cases in CASES.items():
+        for i, case in enumerate(cases):
+            words = make_case(kind, case, made[kind], folder / kind / f"{i:02d}")
+            print(f"{case.name}: {' '.join(words)}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,160 @@
+"""Roots of stores: the run's attributes, in which nothing has to be true."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tests.hostile.changes import Case, edit_root
+
+#: What a root says first of every problem.
+REFUSED = r"The store .*a\.zarr cannot be read: "
+
+
+def _set(*places: Any) -> Callable[[Path], None]:
+    """A change of the root: the last of `places` is put where the others lead."""
+    *path, last, value = places
+
+    def change(attributes: dict[str, Any]) -> None:
+        holder: Any = attributes
+        for part in path:
+            holder = holder[part]
+        holder[last] = value
+
+    return lambda store: edit_root(store, change)
+
+
+def _raw(replaced: str, by: str) -> Callable[[Path], None]:
+    """A change of the text of the root, of which no JSON has to remain."""
+
+    def make(store: Path) -> None:
+        root = store / "zarr.json"
+        text = root.read_text()
+        assert replaced in text
+        root.write_text(text.replace(replaced, by, 1))
+
+    return make
+
+
+def _instead(make: Callable[[Path], object]) -> Callable[[Path], None]:
+    """Something else in place of the root's zarr.json."""
+
+    def change(store: Path) -> None:
+        (store / "zarr.json").unlink()
+        make(store / "zarr.json")
+
+    return change
+
+
+def _outside(root: Path) -> None:
+    target = root.parent.parent / "outside.json"
+    target.write_text("{}")
+    root.symlink_to(target)
+
+
+def _sparse(root: Path) -> None:
+    with root.open("wb") as file:
+        file.truncate(10**12)
+
+
+def _spans(count: int) -> list[dict[str, Any]]:
+    return [{"name": f"s{i}", "kind": "state", "start": i, "stop": i + 1} for i in range(count)]
+
+
+def _growing(store: Path) -> None:
+    def change(attributes: dict[str, Any]) -> None:
+        attributes["recording"]["num_action_queries"] = 100_000
+        attributes["sites"][0]["spans"][-1] |= {"growing": True, "stop": 10**6}
+
+    edit_root(store, change)
+
+
+def _far(store: Path) -> None:
+    """A camera of a huge grid, with the spans behind it moved."""
+
+    def change(attributes: dict[str, Any]) -> None:
+        span = attributes["sites"][0]["spans"][0]
+        rows = span["grid"]["rows"] = 10**9
+        more = rows * span["grid"]["columns"] - span["stop"]
+        for other in attributes["sites"][0]["spans"]:
+            other["stop"] += more
+            if other is not span:
+                other["start"] += more
+
+    edit_root(store, change)
+
+
+def _many_sites(store: Path) -> None:
+    site = {"spans": [{"name": "all", "kind": "state", "start": 0, "stop": 1}]}
+    edit_root(store, lambda root: root.update(sites=[{"name": f"site{i}", **site} for i in range(100)]))
+
+
+SITE = ("sites", 0)
+ROOT_CASES = [
+    Case("root: a FIFO", _instead(os.mkfifo), REFUSED + r"its zarr\.json: it is a FIFO and no regular file"),
+    Case("root: a device", _instead(lambda root: root.symlink_to("/dev/zero")), REFUSED + ".*link that leads out"),
+    Case("root: a folder", _instead(Path.mkdir), REFUSED + ".*it is a folder and no regular file"),
+    Case("root: a link out of the store", _instead(_outside), REFUSED + ".*it is a link that leads out of the store"),
+    Case("root: a terabyte", _instead(_sparse), REFUSED + r".*1,000,000,000,000 bytes; expected at most 4,000,000"),
+    Case("root: 50 MB", _set("provenance", "x", "y" * 50_000_000), REFUSED + r".*bytes; expected at most 4,000,000"),
+    Case("root: nothing", _instead(Path.touch), REFUSED + ".*Expecting value"),
+    Case("root: no UTF-8", _instead(lambda root: root.write_bytes(b'{"a": "\xff\xfe"}')), REFUSED + ".*UTF-8"),
+    Case("root: deep lists", _instead(lambda root: root.write_text("[" * 1_000_000)), REFUSED + ".*nested more than"),
+    Case(
+        "root: deep objects",
+        _raw('"config": {', '"config": {"a": ' + '{"a": ' * 500 + "1" + "}" * 500 + ', "b": {}, '),
+        REFUSED + ".*nested more than 64 deep",
+    ),
+    Case("root: a list", _instead(lambda root: root.write_text("[1]")), REFUSED + ".*does not describe a group"),
+    Case("root: many lists", _instead(lambda root: root.write_text(f"[{'[],' * 1_200_000}1]")), REFUSED + ".*lists"),
+    Case("root: 5,000 digits", _raw('"seed": 0', '"seed": ' + "9" * 5000), REFUSED + ".*more than 4,000 digits"),
+    Case("root: 300 digits", _raw('"seed": 0', '"seed": ' + "9" * 300), REFUSED + ".*does not fit into 64 bits"),
+    Case("root: half a surrogate", _raw('"suite": "made_up', r'"suite": "\ud800'), REFUSED + ".*surrogate"),
+    Case(
+        "root: a version of 300 digits",
+        _raw('"store_version": ', '"store_version": 1' + "0" * 300),
+        "with more than 19 digits",
+    ),
+    Case("root: no sites", _set("sites", []), REFUSED + "The number of sites of the run is 0; expected 1 to 64"),
+    Case("root: 100 sites", _many_sites, REFUSED + "The number of sites of the run is 100; expected 1 to 64"),
+    Case("root: a site without spans", _set(*SITE, "spans", []), REFUSED + "The number of spans of site 'joint' is 0"),
+    Case("root: 30,000 spans", _set(*SITE, "spans", _spans(30_000)), REFUSED + "The number of spans .* is 30,000"),
+    Case("root: 10^15 keys", _set(*SITE, "spans", -1, "stop", 10**15), REFUSED + "The number of keys of site 'joint'"),
+    Case("root: keys backwards", _set(*SITE, "spans", -1, "stop", -5), REFUSED + "Span .* covers keys .*-5"),
+    Case("root: spans on one another", _set(*SITE, "spans", 1, "start", 0), REFUSED + "Span .* the next free key is"),
+    Case("root: a grid of 10^9 rows", _far, REFUSED + "The number of rows of a patch grid is 1,000,000,000"),
+    Case("root: a grid of no rows", _set(*SITE, "spans", 0, "grid", "rows", 0), REFUSED + "The number of rows"),
+    Case(
+        "root: a picture of 10^9 lines",
+        _set(*SITE, "spans", 0, "grid", "image_height", 10**9),
+        REFUSED + "The height of a picture is 1,000,000,000; expected 1 to 8,192",
+    ),
+    Case("root: 10^9 heads", _set(*SITE, "heads", 10**9), REFUSED + "The number of heads of site 'joint'"),
+    Case("root: a layer of 10^12", _set(*SITE, "layers", [10**12]), REFUSED + "The highest layer of site 'joint'"),
+    Case("root: 10^12 queries", _set("recording", "num_action_queries", 10**12), REFUSED + "The number of action quer"),
+    Case("root: many generated keys", _growing, REFUSED + "The number of queries x generated keys of site 'joint'"),
+    Case("root: no layers", _set("recording", "layers", []), REFUSED + "The number of recorded layers is 0"),
+    Case(
+        "root: half a million layers",
+        _set("recording", "layers", list(range(500_000))),
+        REFUSED + "The number of recorded layers is 500,000; expected 1 to 10,000",
+    ),
+    Case(
+        "root: a million layers, 8 MB",
+        _set("recording", "layers", list(range(1_000_000))),
+        REFUSED + "its zarr.json: it has .* bytes",
+    ),
+    Case("root: a layer below 0", _set("recording", "layers", [-1, 2]), REFUSED + "The lowest of the recorded layers"),
+    Case("root: no denoise steps", _set("recording", "denoise_steps", []), REFUSED + "The number of recorded denoise"),
+    Case("root: no heads", _set("recording", "heads", []), REFUSED + "The number of recorded heads is 0"),
+    Case("root: -5 mantissa bits", _set("recording", "mantissa_bits", -5), REFUSED + "The number of mantissa bits"),
+    Case("root: pools below 0", _set("recording", "num_pools", -(2**40)), REFUSED + "The number of pools"),
+    Case("root: a policy of 10^12 layers", _set("policy", "num_layers", 10**12), REFUSED + "The policy's num_layers"),
+    Case("root: a horizon of 10^12", _set("policy", "action_horizon", 10**12), REFUSED + "The policy's action_horizon"),
+    Case("root: a suite of 1 MB", _set("protocol", "suite", "x" * 10**6), REFUSED + "The length of the suite 'xxx"),
+    Case("root: a checkpoint of 1 MB", _set("policy", "checkpoint", "x" * 10**6), REFUSED + "The length of the policy"),
+    Case("root: a field of 1 MB", _set("x" * 10**6, 1), REFUSED + r".*has an unknown field 'xxx.*\[\.\.\. 99"),
+    Case("root: a list as a name", _set("policy", "name", [["x"] * 1000] * 100), REFUSED + r"\$\.policy\.name is list"),
+]
