@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.analyze.export.refusing_disk import untold_file
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.steps import measure_episodes
 from vla_attention.analyze.show.output_files import replacing, writing
@@ -145,11 +146,18 @@ def write_netcdf(
     _needed("h5py")
     masses = masses_array(question, progress)
     compressed = {name: {"zlib": True, "complevel": 4} for name in ("mass", "row_sum")}
-    with writing("the arrays", path), replacing(path) as temporary:
-        masses.to_netcdf(temporary, engine="h5netcdf", encoding=compressed)
+    with writing("the arrays", path), replacing(path) as temporary, untold_file(temporary) as untold:
+
+        def advance(episodes: int) -> None:
+            untold.check()
+            if progress is not None:
+                progress(episodes)
+
+        masses.to_netcdf(untold, engine="h5netcdf", encoding=compressed)
+        untold.check()
         if rows:
-            with h5netcdf.File(temporary, "a") as file:
-                _write_rows(file, question, progress)
+            with h5netcdf.File(untold, "a") as file:
+                _write_rows(file, question, advance)
     return path
 
 

@@ -53,7 +53,10 @@ class OnDisk(Sequence[Member], Generic[Member]):
     def __init__(self, members: Iterable[Member] = ()) -> None:
         """Append the members, each as soon as it is there."""
         self._ends = [0]
-        self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115
+        try:
+            self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115
+        except OSError as error:
+            raise _no_room(error) from None
         weakref.finalize(self, self._file.close)
         for member in members:
             self.append(member)
@@ -70,10 +73,7 @@ class OnDisk(Sequence[Member], Generic[Member]):
             while rest:
                 rest = rest[self._file.write(rest) :]
         except OSError as error:
-            raise BadArgument(
-                f"Cannot keep what was measured in a temporary file in {tempfile.gettempdir()}: "
-                f"{error.strerror or error}; set TMPDIR to a folder with room."
-            ) from None
+            raise _no_room(error) from None
         self._ends.append(self._ends[-1] + len(content))
 
     def __len__(self) -> int:
@@ -100,3 +100,14 @@ class OnDisk(Sequence[Member], Generic[Member]):
         # With its place, and not from where the last reading ended: several threads may read.
         member: Member = pickle.loads(os.pread(self._file.fileno(), end - start, start))  # noqa: S301 - this process wrote it
         return member
+
+
+def _no_room(error: OSError) -> BadArgument:
+    try:
+        where = f" in {tempfile.gettempdir()}"
+    except OSError:
+        where = ""
+    return BadArgument(
+        f"Cannot keep what was measured in a temporary file{where}: {error.strerror or error}; set TMPDIR to a folder "
+        "with room."
+    )

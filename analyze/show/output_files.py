@@ -18,8 +18,10 @@ if TYPE_CHECKING:
     import polars as pl
 
 
-#: How libraries in other languages (polars, HDF5) write the number of an error of the operating system.
-_NUMBER_OF_OS_ERROR = re.compile(r"\bos error ([0-9]{1,4})\b|\berrno = ([0-9]{1,4})\b")
+#: How libraries in other languages (polars) write the number of an error of the operating system.
+_NUMBER_OF_OS_ERROR = re.compile(r"\bos error ([0-9]{1,4})\b")
+#: So many bytes more are written to a file to see whether the disk takes them.
+_TRIED_BYTES = 1 << 16
 
 
 @contextmanager
@@ -38,21 +40,31 @@ def replacing(path: Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except BaseException as error:
+        refused = _refusal_in(error, temporary)
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-        refused = _refusal_in(error)
-        if refused is not None:
-            raise refused from error
-        raise
+        if refused is None:
+            raise
+        raise OSError(refused.errno, refused.strerror, str(path)) from error
 
 
-def _refusal_in(error: BaseException) -> OSError | None:
-    """What the operating system refused, where only the text of a library's error says so."""
-    if isinstance(error, (UserError, KeyboardInterrupt)) or (isinstance(error, OSError) and error.errno is not None):
+def _refusal_in(error: BaseException, file: Path) -> OSError | None:
+    """What the operating system refused while a file was written, also where a library's error does not say so."""
+    if isinstance(error, OSError) and error.errno is not None and error.filename is None:
+        return error
+    if isinstance(error, (UserError, KeyboardInterrupt)) or not isinstance(error, Exception):
         return None
     found = _NUMBER_OF_OS_ERROR.search(str(error))
-    number = 0 if found is None else int(found[1] or found[2])
-    return OSError(number, os.strerror(number)) if number else None
+    if found is not None:
+        return OSError(int(found[1]), os.strerror(int(found[1])))
+    if isinstance(error, OSError) or not file.exists():
+        return None
+    try:  # polars says "transport error" where the end of a Parquet file is refused
+        with file.open("ab") as more:
+            more.write(bytes(_TRIED_BYTES))
+    except OSError as refused:
+        return refused
+    return None
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from safetensors.numpy import load_file, save_file
 from tests.kit.lerobot_data_sets import H264, Encoding, episodes_of_store, made_up_episodes, number_of, write_data_set
 from tests.kit.pi_golden import GOLDEN
 from tests.kit.small_tokenizer import train_small_tokenizer
+from tests.kit.spoiled_policy import spoil_actions
 from tests.kit.still_scene import capture_without_simulator
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
@@ -162,6 +163,26 @@ def test_another_instruction_and_known_outcomes(tmp_path):
         assert stored.attrs["success"] is solved
         assert stored.attrs["instruction"] == "close the box"
         assert "dataset_actions" not in stored
+
+
+def test_a_call_that_turns_nan_costs_its_episode(tmp_path, monkeypatch, capsys):
+    data = write_data_set(tmp_path / "data", "v2.1", made_up_episodes((4, 4, 4), tuple(LIBERO_COLUMNS.values())))
+    store = tmp_path / "replay.zarr"
+    words = ("replay", data, *TINY, "--every", 2, "--store", store)
+    assert run(*words, "--overwrite") == 0
+    whole = sorted(path.name for path in (store / "episodes").glob("task*"))
+    task, number = int(whole[1][4:7]), int(whole[1][15:])
+    capsys.readouterr()
+    spoil_actions(monkeypatch, open_store(store).attributes.protocol.seed, task, number)
+    assert run(*words, "--overwrite") == 2
+    said = capsys.readouterr()
+    assert f"is missing: {whole[1]}. The policy's numbers turned NaN or infinite at replan 1 (frame 2)" in said.err
+    assert said.err.count("\n") == 1
+    assert "2 episodes added." in said.out
+    monkeypatch.undo()
+    assert run(*words, "--resume") == 0
+    assert sorted(path.name for path in (store / "episodes").glob("task*")) == whole
+    assert analyze(["verify", str(store)]) == 0
 
 
 def lerobot_checkpoint(folder: Path, cameras: dict[str, str], state: int, action: int) -> Path:

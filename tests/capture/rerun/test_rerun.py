@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tests.capture.rerun.conftest import capture
+from tests.kit.spoiled_policy import spoil_actions
 from vla_attention.capture.__main__ import main
 from vla_attention.capture.policies.pi.embedded import dummy_policy
 from vla_attention.capture.rerun.calls import Repeater
@@ -159,6 +160,35 @@ def test_a_damaged_episode_is_refused(pi_store, tmp_path, capsys):
     said = refused(capsys, "rerun", damaged, "--task-id", "0")
     assert "frames" in said
     assert "task000_episode000" in said
+
+
+@pytest.mark.parametrize(("times", "missing"), [(1, []), (100, ["task000_episode001"])])
+def test_a_call_that_turns_nan_costs_its_episode(pi_store, tmp_path, capsys, monkeypatch, times, missing):
+    left, target = spoil_actions(monkeypatch, 7, 0, 1, times=times), tmp_path / "again.zarr"
+    words = ["rerun", str(pi_store), "--store", str(target), "--check", "0"]
+    assert main(words) == (2 if missing else 0)
+    assert left[0] < times
+    said = capsys.readouterr()
+    assert ("task000_episode001: The policy's numbers turned NaN or infinite at replan 1" in said.out) is True
+    assert ("It begins again." in said.out) is (times == 1)
+    if missing:
+        assert said.err.startswith(
+            f"vla-capture: 1 of the episodes asked for is missing: task000_episode001 of {target}. "
+        )
+        assert said.err.count("\n") == 1
+    assert len(open_store(target).episodes) == 4 - len(missing)
+    monkeypatch.undo()
+    assert main([*words, "--resume"]) == 0
+    assert len(open_store(target).episodes) == 4
+    assert verify_store(open_store(target)) == []
+
+
+def test_a_new_store_in_which_every_episode_failed_is_removed(pi_store, tmp_path, capsys, monkeypatch):
+    spoil_actions(monkeypatch, 7, 0, 0)
+    words = ["rerun", str(pi_store), "--task-id", "0", "--num-episodes", "1", "--store", str(tmp_path / "again.zarr")]
+    assert main([*words, "--check", "0"]) == 2
+    assert "1 of the episodes asked for is missing" in capsys.readouterr().err
+    assert not (tmp_path / "again.zarr").exists()
 
 
 def test_an_existing_store_is_not_overwritten_by_chance(pi_store, tmp_path, capsys):
