@@ -21,8 +21,21 @@ def partial_folder(store: Path) -> Path:
 
 
 def process_tag() -> str:
-    """A name that no other process uses; it has the host and the process number, see `remove_dead_partials`."""
-    return f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
+    """A name that no other process uses: host, process number, and what tells containers of one host apart."""
+    return f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}{_space_mark()}"
+
+
+def process_space() -> str:
+    """The namespace of process numbers, for instance `pid:[4026531836]`; containers of one host may have their own."""
+    try:
+        return os.readlink("/proc/self/ns/pid")
+    except OSError:
+        return ""
+
+
+def _space_mark() -> str:
+    number = "".join(filter(str.isdigit, process_space()))
+    return f"n{int(number):x}" if number else ""
 
 
 def dead_partials(store: Path) -> list[Path]:
@@ -47,9 +60,12 @@ def _partials(store: Path) -> list[Path]:
 
 
 def _process_of(folder: Path) -> int:
-    """The process of this machine that wrote a folder, by `process_tag`; 0 for one of another machine or of nobody."""
-    host, _, process = folder.name.partition("-")[2].rpartition("-")[0].rpartition("-")
-    return int(process) if host == socket.gethostname() and process.isdigit() and len(process) < 10 else 0
+    """The process of this machine that wrote a folder, by `process_tag`; 0: of another one or a container."""
+    begin, _, unique = folder.name.partition("-")[2].rpartition("-")
+    host, _, process = begin.rpartition("-")
+    mark = unique[unique.find("n") :] if "n" in unique else _space_mark()  # digits and a to f before it
+    here = host == socket.gethostname() and mark == _space_mark()
+    return int(process) if here and process.isdigit() and len(process) < 10 else 0
 
 
 def _is_running(process: int) -> bool:

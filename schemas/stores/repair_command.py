@@ -67,7 +67,8 @@ def _leftovers(path: Path, dry_run: bool) -> list[str]:
     return [
         *(f"  {would}: {visible(str(folder))}, left by a process that has ended" for folder in dead),
         *(
-            f"  left: {visible(str(folder))}, written by another machine; delete it when no capture runs there"
+            f"  left: {visible(str(folder))}, written by another machine or container; delete it when "
+            "no capture runs there"
             for folder in others
         ),
     ]

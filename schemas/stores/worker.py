@@ -12,7 +12,7 @@ import socket
 from dataclasses import dataclass
 from pathlib import Path
 
-from vla_attention.schemas.stores.partial_folders import process_tag
+from vla_attention.schemas.stores.partial_folders import process_space, process_tag
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def this_worker() -> Worker:
         host=socket.gethostname(),
         process=process,
         process_start=_process_start(process),
-        process_space=_process_space(),
+        process_space=process_space(),
         slurm_job=job,
         job_name=f"{array}_{index}" if array and index else job,
         restarts=int(restarts) if restarts.isdigit() else 0,
@@ -81,10 +81,3 @@ def _process_start(process: int) -> str:
     # A process in state Z (zombie) or X has ended.
     state, *fields = stat.rpartition(")")[2].split()
     return "" if state in ("Z", "X") else fields[18]
-
-
-def _process_space() -> str:
-    try:
-        return os.readlink("/proc/self/ns/pid")
-    except OSError:
-        return ""

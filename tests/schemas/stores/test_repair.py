@@ -25,6 +25,7 @@ from vla_attention.capture.published.evaluate import evaluate_attention_ratio
 from vla_attention.schemas.stores import repair
 from vla_attention.schemas.stores.claims import Claims, holders
 from vla_attention.schemas.stores.damaged_episodes import DamagedEpisodesLeft
+from vla_attention.schemas.stores.partial_folders import process_tag
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.repair import damaged_folder, repair_store
 from vla_attention.schemas.stores.store_format import StoreError
@@ -354,8 +355,15 @@ def test_leftovers_of_dead_processes_are_removed(store, capsys, program):
     host = os.uname().nodename
     process = subprocess.Popen(["true"])
     process.wait()
-    dead = [f"task000_episode003-{host}-{process.pid}-aaaa", f"copy-{host}-{process.pid}-aaaa"]
-    others = [f"task000_episode003-{host}x-{process.pid}-aaaa", f"x-{host}-{'9' * 40}-aaaa", "notes"]
+    tag = process_tag().replace(f"-{os.getpid()}-", f"-{process.pid}-")
+    dead = [
+        f"task000_episode003-{host}-{process.pid}-aaaa",
+        f"task000_episode005-{tag}",
+        f"copy-{host}-{process.pid}-aaaa",
+    ]
+    another_container = f"task000_episode003-{host}-{process.pid}-0123abcdn1"
+    others = [another_container, f"task000_episode003-{host}x-{process.pid}-aaaa"]
+    others += [f"x-{host}-{'9' * 40}-aaaa", "notes"]
     living = [f"task000_episode004-{host}-{os.getpid()}-aaaa"]
     for name in (*dead, *others, *living):
         (folder / name / "deep").mkdir(parents=True)
@@ -365,7 +373,7 @@ def test_leftovers_of_dead_processes_are_removed(store, capsys, program):
     assert all(f"left: {folder / name}, written by another machine" in said for name in others)
     assert not any(name in said for name in living)
     assert "Nothing was changed (--dry-run)." in said
-    assert len(list(folder.iterdir())) == 6
+    assert len(list(folder.iterdir())) == 8
     assert program(["repair", str(store)]) == 0
     said = capsys.readouterr().out
     assert all(f"  removed: {folder / name}" in said for name in dead)
