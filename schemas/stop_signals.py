@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -127,10 +127,25 @@ def end_program(code: int) -> NoReturn:
 def stops_kept_from_children() -> Iterator[None]:
     """Processes that are started within the block never get Ctrl-C, which a terminal sends to all of a program.
 
-    They inherit the mask of the thread that starts them. Here a Ctrl-C may come at the end of the block only.
+    They inherit the mask of the thread that starts them. Here Ctrl-C and SIGTERM come at the end of the block only: a
+    process whose start is interrupted is told nothing of its work, and ends with a traceback.
     """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
+    came: list[int] = []
+
+    def give_again() -> None:
+        for number in came:
+            signal.raise_signal(number)
+
+    with ExitStack() as stack:  # undone in reverse order, all of it, whatever is raised
+        stack.callback(give_again)
+        if threading.current_thread() is threading.main_thread():
+            number: int
+            for number in (signal.SIGINT, signal.SIGTERM):
+                handler = signal.getsignal(number)
+                if callable(handler):
+                    stack.callback(signal.signal, number, handler)
+                    # The mask does not suffice: a signal that another thread gets is handled in this one, too.
+                    signal.signal(number, lambda number, _frame: came.append(number))
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        stack.callback(signal.pthread_sigmask, signal.SIG_SETMASK, before)
         yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

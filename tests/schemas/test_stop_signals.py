@@ -121,6 +121,37 @@ def test_children_never_get_it():
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("elsewhere", [False, True], ids=["this thread", "another thread"])
+def test_a_process_is_started_whole_before_a_stop(number, elsewhere, capsys):
+    """One that is started in part prints a traceback of its own."""
+    done, now = [], threading.Event()
+
+    def give() -> None:
+        if now.wait(60):
+            signal.raise_signal(number)
+
+    def start() -> int:
+        with stops_kept_from_children():
+            if elsewhere:
+                now.set()
+                thread.join()
+            else:
+                signal.raise_signal(number)
+            done.append("started")
+        done.append("went on")
+        return 0
+
+    thread = threading.Thread(target=give, daemon=True)  # not in the block, whose mask it would inherit
+    thread.start()
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    assert run(start) == 128 + number
+    assert done == ["started"]
+    assert capsys.readouterr().err.count("\n") <= 2
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+
 # ------------------------------------------------------------------------------------------- the programs themselves
 
 
