@@ -100,6 +100,5 @@ def describe_missing(dropped: Mapping[str, str]) -> str:
     more = f" ({count - _MOST_TOLD} more faults are above.)" if count > _MOST_TOLD else ""
     return (
         f"{count} of the episodes asked for {'is' if count == 1 else 'are'} missing: {listing(dropped, 40)}. {told}"
-        f"{more}"
-        " All other episodes are whole; the same command with --resume tries what is missing again."
+        f"{more} What was recorded is whole; the same command with --resume tries what is missing again."
     )

@@ -170,7 +170,7 @@ def test_a_fault_that_stays_costs_the_episode_and_resuming_records_it(scene, who
     assert said.err.startswith("vla-capture: 1 of the episodes asked for is missing: task000_episode001. ")
     assert sentence in said.err
     assert said.err.endswith(
-        "All other episodes are whole; the same command with --resume tries what is missing again.\n"
+        "What was recorded is whole; the same command with --resume tries what is missing again.\n"
     )
     assert said.err.count("\n") == 1
     assert "2 episodes added, 0 solved, 1 missing. Store:" in said.out
