@@ -431,4 +431,5 @@ def _holds_missing(values: NDArray[Any]) -> bool:
     # One pass without a temporary array: rows are large. Squares do not cancel each other, so that their sum is NaN for
     # NaN alone.
     flat = values.reshape(-1)
-    return bool(np.isnan(np.dot(flat, flat)))
+    with np.errstate(over="ignore"):  # a sum that becomes infinite is no NaN
+        return bool(np.isnan(np.dot(flat, flat)))

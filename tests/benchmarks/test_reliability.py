@@ -7,7 +7,7 @@ from benchmarks.reliability import PARTS, fuzz_table, kill_table, race_table, ro
 from benchmarks.reliability_kill import COUNTS, SERIES
 from benchmarks.reliability_state import Results
 
-KILL = {"changed": 0, "faulty": False, "unlike": False, "problems": []}
+ENDED = {"compared": 3, "changed": 0, "faulty": False, "completed": False, "unlike": False, "problems": []}
 
 
 def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path, capsys):
@@ -25,11 +25,11 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path, capsys):
 def test_kills_are_counted(tmp_path):
     results = Results(tmp_path / "kill.jsonl")
     for number, completed in enumerate((False, True)):
-        results.add({"series": "SIGKILL", "number": number, "compared": 3, "completed": completed, **KILL})
-    results.add({"series": "SIGTERM", "number": 0, "compared": 1, "completed": False, **KILL, "problems": ["late"]})
+        results.add({"series": "SIGKILL", "number": number, "code": -9 * number, **ENDED, "completed": completed})
+    results.add({"series": "full disk", "number": 0, "code": 0, **ENDED, "problems": ["late"]})
     rows = kill_table(results).rows
-    assert [row["times"] for row in rows] == [2, 1]
-    assert [row["compared"] for row in rows] == [6, 1]
+    assert [row["times"] for row in rows] == [1, 1]  # one capture ended before the signal
+    assert [row["compared"] for row in rows] == [6, 3]
     assert [row["completed"] for row in rows] == [1, 0]
     assert [row["other"] for row in rows] == [0, 1]
 

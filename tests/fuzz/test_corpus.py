@@ -8,6 +8,8 @@ import pytest
 
 from tests.kit.fuzz_targets import TARGETS, run, seeds
 
+# A number that overflows is no reason for a line of numpy's on the terminal.
+pytestmark = pytest.mark.filterwarnings("error")
 CORPUS = Path(__file__).with_name("corpus")
 FILES = sorted(CORPUS.glob("*/*"))
 

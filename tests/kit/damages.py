@@ -84,6 +84,12 @@ def _rest(run: OpenStores, site: str) -> dict[str, Any]:
     }
 
 
+def _of_groups(run: OpenStores, site: str) -> pl.DataFrame | None:
+    """Norms of groups; those of `contributions` are read at the first site that has such keys."""
+    tables = run.analysis(site=site).group_contributions
+    return None if tables is None else tables.groups
+
+
 def _camera(run: OpenStores) -> str:
     return next(camera for site in run.attributes.sites for camera in site.cameras)
 
@@ -94,7 +100,7 @@ ANALYSES: dict[str, Callable[[OpenStores, str], object]] = {
     "spans": lambda run, site: (run.ratios("steps", site=site), run.masses("tasks", site=site), run.summary(site=site)),
     "patches": lambda run, site: _groups(run, site, corner=f"patch:{_camera(run)}[0:1,0:1]"),
     "words": lambda run, site: run.words("episodes", site=site),
-    "contributions": lambda run, site: run.contributions(site=site),
+    "contributions": lambda run, site: (run.contributions(site=site), _of_groups(run, site)),
     "objects": lambda run, site: _groups(run, site, bowl="object:akita_black_bowl_1"),
     "time": lambda run, site: run.time("course", bins=2, site=site),
     "rest": _rest,
