@@ -25,6 +25,11 @@ def test_what_was_found_stays_mended(path):
 
 #: What no parser expects.
 ANYWHERE = {
+    "nothing": b"",
+    "no text": b"\xff\xfe{}",
+    "lists in lists": b"[" * 5000 + b"]" * 5000,
+    "objects in objects": b'{"a":' * 3000 + b"1" + b"}" * 3000,
+    "5,000 digits": b"9" * 5000,
     "a large number": b"1e999",
     "null": b"null",
     "not a number": b"NaN",
