@@ -104,7 +104,16 @@ def kill_table(results: Results) -> Table:
         "unlike": "unlike an undisturbed one",
         "other": "cases with any problem",
     }
-    return Table(columns, rows)
+    return Table(columns, rows, _cut_short({name: len(cases) for name, cases in results.series().items()}))
+
+
+def _cut_short(tried: dict[str, int]) -> str:
+    """A sentence that says which kills of a whole run were not tried; empty if all were."""
+    from reliability_kill import COUNTS
+
+    left = {name: count - tried.get(name, 0) for name, count in COUNTS.items() if name.startswith(_SIGNALS)}
+    missing = [f"{count} by {name}" for name, count in left.items() if count > 0]
+    return f"The run was cut short; not tried yet: {', '.join(missing)}." if missing else ""
 
 
 def rot_table(results: Results) -> Table:

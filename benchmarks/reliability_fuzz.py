@@ -44,7 +44,7 @@ def run(folder: Path, results: Any, seconds: float, targets: Iterable[str]) -> N
         ended = subprocess.run(command, capture_output=True, text=True, check=False)
         took = time.monotonic() - began
         done = [line.split()[-1] for line in ended.stderr.splitlines() if "number_of_executed_units" in line]
-        kept = sorted((folder / "findings" / target).glob("*")) if (folder / "findings" / target).exists() else []
+        kept = sorted(path for path in (folder / "findings" / target).glob("*") if path.suffix != ".txt")
         problems = [f"{path.name} in {path.parent}" for path in kept]
         if not done:
             problems.append(f"the fuzzer ended with {ended.returncode}: {ended.stderr[-2000:]}")

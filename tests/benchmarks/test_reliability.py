@@ -27,7 +27,8 @@ def test_kills_are_counted(tmp_path):
     for number, completed in enumerate((False, True)):
         results.add({"series": "SIGKILL", "number": number, "code": -9 * number, **ENDED, "completed": completed})
     results.add({"series": "full disk", "number": 0, "code": 0, **ENDED, "problems": ["late"]})
-    rows = kill_table(results).rows
+    rows, note = kill_table(results).rows, kill_table(results).note
+    assert note.startswith(f"The run was cut short; not tried yet: {COUNTS['SIGKILL, one simulator']} by SIGKILL, one")
     assert [row["times"] for row in rows] == [1, 1]  # one capture ended before the signal
     assert [row["compared"] for row in rows] == [6, 3]
     assert [row["completed"] for row in rows] == [1, 0]

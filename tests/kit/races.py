@@ -37,7 +37,7 @@ class Round:
 
     Attributes:
         lists: the tasks that each process was asked for.
-        victim: which process was killed, and `killed_after` how many seconds after the first episode began.
+        victim: which process was killed, and `killed_after` how many seconds after some episodes were committed.
         committed: episodes that were in the store when it was killed.
         changed: files of these that were not the same at the end.
         exit_codes: of every process; -9 for the victim, 0 if it had ended before.
@@ -116,9 +116,12 @@ def run_round(folder: Path, undisturbed: Path, number: int, processes: int) -> R
     logs = [folder / f"{process}.log" for process in range(processes)]
     began = [forks.start(capture, store, tasks, log=log) for tasks, log in zip(lists, logs, strict=True)]
     partial = store.with_name(store.name + ".partial")
-    while not list(partial.glob("task*")) and not all(map(forks.ended, began)):
+    # After some episodes, however busy the machine is, and at any moment of the next ones.
+    wanted, victim, pause = random.randint(0, TASKS), random.randrange(processes), random.uniform(0, 0.5)
+    while not all(map(forks.ended, began)):
+        if list(partial.glob("task*")) and len(list((store / "episodes").glob("task*"))) >= wanted:
+            break
         time.sleep(0.005)
-    victim, pause = random.randrange(processes), random.uniform(0, 1.5)
     time.sleep(pause)
     committed = sorted(episode.name for episode in (store / "episodes").glob("task*"))
     before = {name: file_digests(store / "episodes" / name) for name in committed}
