@@ -16,18 +16,22 @@ if TYPE_CHECKING:
 
 #: What is said after Ctrl-C.
 IF_STOPPED = "complete episodes are kept, continue with --resume."
+#: Commands that record nothing, and what is said of them.
+_RECORD_NOTHING = ("doctor", "parity", "repair", "status", "tasks", "verify")
+_IF_LOOKING = "nothing was left half written."
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code, which is 2 after a mistake in the arguments."""
     given = sys.argv[1:] if argv is None else list(argv)
+    if_stopped = _IF_LOOKING if given and given[0] in _RECORD_NOTHING else IF_STOPPED
 
     def run() -> int:
         from vla_attention.capture.command_line import run_capture_command
 
-        return run_capture_command("vla-capture", lambda termination: _run(given, termination), lambda: 0)
+        return run_capture_command("vla-capture", lambda termination: _run(given, termination), lambda: 0, if_stopped)
 
-    return run_until_stopped("vla-capture", run, IF_STOPPED)
+    return run_until_stopped("vla-capture", run, if_stopped)
 
 
 def _run(given: Sequence[str], termination: Termination) -> int:

@@ -17,10 +17,16 @@ class GpuMemoryFull(UserError, MemoryError):
     """The memory of the GPU does not suffice."""
 
 
-def run_capture_command(program: str, command: Callable[[Termination], int], max_requeues: Callable[[], int]) -> int:
+def run_capture_command(
+    program: str,
+    command: Callable[[Termination], int],
+    max_requeues: Callable[[], int],
+    if_stopped: str = "complete episodes are kept, continue with --resume.",
+) -> int:
     """Run a command that captures; returns the exit code: 2 after a mistake, 130 after Ctrl-C, 75 after SIGTERM.
 
-    After SIGTERM a SLURM job is put back into the queue, at most `max_requeues()` times (0: never).
+    After SIGTERM a SLURM job is put back into the queue, at most `max_requeues()` times (0: never). if_stopped: what is
+    kept and how to go on, for the sentence after either signal.
     """
     # Set before MuJoCo is imported, because GPU nodes and CI have no display.
     os.environ.setdefault("MUJOCO_GL", "egl")
@@ -29,7 +35,7 @@ def run_capture_command(program: str, command: Callable[[Termination], int], max
             return run_command(
                 program,
                 lambda: _until_terminated(command, termination),
-                "complete episodes are kept, continue with --resume.",
+                if_stopped,
             )
         except Terminated:
             # SLURM sends the signal again to a job that is being requeued.
@@ -39,7 +45,7 @@ def run_capture_command(program: str, command: Callable[[Termination], int], max
             from vla_attention.schemas.stores.worker import this_worker
 
             requeued = ask_for_requeue(this_worker(), max_requeues()) if max_requeues() else ""
-            what_next = requeued or "Complete episodes are kept; the same command with --resume goes on."
+            what_next = requeued or if_stopped[:1].upper() + if_stopped[1:]
             print(f"{program}: stopped by SIGTERM. {what_next}", file=sys.stderr, flush=True)
             return EXIT_TERMINATED
 

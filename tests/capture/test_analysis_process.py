@@ -28,7 +28,7 @@ while true; do sleep 0.05; done
     ("number", "code", "said"),
     [
         (signal.SIGINT, 130, ["vla-analyze: stopped; nothing was left half written."]),
-        (signal.SIGTERM, 75, ["vla-capture: stopped by SIGTERM. Complete episodes are kept; the same command with"]),
+        (signal.SIGTERM, 75, ["vla-capture: stopped by SIGTERM. Complete episodes are kept, continue with --resume."]),
     ],
 )
 def test_a_stopped_analysis_says_it_once(tmp_path, monkeypatch, capfd, number, code, said):

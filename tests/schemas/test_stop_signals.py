@@ -215,9 +215,16 @@ def test_a_capture_that_is_stopped_says_one_sentence(tmp_path, moment, times):
     assert done.returncode == 130
 
 
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_command_that_records_nothing_speaks_of_no_episodes(name):
+    done = run_stopped("vla_attention.capture", ["doctor", "--no-trial"], at_import("torch"), name)
+    assert done.stderr.count("nothing was left half written.".capitalize() if name == "SIGTERM" else "nothing was") == 1
+    assert "--resume" not in done.stderr
+
+
 def test_a_capture_that_gets_sigterm_while_it_loads_says_one_sentence(tmp_path):
     words = [str(tmp_path / "a.zarr") if word == "STORE" else word for word in CAPTURE]
     done = run_stopped("vla_attention.capture", words, at_import("torch.nn"), "SIGTERM")
     assert done.stderr.count("\n") == 1
-    assert done.stderr.startswith("vla-capture: stopped by SIGTERM. Complete episodes are kept;")
+    assert done.stderr.startswith("vla-capture: stopped by SIGTERM. Complete episodes are kept")
     assert done.returncode == 75
