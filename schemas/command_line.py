@@ -65,7 +65,7 @@ def _run(program: str, command: Callable[[], int]) -> int:
         return code
     except UserError as error:
         # One line, whatever a name in it holds: a line of its own could pass for another message.
-        sentence = visible(str(error))
+        sentence = str(error)
     except BrokenPipeError:  # `| head` has seen enough
         _drop_output()
         return 141

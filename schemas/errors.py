@@ -11,15 +11,24 @@ from collections.abc import Iterable
 from itertools import islice
 
 from vla_attention.schemas.limits import COMPARED_NAMES, NAME_CHARACTERS, SENTENCE_CHARACTERS, SHOWN_CHARACTERS
+from vla_attention.schemas.visible_text import visible
 
 
 class UserError(Exception):
-    """A mistake in what was given: arguments, files, selections. Never a defect of the program."""
+    """A mistake in what was given: arguments, files, selections. Never a defect of the program.
+
+    Its text is one line: names from files are part of it, and Python prints it in tracebacks as it is. `has_lines` is
+    for errors that end with a table.
+    """
+
+    has_lines = False
 
     def __str__(self) -> str:
         # KeyError and FileNotFoundError format their arguments in their own ways; this class always gives the sentence
         # itself.
-        return shortened(str(self.args[0]), SENTENCE_CHARACTERS) if self.args else type(self).__name__
+        if not self.args:
+            return type(self).__name__
+        return visible(shortened(str(self.args[0]), SENTENCE_CHARACTERS), keep="\n" if self.has_lines else "")
 
 
 class BadArgument(UserError, ValueError):

@@ -20,21 +20,11 @@ from urllib.parse import quote
 from vla_attention.schemas.errors import BadArgument, shortened
 from vla_attention.schemas.limit_checks import check_at_most
 from vla_attention.schemas.limits import LINE_CHARACTERS, NAME_CHARACTERS, TEXT_CHARACTERS
+from vla_attention.schemas.visible_text import visible as visible
 
 #: Beside letters and digits, what stays as it is in `file_part`.
 _PLAIN = re.compile(r"[\w ._+=,@-]")
 _LINE_END = "\n"
-
-
-def visible(text: str, keep: str = "") -> str:
-    r"""Text with its unprintable characters as escapes, for instance \x1b, \n or \u202e.
-
-    Unprintable are control and format characters, line and paragraph separators, spaces other than the plain one, and
-    code points without a character (`str.isprintable`). Characters in `keep` stay as they are.
-    """
-    if text.isprintable():
-        return text
-    return "".join(c if c.isprintable() or c in keep else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 def check_name(what: str, name: str) -> None:

@@ -1,20 +1,18 @@
-"""JSON files of limited size, nesting and numbers."""
+"""JSON files of limited size, nesting and numbers; see `schemas.documents`."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from vla_attention.capture.foreign_files.regular_files import Refuse, check_regular
+from vla_attention.schemas.documents import decode_json
+from vla_attention.schemas.limits import WHOLE_NUMBER
+from vla_attention.schemas.regular_files import NotRegular, read_regular
 
 #: Bytes of a file. The largest of a real checkpoint, statistics and trees of arrays, have 0.2 MB; decoded, empty lists
 #: take 25 times as much memory.
 MAX_BYTES = 8_000_000
-#: Objects and lists in one another. Real files have up to six.
-MAX_DEPTH = 64
-#: Digits of a whole number: those that 64 bits hold for certain.
-MAX_DIGITS = 18
 
 
 def read_object(path: Path, refuse: Refuse, *, inside: Path | None = None) -> dict[str, Any]:
@@ -24,42 +22,25 @@ def read_object(path: Path, refuse: Refuse, *, inside: Path | None = None) -> di
         FileNotFoundError: there is no such file.
         What `refuse` makes: it is no regular file, too large, no JSON, too deep, or holds something else.
     """
-    size = check_regular(path, refuse, inside=inside)
-    if size > MAX_BYTES:
-        raise refuse(f"'{path}' has {size} bytes; a JSON file of {MAX_BYTES} at most is read.")
+    check_regular(path, refuse, inside=inside)
     try:
-        content = json.loads(path.read_bytes(), parse_int=_whole)
+        content = decode_json(read_regular(path, MAX_BYTES))
+    except NotRegular as error:
+        raise refuse(f"'{path}' cannot be read: {error.strerror}.") from None
     except (ValueError, OSError) as error:
         raise refuse(f"'{path}' is not valid JSON ({error}).") from error
-    except RecursionError:
-        raise refuse(_too_deep(path)) from None
     if not isinstance(content, dict):
         raise refuse(f"'{path}' should hold a JSON object, but holds a {type(content).__name__}.")
-    if _depth_exceeds(content, MAX_DEPTH):
-        raise refuse(_too_deep(path))
+    if _has_longer_number(content):
+        raise refuse(f"'{path}' has a whole number that 64 bits do not hold.")
     return content
 
 
-def _too_deep(path: Path) -> str:
-    return f"'{path}' has objects and lists that are nested more than {MAX_DEPTH} deep."
-
-
-def _whole(digits: str) -> int:
-    if len(digits.lstrip("-")) > MAX_DIGITS:
-        raise ValueError(f"it has a whole number of {len(digits.lstrip('-'))} digits; expected at most {MAX_DIGITS}")
-    return int(digits)
-
-
-def _depth_exceeds(content: Any, limit: int) -> bool:
-    """Whether values are nested deeper than `limit`; level by level, without recursion."""
+def _has_longer_number(content: Any) -> bool:
     level: list[Any] = [content]
-    for _ in range(limit):
-        level = [
-            inner
-            for outer in level
-            for inner in (outer.values() if isinstance(outer, dict) else outer)
-            if isinstance(inner, (dict, list))
-        ]
-        if not level:
-            return False
-    return True
+    while level:
+        inner = [value for outer in level for value in (outer.values() if isinstance(outer, dict) else outer)]
+        if any(isinstance(value, int) and not -WHOLE_NUMBER <= value < WHOLE_NUMBER for value in inner):
+            return True
+        level = [value for value in inner if isinstance(value, (dict, list))]
+    return False

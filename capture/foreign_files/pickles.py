@@ -97,6 +97,7 @@ _DTYPE = re.compile(r"torch\.(b?float|complex|u?int|bool|half|double|long|short)
 TENSORS: Mapping[str, Check] = {
     "collections.OrderedDict": nothing,
     "torch._utils._rebuild_tensor_v2": anything,
+    "torch._utils._rebuild_tensor_v3": anything,
     "torch._utils._rebuild_parameter": anything,
     "torch.Size": anything,
     "torch.device": anything,

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import stat
 from collections.abc import Callable
 from pathlib import Path
 
 from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.regular_files import NotRegular, open_regular
 
 #: What makes an error of a sentence: mostly a class of errors.
 Refuse = Callable[[str], UserError]
@@ -15,13 +15,6 @@ Refuse = Callable[[str], UserError]
 #: Files and folders below one folder of a checkpoint. Those of openpi have some hundreds.
 MAX_FILES = 100_000
 
-_KINDS = {
-    stat.S_IFDIR: "a folder",
-    stat.S_IFIFO: "a named pipe",
-    stat.S_IFSOCK: "a socket",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-}
 #: The folder of the hub's cache whose files are links to `blobs` beside it.
 _SNAPSHOTS = "snapshots"
 
@@ -37,19 +30,19 @@ def check_regular(path: Path, refuse: Refuse, *, inside: Path | None = None) -> 
         What `refuse` makes: the path is no regular file, or a link that leads out of the folder.
     """
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            kind = _KINDS.get(stat.S_IFMT(status.st_mode), "something else")
-            raise refuse(f"'{path}' is {kind}; expected a regular file.")
+        handle, size = open_regular(path)
+        os.close(handle)
         if inside is not None:
             _check_inside(path, inside, refuse)
     except FileNotFoundError:
         raise
+    except NotRegular as error:
+        raise refuse(f"'{path}' cannot be read: {error.strerror}.") from None
     except (OSError, RuntimeError) as error:  # a circle of links is a RuntimeError of pathlib
         if isinstance(error, UserError):
             raise
         raise refuse(f"'{path}' cannot be read ({getattr(error, 'strerror', None) or error}).") from error
-    return status.st_size
+    return size
 
 
 def _check_inside(path: Path, folder: Path, refuse: Refuse) -> None:

@@ -21,6 +21,8 @@ from vla_attention.schemas.errors import BadArgument, UserError, listing
 class CallsDoNotFit(UserError, ValueError):
     """The attention calls of a policy are not those of its layout. The message ends with a table of the calls."""
 
+    has_lines = True
+
 
 @dataclass(frozen=True)
 class CallPlace:

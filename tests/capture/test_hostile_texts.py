@@ -25,6 +25,7 @@ from vla_attention.capture import capture_run
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.capture.rollout.progress import Progress
+from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.schemas.command_line import run_command
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.testing.stores import StoreSpec, reseal, reseal_root, write_store
@@ -193,6 +194,15 @@ def test_progress_lines(capsys: pytest.CaptureFixture[str]):
 
     assert run_command("program", show, "") == 0
     assert check_output(capsys).count(r"x\x1b[2J\u202e") == 3
+
+
+def test_errors_of_the_library():
+    """Python prints an error's text as it is, in a script of somebody who uses the library."""
+    text = str(BadArgument(HOSTILE))
+    assert text.isprintable()
+    assert text.count(FORGED) == HOSTILE.count(FORGED)
+    with_table = str(CallsDoNotFit(f"a\x1b[2J\n{FORGED}"))
+    assert with_table == f"a\\x1b[2J\n{FORGED}"
 
 
 def test_errors_warnings_and_log_lines(capsys: pytest.CaptureFixture[str]):

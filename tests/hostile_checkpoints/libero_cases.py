@@ -159,7 +159,7 @@ LIBERO: dict[str, Case] = {
     "initial states of another scene": Case(as_states(np.zeros((50, 3))), "do not belong together|cannot be built"),
     "initial states cut off": Case(states(lambda path: path.write_bytes(path.read_bytes()[:3000])), "damaged"),
     "no initial states": Case(states(os.remove), "There are no initial states"),
-    "a pipe for initial states": Case(states(pipe), "is a named pipe"),
+    "a pipe for initial states": Case(states(pipe), "it is a FIFO"),
     "initial states of 5 GB": Case(states(lambda path: sparse(path, 5 * 10**9)), "initial states of 64000000 at most"),
     "a task that executes": Case(task(executing_task), "as an angle .*Nothing of it was executed"),
     "a task of parentheses": Case(task(lambda path: path.write_text("(" * 100_000 + ")" * 100_000)), "parentheses"),
@@ -169,17 +169,17 @@ LIBERO: dict[str, Case] = {
         "The task file .* cannot be read",
     ),
     "a task that is no text": Case(task(lambda path: path.write_bytes(b"\xff\xfe")), "cannot be read"),
-    "a pipe for a task": Case(task(pipe), "is a named pipe"),
+    "a pipe for a task": Case(task(pipe), "it is a FIFO"),
     "assets that are empty": Case(states(lambda path: None), "cannot be built from"),
     "a pipe among the assets": Case(
-        lambda folder: made(lambda path, file, assets: pipe(assets / "scenes" / "x.xml"), folder), "is a named pipe"
+        lambda folder: made(lambda path, file, assets: pipe(assets / "scenes" / "x.xml"), folder), "it is a FIFO"
     ),
 }
 PARITY: dict[str, Case] = {
     "arrays of 600 MB in 0.6": Case(parity(array_bomb), "holds 600000128 bytes of arrays"),
     "an array that claims 4 PB": Case(parity(array_that_claims), "cannot be read as arrays"),
     "arrays of objects": Case(parity(objects), "cannot be read as arrays"),
-    "a pipe for arrays": Case(parity(lambda case: pipe(case / "inputs.npz")), "is a named pipe"),
+    "a pipe for arrays": Case(parity(lambda case: pipe(case / "inputs.npz")), "it is a FIFO"),
     "weights outside of the case": Case(
         facts(lambda content: content.update(state_dict="../../x.pt")), "the name of a file beside"
     ),

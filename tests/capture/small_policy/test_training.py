@@ -176,7 +176,7 @@ def test_a_checkpoint_that_executes_or_is_damaged_is_refused(tmp_path):
         with pytest.raises(UnusableTraining, match=said):
             export(tmp_path, tmp_path / "out", "name")
     pipe(tmp_path / "checkpoint.pt")
-    with pytest.raises(UnusableTraining, match=r"no checkpoint|named pipe"):
+    with pytest.raises(UnusableTraining, match=r"no checkpoint|FIFO"):
         export(tmp_path, tmp_path / "out", "name")
     assert not (tmp_path / TRACE).exists()
     assert not (tmp_path / "out").exists()
