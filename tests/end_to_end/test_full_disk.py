@@ -22,7 +22,6 @@ OUT = ("--output", "OUT", "--no-cache")
 WRITING: dict[str, tuple[str, ...]] = {
     "ratios, second process": ("ratios", "STORE", *OUT, "--threads", "2", "--layers", "0"),
     "ratios, tables": ("ratios", "STORE", *OUT, "--no-plots"),
-    "groups": ("groups", "STORE", *OUT),
     "words": ("words", "STORE", *OUT, "--task", "0"),
     "overlay": ("overlay", "STORE", *OUT, "--video", "gif"),
     "export csv": ("export", "STORE", "--csv", *OUT),

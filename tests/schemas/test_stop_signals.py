@@ -168,15 +168,13 @@ SECOND = "vla_attention.analyze.stores.second_process"
     ("moment", "words"),
     [
         (at_import("vla_attention.analyze.command_line"), []),
-        (at_import("argparse"), []),
         (at_import("numpy"), []),
-        (at_import("polars"), []),
         (at_import("matplotlib"), ["--threads", "1"]),
         (after_call(WORKERS, "WorkerProcesses", "_submit"), ["--workers", "2"]),
         (after_call(SECOND, "SecondProcess", "__init__"), ["--threads", "2"]),
         (after_call("os", "", "replace"), ["--no-plots"]),
     ],
-    ids=["start", "arguments", "numpy", "polars", "pictures", "workers", "second process", "first file"],
+    ids=["start", "numpy", "pictures", "workers", "second process", "first file"],
 )
 def test_an_analysis_that_is_stopped_says_one_sentence(store, tmp_path, moment, words):
     given = [str(store), "--output", str(tmp_path / "out"), "--no-cache", *words]
