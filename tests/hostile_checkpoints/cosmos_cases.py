@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import json
 import pickle
 import shutil
@@ -41,7 +42,9 @@ from vla_attention.capture.policies.cosmos.locate import EMBEDDINGS_NAME, STATIS
 @cache
 def dummy() -> Path:
     """A checkpoint of test size, written once in a process."""
-    return write_dummy_folder(Path(mkdtemp(prefix="hostile-")) / "dummy", DUMMY_CONFIG, ["lift the cube"])
+    folder = Path(mkdtemp(prefix="hostile-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return write_dummy_folder(folder / "dummy", DUMMY_CONFIG, ["lift the cube"])
 
 
 def made(change: Callable[[Path], object], folder: Path) -> list[str]:
