@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 use_threads()
 # What is tested is measured; tests of the cache switch it on in a folder of their own. Subprocesses inherit it.
 os.environ["VLA_CACHE"] = os.environ["VLA_REMOTE_CACHE"] = "off"
+# A shell starts a program in the background with Ctrl-C ignored, which subprocesses inherit: tests that give it would wait.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 for _name, _count in PROFILES.items():
     settings.register_profile(_name, max_examples=_count, deadline=None)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,15 +21,13 @@ class StoreWithoutInputs(StoreError):
 
 @dataclass(frozen=True)
 class StoredCalls:
-    """The policy calls of one episode.
+    """The policy calls of one episode. Pictures are read call by call: black ones take little disk and much memory.
 
-    frames, camera_frames: camera -> (replan, height, width, 3) uint8. coverage: camera -> (replan, patch, object).
+    coverage: camera -> (replan, patch, object).
     state: (replan, state dim). noise_seed, env_step, prompt_index: (replan,). actions: (replan, horizon, action dim).
     """
 
     episode: StoredEpisode
-    frames: Mapping[str, NDArray[np.uint8]]
-    camera_frames: Mapping[str, NDArray[np.uint8]]
     coverage: Mapping[str, NDArray[np.float32]]
     state: NDArray[np.float64]
     noise_seed: NDArray[np.int64]
@@ -51,14 +48,18 @@ class StoredCalls:
         return self.attributes.num_replans
 
     def given(self, replan: int) -> GivenInputs:
-        """Return what a policy call was given."""
+        """Return what a policy call was given; `CorruptEpisode` when a picture's bytes are not those that were sealed."""
         prompt = self.attributes.prompts[self.prompt_index[replan]]
         return GivenInputs(
-            frames={camera: frames[replan] for camera, frames in self.frames.items()},
-            camera_frames={camera: frames[replan] for camera, frames in self.camera_frames.items()},
+            frames=self._pictures("frames", replan),
+            camera_frames=self._pictures("camera_frames", replan),
             state=self.state[replan],
             instruction=prompt.instruction_text,
         )
+
+    def _pictures(self, group: str, replan: int) -> dict[str, NDArray[np.uint8]]:
+        """Camera -> (height, width, 3)."""
+        return {camera: self.episode.read(f"{group}/{camera}", replan) for camera in _cameras(self.episode, group)}
 
     def context(self, replan: int, instructions: Mapping[int, str]) -> CallContext:
         """Return the place of a policy call and its scene. instructions: of the store's tasks."""
@@ -84,17 +85,10 @@ class StoredCalls:
 
 
 def read_calls(episode: StoredEpisode) -> StoredCalls:
-    """Read the policy calls of an episode; `CorruptEpisode` when its bytes are not those that were sealed."""
-
-    def by_camera(group: str) -> dict[str, NDArray[Any]]:
-        names = [name for name in episode.attributes.arrays if name.startswith(f"{group}/")]
-        return {name.removeprefix(f"{group}/"): episode.read(name) for name in names}
-
+    """Read all but the pictures of an episode's calls; `CorruptEpisode` when its bytes are not those that were sealed."""
     return StoredCalls(
         episode=episode,
-        frames=by_camera("frames"),
-        camera_frames=by_camera("camera_frames"),
-        coverage=by_camera("objects"),
+        coverage={camera: episode.read(f"objects/{camera}") for camera in _cameras(episode, "objects")},
         state=episode.read("state"),
         noise_seed=episode.read("noise_seed"),
         env_step=episode.read("env_step"),
@@ -104,6 +98,11 @@ def read_calls(episode: StoredEpisode) -> StoredCalls:
         if episode.has("dataset_actions")
         else None,
     )
+
+
+def _cameras(episode: StoredEpisode, group: str) -> list[str]:
+    """The cameras that a group of arrays has."""
+    return [name.removeprefix(f"{group}/") for name in episode.attributes.arrays if name.startswith(f"{group}/")]
 
 
 def check_has_inputs(store: Store, policy: Policy) -> None:

@@ -37,6 +37,8 @@ _DIGEST_BYTES = 32
 ANSWER_WITHIN_S = 60.0
 #: The cache is searched for what to remove after every so many bytes that were added to it.
 _LOOK_EVERY = 64_000_000
+#: Protocols whose addresses may be `//name:password@host`; elsewhere @ stands before a revision.
+_WITH_PASSWORDS = ("http", "https", "ftp", "sftp", "ssh", "smb", "webdav")
 
 
 class RemoteFailure(UserError, OSError):
@@ -47,10 +49,16 @@ def source_of(place: StorePlace) -> ByteSource:
     """The files below a path or an address.
 
     Raises:
-        BadArgument: an address with a query or a fragment, which is one file's and not a folder's.
+        BadArgument: an address with a query or a fragment, which is one file's and not a folder's; or with a password.
     """
     if not isinstance(place, StoreUrl):
         return Folder(place)
+    who, at, host = place.url.partition("://")[2].partition("/")[0].rpartition("@")
+    if at and ":" in who and place.protocol in _WITH_PASSWORDS:
+        raise BadArgument(
+            f"The address of {host} was given with a password, which summaries and results would show. Give it without; "
+            "fsspec reads passwords from its own configuration (~/.config/fsspec)."
+        )
     without = re.split("[?#]", place.url, maxsplit=1)[0]
     if without != place.url and place.protocol in ("http", "https"):
         raise BadArgument(

@@ -385,6 +385,13 @@ def test_addresses(given, expected):
     assert store_place(given) == expected
 
 
+def test_an_address_with_a_password_is_refused_and_not_repeated(capsys):
+    assert analyze(["https://user:secret@host/x/a.zarr", "--list"]) == 2
+    said = capsys.readouterr().err
+    assert "The address of host was given with a password" in said
+    assert "secret" not in said
+
+
 @pytest.mark.parametrize("link", ["https://host/x/a.zarr?signature=secret", "https://host/a.zarr#secret"])
 def test_a_signed_link_is_refused_and_not_repeated(link, capsys):
     assert analyze([link, "--list"]) == 2
