@@ -219,7 +219,7 @@ class HostileSites(SiteStoreSpec):
 
 
 @pytest.mark.parametrize(
-    "command", slow_except(("ratios", "report"), sorted(set(WORDS) - {"effects", "objects", "compare"}))
+    "command", slow_except(("ratios", "report"), sorted(set(WORDS) - {"effects", "objects", "compare", "merge"}))
 )
 def test_hostile_names_of_sites_are_printed_visibly_and_nothing_is_written_elsewhere(tmp_path, capsys, command):
     store = write_site_store(tmp_path / "a.zarr", HostileSites(kind="split", dataset_actions=0.5, outcome="some"))

@@ -153,7 +153,7 @@ STORABLE: dict[str, tuple[Change, str]] = {
         frame_with(lambda frame: frame[:8]),
         "frames/base_0_rgb has pictures of shape (8, 16, 3) and type uint8; expected (12, 16, 3) and uint8",
     ),
-    "a picture of another type": (frame_with(lambda frame: frame.astype(np.uint16)), "(12, 16, 3) and type uint16"),
+    "a picture of another type": (frame_with(lambda frame: frame.astype(np.float32)), "(12, 16, 3) and type float32"),
     "coverage of another camera": (
         coverage_with(lambda shares: shares[:4]),
         "objects/base_0_rgb has the shape (4, 5) and type float32; expected (12, 5) and float32: the camera's 3 x 4 "
