@@ -20,7 +20,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 use_threads()
 # What is tested is measured; tests of the cache switch it on in a folder of their own. Subprocesses inherit it.
 os.environ["VLA_CACHE"] = os.environ["VLA_REMOTE_CACHE"] = "off"
-# A shell starts a program in the background with Ctrl-C ignored, which subprocesses inherit: tests that give it would wait.
+# Shells start programs in the background with Ctrl-C ignored, and subprocesses inherit that: tests that give it would
+# wait.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -48,7 +48,7 @@ class StoredCalls:
         return self.attributes.num_replans
 
     def given(self, replan: int) -> GivenInputs:
-        """Return what a policy call was given; `CorruptEpisode` when a picture's bytes are not those that were sealed."""
+        """Return what a policy call was given; `CorruptEpisode` when a picture is not the one that was sealed."""
         prompt = self.attributes.prompts[self.prompt_index[replan]]
         return GivenInputs(
             frames=self._pictures("frames", replan),
@@ -85,7 +85,7 @@ class StoredCalls:
 
 
 def read_calls(episode: StoredEpisode) -> StoredCalls:
-    """Read all but the pictures of an episode's calls; `CorruptEpisode` when its bytes are not those that were sealed."""
+    """Read all but the pictures of an episode's calls; `CorruptEpisode` when bytes are not those that were sealed."""
     return StoredCalls(
         episode=episode,
         coverage={camera: episode.read(f"objects/{camera}") for camera in _cameras(episode, "objects")},

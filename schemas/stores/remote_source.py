@@ -56,8 +56,8 @@ def source_of(place: StorePlace) -> ByteSource:
     who, at, host = place.url.partition("://")[2].partition("/")[0].rpartition("@")
     if at and ":" in who and place.protocol in _WITH_PASSWORDS:
         raise BadArgument(
-            f"The address of {host} was given with a password, which summaries and results would show. Give it without; "
-            "fsspec reads passwords from its own configuration (~/.config/fsspec)."
+            f"The address of {host} was given with a password, which summaries and results would show. Give it "
+            "without; fsspec reads passwords from its own configuration (~/.config/fsspec)."
         )
     without = re.split("[?#]", place.url, maxsplit=1)[0]
     if without != place.url and place.protocol in ("http", "https"):
