@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +59,17 @@ def _zarr_works_without_threads() -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(asyncio, "to_thread", call)
         yield
+
+
+@pytest.fixture
+def usual_signals() -> Iterator[None]:
+    """Python's own handling of Ctrl-C and SIGTERM, whatever libraries and tests before have made of it."""
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
+    for number, handler in before.items():
+        if handler is not None:  # None: not set by Python, which cannot set it again
+            signal.signal(number, handler)
 
 
 @pytest.fixture(scope="session")

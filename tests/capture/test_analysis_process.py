@@ -15,6 +15,8 @@ from vla_attention.capture import analysis_process
 from vla_attention.capture.analysis_process import run_analysis
 from vla_attention.capture.command_line import run_capture_command
 
+pytestmark = pytest.mark.usefixtures("usual_signals")
+
 _ANALYSIS = """#!/bin/sh
 echo $$ > {folder}/process
 trap 'echo "vla-analyze: stopped; nothing was left half written." >&2; exit 130' INT
