@@ -16,10 +16,10 @@ from tests.kit.races import EPISODES, TASKS, overlapping_lists
 
 
 def test_eight_processes_of_which_one_is_killed_fill_a_store_as_one_does(tmp_path):
-    command = [sys.executable, "-m", "tests.kit.races", str(tmp_path), "--rounds", "2"]
+    command = [sys.executable, "-m", "tests.kit.races", str(tmp_path), "--rounds", "1"]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     rounds = [json.loads(line) for line in ended.stdout.splitlines()]
-    assert [one["problems"] for one in rounds] == [[], []], ended.stderr
+    assert [one["problems"] for one in rounds] == [[]], ended.stderr
     assert ended.returncode == 0, ended.stderr
     for one in rounds:
         assert len(one["exit_codes"]) == 9
