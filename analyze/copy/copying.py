@@ -20,14 +20,8 @@ from pathlib import Path
 from vla_attention.analyze.copy.packing import Packing
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 from vla_attention.schemas.stores.digest import run_digest, with_digest
-from vla_attention.schemas.stores.episode_files import files_of_no_array, links_in_episode
-from vla_attention.schemas.stores.partial_folders import (
-    make_partial,
-    partial_folder,
-    process_tag,
-    remove_dead_partials,
-    remove_if_empty,
-)
+from vla_attention.schemas.stores.episode_files import files_of_no_array, refuse_links
+from vla_attention.schemas.stores.partial_folders import partial_of, remove_dead_partials
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
 from vla_attention.schemas.stores.root import episode_folders, group_attributes, group_document, without_other_fields
@@ -123,38 +117,35 @@ def _copy(
     run = run_digest(group_attributes(root))
     target.parent.mkdir(parents=True, exist_ok=True)
     remove_dead_partials(target)
-    building = partial_folder(target) / f"copy-{process_tag()}"
-    make_partial(building)
     pack: Packing | None = None
     lock: int | None = None
-    try:
-        _ensure_root(store, target, root, building)
-        lock = lock_for_writing(target, packing=packed)
-        pack = Packing(target, run, building) if packed else None
-        present = {folder.name for folder in episode_folders(target)} if pack is None else pack.present()
-        _refuse_others(store, target, present)
-        added = copied = left = 0
-        for episode in store.episodes:
-            if episode.name not in present:
-                folder = building / episode.name
-                sizes = _copy_episode(store, episode, folder, without, run)
-                copied, left, added = copied + sizes[0], left + sizes[1], added + 1
-                if pack is None:
-                    _rename_new(folder, target / EPISODES_GROUP / episode.name)
-                else:
-                    pack.add(episode.name, folder)
-                    shutil.rmtree(folder)
-            if progress is not None:
-                progress(1)
-    finally:
+    with partial_of(target, "copy") as building:
         try:
-            if pack is not None:
-                pack.write_index()
+            _ensure_root(store, target, root, building)
+            lock = lock_for_writing(target, packing=packed)
+            pack = Packing(target, run, building) if packed else None
+            present = {folder.name for folder in episode_folders(target)} if pack is None else pack.present()
+            _refuse_others(store, target, present)
+            added = copied = left = 0
+            for episode in store.episodes:
+                if episode.name not in present:
+                    folder = building / episode.name
+                    sizes = _copy_episode(store, episode, folder, without, run)
+                    copied, left, added = copied + sizes[0], left + sizes[1], added + 1
+                    if pack is None:
+                        _rename_new(folder, target / EPISODES_GROUP / episode.name)
+                    else:
+                        pack.add(episode.name, folder)
+                        shutil.rmtree(folder)
+                if progress is not None:
+                    progress(1)
         finally:
-            if lock is not None:
-                os.close(lock)
-            shutil.rmtree(building, ignore_errors=True)
-            remove_if_empty(building.parent)
+            try:
+                if pack is not None:
+                    pack.write_index()
+            finally:
+                if lock is not None:
+                    os.close(lock)
     return Copied(added, len(store.episodes) - added, copied, left)
 
 
@@ -213,8 +204,7 @@ def _copy_episode(
             f"Episode {episode.name} has files that belong to no array: {listing(beyond, 5)}. They are not copied, and "
             "without them its seal would not fit."
         )
-    for path in links_in_episode(episode):
-        raise CorruptEpisode(f"Episode {episode.name} is damaged: its {path} is a link, and no copy follows links.")
+    refuse_links(episode)
     for name in episode.attributes.arrays:
         if _part_of(name) not in without and f"{name}/zarr.json" not in episode.files.records:
             raise CorruptEpisode(f"Episode {episode.name} lacks the array {name}: its files are gone.")

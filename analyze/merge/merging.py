@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,14 +16,8 @@ from pathlib import Path
 from vla_attention.analyze.stores.checking import reports_of_store
 from vla_attention.schemas.errors import BadArgument, UserError, listing
 from vla_attention.schemas.stores.digest import with_digest
-from vla_attention.schemas.stores.episode_files import links_in_episode
-from vla_attention.schemas.stores.partial_folders import (
-    make_partial,
-    partial_folder,
-    process_tag,
-    remove_dead_partials,
-    remove_if_empty,
-)
+from vla_attention.schemas.stores.episode_files import refuse_links
+from vla_attention.schemas.stores.partial_folders import partial_of, remove_dead_partials
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.remote_source import source_of
 from vla_attention.schemas.stores.root import group_attributes, group_document
@@ -72,13 +65,8 @@ def merge_stores(
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         remove_dead_partials(target)
-        building = partial_folder(target) / f"merge-{process_tag()}"
-        make_partial(building)
-        try:
+        with partial_of(target, "merge") as building:
             return _merge(stores, target, building / target.name, progress, link)
-        finally:
-            shutil.rmtree(building, ignore_errors=True)
-            remove_if_empty(building.parent)
     except OSError as error:
         if isinstance(error, UserError) or error.errno is None:
             raise
@@ -168,8 +156,7 @@ def _bring(episode: StoredEpisode, folder: Path, link: bool) -> tuple[int, int]:
     """Link or copy the files of an episode that its seal lists; returns the bytes that were linked and copied."""
     linked = copied = 0
     try:
-        for path in links_in_episode(episode):
-            raise CorruptEpisode(f"Episode {episode.name} is damaged: its {path} is a link, and no copy follows links.")
+        refuse_links(episode)
         files = [*episode.files.records, SEAL_FILE]
         for file in files:
             place = folder / file

@@ -10,7 +10,13 @@ import zarr
 from vla_attention.capture.store.durable_files import publish
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.stores.digest import with_digest
-from vla_attention.schemas.stores.partial_folders import make_partial, partial_folder, process_tag, remove_if_empty
+from vla_attention.schemas.stores.partial_folders import (
+    make_partial,
+    partial_folder,
+    partial_of,
+    process_tag,
+    remove_if_empty,
+)
 from vla_attention.schemas.stores.root import read_root
 from vla_attention.schemas.stores.run_differences import run_differences
 from vla_attention.schemas.stores.store_format import (
@@ -51,20 +57,16 @@ def create_root(path: Path, attributes: RootAttributes, durable: bool) -> RootAt
 
     Another process may have created it first. `durable`: flush it to disk, see `RunStore`.
     """
-    building = partial_folder(path) / f"root-{process_tag()}"
     try:
-        make_partial(building)
-        root = zarr.create_group(building, zarr_format=3)
-        root.update_attributes(with_digest(to_json(attributes)))
-        root.create_group(EPISODES_GROUP)
-        publish(building, path, durable)
+        with partial_of(path, "root") as building:
+            root = zarr.create_group(building, zarr_format=3)
+            root.update_attributes(with_digest(to_json(attributes)))
+            root.create_group(EPISODES_GROUP)
+            publish(building, path, durable)
     except OSError:
         # If a store is there now, another process of the same array job was first.
         if not path.exists():
             raise
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
-        remove_if_empty(building.parent)
     return read_existing_root(path)
 
 

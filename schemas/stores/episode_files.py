@@ -13,7 +13,7 @@ from pathlib import PurePosixPath
 
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.seal import SEAL_FILE
-from vla_attention.schemas.stores.store_format import EpisodeAttributes, RootAttributes
+from vla_attention.schemas.stores.store_format import CorruptEpisode, EpisodeAttributes, RootAttributes
 from vla_attention.schemas.stores.store_url import StoreUrl
 
 #: Names of chunks below their array, in the encodings that Zarr v3 has: `c.0.1`, `c/0/1`, `0.1`, `0/1`, `c`.
@@ -47,3 +47,9 @@ def links_in_episode(episode: StoredEpisode) -> list[str]:
     files = [*episode.files.records, SEAL_FILE]
     folders = {str(parent) for file in files for parent in PurePosixPath(file).parents}
     return [path for path in sorted({*folders, *files}) if os.path.islink(episode.folder / path)]
+
+
+def refuse_links(episode: StoredEpisode) -> None:
+    """Raise `CorruptEpisode` for an episode with links, which is not copied."""
+    for path in links_in_episode(episode):
+        raise CorruptEpisode(f"Episode {episode.name} is damaged: its {path} is a link, and no copy follows links.")

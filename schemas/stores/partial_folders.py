@@ -10,6 +10,8 @@ import os
 import shutil
 import socket
 import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from vla_attention.schemas.stores.store_format import PARTIAL_SUFFIX
@@ -87,6 +89,18 @@ def make_partial(folder: Path) -> None:
         except FileNotFoundError:
             continue
         return
+
+
+@contextmanager
+def partial_of(store: Path, purpose: str) -> Iterator[Path]:
+    """A new folder beside the store for what is being written; after the block what was not renamed is removed."""
+    folder = partial_folder(store) / f"{purpose}-{process_tag()}"
+    try:
+        make_partial(folder)
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        remove_if_empty(folder.parent)
 
 
 def remove_if_empty(folder: Path) -> None:
