@@ -5,6 +5,7 @@
 #   make test        formatting, types, all tests, and the package as others install it
 #   make test-policies   policies of transformers 5 and LeRobot, in environments of their own (.venv-transformers, .venv-lerobot)
 #   make test-remote stores in S3, on moto's server on this machine, in an environment of its own (.venv-remote)
+#   make viewer      the page of `vla-analyze view` from its sources in analyze/view/web (needs node and npm)
 #   make fuzz        made-up bytes for every parser of files, for SECONDS=3600, in an environment of its own (.venv-fuzz)
 #   make test-slurm  an array job on the SLURM that sbatch reaches from here (opt-in; installs nothing)
 #   make setup       the whole environment        make setup-analyze   the laptop's part of it
@@ -37,7 +38,7 @@ WORKERS ?= 2
 # An empty PYTHONDONTWRITEBYTECODE: where it is set, both processes compile all tests anew at every run.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: capture analyze test test-policies test-remote test-slurm fuzz test-thorough check unit package audit setup setup-analyze schemas clean
+.PHONY: capture analyze test test-policies test-remote test-slurm fuzz test-thorough check unit package audit setup setup-analyze schemas viewer clean
 
 capture: .venv/capture-installed
 	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --store $(STORE) \
@@ -92,6 +93,13 @@ audit: .venv/capture-installed .venv-audit/installed
 
 schemas: .venv/capture-installed
 	$(BIN)/python -m vla_attention.schemas.json_files
+
+# What users get is checked in: only who changes the page's sources needs node. The copy of the lock file says what is installed.
+VIEWER := analyze/view/web
+viewer:
+	@command -v npm >/dev/null || { echo "make viewer needs node (18.18 or later) and npm." >&2; exit 2; }
+	cmp -s $(VIEWER)/package-lock.json $(VIEWER)/node_modules/.installed || { cd $(VIEWER) && npm ci --ignore-scripts --no-audit --no-fund && cp package-lock.json node_modules/.installed; }
+	cd $(VIEWER) && npm run --silent check && npm run --silent build
 
 setup: .venv/capture-installed
 

@@ -26,7 +26,9 @@ from pathlib import Path, PurePosixPath
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "vla_attention"
 #: Folders of the checkout that are no part of its source.
-LEFT_OUT = shutil.ignore_patterns(".*", "build", "dist", "*.egg-info", "__pycache__", "runs", "results")
+LEFT_OUT = shutil.ignore_patterns(".*", "build", "dist", "*.egg-info", "__pycache__", "runs", "results", "node_modules")
+#: What the wheel, other than the source distribution, has no use for: the viewer's page is built.
+SOURCES_OF_THE_PAGE = f"{PACKAGE}/analyze/view/web/"
 #: What stands at the top of the source distribution.
 TOP_OF_SDIST = {
     PACKAGE,
@@ -107,6 +109,7 @@ def build_packages(folder: Path) -> Path:
         names = {name for name in archive.namelist() if not name.endswith("/")}
         (top_level,) = (archive.read(name).decode().split() for name in names if name.endswith("/top_level.txt"))
     compare("top_level.txt of the wheel", set(top_level), {PACKAGE})
+    expected = {name for name in expected if not name.startswith(SOURCES_OF_THE_PAGE)}
     compare(wheel.name, {name for name in names if ".dist-info/" not in name}, expected)
     print(f"built {sdist.name} and from it {wheel.name}: {len(expected)} files in {PACKAGE}/, nothing beside it")
     return wheel
