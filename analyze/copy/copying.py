@@ -3,7 +3,8 @@
 An episode's attributes list its arrays, and its seal lists its files. Deleting folders therefore gives a damaged store.
 A copy has attributes that list the arrays it has, a root that names the omitted parts and the run it was copied from,
 and a new seal that names the one under which the episode was captured. A copy without omissions is the same to the
-byte, its seals too. Every file is compared with the seal when it is copied, so a damaged episode is refused.
+byte, its seals too; the root of one from the hub names the commit that it was copied from. Every file is compared with
+the seal when it is copied, so a damaged episode is refused.
 """
 
 from __future__ import annotations
@@ -16,11 +17,13 @@ import shutil
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from vla_attention.analyze.copy.packing import Packing
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 from vla_attention.schemas.stores.digest import run_digest, with_digest
 from vla_attention.schemas.stores.episode_files import files_of_no_array, refuse_links
+from vla_attention.schemas.stores.hub_address import HUB_PROTOCOL, MAIN, HubAddress
 from vla_attention.schemas.stores.partial_folders import partial_of, remove_dead_partials
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
@@ -34,6 +37,7 @@ from vla_attention.schemas.stores.store_format import (
 )
 from vla_attention.schemas.stores.store_lock import lock_for_writing
 from vla_attention.schemas.stores.store_place import check_place
+from vla_attention.schemas.stores.store_url import StoreUrl
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,8 @@ PARTS: dict[str, Part] = {
     "contributions": Part("value-weighted contributions; their norms need them", r"/contribution(/|$)"),
 }
 REST = "rest"
+#: What a copy's provenance calls the address on the hub that it was copied from, with its commit.
+FETCHED_FROM = "fetched_from"
 
 
 @dataclass(frozen=True)
@@ -158,7 +164,13 @@ def _ensure_root(store: Store, target: Path, root: bytes, building: Path) -> Non
         (empty / EPISODES_DOCUMENT).write_bytes(_episodes_document(store))
         _rename_new(empty, target)
     if (target / "zarr.json").read_bytes() != root if (target / "zarr.json").is_file() else True:
-        open_store(target)  # raises when it is no store
+        there = open_store(target).attributes.provenance.get(FETCHED_FROM)  # raises when it is no store
+        here = group_attributes(root)["provenance"].get(FETCHED_FROM)
+        if there and here and HubAddress.of(there).at(MAIN) == HubAddress.of(here).at(MAIN) and there != here:
+            raise RunMismatch(
+                f"Cannot continue the copy {target}: it is of {there}, and the repository is at another commit now "
+                f"({here}). Give the first address to go on with it, or another name for a new copy."
+            )
         raise RunMismatch(
             f"Cannot continue the copy {target}: it is of another run than {store.path}, or leaves other parts behind; "
             "give another name."
@@ -232,16 +244,25 @@ def _copy_episode(
 def _root_document(store: Store, without: tuple[str, ...]) -> bytes:
     """The copy's `zarr.json`: that of the run, in the version that it has, with the omitted parts."""
     content = without_other_fields(source_of(store.path).whole("zarr.json"))
-    if not without:
+    from_hub = isinstance(store.path, StoreUrl) and store.path.url.startswith(HUB_PROTOCOL)
+    if not without and not from_hub:
         return content
     attributes = group_attributes(content)
     recording, provenance = attributes["recording"], attributes["provenance"]
+    if from_hub:
+        provenance[FETCHED_FROM] = str(store.path)
+    if without:
+        _leave_out(recording, provenance, without, store.run)
+    return group_document(with_digest(attributes) if store.attributes.store_version else attributes)
+
+
+def _leave_out(recording: dict[str, Any], provenance: dict[str, str], without: Sequence[str], run: str) -> None:
+    """State in a root that a copy has no such parts, and of which run it is."""
     recording.update({name: False for name in without if name in recording})
     before = provenance.get("copied_without", "").split(", ")
     provenance["copied_without"] = ", ".join(name for name in PARTS if name in without or name in before)
     # A copy of a copy names the store that was captured, not the copy.
-    provenance.setdefault("copied_from", store.run)
-    return group_document(with_digest(attributes) if store.attributes.store_version else attributes)
+    provenance.setdefault("copied_from", run)
 
 
 def _episodes_document(store: Store) -> bytes:

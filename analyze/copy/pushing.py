@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +10,10 @@ from vla_attention.analyze.stores.contents import protocol_text
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, MissingDependency, listing
 from vla_attention.schemas.safe_text import visible
+from vla_attention.schemas.stores.hub_address import HUB_PROTOCOL, HubAddress
 from vla_attention.schemas.stores.packed_index import INDEX_FILE
 from vla_attention.schemas.stores.reader import Store, open_store
-from vla_attention.schemas.stores.remote_source import RemoteFailure, hub_parts
+from vla_attention.schemas.stores.remote_source import RemoteFailure
 from vla_attention.schemas.stores.store_format import EPISODES_GROUP, STORE_SUFFIX, StoreError
 
 #: Files of one commit; the hub advises against thousands.
@@ -21,34 +21,19 @@ _FILES_A_COMMIT = 200
 CARD = "README.md"
 
 
-@dataclass(frozen=True)
-class HubPlace:
-    """A folder of a data set on the hub."""
-
-    repository: str
-    revision: str
-    path: str
-
-    @property
-    def url(self) -> str:
-        """Its address for the commands."""
-        at = "" if self.revision == "main" else f"@{self.revision}"
-        return f"hf://datasets/{self.repository}{at}/{self.path}"
-
-
-def check_push(address: str) -> HubPlace:
+def check_push(address: str) -> HubAddress:
     """Where to upload to; raises `BadArgument` for another address than a NAME.zarr in a data set of the hub."""
     expected = "expected hf://datasets/ORG/NAME/FILE.zarr"
-    if not address.startswith("hf://"):
+    if not address.startswith(HUB_PROTOCOL):
         raise BadArgument(f"Cannot push to {address}: {expected}.")
-    kind, repository, revision, path = hub_parts(address)
-    if kind != "datasets" or not path.endswith(STORE_SUFFIX):
+    place = HubAddress.of(address)
+    if place.kind != "datasets" or not place.path.endswith(STORE_SUFFIX):
         raise BadArgument(f"Cannot push to {address}: {expected}.")
     _client()
-    return HubPlace(repository, revision, path)
+    return place
 
 
-def push_store(path: Path, place: HubPlace) -> str:
+def push_store(path: Path, place: HubAddress) -> str:
     """Upload the packed store at `path`; returns a sentence that says what was done.
 
     Episodes go first and the index last: a reader never finds an index of what is not there. A card that the data set
@@ -82,15 +67,15 @@ def push_store(path: Path, place: HubPlace) -> str:
         if isinstance(error, (StoreError, BadArgument)):
             raise
         raise RemoteFailure(
-            f"The hub did not take {path} for {place.url}: {visible(str(error).partition(chr(10))[0])}. Log in with "
+            f"The hub did not take {path} for {place}: {visible(str(error).partition(chr(10))[0])}. Log in with "
             "`hf auth login`, check that you may write there, and run the same command again: what is there is not "
             "sent twice."
         ) from None
     card = f"; its {CARD} is left as it was" if has_card else ""
-    return f"{place.url}: {plural(len(store.episodes), 'episode')} in {plural(len(files) + 1, 'file')}{card}."
+    return f"{place}: {plural(len(store.episodes), 'episode')} in {plural(len(files) + 1, 'file')}{card}."
 
 
-def dataset_card(store: Store, place: HubPlace) -> str:
+def dataset_card(store: Store, place: HubAddress) -> str:
     """The card of a data set that holds a packed store."""
     root = store.attributes
     recording, policy = root.recording, root.policy
@@ -141,15 +126,15 @@ def dataset_card(store: Store, place: HubPlace) -> str:
         "",
         "```bash",
         "pip install 'vla-attention[remote]'",
-        f"vla-analyze {place.url}             # only the bytes that the question needs are fetched",
-        f"vla-analyze verify {place.url}",
+        f"vla-analyze {place}             # only the bytes that the question needs are fetched",
+        f"vla-analyze verify {place}",
         "```",
         "",
     ]
     return "\n".join(lines)
 
 
-def _commit(hub: Any, api: Any, place: HubPlace, files: dict[Any, str]) -> None:
+def _commit(hub: Any, api: Any, place: HubAddress, files: dict[Any, str]) -> None:
     """Upload files (paths, or bytes) under their names in the data set."""
     operations = [
         hub.CommitOperationAdd(path_in_repo=name, path_or_fileobj=str(file) if isinstance(file, Path) else file)

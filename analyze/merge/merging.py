@@ -13,10 +13,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.stores.checking import reports_of_store
 from vla_attention.schemas.errors import BadArgument, UserError, listing
 from vla_attention.schemas.stores.digest import with_digest
 from vla_attention.schemas.stores.episode_files import refuse_links
+from vla_attention.schemas.stores.hub_address import HUB_PROTOCOL
 from vla_attention.schemas.stores.partial_folders import partial_of, remove_dead_partials
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.remote_source import source_of
@@ -31,7 +33,7 @@ from vla_attention.schemas.stores.store_format import (
     StoreExists,
 )
 from vla_attention.schemas.stores.store_place import check_place
-from vla_attention.schemas.stores.store_url import StoreUrl
+from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
 
 #: Differing fields that are named of two stores.
 _MOST_NAMED = 5
@@ -147,9 +149,14 @@ def _root_document(stores: Sequence[Store]) -> bytes:
     """The root of the first store, with the names of all of them in its provenance."""
     attributes = group_attributes(source_of(stores[0].path).whole("zarr.json"))
     attributes["provenance"]["merged_from"] = ", ".join(
-        f"{store.path.name} ({len(store.episodes)} episodes)" for store in stores
+        f"{_named(store.path)} ({plural(len(store.episodes), 'episode')})" for store in stores
     )
     return group_document(with_digest(attributes) if stores[0].attributes.store_version else attributes)
+
+
+def _named(place: StorePlace) -> str:
+    """What a store is called in the provenance: its name, or its address on the hub with the commit."""
+    return str(place) if str(place).startswith(HUB_PROTOCOL) else place.name
 
 
 def _bring(episode: StoredEpisode, folder: Path, link: bool) -> tuple[int, int]:

@@ -26,7 +26,7 @@ from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder
 from vla_attention.schemas.stores.episode_shapes import misfits
 from vla_attention.schemas.stores.packed_index import INDEX_FILE, PackedEpisode, read_index
-from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
+from vla_attention.schemas.stores.remote_source import RemoteFailure, at_commit, source_of
 from vla_attention.schemas.stores.root import group_attributes, list_episodes, read_run
 from vla_attention.schemas.stores.seal import identity_problem, read_seal
 from vla_attention.schemas.stores.sealed_files import SealedFiles
@@ -381,6 +381,7 @@ class Store:
 def open_store(path: str | StorePlace) -> Store:
     """Open a store for reading, at a path or an address; its episodes are in the order of task id and episode index.
 
+    What is on the hub is read at one commit, which is in the `path` of the opened store.
     What lies among the episodes and is none is named in a `Note` and ignored.
 
     Raises:
@@ -388,7 +389,7 @@ def open_store(path: str | StorePlace) -> Store:
         StoreError: something else is there, or its attributes cannot be read.
         FormatTooNew: a later version wrote it.
     """
-    path = store_place(path)
+    path = at_commit(store_place(path))
     root, run = read_run(path)
     source = source_of(path)
     index = read_index(source, path, run)

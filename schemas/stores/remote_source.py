@@ -22,9 +22,10 @@ from typing import Any
 
 from vla_attention.schemas.byte_counts import parse_bytes
 from vla_attention.schemas.errors import BadArgument, UserError
-from vla_attention.schemas.limits import WHOLE_FILE_BYTES
+from vla_attention.schemas.limits import ROOT_BYTES, WHOLE_FILE_BYTES
 from vla_attention.schemas.stores.bounded_fetch import fetched
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder, Memory, copy_into, split
+from vla_attention.schemas.stores.hub_address import HUB_PROTOCOL, HubAddress, stated_commit
 from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
 
 FOLDER_VARIABLE = "VLA_REMOTE_CACHE"
@@ -68,6 +69,37 @@ def source_of(place: StorePlace) -> ByteSource:
     return RemoteFolder(place.url)
 
 
+def at_commit(place: StorePlace) -> StorePlace:
+    """The same place, at the commit that its branch or tag on the hub is now; other places are as they are.
+
+    A branch may be moved between two requests, so that a store would be read half at one commit and half at another.
+
+    Raises:
+        RemoteFailure: the hub has no such repository or revision, shows it to others only, or cannot be asked.
+    """
+    if not isinstance(place, StoreUrl) or not place.url.startswith(HUB_PROTOCOL):
+        return place
+    address = HubAddress.of(place.url)
+    if address.is_commit:
+        return place
+    files, _ = _file_system(place.url)
+    asked = address.revision_address(_hub()[0])
+    try:
+        answer = _asked(place.url, lambda: fetched(files, asked, None, None, ROOT_BYTES))
+    except FileNotFoundError:
+        raise RemoteFailure(
+            f"{place.url} cannot be read: the hub knows no revision {address.revision} of {address.repository}. "
+            "Private repositories need HF_TOKEN or `hf auth login`."
+        ) from None
+    commit = stated_commit(answer)
+    if commit is None:
+        raise RemoteFailure(
+            f"{place.url} cannot be read: the hub did not say which commit {address.revision} is. Give the commit "
+            "after the repository's name: hf://datasets/ORG/NAME@COMMIT/PATH."
+        )
+    return StoreUrl(str(address.at(commit)))
+
+
 @dataclass(frozen=True)
 class RemoteFolder:
     """A folder at an address that fsspec can read.
@@ -105,7 +137,7 @@ class RemoteFolder:
 
     def names(self, folder: str) -> list[str]:
         """The names in a folder, where the server lists them."""
-        if self.url.startswith("hf://"):
+        if self.url.startswith(HUB_PROTOCOL):
             files, path = _hub_listing(self.url)
         else:
             files, path = _file_system(self.url)
@@ -242,10 +274,10 @@ def _file_system_of(url: str, _process: int, *_hub_variables: str | None) -> tup
     except ImportError as error:
         raise _missing(url, error) from None
     try:
-        if url.startswith("hf://"):
+        if url.startswith(HUB_PROTOCOL):
             endpoint, headers = _hub()
             options = {"headers": headers, "timeout": _time_limits()}
-            return fsspec.filesystem("https", client_kwargs=options), _hub_address(endpoint, url)
+            return fsspec.filesystem("https", client_kwargs=options), HubAddress.of(url).file_address(endpoint)
         is_web = url.startswith(("http://", "https://"))
         files, path = url_to_fs(url, **({"client_kwargs": {"timeout": _time_limits()}} if is_web else {}))
     except ImportError as error:
@@ -273,28 +305,12 @@ def _hub() -> tuple[str, dict[str, str]]:
     return endpoint, {"authorization": f"Bearer {token}"} if token else {}
 
 
-def hub_parts(url: str) -> tuple[str, str, str, str]:
-    """Kind (`datasets` or `models`), repository, revision and path of a `hf://` address."""
-    parts = url.removeprefix("hf://").split("/")
-    kind = parts.pop(0) if parts[0] in ("datasets", "spaces") else "models"
-    name, _, revision = (parts[1] if len(parts) > 1 else "").partition("@")
-    if not parts[0] or not name:
-        raise BadArgument(f"{url} is no address on the hub; expected hf://datasets/ORG/NAME/PATH.")
-    return kind, f"{parts[0]}/{name}", revision or "main", "/".join(parts[2:])
-
-
-def _hub_address(endpoint: str, url: str) -> str:
-    kind, repository, revision, path = hub_parts(url)
-    prefix = "" if kind == "models" else f"{kind}/"
-    return f"{endpoint}/{prefix}{repository}/resolve/{revision.replace('/', '%2F')}/{path}".rstrip("/")
-
-
 def _hub_listing(url: str) -> tuple[Any, str]:
     try:
         from huggingface_hub import HfFileSystem
     except ImportError as error:
         raise _missing(url, error) from None
-    return HfFileSystem(), url.removeprefix("hf://")
+    return HfFileSystem(), url.removeprefix(HUB_PROTOCOL)
 
 
 def _missing(url: str, error: ImportError) -> RemoteFailure:

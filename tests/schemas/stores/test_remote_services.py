@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import sys
 from collections.abc import Iterator
@@ -22,6 +23,9 @@ from vla_attention.testing.stores import StoreSpec, write_store
 pytest.importorskip("aiohttp", reason="needs the extra remote: pip install 'vla-attention[remote]'")
 
 
+COMMIT = "a" * 40
+
+
 @pytest.fixture(scope="module")
 def stores(tmp_path_factory) -> tuple[Path, Path]:
     """A store of folders, and the same packed."""
@@ -29,6 +33,10 @@ def stores(tmp_path_factory) -> tuple[Path, Path]:
     folder = write_store(made / "folder.zarr", spec=StoreSpec(tasks=(0,), episodes=2, replans=2))
     copy_store(open_store(folder), made / "packed.zarr", (), packed=True)
     return folder, made / "packed.zarr"
+
+
+def hub_commit(folder: Path, commit: str) -> Path:
+    return folder / f"hub/datasets/org/name/resolve/{commit}"
 
 
 def csv_of(place: str, out: Path) -> dict[str, bytes]:
@@ -87,10 +95,17 @@ def test_stores_in_s3_give_the_same_tables(bucket, stores, tmp_path, capsys):
         assert said.count("\n") == 1
 
 
+def point_main_at(hub: Path, commit: str) -> None:
+    revisions = hub / "api/datasets/org/name/revision"
+    revisions.mkdir(parents=True, exist_ok=True)
+    (revisions / "main").write_text(json.dumps({"id": "org/name", "sha": commit}))
+
+
 @pytest.fixture
 def hub(stores, tmp_path, monkeypatch) -> Iterator[Served]:
-    """A server with the addresses under which the hub serves files."""
-    shutil.copytree(stores[1], tmp_path / "hub/datasets/org/name/resolve/main/runs/a.zarr")
+    """A server with the addresses under which the hub serves files, of commits only, and says what `main` is."""
+    shutil.copytree(stores[1], hub_commit(tmp_path, COMMIT) / "runs/a.zarr")
+    point_main_at(tmp_path / "hub", COMMIT)
     with serve(tmp_path / "hub") as served:
         monkeypatch.setenv("HF_ENDPOINT", served.url)
         monkeypatch.setenv("HF_TOKEN", "made-up")
@@ -102,18 +117,63 @@ def test_a_store_on_the_hub_is_read_by_ranges(hub, stores, tmp_path, capsys):
     assert csv_of(url, tmp_path / "there").keys() == csv_of(str(stores[1]), tmp_path / "here").keys()
     for name in ("summary.txt",):
         there, here = (tmp_path / "there" / name).read_text(), (tmp_path / "here" / name).read_text()
-        assert there.replace(url, "S") == here.replace(str(stores[1]), "S")
+        assert there.replace(url.replace("name/", f"name@{COMMIT}/"), "S") == here.replace(str(stores[1]), "S")
     assert all(wanted for path, wanted in hub.requests if path.endswith(".zip"))
     assert verify_store(open_store(url)) == []
     capsys.readouterr()
     for wrong, expected in (
         ("hf://datasets/org/name/runs/b.zarr", "There is no store at"),
         ("hf://datasets/org", "expected hf://datasets/ORG/NAME/PATH"),
+        ("hf://datasets/org/name@v2/runs/a.zarr", "knows no revision v2 of org/name"),
+        ("hf://datasets/org/other/a.zarr", "knows no revision main of org/other"),
     ):
         assert analyze([wrong, "--no-plots"]) == 2
         said = capsys.readouterr().err
         assert expected in said
         assert said.count("\n") == 1
+
+
+def test_a_branch_is_asked_for_once_and_everything_is_read_at_its_commit(hub, stores, tmp_path, capsys):
+    """While the store is read, somebody moves `main` to a commit that has nothing of it."""
+
+    def move(path: str, content: bytes) -> bytes:
+        if path.endswith("a.zarr/zarr.json"):
+            point_main_at(tmp_path / "hub", "b" * 40)
+        return content
+
+    hub.change = move
+    assert analyze(["copy", "hf://datasets/org/name/runs/a.zarr", str(tmp_path / "here.zarr")]) == 0
+    assert sum("/revision/" in path for path, _ in hub.requests) == 1
+    assert all(f"/resolve/{COMMIT}/" in path for path, _ in hub.requests if "/revision/" not in path)
+    copied = open_store(tmp_path / "here.zarr")
+    assert copied.attributes.provenance["fetched_from"] == f"hf://datasets/org/name@{COMMIT}/runs/a.zarr"
+    assert copied.run == open_store(stores[0]).run
+    assert verify_store(copied) == []
+    # A copy is of one commit. With it the same command goes on.
+    capsys.readouterr()
+    shutil.copytree(hub_commit(tmp_path, COMMIT), hub_commit(tmp_path, "b" * 40))
+    assert analyze(["copy", "hf://datasets/org/name/runs/a.zarr", str(tmp_path / "here.zarr")]) == 2
+    said = capsys.readouterr().err
+    assert f"it is of hf://datasets/org/name@{COMMIT}/runs/a.zarr" in said
+    assert said.count("\n") == 1
+    assert analyze(["copy", f"hf://datasets/org/name@{COMMIT}/runs/a.zarr", str(tmp_path / "here.zarr")]) == 0
+    assert "2 were there already" in capsys.readouterr().out
+
+
+def test_a_merged_store_names_the_commit(hub, tmp_path):
+    more = write_store(tmp_path / "more.zarr", spec=StoreSpec(tasks=(1,), episodes=1, replans=2))
+    url = "hf://datasets/org/name/runs/a.zarr"
+    assert analyze(["merge", url, str(more), "-o", str(tmp_path / "all.zarr")]) == 0
+    assert open_store(tmp_path / "all.zarr").attributes.provenance["merged_from"] == (
+        f"hf://datasets/org/name@{COMMIT}/runs/a.zarr (2 episodes), more.zarr (1 episode)"
+    )
+
+
+@pytest.mark.parametrize("answer", ["{}", "no JSON", '{"sha": "main"}', "[]", '{"sha": 5}'])
+def test_a_hub_that_states_no_commit(hub, tmp_path, capsys, answer):
+    (tmp_path / "hub/api/datasets/org/name/revision/main").write_text(answer)
+    assert analyze(["hf://datasets/org/name/runs/a.zarr", "--list"]) == 2
+    assert "did not say which commit main is" in capsys.readouterr().err
 
 
 def test_the_token_goes_to_the_hub_and_not_where_it_sends_readers(hub, stores, tmp_path):
