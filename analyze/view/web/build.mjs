@@ -30,6 +30,7 @@ const COMMON = {
   target: "es2022",
   charset: "utf8",
   legalComments: "none",
+  loader: { ".txt": "text" },
   plugins: [onlyBlosc],
   logLevel: "warning",
 };
@@ -51,6 +52,14 @@ async function digestOfSources() {
   const lines = [];
   for (const path of await filesOf(HERE)) lines.push(`${sha256(await readFile(join(HERE, path)))}  ${path}\n`);
   return sha256(lines.join(""));
+}
+
+/** Digests of what the page takes from elsewhere in the checkout, by the path as seen from here. */
+async function filesFromElsewhere(inputs) {
+  const paths = Object.keys(inputs).filter((path) => path.startsWith("../") && !path.includes("node_modules/"));
+  return Object.fromEntries(
+    await Promise.all(paths.sort().map(async (path) => [path, sha256(await readFile(join(HERE, path)))])),
+  );
 }
 
 /** The licences of the packages that are part of the page. */
@@ -85,7 +94,8 @@ async function buildPage(folder) {
   files.set("index.html", await readFile(join(HERE, "src/index.html")));
   files.set("licenses.txt", Buffer.from(await licenses(metafile.inputs)));
   const digests = Object.fromEntries([...files.keys()].sort().map((name) => [name, sha256(files.get(name))]));
-  const built = { sources: await digestOfSources(), files: digests };
+  const elsewhere = await filesFromElsewhere(metafile.inputs);
+  const built = { sources: await digestOfSources(), elsewhere, files: digests };
   files.set("build.json", Buffer.from(`${JSON.stringify(built, null, 2)}\n`));
 
   await mkdir(folder, { recursive: true });

@@ -35,6 +35,8 @@ def digest_of_sources(folder: Path) -> str:
 def test_the_bundle_is_the_build_of_the_sources():
     built = json.loads((BUNDLE / "build.json").read_text())
     assert built["sources"] == digest_of_sources(SOURCES), f"The page was built from other sources. {NEXT_STEP}"
+    elsewhere = {path: sha256((SOURCES / path).read_bytes()) for path in built["elsewhere"]}
+    assert built["elsewhere"] == elsewhere, f"The page was built from another state of these files. {NEXT_STEP}"
     files = {path.name: sha256(path.read_bytes()) for path in BUNDLE.iterdir() if path.name != "build.json"}
     assert built["files"] == files, f"Files of the bundle are not those that were built. {NEXT_STEP}"
 
