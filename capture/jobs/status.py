@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 from vla_attention.capture.environments.suites import SUITES
-from vla_attention.capture.jobs.worker_records import planned_tasks, read_records
+from vla_attention.capture.jobs.worker_records import WorkerRecord, planned_tasks, read_records
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.jsonable import to_json
@@ -17,7 +17,7 @@ from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.claims import Holder, holders
 from vla_attention.schemas.stores.damaged_episodes import DamagedEpisode, look_at
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.schemas.stores.store_format import parse_episode_name
+from vla_attention.schemas.stores.store_format import is_episode_name, parse_episode_name
 from vla_attention.schemas.stores.store_url import local_path
 
 
@@ -38,6 +38,23 @@ class EpisodeStatus:
 
 
 @dataclass(frozen=True)
+class DroppedEpisode:
+    """An episode that the store lacks, because a worker left it out after a fault.
+
+    at: time of the last such fault (ISO 8601, UTC). by: the worker. reason: the sentence of the fault.
+    """
+
+    name: str
+    at: str
+    by: str
+    reason: str
+
+    def describe(self) -> str:
+        """Return the episode and what happened as one line."""
+        return f"{self.name} by {self.by}, {_plain_time(self.at)}: {self.reason}"
+
+
+@dataclass(frozen=True)
 class TaskStatus:
     """One task.
 
@@ -45,6 +62,7 @@ class TaskStatus:
     committed, success, bytes: of the episodes that are not damaged. unknown: how many of them have no known outcome.
     missing: indices of the expected episodes that the store lacks.
     damaged: episodes that are in the store, but cannot be used.
+    dropped: missing episodes that a capture left out after a fault, with the reason.
     """
 
     task_id: int
@@ -58,6 +76,7 @@ class TaskStatus:
     missing: tuple[int, ...]
     damaged: tuple[DamagedEpisode, ...]
     unknown: int = 0
+    dropped: tuple[DroppedEpisode, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -78,14 +97,15 @@ class StoreStatus:
         return None if any(task.expected is None for task in self.tasks) or not self.tasks else True
 
     def lacking_lines(self) -> list[str]:
-        """Return a line for every task with missing episodes, and for every damaged episode."""
+        """Return a line for every task with missing episodes, and for every dropped and every damaged episode."""
         missing = [
             f"missing: task {task.task_id} lacks {len(task.missing)} of {task.expected} episodes: "
             f"{listing(task.missing, 20)}"
             for task in self.tasks
             if task.missing
         ]
-        return missing + [f"damaged: {episode.describe()}" for task in self.tasks for episode in task.damaged]
+        dropped = [f"dropped: {episode.describe()}" for task in self.tasks for episode in task.dropped]
+        return missing + dropped + [f"damaged: {episode.describe()}" for task in self.tasks for episode in task.damaged]
 
 
 def store_status(path: Path, expected: int | None = None, verify: bool = False) -> StoreStatus:
@@ -127,7 +147,8 @@ def store_status(path: Path, expected: int | None = None, verify: bool = False) 
                 by=worker.describe() if worker else "",
             )
         )
-    ids = set(plan) | set(episodes) | set(damaged)
+    dropped = _dropped(records, {stored.name for stored in store.episodes})
+    ids = set(plan) | set(episodes) | set(damaged) | set(dropped)
     if expected is not None and not plan:
         ids |= set(range(next((suite.num_tasks for suite in SUITES if suite.name == root.protocol.suite), 0)))
     tasks = []
@@ -150,6 +171,7 @@ def store_status(path: Path, expected: int | None = None, verify: bool = False) 
                 missing=tuple(sorted(set(range(wanted or 0)) - present)),
                 damaged=tuple(faulty),
                 unknown=sum(episode.success is None for episode in found),
+                dropped=tuple(dropped.get(task_id, ())),
             )
         )
     return StoreStatus(str(path), root.protocol.suite, root.policy.name, tuple(tasks), tuple(holders(path)))
@@ -167,6 +189,25 @@ def print_status(stores: Sequence[Path], expected: int | None, as_json: bool, ch
     else:
         print("\n\n".join(_text(status) for status in found))
     return 1 if check and any(status.complete is False for status in found) else 0
+
+
+def _dropped(records: Sequence[WorkerRecord], present: Set[str]) -> dict[int, list[DroppedEpisode]]:
+    """The episodes that workers dropped and that the store lacks, by task, each with its last fault."""
+    last: dict[str, DroppedEpisode] = {}
+    for record in records:
+        for drop in record.dropped:
+            known = last.get(drop.episode)
+            if drop.episode not in present and is_episode_name(drop.episode) and (known is None or known.at <= drop.at):
+                last[drop.episode] = DroppedEpisode(drop.episode, drop.at, record.worker.describe(), drop.reason)
+    by_task: dict[int, list[DroppedEpisode]] = {}
+    for name in sorted(last):
+        by_task.setdefault(parse_episode_name(name)[0], []).append(last[name])
+    return by_task
+
+
+def _plain_time(at: str) -> str:
+    """A time of the records without its offset, which is that of UTC."""
+    return at.removesuffix("+00:00").replace("T", " ")
 
 
 def _time_of(folder: Path) -> str:
@@ -187,7 +228,7 @@ def _cells(task: TaskStatus) -> tuple[str, ...]:
         f"{task.committed} of {'?' if task.expected is None else task.expected}",
         _solved(task),
         format_bytes(task.bytes) if task.committed else "-",
-        task.last_at.removesuffix("+00:00").replace("T", " ") or "-",
+        _plain_time(task.last_at) or "-",
         visible(task.last_by) or ("unknown" if task.committed else "-"),
         visible(task.instruction),
     )

@@ -1,8 +1,9 @@
-"""The record of each worker: the episodes that it plans and has committed, in a small file beside the store.
+"""The record of each worker: the episodes that it plans, has committed and has dropped, in a file beside the store.
 
 The files are `NAME.zarr.jobs/runs/*.json`. Each worker writes only its own file, and always the whole file.
-`vla-capture status` reads from them how many episodes are expected, and who committed each. No reader of a store needs
-them. They name machines and jobs, so a copy of a store omits them. Deleting them loses nothing else.
+`vla-capture status` reads from them how many episodes are expected, who committed each, and why one is missing. No
+reader of a store needs them. They name machines and jobs, so a copy of a store omits them. Deleting them loses nothing
+else.
 """
 
 from __future__ import annotations
@@ -15,9 +16,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
+from vla_attention.schemas.errors import shortened
 from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
 from vla_attention.schemas.stores.claims import jobs_folder
 from vla_attention.schemas.stores.worker import Worker
+
+#: Characters of a fault's sentence that are kept: the error of a simulator may hold a page of text, and a worker writes
+#: its whole record after every episode.
+_REASON_CHARACTERS = 1000
 
 
 @dataclass(frozen=True)
@@ -39,10 +45,20 @@ class Commit:
 
 
 @dataclass(frozen=True)
+class Drop:
+    """An episode that the worker left out after a fault, the time (ISO 8601, UTC), and the sentence of the fault."""
+
+    episode: str
+    at: str
+    reason: str
+
+
+@dataclass(frozen=True)
 class WorkerRecord:
     """The record of one worker.
 
     store: `store_identity` of its store, which differs from that of a later store with the same name.
+    dropped: each episode once, with its last fault.
     threads: number of processor threads that its policy computes with; 0 in a record that does not state it.
     """
 
@@ -53,6 +69,7 @@ class WorkerRecord:
     state: Literal["running", "finished", "stopped", "failed"]
     committed: tuple[Commit, ...] = ()
     threads: int = 0
+    dropped: tuple[Drop, ...] = ()
 
 
 class RecordWriter:
@@ -66,6 +83,13 @@ class RecordWriter:
     def add_commit(self, episode: str) -> None:
         """Record that the worker has committed an episode."""
         self.record = replace(self.record, committed=(*self.record.committed, Commit(episode, now())))
+        self._write()
+
+    def add_drop(self, episode: str, reason: str) -> None:
+        """Record that the worker left an episode out after a fault."""
+        others = (drop for drop in self.record.dropped if drop.episode != episode)
+        drop = Drop(episode, now(), shortened(reason, _REASON_CHARACTERS))
+        self.record = replace(self.record, dropped=(*others, drop))
         self._write()
 
     def end(self, state: Literal["finished", "stopped", "failed"]) -> None:

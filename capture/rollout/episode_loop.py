@@ -15,7 +15,7 @@ from vla_attention.capture.environments.suites import make_environment
 from vla_attention.capture.jobs.termination import Terminated, Termination
 from vla_attention.capture.jobs.worker_records import RecordWriter
 from vla_attention.capture.rollout.episode import EpisodeResult, EpisodeRun, episode_title, record_episode
-from vla_attention.capture.rollout.episode_faults import EPISODE_FAULTS, Faults
+from vla_attention.capture.rollout.episode_faults import EPISODE_FAULTS, Faults, MachineBroken
 from vla_attention.capture.rollout.progress import EpisodeProgress, Progress
 from vla_attention.capture.rollout.simulation import SimulationFailed, naming_the_simulator
 from vla_attention.schemas.command_line import format_bytes
@@ -192,11 +192,16 @@ class EpisodeLoop:
             MachineBroken: the fault came again and again, and every episode would meet it.
         """
         self.positions.pop(name, None)
-        again = self.faults.note(name, error)
+        try:
+            again = self.faults.note(name, error)
+        except MachineBroken:
+            self.record.add_drop(name, str(error))
+            raise
         if again:
             progress.put_back()
         else:
             progress.drop()
+            self.record.add_drop(name, str(error))
         what_next = "The episode begins again." if again else "The episode is left out, and the run goes on."
         self.progress.say(f"{name}: {error} {what_next}")
         return again
