@@ -1,6 +1,5 @@
-/** The page's entry: everything that it shows is below `page/`. */
+/** The page's entry. The workers run the same script: it has no document there. */
 import "./main.css";
-import * as zarr from "zarrita";
+import { serveWorker } from "./store/worker";
 
-const page = document.getElementById("page");
-if (page) page.textContent = `zarrita knows ${zarr.registry.size} codecs.`;
+if (typeof document === "undefined") serveWorker();

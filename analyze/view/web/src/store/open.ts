@@ -1,0 +1,206 @@
+/** Stores beside the page: what `stores.json` lists, their roots, and their episodes. */
+import { type EpisodeDocument, type RootDocument, parseEpisode, parseRoot } from "./documents";
+import { Episode } from "./episode";
+import { StoreError } from "./errors";
+import { type Fields, flag, list, name, object, parseDocument, text, whole } from "./json_fields";
+import { DOCUMENT_BYTES, ROOT_BYTES, ZIP_TAIL_BYTES } from "./limits";
+import type { Place } from "./messages";
+import { type Port, ReaderPool } from "./reader_pool";
+
+export interface StoreEntry {
+  name: string;
+  /** Address of the store's root, relative to the page; ends in a slash. */
+  root: string;
+  episodes: { name: string }[];
+  packed: boolean;
+  /** Address of what Python measured of every episode, relative to the page. */
+  summary: string;
+}
+
+export interface EpisodeSummary {
+  name: string;
+  task: string;
+  episode: number;
+  instruction: string;
+  success: boolean | null;
+  replans: number;
+  ratio: number | null;
+  lift: number | null;
+}
+
+export interface Summary {
+  complete: boolean;
+  failed: string | null;
+  ratio: string;
+  grouping: string;
+  site: string;
+  episodes: EpisodeSummary[];
+}
+
+const MOST_STORES = 1000;
+const MOST_EPISODES = 1_000_000;
+const EPISODE_NAME = /^task[0-9]{3,12}_episode[0-9]{3,12}$/;
+const EPISODES_KEPT = 8;
+
+async function documentAt(address: string): Promise<Fields> {
+  let response: Response;
+  try {
+    response = await fetch(address);
+  } catch {
+    throw new StoreError(`The web server does not answer, so ${address} cannot be read. Is vla-analyze view still running?`);
+  }
+  if (!response.ok) throw new StoreError(`The web server answers ${response.status} to ${address}.`);
+  return object(parseDocument(new Uint8Array(await response.arrayBuffer()), address), address);
+}
+
+function checkedName(value: unknown): string {
+  const given = name(value, "the name of an episode");
+  if (!EPISODE_NAME.test(given)) throw new StoreError(`"${given}" is no name of an episode.`);
+  return given;
+}
+
+/** What `stores.json` beside the page lists. */
+export async function openStores(): Promise<StoreEntry[]> {
+  const document = await documentAt("stores.json");
+  return list(document.stores, "stores", MOST_STORES).map((each, i) => {
+    const entry = object(each, `stores[${i}]`);
+    return {
+      name: text(entry.name, `stores[${i}].name`),
+      root: text(entry.root, `stores[${i}].root`),
+      packed: flag(entry.packed, `stores[${i}].packed`),
+      summary: text(entry.summary, `stores[${i}].summary`),
+      episodes: list(entry.episodes, `stores[${i}].episodes`, MOST_EPISODES).map((one) => ({
+        name: checkedName(object(one, "an episode").name),
+      })),
+    };
+  });
+}
+
+const numberOrNull = (value: unknown): number | null => (typeof value === "number" ? value : null);
+
+/** What Python measured of a store's episodes, as far as it is done. */
+export async function summaryOf(entry: StoreEntry): Promise<Summary> {
+  const document = await documentAt(entry.summary);
+  return {
+    complete: flag(document.complete, "complete"),
+    failed: document.failed == null ? null : text(document.failed, "failed"),
+    ratio: text(document.ratio ?? "", "ratio"),
+    grouping: text(document.grouping ?? "", "grouping"),
+    site: text(document.site ?? "", "site"),
+    episodes: list(document.episodes, "episodes", MOST_EPISODES).map((each) => {
+      const one = object(each, "an episode");
+      return {
+        name: checkedName(one.name),
+        task: text(String(one.task ?? ""), "task"),
+        episode: Number(one.episode ?? 0),
+        instruction: text(one.instruction ?? "", "instruction"),
+        success: typeof one.success === "boolean" ? one.success : null,
+        replans: Number(one.replans ?? 0),
+        ratio: numberOrNull(one.ratio),
+        lift: numberOrNull(one.lift),
+      };
+    }),
+  };
+}
+
+interface PackedEntry {
+  file: string;
+  bytes: number;
+  tail: number;
+}
+
+function packedEntries(document: unknown): Map<string, PackedEntry> {
+  const fields = object(document, "index.json");
+  if (fields.format !== "vla-attention-index" || fields.version !== 1) {
+    throw new StoreError("The index.json of the packed store is of another format; this page reads version 1.");
+  }
+  const found = new Map<string, PackedEntry>();
+  for (const [key, value] of Object.entries(object(fields.episodes, "episodes of index.json"))) {
+    const entry = object(value, `the entry of ${checkedName(key)}`);
+    const file = text(entry.file, "file");
+    if (file.split("/").some((part) => !part || part === "." || part === "..") || /[\\\p{C}]/u.test(file)) {
+      throw new StoreError("The index.json of the packed store names a file outside of it.");
+    }
+    const bytes = whole(entry.bytes, "bytes", Number.MAX_SAFE_INTEGER, 1);
+    const tail = whole(entry.tail, "tail", bytes - 1);
+    if (bytes - tail > ZIP_TAIL_BYTES) throw new StoreError(`The zip ${file} has a tail of ${bytes - tail} bytes.`);
+    found.set(key, { file, bytes, tail });
+  }
+  return found;
+}
+
+/** One store; episodes are opened when they are asked for. */
+export class Store {
+  readonly #episodes = new Map<string, Promise<Episode>>();
+  #packed: Promise<Map<string, PackedEntry>> | undefined;
+
+  constructor(
+    readonly entry: StoreEntry,
+    readonly root: RootDocument,
+    private readonly url: string,
+    private readonly pool: ReaderPool,
+  ) {}
+
+  get episodeNames(): string[] {
+    return this.entry.episodes.map((episode) => episode.name);
+  }
+
+  async #placeOf(episode: string): Promise<Place> {
+    if (!this.entry.packed) return { kind: "folder", url: `${this.url}episodes/${encodeURIComponent(episode)}/` };
+    this.#packed ??= this.pool
+      .document({ kind: "folder", url: this.url }, "index.json", DOCUMENT_BYTES)
+      .then(packedEntries);
+    const found = (await this.#packed).get(episode);
+    if (!found) throw new StoreError(`The packed store has no episode ${episode}.`);
+    return { kind: "zip", url: this.url, ...found };
+  }
+
+  async #open(episode: string): Promise<Episode> {
+    if (!this.entry.episodes.some((each) => each.name === episode)) {
+      throw new StoreError(`The store ${this.entry.name} has no episode ${episode}.`);
+    }
+    const place = await this.#placeOf(episode);
+    const document: EpisodeDocument = parseEpisode(await this.pool.document(place, "zarr.json", DOCUMENT_BYTES), episode);
+    return Episode.open(this.root, episode, document, place, this.pool);
+  }
+
+  /** An episode by its name. The last ones that were opened are kept. */
+  openEpisode(episode: string): Promise<Episode> {
+    let found = this.#episodes.get(episode);
+    if (!found) {
+      found = this.#open(episode);
+      found.catch(() => this.#episodes.delete(episode));
+    }
+    this.#episodes.delete(episode);
+    this.#episodes.set(episode, found);
+    if (this.#episodes.size > EPISODES_KEPT) this.#episodes.delete(this.#episodes.keys().next().value!);
+    return found;
+  }
+}
+
+/** Opens stores with workers of its own. */
+export class Library {
+  readonly #pool: ReaderPool;
+  readonly #stores = new Map<string, Promise<Store>>();
+
+  /** `base`: the address of the page, to which those in `stores.json` are relative. */
+  constructor(
+    ports: readonly Port[],
+    private readonly base: string,
+  ) {
+    this.#pool = new ReaderPool(ports);
+  }
+
+  openStore(entry: StoreEntry): Promise<Store> {
+    let found = this.#stores.get(entry.root);
+    if (!found) {
+      const url = new URL(entry.root, this.base).href;
+      found = this.#pool
+        .document({ kind: "folder", url }, "zarr.json", ROOT_BYTES)
+        .then((document) => new Store(entry, parseRoot(document), url, this.#pool));
+      this.#stores.set(entry.root, found);
+      found.catch(() => this.#stores.delete(entry.root));
+    }
+    return found;
+  }
+}
