@@ -145,7 +145,7 @@ class EpisodeRecording:
         env_step = protocol.wait_steps + self.step
         where = f"replan {replan} (environment step {env_step}) of {title}"
         cameras = [camera.source for camera in policy.cameras]
-        self.run.observed.check(start.task_id, seen.observation, cameras, where)
+        constant = self.run.observed.check(start.task_id, seen.observation, cameras, where)
         policy_input = policy.prepare(seen.observation, start.instruction)
         context = CallContext(
             start.task_id, start.episode_index, replan, changes.instructions, start.objects, seen.coverage
@@ -163,6 +163,7 @@ class EpisodeRecording:
             noise_seed=policy.replan_noise_seed(noise, start.task_id, start.episode_index, replan),
             coverage=seen.coverage,
             editors=changes.editors(policy.sites, policy_input, context),
+            constant_cameras=constant,
         )
 
     def keep(self, prepared: PreparedCall, call: RecordedCall, writer: ReplanWriter) -> None:
@@ -177,6 +178,7 @@ class EpisodeRecording:
                 env_step=prepared.env_step,
                 noise_seed=prepared.noise_seed,
                 coverage=prepared.coverage,
+                constant_cameras=prepared.constant_cameras,
             )
         )
 

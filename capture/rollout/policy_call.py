@@ -60,6 +60,7 @@ def replan_record(
     noise_seed: int,
     coverage: Mapping[str, NDArray[np.float32]] | None = None,
     dataset_actions: NDArray[np.float64] | None = None,
+    constant_cameras: frozenset[str] = frozenset(),
 ) -> ReplanRecord:
     """Return what is stored of a policy call; see `ReplanRecord`."""
     return ReplanRecord(
@@ -74,6 +75,7 @@ def replan_record(
         camera_frames=policy_input.camera_frames if recording.frames else {},
         coverage=coverage or {},
         dataset_actions=dataset_actions,
+        constant_cameras=constant_cameras,
     )
 
 
@@ -82,7 +84,7 @@ class PreparedCall:
     """A policy call before it is made.
 
     where: replan, environment step and episode, for messages. coverage: policy camera -> (patch, object) float32.
-    editors: the editor of each site whose attention changes.
+    editors: the editor of each site whose attention changes. constant_cameras: those whose picture shows nothing.
     """
 
     env_step: int
@@ -91,6 +93,7 @@ class PreparedCall:
     noise_seed: int
     coverage: Mapping[str, NDArray[np.float32]]
     editors: Mapping[str, AttentionEditor] | None
+    constant_cameras: frozenset[str] = frozenset()
 
 
 def record_calls(

@@ -44,6 +44,9 @@ from vla_attention.schemas.stores.store_format import (
     episode_name,
 )
 
+#: What an episode's provenance calls the cameras whose picture is of one colour at every replan.
+CONSTANT_CAMERAS = "constant_cameras"
+
 
 @dataclass(frozen=True)
 class ReplanRecord:
@@ -53,6 +56,7 @@ class ReplanRecord:
     environment, `frames` and `camera_frames` per policy camera (row, column, channel) uint8, `coverage` per policy
     camera (patch, object) float32. `dataset_actions` (steps, action_dim) are those that a data set has from this replan
     on, fewer at the end of its episode. What is None is not known; all replans of an episode know the same.
+    `constant_cameras`: cameras of the simulator whose picture is of one colour.
     """
 
     env_step: int
@@ -66,6 +70,7 @@ class ReplanRecord:
     camera_frames: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
     coverage: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     dataset_actions: NDArray[np.float64] | None = None
+    constant_cameras: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -205,8 +210,10 @@ class EpisodeWriter:
 
     def _attributes(self, success: bool | None, num_steps: int) -> EpisodeAttributes:
         records = self.records
+        constant = frozenset.intersection(*(record.constant_cameras for record in records))
+        facts = {CONSTANT_CAMERAS: ", ".join(sorted(constant))} if constant else {}
         return EpisodeAttributes(
-            **vars(self.start),
+            **vars(replace(self.start, provenance=self.start.provenance | facts)),
             success=success,
             num_steps=num_steps,
             num_replans=len(records),

@@ -217,14 +217,44 @@ def test_black_pictures_again_and_again_end_the_run(scene, tmp_path, capsys, num
     check_nothing_is_left(tmp_path / "a.zarr")
 
 
-def test_pictures_that_are_black_from_the_beginning_are_no_fault(scene, tmp_path):
+class Grey(AlwaysBlack):
+    def act(self, result: StepResult) -> StepResult:
+        if result.observation is None:
+            return result
+        images = {**result.observation.images}
+        images["agentview"] = np.full_like(images["agentview"], (90, 91, 92))
+        return changed_pictures(result, images=images)
+
+
+@pytest.mark.parametrize(
+    ("num_envs", "kind", "shown"), [(1, AlwaysBlack, "black"), (2, Grey, "of one colour")], ids=["black", "grey"]
+)
+def test_pictures_without_content_from_the_beginning_are_said_once_and_no_fault(
+    scene, whole, tmp_path, capsys, monkeypatch, num_envs, kind, shown
+):
     """A camera may look at nothing: the task's first picture decides."""
-    spoil(scene, AlwaysBlack, 100)
-    AlwaysBlack.at, before = 0, AlwaysBlack.at
-    try:
-        assert record(tmp_path / "a.zarr", 1, *WORDS) == 0
-    finally:
-        AlwaysBlack.at = before
+    spoil(scene, kind, 100)
+    monkeypatch.setattr(kind, "at", 0)
+    assert record(tmp_path / "a.zarr", num_envs, *WORDS) == 0
+    said = capsys.readouterr().err
+    assert said.startswith(
+        "vla-capture: The picture of agentview at replan 0 (environment step 10) of episode task000_"
+    )
+    assert f", the first of its task, is {shown}: the camera shows nothing." in said
+    assert said.count("\n") == 1
+    facts = [
+        episode.attributes.provenance.get("constant_cameras") for episode in open_store(tmp_path / "a.zarr").episodes
+    ]
+    assert facts == ["agentview"] * 3
+    assert not any("constant_cameras" in one.attributes.provenance for one in open_store(whole).episodes)
+
+
+def test_a_camera_that_shows_something_later_is_not_named_in_the_store(scene, tmp_path, capsys, monkeypatch):
+    spoil(scene, AlwaysBlack, 1)
+    monkeypatch.setattr(AlwaysBlack, "at", 0)
+    assert record(tmp_path / "a.zarr", 1, *WORDS) == 0
+    assert "The picture of agentview at replan 0" in capsys.readouterr().err
+    assert not any("constant_cameras" in one.attributes.provenance for one in open_store(tmp_path / "a.zarr").episodes)
 
 
 @both
