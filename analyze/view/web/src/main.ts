@@ -2,4 +2,7 @@
 import "./main.css";
 import { serveWorker } from "./store/worker";
 
+/** For tests; see there. */
+export * as engine from "./engine";
+
 if (typeof document === "undefined") serveWorker();

@@ -1,0 +1,16 @@
+/**
+ * The grouping language and the measures, for tests: the page exports them, so that node can run what ships with the
+ * cases on which Python decides (tests/analyze/view/test_grouping_parity.py).
+ */
+export * from "./grouping/builtin_groupings";
+export * from "./grouping/grouping";
+export * from "./grouping/grouping_files";
+export * from "./grouping/resolve";
+export * from "./grouping/selector_parser";
+export * from "./grouping/text";
+export * from "./grouping/tokens";
+export * from "./grouping/words";
+export * from "./measures/masses";
+export * from "./measures/ranks";
+export * from "./measures/replans";
+export * from "./measures/segments";

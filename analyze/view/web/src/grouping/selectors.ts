@@ -1,0 +1,238 @@
+/**
+ * The kinds of selectors: the keys that each takes, and what makes a name wrong. schemas/groupings/selectors.py.
+ */
+import type { SiteDocument } from "../store/documents";
+import type { Atom } from "./selector_parser";
+import { casefold, didYouMean, listing, SelectorError, SPACE } from "./text";
+import {
+  cameraSpan,
+  camerasOf,
+  type EpisodeTokens,
+  findRole,
+  latentFrame,
+  NO_COVERAGE,
+  NO_WORDS,
+  spanNamed,
+  type Vocabulary,
+} from "./tokens";
+import { findPhrase, hasPhrase, type Word, wordClass, wordTexts } from "./words";
+
+/**
+ * The (key, cell) pairs that a selector takes: 0 or 1, axes (replan or 1, key, cell or 1). Every key is divided into
+ * cells, one per scene object and one that no object covers, so that set operations on objects are exact.
+ */
+export interface Membership {
+  readonly replans: number;
+  readonly keys: number;
+  readonly cells: number;
+  readonly bits: Uint8Array;
+}
+
+interface SelectorKind {
+  keys(argument: string, tokens: EpisodeTokens): Membership;
+  /** What is wrong with the argument, as the end of a sentence, or null. */
+  problem(argument: string, vocabulary: Vocabulary, layout: SiteDocument): string | null;
+}
+
+const s = `[${SPACE}]*`;
+const PATCH = new RegExp(
+  `^(?<camera>[^\\[]+)\\[(?<r0>[0-9]{0,9}):(?<r1>[0-9]{0,9})${s},${s}(?<c0>[0-9]{0,9}):(?<c1>[0-9]{0,9})\\]$`,
+  "u",
+);
+const KEYS = /^([0-9]{1,9})(?:-([0-9]{1,9}))?$/;
+const OBJECT_CLASSES = ["@interest", "@robot", "@background"];
+const WORD_CLASSES = ["content", "stop", "all"];
+
+export function noKeys(tokens: EpisodeTokens): Membership {
+  return { replans: 1, keys: tokens.keys, cells: 1, bits: new Uint8Array(tokens.keys) };
+}
+
+export function everyKey(tokens: EpisodeTokens): Membership {
+  return { replans: 1, keys: tokens.keys, cells: 1, bits: new Uint8Array(tokens.keys).fill(1) };
+}
+
+function keyRange(tokens: EpisodeTokens, start: number, stop: number): Membership {
+  const member = noKeys(tokens);
+  member.bits.fill(1, start, stop);
+  return member;
+}
+
+/** The problem of a name that is not among the existing ones. */
+function missing(kind: string, name: string, existing: readonly string[]): string | null {
+  if (existing.includes(name)) return null;
+  return `there is no ${kind} '${name}'.${didYouMean(name, existing)} Existing: ${listing(existing, 40)}.`;
+}
+
+function spanKind(
+  find: (layout: SiteDocument, name: string) => { start: number; stop: number },
+  problem: SelectorKind["problem"],
+): SelectorKind {
+  return {
+    keys(argument, tokens) {
+      const span = find(tokens.layout, argument);
+      return keyRange(tokens, span.start, span.stop);
+    },
+    problem,
+  };
+}
+
+function roleKeys(argument: string, tokens: EpisodeTokens): Membership {
+  const { replans, keys, codes } = tokens.keyRole;
+  const role = findRole(argument);
+  return { replans, keys, cells: 1, bits: codes.map((code) => (code === role ? 1 : 0)) };
+}
+
+function wordKeys(argument: string, tokens: EpisodeTokens): Membership {
+  return keysOfWords(
+    tokens,
+    tokens.words.map((words) => findPhrase(words, argument)),
+  );
+}
+
+function wordProblem(argument: string, vocabulary: Vocabulary): string | null {
+  if (!vocabulary.words.length) return `${NO_WORDS}.`;
+  const words = wordTexts(argument);
+  if (!words.length) return `'${argument}' has no letter or digit, so it is no word.`;
+  for (const word of words) {
+    if (!vocabulary.words.includes(casefold(word))) {
+      const near = didYouMean(word, vocabulary.words);
+      return `no instruction has the word '${word}'.${near} Words: ${listing(vocabulary.words, 40)}.`;
+    }
+  }
+  if (vocabulary.sentences.some((sentence) => hasPhrase(sentence, argument))) return null;
+  const shared = (sentence: readonly string[]): number =>
+    words.filter((word) => sentence.includes(casefold(word))).length;
+  const nearest = vocabulary.sentences.reduce((best, other) => (shared(other) > shared(best) ? other : best));
+  return (
+    `no instruction has the words '${argument}' one after the other. Nearest: '${nearest.join(" ")}'; a list of ` +
+    "word: selectors takes single words."
+  );
+}
+
+function wordsKeys(argument: string, tokens: EpisodeTokens): Membership {
+  const wanted = casefold(argument);
+  const problem = WORD_CLASSES.includes(wanted) ? null : missing("word class", argument, WORD_CLASSES);
+  if (problem) throw new SelectorError(problem[0]!.toUpperCase() + problem.slice(1));
+  return keysOfWords(
+    tokens,
+    tokens.words.map((words) => words.filter((word) => wanted === "all" || wordClass(word.text) === wanted)),
+  );
+}
+
+function wordsProblem(argument: string, vocabulary: Vocabulary): string | null {
+  if (!WORD_CLASSES.includes(casefold(argument))) return missing("word class", argument, WORD_CLASSES);
+  return vocabulary.words.length ? null : `${NO_WORDS}.`;
+}
+
+/** The keys of the words that were chosen from each of the episode's prompts. */
+function keysOfWords(tokens: EpisodeTokens, chosen: readonly (readonly Word[])[]): Membership {
+  const { keys, promptIndex } = tokens;
+  const byPrompt = chosen.map((words) => {
+    const row = new Uint8Array(keys);
+    for (const word of words) for (const key of word.keys) row[key] = 1;
+    return row;
+  });
+  if (byPrompt.length <= 1 || !promptIndex.length) {
+    return { replans: 1, keys, cells: 1, bits: byPrompt[0] ?? new Uint8Array(keys) };
+  }
+  const bits = new Uint8Array(promptIndex.length * keys);
+  promptIndex.forEach((prompt, replan) => bits.set(byPrompt[prompt]!, replan * keys));
+  return { replans: promptIndex.length, keys, cells: 1, bits };
+}
+
+function objectKeys(argument: string, tokens: EpisodeTokens): Membership {
+  const cells = 1 + tokens.objects.length;
+  const bits = new Uint8Array(tokens.keys * cells);
+  tokens.objects.forEach((thing, i) => {
+    const byClass: Record<string, boolean> = {
+      "@interest": thing.of_interest,
+      "@robot": thing.kind === "robot",
+      "@background": thing.kind === "background",
+    };
+    const taken = Object.hasOwn(byClass, argument) ? byClass[argument]! : thing.name === argument;
+    if (!taken) return;
+    for (const camera of tokens.coverage.keys()) {
+      const span = cameraSpan(tokens.layout, camera);
+      for (let key = span.start; key < span.stop; key++) bits[key * cells + 1 + i] = 1;
+    }
+  });
+  return { replans: 1, keys: tokens.keys, cells, bits };
+}
+
+function objectProblem(argument: string, vocabulary: Vocabulary): string | null {
+  const isClass = OBJECT_CLASSES.includes(argument);
+  if (argument.startsWith("@") && !isClass) return missing("object class", argument, OBJECT_CLASSES);
+  if (!vocabulary.objects.length) return `${NO_COVERAGE}.`;
+  return isClass ? null : missing("object", argument, vocabulary.objects);
+}
+
+function patchKeys(argument: string, tokens: EpisodeTokens): Membership {
+  const match = PATCH.exec(argument)?.groups;
+  if (!match) throw new SelectorError(`Cannot read selector 'patch:${argument}'; expected patch:CAMERA[r0:r1,c0:c1].`);
+  const camera = match.camera!;
+  const span = cameraSpan(tokens.layout, camera);
+  if (!span.grid) throw new SelectorError(`Camera '${camera}' has no patch grid.`);
+  const { rows, columns } = span.grid;
+  const [r0, r1] = [Number(match.r0), Number(match.r1 || rows)];
+  const [c0, c1] = [Number(match.c0), Number(match.c1 || columns)];
+  if (!(r0 < r1 && r1 <= rows && c0 < c1 && c1 <= columns)) {
+    throw new SelectorError(
+      `Selector 'patch:${argument}' leaves the grid of camera '${camera}', which has ${rows} rows and ` +
+        `${columns} columns of patches; expected 0 <= r0 < r1 <= ${rows} and 0 <= c0 < c1 <= ${columns}.`,
+    );
+  }
+  const member = noKeys(tokens);
+  for (let row = r0; row < r1; row++) {
+    member.bits.fill(1, span.start + row * columns + c0, span.start + row * columns + c1);
+  }
+  return member;
+}
+
+function numberKeys(argument: string, tokens: EpisodeTokens): Membership {
+  const match = KEYS.exec(argument);
+  if (!match) throw new SelectorError(`Cannot read selector 'keys:${argument}'; expected keys:a or keys:a-b.`);
+  const first = Number(match[1]);
+  const last = Number(match[2] ?? match[1]);
+  if (!(first <= last && last < tokens.keys)) {
+    throw new SelectorError(
+      `Selector 'keys:${argument}' leaves the site's keys; expected a <= b <= ${tokens.keys - 1}.`,
+    );
+  }
+  return keyRange(tokens, first, last + 1);
+}
+
+const cameraProblem: SelectorKind["problem"] = (argument, _, layout) => missing("camera", argument, camerasOf(layout));
+
+const SELECTOR_KINDS: Record<string, SelectorKind> = {
+  camera: spanKind(cameraSpan, cameraProblem),
+  role: {
+    keys: roleKeys,
+    problem: (argument) => {
+      findRole(argument); // throws the error that lists the roles
+      return null;
+    },
+  },
+  span: spanKind(spanNamed, (argument, vocabulary) => missing("span", argument, vocabulary.spans)),
+  frame: spanKind(latentFrame, (argument, _, layout) => {
+    latentFrame(layout, argument); // throws the error that lists the frames
+    return null;
+  }),
+  word: { keys: wordKeys, problem: wordProblem },
+  words: { keys: wordsKeys, problem: wordsProblem },
+  object: { keys: objectKeys, problem: objectProblem },
+  patch: {
+    keys: patchKeys,
+    problem: (argument, vocabulary, layout) => cameraProblem(argument.split("[")[0]!, vocabulary, layout),
+  },
+  keys: { keys: numberKeys, problem: () => null }, // a range that leaves the site is found when the keys are taken
+};
+
+/** The keys that one part of a selector takes. */
+export function keysOf(atom: Atom, tokens: EpisodeTokens): Membership {
+  return SELECTOR_KINDS[atom.kind]!.keys(atom.argument, tokens);
+}
+
+/** What is wrong with one part of a selector, as the end of a sentence, or null. */
+export function problemOf(atom: Atom, vocabulary: Vocabulary): string | null {
+  return SELECTOR_KINDS[atom.kind]!.problem(atom.argument, vocabulary, vocabulary.layout);
+}

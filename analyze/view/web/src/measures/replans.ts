@@ -1,0 +1,107 @@
+/**
+ * What the masses of an episode's replans give: the rows of `replans` and `replans_groups` that `vla-analyze` writes
+ * (analyze/measures/episodes.py, `replan_values`), for one layer or for the mean over several.
+ */
+import type { Grouping } from "../grouping/grouping";
+import { ofReplan, type ResolvedGrouping } from "../grouping/resolve";
+import { finiteGeometricMean, finiteMean, type GroupMeasures, groupMeasures, masses, sides } from "./masses";
+
+/** Masses of one layer, means over the chosen denoise steps, heads and queries. */
+export interface LayerMasses {
+  /** (replan, group + 1); the last is the mass of all valid keys. */
+  readonly values: Float64Array;
+  readonly groups: number;
+}
+
+export interface ReplanValues {
+  readonly groups: GroupMeasures;
+  readonly validMass: number;
+  readonly numValid: number;
+  /** Absent where the grouping has no ratio. */
+  readonly ratio?: {
+    readonly numerator: number;
+    readonly denominator: number;
+    /** Of a mean over layers: the mean of the layers' finite ratios. */
+    readonly value: number;
+    /** What uniform attention gives. */
+    readonly uniform: number;
+    /** The same, but of a mean over layers the geometric mean of the layers' ratios. */
+    readonly geometric: number;
+    /** geometric / uniform */
+    readonly lift: number;
+  };
+}
+
+/**
+ * Masses of a layer from mean rows (replan, key), or mean segment masses (replan, segment), and weights with the valid
+ * keys as the last group (group + 1, key or segment), of each replan or once.
+ */
+export function layerMasses(rows: Float32Array | Float64Array, weights: readonly Float32Array[], keys: number): LayerMasses {
+  const parts = weights[0]!.length / keys;
+  const replans = rows.length / keys;
+  const values = new Float64Array(replans * parts);
+  for (let replan = 0; replan < replans; replan++) {
+    values.set(masses(rows.subarray(replan * keys, (replan + 1) * keys), keys, ofReplan(weights, replan)), replan * parts);
+  }
+  return { values, groups: parts - 1 };
+}
+
+/** The values of every replan; `layers`: one layer's masses, or those of all layers that the mean is over. */
+export function replanValues(
+  layers: readonly LayerMasses[],
+  grouping: Grouping,
+  resolved: ResolvedGrouping,
+): ReplanValues[] {
+  const { groups } = layers[0]!;
+  const replans = layers[0]!.values.length / (groups + 1);
+  return Array.from({ length: replans }, (_, replan) => {
+    const of = (layer: LayerMasses): Float64Array =>
+      layer.values.subarray(replan * (groups + 1), (replan + 1) * (groups + 1));
+    const mean = new Float64Array(groups + 1);
+    for (const layer of layers) of(layer).forEach((value, i) => (mean[i]! += value / layers.length));
+    const mass = mean.slice(0, groups);
+    const numKeys = ofReplan(resolved.numKeys, replan);
+    const numValid = ofReplan(resolved.numValid, replan);
+    const measures = groupMeasures(mass, mean[groups]!, numKeys, numValid);
+    const values = { groups: measures, validMass: mean[groups]!, numValid };
+    if (!grouping.ratio) return values;
+    const [numerator, denominator] = sides(mass, grouping);
+    const [above, below] = sides(numKeys, grouping);
+    const uniform = above / below;
+    const ratios = layers.map((layer) => {
+      const [top, bottom] = sides(of(layer), grouping);
+      return top / bottom;
+    });
+    const one = ratios.length === 1;
+    const value = one ? ratios[0]! : finiteMean(ratios);
+    const geometric = one ? ratios[0]! : finiteGeometricMean(ratios);
+    return { ...values, ratio: { numerator, denominator, value, uniform, geometric, lift: geometric / uniform } };
+  });
+}
+
+/** What an episode's replans give together. */
+export interface EpisodeValues {
+  /** Of each group, means over the replans in which they are defined. */
+  readonly groups: { mass: number; fraction: number; keys: number; lift: number }[];
+  /** Geometric means over the replans with a finite positive ratio; NaN without a ratio. */
+  readonly geometricMean: number;
+  readonly uniformRatio: number;
+  readonly ratioLift: number;
+  /** Replans whose ratio is infinite or undefined. */
+  readonly numNonfinite: number;
+}
+
+/** The rows of `episodes` and `episodes_groups` from those of the replans. */
+export function episodeValues(replans: readonly ReplanValues[]): EpisodeValues {
+  const ratios = replans.flatMap((one) => (one.ratio ? [one.ratio] : []));
+  return {
+    groups: Array.from(replans[0]!.groups.mass, (_, group) => {
+      const mean = (measure: keyof GroupMeasures): number => finiteMean(replans.map((one) => one.groups[measure][group]!));
+      return { mass: mean("mass"), fraction: mean("fraction"), keys: mean("keys"), lift: mean("lift") };
+    }),
+    geometricMean: finiteGeometricMean(ratios.map((one) => one.geometric)),
+    uniformRatio: finiteGeometricMean(ratios.map((one) => one.uniform)),
+    ratioLift: finiteGeometricMean(ratios.map((one) => one.lift)),
+    numNonfinite: ratios.filter((one) => !Number.isFinite(one.value)).length,
+  };
+}
