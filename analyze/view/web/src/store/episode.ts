@@ -228,6 +228,13 @@ export class Episode {
     return { replans: this.numReplans, keys, codes: found.values as Uint8Array };
   }
 
+  /** How many replans a chunk of a site's rows holds. */
+  async replansPerChunk(site: string): Promise<number> {
+    const array = this.#rows(this.site(site));
+    const found = await this.#once(`${array.path}|chunk`, 100, () => this.pool.values(this.place, { kind: "chunk", array }));
+    return found.values[0]!;
+  }
+
   /** The rows of one layer and denoise step (positions) of the chunk that holds a replan. */
   async rows(site: string, layer: number, denoise: number, replan: number): Promise<RowBlock> {
     const info = this.site(site);
@@ -373,10 +380,8 @@ export class Episode {
     return { replans: this.numReplans, size, shape: array.shape, values: found.values as Float64Array };
   }
 
-  /** The prompt of a replan with its pieces at a site's keys; null where there is none. */
-  promptAt(site: string, replan: number): PromptDocument | null {
-    const { prompts, prompt_index: index } = this.document;
-    const prompt = prompts[index.length ? index[replan]! : 0];
-    return prompt ? promptAtSite(this.root.sites, this.site(site).layout, prompt) : null;
+  /** A prompt with its pieces at the keys of a site. */
+  promptOf(layout: SiteDocument, prompt: PromptDocument): PromptDocument {
+    return promptAtSite(this.root.sites, layout, prompt);
   }
 }

@@ -8,6 +8,8 @@ export type Place =
 
 export type Question =
   | { kind: "document"; path: string; most: number }
+  /** The shape of what is decoded at once. */
+  | { kind: "chunk"; array: ArrayName }
   | { kind: "part"; array: ArrayName; first: number; count: number }
   /** Rows of one layer and denoise step, all of one chunk. */
   | { kind: "rows"; array: ArrayName; layer: number; denoise: number; replan: number }

@@ -39,6 +39,10 @@ async function find({ source, reader }: Opened, question: Question): Promise<Fou
   switch (question.kind) {
     case "document":
       return { document: parseDocument(await source.whole(question.path, question.most), question.path) };
+    case "chunk": {
+      const { chunk } = await reader.open(question.array);
+      return { values: Int32Array.from(chunk), first: 0, count: chunk.length };
+    }
     case "part": {
       const { array, first, count } = question;
       return { values: await reader.part(array, first, count), first, count };

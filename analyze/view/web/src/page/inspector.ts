@@ -1,0 +1,134 @@
+/** What is below the pointer: a patch's share and objects, or a word and the heads that read it most. */
+import type { HeadRows } from "../store/episode";
+import { sentenceOf } from "../store/errors";
+import { element } from "./dom";
+import { formatNumber, formatPercent } from "./number_text";
+import type { PictureBoard } from "./picture_board";
+import type { Shown } from "./shown";
+import { measuresOfKeys, type WordStrip } from "./word_strip";
+
+/** Heads whose patches are shown for a word. */
+const HEADS_OF_WORD = 3;
+/** An object that covers less of a patch is not named. */
+const LEAST_COVERED = 0.005;
+
+export interface Reader {
+  layer: number;
+  head: number;
+  mass: number;
+}
+
+/** The heads (positions in `rows`) with the most attention on some keys, most first. */
+export function headsThatRead(rows: HeadRows, keys: readonly number[], most: number): Reader[] {
+  const found: Reader[] = [];
+  rows.layers.forEach((layer, i) => {
+    for (let head = 0; head < rows.heads; head++) {
+      const first = (i * rows.heads + head) * rows.keys;
+      found.push({ layer, head, mass: keys.reduce((sum, key) => sum + rows.values[first + key]!, 0) });
+    }
+  });
+  return found.sort((a, b) => b.mass - a.mass).slice(0, most);
+}
+
+export interface ObjectOfPatch {
+  name: string;
+  /** Part of the patch that it covers. */
+  covered: number;
+  /** Part of the camera's attention that lies on it. */
+  share: number;
+}
+
+/** The objects that cover a patch, and the part of the camera's attention that lies on each. */
+export function objectsAt(shown: Shown, camera: string, patch: number): ObjectOfPatch[] {
+  const coverage = shown.coverage.get(camera);
+  const span = shown.site.layout.spans.find((each) => each.camera === camera);
+  if (!coverage || !span) return [];
+  const first = coverage.replans === 1 ? 0 : shown.replan * coverage.patches * coverage.objects;
+  const at = (place: number, thing: number): number => coverage.values[first + place * coverage.objects + thing]!;
+  let camera_ = 0;
+  for (let key = span.start; key < span.stop; key++) camera_ += shown.row[key]!;
+  return shown.tokens.objects
+    .map(({ name }, thing) => {
+      let mass = 0;
+      for (let place = 0; place < coverage.patches; place++) mass += shown.row[span.start + place]! * at(place, thing);
+      return { name, covered: at(patch, thing), share: mass / camera_ };
+    })
+    .filter(({ covered }) => covered >= LEAST_COVERED)
+    .sort((a, b) => b.covered - a.covered);
+}
+
+export class Inspector {
+  readonly host = element("p", { class: "inspector", "data-inspector": "" });
+  #shown: Shown | null = null;
+  #asked = 0;
+
+  constructor(
+    private readonly pictures: PictureBoard,
+    words: WordStrip,
+  ) {
+    pictures.onHover((camera, patch) => (patch === null ? this.#clear() : this.#patch(camera, patch)));
+    words.onHover((place) => (place === null ? this.#clear() : void this.#word(place)));
+  }
+
+  show(shown: Shown): void {
+    this.#shown = shown;
+    this.#asked++;
+    this.#clear();
+  }
+
+  #clear(): void {
+    this.#asked++;
+    this.pictures.preview(null);
+    this.host.replaceChildren("Point at a patch or a word.");
+  }
+
+  #patch(camera: string, patch: number): void {
+    const shown = this.#shown;
+    const span = shown?.site.layout.spans.find((each) => each.camera === camera);
+    if (!shown || !span) return;
+    const { columns } = span.grid!;
+    const { mass, lift } = measuresOfKeys([span.start + patch], shown);
+    let image = 0;
+    for (let key = span.start; key < span.stop; key++) image += shown.row[key]!;
+    const number = (name: string, value: number, text: string): HTMLElement =>
+      element("strong", { "data-number": name, "data-value": String(value) }, text);
+    const things = objectsAt(shown, camera, patch).map(
+      ({ name, covered, share }) => `${name} covers ${formatPercent(covered, 0)} of it and has ${formatPercent(share)} of this picture's attention`,
+    );
+    this.host.replaceChildren(
+      `${camera}, patch row ${Math.floor(patch / columns)} column ${patch % columns}: `,
+      number("patch-mass", mass, formatPercent(mass, 2)),
+      " of all attention, ",
+      number("patch-share", mass / image, formatPercent(mass / image, 2)),
+      " of this picture's, lift ",
+      number("patch-lift", lift, formatNumber(lift)),
+      things.length ? `. ${things.join("; ")}.` : ".",
+    );
+  }
+
+  async #word(place: number): Promise<void> {
+    const shown = this.#shown;
+    const word = shown?.words[place];
+    if (!shown || !word) return;
+    const asked = ++this.#asked;
+    const { mass, lift } = measuresOfKeys(word.keys, shown);
+    const start = `"${word.text}": ${formatPercent(mass, 2)} of all attention, lift ${formatNumber(lift)}`;
+    this.host.textContent = `${start}.`;
+    try {
+      const { site, episode, selection, replan } = shown;
+      const rows = await episode.headRows(site.layout.name, selection, replan);
+      if (asked !== this.#asked) return;
+      const best = headsThatRead(rows, word.keys, HEADS_OF_WORD);
+      const named = best.map(({ layer, head, mass: own }) => `layer ${site.layers[layer]} head ${site.heads[head]} (${formatPercent(own)})`);
+      const mean = new Float64Array(site.keys);
+      for (const { layer, head } of best) {
+        const first = (rows.layers.indexOf(layer) * rows.heads + head) * rows.keys;
+        for (let key = 0; key < rows.keys; key++) mean[key]! += rows.values[first + key]! / best.length;
+      }
+      this.host.textContent = `${start}. The heads that read it most: ${named.join(", ")}; the pictures show where they look.`;
+      this.pictures.preview(mean);
+    } catch (failure) {
+      if (asked === this.#asked) this.host.textContent = sentenceOf(failure);
+    }
+  }
+}

@@ -1,0 +1,378 @@
+/** The cameras' pictures with attention over them: one canvas a camera, with outlines, a brush and a cursor. */
+import type { CameraDocument, SpanDocument } from "../store/documents";
+import { colourTable } from "./colour_maps";
+import { element } from "./dom";
+import { type Painting, type Scale, overlayPixels, patchAt, placeOfPatch, scaleFor, shownValues, viewOf } from "./overlay";
+import type { Shown } from "./shown";
+
+export type PatchListener = (camera: string, patch: number, replan: number) => void;
+
+export interface Brush {
+  paint(camera: string, patches: number[], erase: boolean): void;
+  end(): void;
+}
+
+interface Outline {
+  name: string;
+  colour: string;
+  members: ReadonlyMap<string, Uint8Array>;
+}
+
+interface Drawn {
+  figure: HTMLElement;
+  canvas: HTMLCanvasElement;
+  note: HTMLElement;
+  painted: HTMLCanvasElement;
+  span: SpanDocument;
+  view: CameraDocument;
+  /** The patch below the pointer or the cursor; -1: none. */
+  patch: number;
+  cursor: boolean;
+}
+
+/** How many patches of a picture are named for those who cannot see it. */
+const NAMED_PATCHES = 3;
+
+export class PictureBoard {
+  readonly host = element("div", { class: "pictures" });
+  readonly #drawn = new Map<string, Drawn>();
+  readonly #outlines = new Map<string, Outline>();
+  readonly #clicked = new Set<PatchListener>();
+  readonly #hovered = new Set<(camera: string, patch: number | null) => void>();
+  #brush: Brush | null = null;
+  #painting: { camera: string; last: number; erase: boolean } | null = null;
+  #shown: Shown | null = null;
+  #preview: Float64Array | null = null;
+  #scale: Scale | null = null;
+  #others: readonly PictureBoard[] = [];
+
+  constructor() {
+    new ResizeObserver(() => this.#compose()).observe(this.host);
+  }
+
+  cameras(): string[] {
+    return [...this.#drawn.keys()];
+  }
+
+  get scale(): Scale | null {
+    return this.#scale;
+  }
+
+  /** Draw what is shown. */
+  show(shown: Shown): void {
+    const before = this.#shown;
+    this.#shown = shown;
+    this.#preview = null;
+    const cameras = [...shown.frames.keys()];
+    if (before?.site.layout !== shown.site.layout || cameras.join() !== this.cameras().join()) this.#build(shown, cameras);
+    this.#paint();
+  }
+
+  /** Lay another row over the pictures for a moment, (key); null: that of what is shown. */
+  preview(row: Float64Array | null): void {
+    if (this.#preview === row) return;
+    this.#preview = row;
+    this.#paint();
+  }
+
+  /** Use one colour scale with other boards. */
+  shareScale(...others: PictureBoard[]): void {
+    this.#others = others;
+    this.#paint();
+  }
+
+  /** Outline the patches of a group: those with a weight of at least 128 of 255; null removes it. */
+  setOutline(id: string, name: string, colour: string, members: ReadonlyMap<string, Uint8Array> | null): void {
+    if (members) this.#outlines.set(id, { name, colour, members });
+    else if (!this.#outlines.delete(id)) return;
+    this.#compose();
+  }
+
+  /** While set, a pointer that is dragged over pictures paints patches. */
+  brush(on: Brush | null): void {
+    this.#brush = on;
+    this.host.classList.toggle("brushing", on !== null);
+  }
+
+  onPatch(listen: PatchListener): () => void {
+    this.#clicked.add(listen);
+    return () => this.#clicked.delete(listen);
+  }
+
+  /** Be told which patch the pointer or the cursor is on; null: it left. */
+  onHover(listen: (camera: string, patch: number | null) => void): () => void {
+    this.#hovered.add(listen);
+    return () => this.#hovered.delete(listen);
+  }
+
+  #build(shown: Shown, cameras: readonly string[]): void {
+    this.#drawn.clear();
+    this.host.replaceChildren();
+    for (const camera of cameras) {
+      const span = shown.site.layout.spans.find((each) => each.camera === camera)!;
+      const grid = span.grid!;
+      const canvas = element("canvas", { "data-camera": camera, tabindex: 0, role: "img" });
+      canvas.style.aspectRatio = `${grid.image_width} / ${grid.image_height}`;
+      const note = element("span", { class: "soft" });
+      const figure = element("figure", {}, canvas, element("figcaption", {}, camera, " ", note));
+      const drawn: Drawn = {
+        figure,
+        canvas,
+        note,
+        painted: document.createElement("canvas"),
+        span,
+        view: viewOf(shown.store.root.policy.cameras, camera),
+        patch: -1,
+        cursor: false,
+      };
+      this.#drawn.set(camera, drawn);
+      this.#listen(camera, drawn);
+      this.host.append(figure);
+    }
+  }
+
+  #listen(camera: string, drawn: Drawn): void {
+    const { canvas } = drawn;
+    const patchOf = (event: PointerEvent): number => {
+      const box = canvas.getBoundingClientRect();
+      return patchAt((event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height, drawn.span, drawn.view);
+    };
+    canvas.addEventListener("pointermove", (event) => {
+      const patch = patchOf(event);
+      if (this.#painting && this.#brush) this.#paintTo(camera, drawn, patch);
+      this.#hover(camera, drawn, patch);
+    });
+    canvas.addEventListener("pointerleave", () => this.#hover(camera, drawn, -1));
+    canvas.addEventListener("pointerdown", (event) => {
+      if (!this.#brush) return;
+      event.preventDefault();
+      canvas.setPointerCapture(event.pointerId);
+      this.#painting = { camera, last: -1, erase: event.shiftKey || event.button === 2 };
+      this.#paintTo(camera, drawn, patchOf(event));
+    });
+    const end = (): void => {
+      if (this.#painting) this.#brush?.end();
+      this.#painting = null;
+    };
+    canvas.addEventListener("pointerup", end);
+    canvas.addEventListener("pointercancel", end);
+    canvas.addEventListener("contextmenu", (event) => {
+      if (this.#brush) event.preventDefault();
+    });
+    canvas.addEventListener("click", (event) => {
+      if (this.#brush || !this.#shown) return;
+      const patch = patchOf(event as PointerEvent);
+      this.#hover(camera, drawn, patch);
+      for (const listen of this.#clicked) listen(camera, patch, this.#shown.replan);
+    });
+    canvas.addEventListener("keydown", (event) => this.#key(event, camera, drawn));
+    canvas.addEventListener("blur", () => {
+      drawn.cursor = false;
+      this.#hover(camera, drawn, -1);
+    });
+  }
+
+  /** Paint from the last patch to this one, so that a quick stroke has no gaps. */
+  #paintTo(camera: string, drawn: Drawn, patch: number): void {
+    const painting = this.#painting!;
+    if (painting.camera !== camera || painting.last === patch) return;
+    const { columns } = drawn.span.grid!;
+    const from = painting.last < 0 ? patch : painting.last;
+    const [row, column] = [Math.floor(from / columns), from % columns];
+    const [down, across] = [Math.floor(patch / columns) - row, (patch % columns) - column];
+    const steps = Math.max(Math.abs(down), Math.abs(across), 1);
+    const patches = new Set<number>();
+    for (let i = 0; i <= steps; i++) {
+      patches.add((row + Math.round((i * down) / steps)) * columns + column + Math.round((i * across) / steps));
+    }
+    painting.last = patch;
+    this.#brush!.paint(camera, [...patches], painting.erase);
+  }
+
+  /** Enter begins the cursor, arrows move it, space paints or clicks, Escape ends it. */
+  #key(event: KeyboardEvent, camera: string, drawn: Drawn): void {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (!drawn.cursor) {
+      if (event.key !== "Enter") return;
+      drawn.cursor = true;
+      this.#hover(camera, drawn, Math.max(drawn.patch, 0));
+    } else if (event.key === "Escape") {
+      drawn.cursor = false;
+      this.#hover(camera, drawn, -1);
+    } else if (event.key === " " || event.key === "Enter") {
+      if (this.#brush) {
+        this.#brush.paint(camera, [drawn.patch], event.shiftKey);
+        this.#brush.end();
+      } else if (this.#shown) for (const listen of this.#clicked) listen(camera, drawn.patch, this.#shown.replan);
+    } else {
+      const steps: Record<string, [number, number]> = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+      const step = steps[event.key];
+      if (!step) return;
+      const [left, top, width, height] = placeOfPatch(drawn.patch, drawn.span, drawn.view);
+      const x = Math.min(Math.max(left + (0.5 + step[0]) * width, 0), 1 - width / 2);
+      const y = Math.min(Math.max(top + (0.5 + step[1]) * height, 0), 1 - height / 2);
+      this.#hover(camera, drawn, patchAt(x, y, drawn.span, drawn.view));
+    }
+    event.preventDefault();
+    event.stopPropagation();
+  }
+
+  #hover(camera: string, drawn: Drawn, patch: number): void {
+    if (drawn.patch === patch) return;
+    drawn.patch = patch;
+    this.#compose(camera);
+    for (const listen of this.#hovered) listen(camera, patch < 0 ? null : patch);
+  }
+
+  #valuesOf(row: Float64Array): Float64Array {
+    const { state, tokens, valid, replan } = this.#shown!;
+    const counts = tokens.keyCounts;
+    return shownValues(row, valid, counts ? counts[counts.length === 1 ? 0 : replan]! : null, state.measure);
+  }
+
+  /** The values of all shown patches of all replans, where they are known: the scale does not change from one to the next. */
+  #patchValues(): { values: number[]; uniform: number } {
+    const shown = this.#shown!;
+    const { site, state, tokens } = shown;
+    const spans = [...this.#drawn.values()].map((drawn) => drawn.span);
+    const values: number[] = [];
+    let uniform = 0;
+    const rows = this.#preview ? null : shown.allRows;
+    const replans = rows ? shown.episode.numReplans : 1;
+    for (let replan = 0; replan < replans; replan++) {
+      const row = rows ? Float64Array.from(rows.subarray(replan * site.keys, (replan + 1) * site.keys)) : (this.#preview ?? shown.row);
+      const first = rows && tokens.keyRole.replans > 1 ? replan * site.keys : 0;
+      const valid = rows ? tokens.valid.subarray(first, first + site.keys) : shown.valid;
+      const counts = tokens.keyCounts;
+      const own = counts ? counts[counts.length === 1 ? 0 : rows ? replan : shown.replan]! : null;
+      const all = shownValues(row, valid, own, state.measure);
+      for (const span of spans) for (let key = span.start; key < span.stop; key++) values.push(all[key]!);
+      let mass = 0;
+      let number = 0;
+      row.forEach((value, key) => {
+        if (!valid[key]) return;
+        mass += value;
+        number += own ? own[key]! : 1;
+      });
+      uniform += (100 * mass) / number / replans;
+    }
+    return { values, uniform };
+  }
+
+  readonly #scales = new WeakMap<object, Map<string, Scale>>();
+
+  /** The scale of what is shown; computed once for an episode's rows. */
+  ownScale(): Scale | null {
+    const shown = this.#shown;
+    if (!shown || !this.#drawn.size) return null;
+    const key = this.#preview ?? shown.allRows ?? shown.row;
+    let of = this.#scales.get(key);
+    if (!of) this.#scales.set(key, (of = new Map()));
+    let scale = of.get(shown.state.measure);
+    if (!scale) {
+      const { values, uniform } = this.#patchValues();
+      scale = scaleFor(values, shown.state.measure, uniform);
+      of.set(shown.state.measure, scale);
+    }
+    return scale;
+  }
+
+  #paint(): void {
+    const shown = this.#shown;
+    if (!shown) return;
+    const scales = [this, ...this.#others].map((board) => board.ownScale()).filter((scale): scale is Scale => scale !== null);
+    this.#scale = scales.length ? scales.reduce((high, scale) => (scale.high > high.high ? scale : high)) : null;
+    if (!this.#scale) return;
+    const { state } = shown;
+    const values = this.#valuesOf(this.#preview ?? shown.row);
+    const painting: Painting = { scale: this.#scale, colours: colourTable(state.colours), opacity: state.opacity, smooth: state.smooth };
+    for (const [camera, drawn] of this.#drawn) {
+      const { span, view, painted, canvas } = drawn;
+      const own = values.slice(span.start, span.stop);
+      const { height, width, pixels } = overlayPixels(shown.frames.get(camera) ?? null, own, span, view, painting);
+      painted.width = width;
+      painted.height = height;
+      painted.getContext("2d")!.putImageData(new ImageData(pixels, width, height), 0, 0);
+      canvas.dataset.top = String(this.#scale.high);
+      this.#describe(camera, drawn, own);
+    }
+    this.#compose();
+  }
+
+  #describe(camera: string, drawn: Drawn, own: Float64Array): void {
+    const shown = this.#shown!;
+    const { columns } = drawn.span.grid!;
+    const best = [...own.keys()].filter((i) => !Number.isNaN(own[i]!)).sort((a, b) => own[b]! - own[a]!);
+    const named = best.slice(0, NAMED_PATCHES).map((patch) => `row ${Math.floor(patch / columns)} column ${patch % columns}`);
+    let share = 0;
+    for (let key = drawn.span.start; key < drawn.span.stop; key++) share += shown.row[key]!;
+    drawn.note.textContent = `${(100 * share).toFixed(1)}% of the attention`;
+    drawn.canvas.dataset.mass = String(share);
+    drawn.canvas.setAttribute(
+      "aria-label",
+      `Camera ${camera} at replan ${shown.replan}: ${(100 * share).toFixed(1)} per cent of the attention; ` +
+        `most on the patches ${named.join(", ")} of the stored picture. Enter: move over the patches with the arrow keys.`,
+    );
+  }
+
+  /** Put pictures, outlines and the cursor on the canvases, at the resolution of the screen. */
+  #compose(only?: string): void {
+    for (const [camera, drawn] of this.#drawn) {
+      if (only !== undefined && only !== camera) continue;
+      const { canvas, painted } = drawn;
+      const width = Math.round(canvas.clientWidth * devicePixelRatio);
+      const height = Math.round(canvas.clientHeight * devicePixelRatio);
+      if (!width || !height || !painted.width) continue;
+      if (canvas.width !== width || canvas.height !== height) {
+        canvas.width = width;
+        canvas.height = height;
+      }
+      const context = canvas.getContext("2d")!;
+      context.imageSmoothingEnabled = painted.width >= 128;
+      context.drawImage(painted, 0, 0, width, height);
+      for (const { colour, members } of this.#outlines.values()) {
+        const own = members.get(camera);
+        if (own) this.#stroke(context, drawn, (patch) => (own[patch] ?? 0) >= 128, colour, 2 * devicePixelRatio);
+      }
+      const hovered = drawn.patch;
+      if (hovered >= 0) {
+        this.#stroke(context, drawn, (patch) => patch === hovered, "#000", 4 * devicePixelRatio);
+        this.#stroke(context, drawn, (patch) => patch === hovered, "#fff", 2 * devicePixelRatio);
+      }
+    }
+  }
+
+  /** Lines along the border of the member patches. */
+  #stroke(
+    context: CanvasRenderingContext2D,
+    { span, view, canvas }: Drawn,
+    member: (patch: number) => boolean,
+    colour: string,
+    width: number,
+  ): void {
+    const { rows, columns } = span.grid!;
+    context.strokeStyle = colour;
+    context.lineWidth = width;
+    context.beginPath();
+    for (let patch = 0; patch < rows * columns; patch++) {
+      if (!member(patch)) continue;
+      const [left, top, across, down] = placeOfPatch(patch, span, view);
+      const [x, y] = [left * canvas.width, top * canvas.height];
+      const [right, bottom] = [x + across * canvas.width, y + down * canvas.height];
+      const row = Math.floor(patch / columns);
+      const column = patch % columns;
+      const is = (r: number, c: number): boolean => r >= 0 && c >= 0 && r < rows && c < columns && member(r * columns + c);
+      const side = view.mirrored ? 1 : -1;
+      const over = view.upright ? -1 : 1;
+      const line = (x0: number, y0: number, x1: number, y1: number): void => {
+        context.moveTo(x0, y0);
+        context.lineTo(x1, y1);
+      };
+      if (!is(row, column + side)) line(x, y, x, bottom);
+      if (!is(row, column - side)) line(right, y, right, bottom);
+      if (!is(row + over, column)) line(x, y, right, y);
+      if (!is(row - over, column)) line(x, bottom, right, bottom);
+    }
+    context.stroke();
+  }
+}

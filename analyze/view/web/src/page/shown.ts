@@ -1,0 +1,179 @@
+/** What is on the page at one moment: everything that its parts draw, read for one state. */
+import { EpisodeTokens } from "../grouping/tokens";
+import type { Word } from "../grouping/words";
+import { wordsOf } from "../grouping/words";
+import type { PromptDocument } from "../store/documents";
+import type { Coverage, Episode, Picture, Selection, SiteInfo } from "../store/episode";
+import type { Store } from "../store/open";
+import { type EpisodeNumbers, episodeNumbers } from "./episode_numbers";
+import type { OneOrMean, ViewState } from "./state";
+
+export interface Shown {
+  readonly state: ViewState;
+  readonly store: Store;
+  readonly episode: Episode;
+  readonly site: SiteInfo;
+  /** One that exists. */
+  readonly replan: number;
+  /** Positions on the axes that `row` is the mean over. */
+  readonly selection: Selection;
+  /** Probability of every key, (key). */
+  readonly row: Float64Array;
+  /** The mean rows of all replans, (replan, key); null where an episode is too large to read for one picture. */
+  readonly allRows: Float32Array | null;
+  readonly tokens: EpisodeTokens;
+  /** Keys that can hold information at this replan, (key). */
+  readonly valid: Uint8Array;
+  readonly prompt: PromptDocument | null;
+  readonly words: readonly Word[];
+  /** By camera that the policy sees at this site. */
+  readonly frames: ReadonlyMap<string, Picture | null>;
+  readonly coverage: ReadonlyMap<string, Coverage>;
+  readonly numbers: EpisodeNumbers;
+  /** What of the state does not exist here, in a sentence; empty: nothing. */
+  readonly corrections: string;
+}
+
+/** Decoded bytes up to which the rows of a whole episode are read for one selection. */
+const WHOLE_EPISODE_BYTES = 128_000_000;
+
+function positions(wanted: OneOrMean, recorded: readonly number[], what: string, missing: string[]): number[] {
+  // A block that two numbers name counts once in a mean.
+  if (wanted === "mean") return recorded.flatMap((number, i) => (recorded.indexOf(number) === i ? [i] : []));
+  let nearest = 0;
+  recorded.forEach((number, i) => {
+    if (Math.abs(number - wanted) < Math.abs(recorded[nearest]! - wanted)) nearest = i;
+  });
+  if (recorded[nearest] !== wanted) missing.push(`${what} ${wanted} was not recorded: ${recorded[nearest]} is shown`);
+  return [nearest];
+}
+
+/** The positions that a state names at a site, and what of it does not exist there. */
+export function selectionAt(site: SiteInfo, state: ViewState): { selection: Selection; missing: string[] } {
+  const missing: string[] = [];
+  let query = state.query;
+  if (query !== "mean" && query >= site.numQueries) {
+    missing.push(`query ${query} was not recorded: the mean is shown`);
+    query = "mean";
+  }
+  const selection = {
+    layers: positions(state.layer, site.layers, "layer", missing),
+    denoise: positions(state.denoise, site.denoise, "denoise step", missing),
+    heads: positions(state.head, site.heads, "head", missing),
+    query: site.numQueries === 1 ? ("mean" as const) : query,
+  };
+  return { selection, missing };
+}
+
+/** The site that a state names in an episode. */
+export function siteOf(episode: Episode, state: ViewState): SiteInfo {
+  return episode.sites.find((site) => site.layout.name === state.site) ?? episode.firstSite;
+}
+
+const tokensOfEpisodes = new WeakMap<Episode, Map<string, Promise<EpisodeTokens>>>();
+
+async function readTokens(episode: Episode, site: SiteInfo): Promise<EpisodeTokens> {
+  const { layout } = site;
+  const coverage = new Map<string, Coverage>();
+  const cameras = layout.spans.flatMap((span) => (span.camera && span.grid ? [span.camera] : []));
+  const [keyRole] = await Promise.all([
+    episode.keyRole(layout.name),
+    ...cameras.map(async (camera) => {
+      const found = await episode.coverage(camera);
+      if (found) coverage.set(camera, found);
+    }),
+  ]);
+  const { document } = episode;
+  const hasText = layout.spans.some((span) => span.kind === "text");
+  return new EpisodeTokens({
+    layout,
+    keyRole,
+    numReplans: episode.numReplans,
+    prompts: hasText ? document.prompts.map((prompt) => episode.promptOf(layout, prompt)) : [],
+    promptIndex: document.prompt_index,
+    objects: document.objects,
+    coverage: new Map([...coverage].sort(([a], [b]) => cameras.indexOf(a) - cameras.indexOf(b))),
+    numQueries: site.numActionQueries,
+  });
+}
+
+/** What selectors need of an episode's keys at a site; read once. */
+export function tokensOf(episode: Episode, site: SiteInfo): Promise<EpisodeTokens> {
+  let of = tokensOfEpisodes.get(episode);
+  if (!of) tokensOfEpisodes.set(episode, (of = new Map()));
+  let found = of.get(site.layout.name);
+  if (!found) {
+    found = readTokens(episode, site);
+    of.set(site.layout.name, found);
+    const kept = of;
+    found.catch(() => kept.delete(site.layout.name));
+  }
+  return found;
+}
+
+/** Cameras of a site whose patches are not all masked, in the order of the keys. */
+export function seenCameras(tokens: EpisodeTokens): string[] {
+  const { codes, keys, replans } = tokens.keyRole;
+  return tokens.layout.spans.flatMap((span) => {
+    if (span.camera === null || !span.grid) return [];
+    for (let replan = 0; replan < replans; replan++) {
+      for (let key = span.start; key < span.stop; key++) if (codes[replan * keys + key] === 1) return [span.camera];
+    }
+    return [];
+  });
+}
+
+/** Whether all replans of a selection are read at once: chunks mostly hold many of them. */
+async function readsWhole(episode: Episode, site: SiteInfo, selection: Selection): Promise<boolean> {
+  const cells = selection.layers.length * selection.denoise.length;
+  const bytes = 4 * episode.numReplans * cells * site.heads.length * site.numQueries * site.keys;
+  return bytes <= WHOLE_EPISODE_BYTES || episode.numReplans <= 3 * (await episode.replansPerChunk(site.layout.name));
+}
+
+/** Read all that a state shows of an episode. */
+export async function loadShown(store: Store, episode: Episode, state: ViewState): Promise<Shown> {
+  const missing: string[] = [];
+  if (state.site !== null && !episode.sites.some((site) => site.layout.name === state.site)) {
+    missing.push(`the episode has no site ${state.site}: ${episode.firstSite.layout.name} is shown`);
+  }
+  const site = siteOf(episode, state);
+  const name = site.layout.name;
+  const { selection, missing: axes } = selectionAt(site, state);
+  missing.push(...axes);
+  const replan = Math.min(state.replan, episode.numReplans - 1);
+  if (replan !== state.replan) missing.push(`the episode has no replan ${state.replan}: its last is ${replan}`);
+  const reading = tokensOf(episode, site);
+  const rows = readsWhole(episode, site, selection).then(async (whole) => {
+    if (!whole) return { all: null, own: await episode.meanRow(name, selection, replan) };
+    const all = (await episode.meanRows(name, selection)).values;
+    return { all, own: all.subarray(replan * site.keys, (replan + 1) * site.keys) };
+  });
+  const [tokens, { all, own }, numbers] = await Promise.all([
+    reading,
+    rows,
+    reading.then((known) => episodeNumbers(episode, site, known, selection)),
+  ]);
+  const cameras = seenCameras(tokens);
+  const frames = new Map(await Promise.all(cameras.map(async (camera) => [camera, await episode.frame(camera, replan)] as const)));
+  const first = tokens.keyRole.replans === 1 ? 0 : replan * site.keys;
+  const hasText = tokens.prompts.length > 0;
+  const prompt = hasText ? (tokens.prompts[tokens.promptIndex.length ? tokens.promptIndex[replan]! : 0] ?? null) : null;
+  return {
+    state,
+    store,
+    episode,
+    site,
+    replan,
+    selection,
+    row: Float64Array.from(own),
+    allRows: all,
+    tokens,
+    valid: tokens.valid.subarray(first, first + site.keys),
+    prompt,
+    words: prompt ? wordsOf(prompt) : [],
+    frames,
+    coverage: tokens.coverage,
+    numbers,
+    corrections: missing.length ? `${missing.join("; ")}.` : "",
+  };
+}

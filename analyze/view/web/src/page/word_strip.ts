@@ -1,0 +1,134 @@
+/** The prompt as text: the instruction's words shaded by the attention on their keys, the rest as it stands. */
+import { characters } from "../grouping/text";
+import type { Word } from "../grouping/words";
+import { button, element } from "./dom";
+import { formatNumber, formatPercent } from "./number_text";
+import type { Shown } from "./shown";
+
+export type WordListener = (place: number, word: Word) => void;
+
+export interface WordMeasures {
+  mass: number;
+  /** Mass per key / mean mass of a valid key; NaN for a word without keys. */
+  lift: number;
+}
+
+/** Mass and lift of keys in a row, as `vla-analyze words` has them. */
+export function measuresOfKeys(keys: readonly number[], shown: Pick<Shown, "row" | "valid" | "tokens" | "replan">): WordMeasures {
+  const counts = shown.tokens.keyCounts;
+  const own = counts ? counts[counts.length === 1 ? 0 : shown.replan]! : null;
+  let valid = 0;
+  let number = 0;
+  shown.row.forEach((value, key) => {
+    if (!shown.valid[key]) return;
+    valid += value;
+    number += own ? own[key]! : 1;
+  });
+  let mass = 0;
+  let pieces = 0;
+  for (const key of keys) {
+    mass += shown.row[key]!;
+    pieces += own ? own[key]! : 1;
+  }
+  return { mass, lift: pieces > 0 ? mass / pieces / (valid / number) : NaN };
+}
+
+/** A word's shade ends at this lift, or at the highest of the sentence. */
+const LEAST_TOP = 4;
+
+export class WordStrip {
+  readonly host = element("div", { class: "words" });
+  readonly #clicked = new Set<WordListener>();
+  readonly #hovered = new Set<(place: number | null) => void>();
+  readonly #marks = new Map<string, { places: ReadonlySet<number>; colour: string }>();
+  readonly #line = element("p", { class: "prompt" });
+  readonly #note = element("p", { class: "soft" });
+  #buttons: HTMLButtonElement[] = [];
+  #built = "";
+
+  constructor() {
+    this.host.append(this.#line, this.#note);
+  }
+
+  onWord(listen: WordListener): () => void {
+    this.#clicked.add(listen);
+    return () => this.#clicked.delete(listen);
+  }
+
+  /** Be told which word the pointer or the focus is on; null: it left. */
+  onHover(listen: (place: number | null) => void): () => void {
+    this.#hovered.add(listen);
+    return () => this.#hovered.delete(listen);
+  }
+
+  /** Underline words in a group's colour; an empty set removes the line. */
+  mark(id: string, places: ReadonlySet<number>, colour: string): void {
+    if (places.size) this.#marks.set(id, { places, colour });
+    else this.#marks.delete(id);
+    this.#drawMarks();
+  }
+
+  show(shown: Shown): void {
+    const { words, prompt, episode, site } = shown;
+    const built = prompt ? `${prompt.text}\n${words.map((word) => word.start).join()}` : episode.document.instruction;
+    if (built !== this.#built) {
+      this.#built = built;
+      this.#build(shown);
+    }
+    const measures = words.map((word) => measuresOfKeys(word.keys, shown));
+    const finite = measures.map(({ lift }) => lift).filter(Number.isFinite);
+    const top = Math.max(LEAST_TOP, ...finite);
+    measures.forEach(({ mass, lift }, i) => {
+      const made = this.#buttons[i]!;
+      const word = words[i]!;
+      made.dataset.mass = String(mass);
+      made.dataset.lift = String(lift);
+      const part = Number.isFinite(lift) ? Math.min(lift / top, 1) : 0;
+      made.style.setProperty("--part", `${Math.round(100 * part)}%`);
+      made.lastElementChild!.textContent = Number.isFinite(lift) ? `×${formatNumber(lift)}` : "-";
+      made.setAttribute(
+        "aria-label",
+        `${word.text}: ${formatPercent(mass, 2)} of the attention, ${formatNumber(lift)} times uniform attention`,
+      );
+    });
+    this.#note.textContent = words.length
+      ? `Shade and number: attention on a word's keys per key, over the mean of the valid keys (×1 is uniform; full shade: ×${formatNumber(top)}).`
+      : `The keys of site ${site.layout.name} spell no words.`;
+  }
+
+  #build({ prompt, words, episode }: Shown): void {
+    this.#buttons = [];
+    this.#line.replaceChildren();
+    if (!prompt) {
+      this.#line.append(episode.document.instruction);
+      return;
+    }
+    const text = characters(prompt.text);
+    let at = 0;
+    const rest = (until: number): void => {
+      if (until > at) this.#line.append(element("span", { class: "soft" }, text.slice(at, until).join("")));
+    };
+    words.forEach((word, place) => {
+      rest(word.start);
+      at = word.stop;
+      const made = button("", () => this.#clicked.forEach((listen) => listen(place, word)), { "data-word": place, class: "word" });
+      made.append(element("span", {}, word.text), element("small", { "aria-hidden": "true" }));
+      const over = (on: boolean) => (): void => this.#hovered.forEach((listen) => listen(on ? place : null));
+      made.addEventListener("pointerenter", over(true));
+      made.addEventListener("pointerleave", over(false));
+      made.addEventListener("focus", over(true));
+      made.addEventListener("blur", over(false));
+      this.#buttons.push(made);
+      this.#line.append(made);
+    });
+    rest(text.length);
+    this.#drawMarks();
+  }
+
+  #drawMarks(): void {
+    this.#buttons.forEach((made, place) => {
+      const colours = [...this.#marks.values()].filter((mark) => mark.places.has(place)).map((mark) => mark.colour);
+      made.style.borderBottomColor = colours[0] ?? "transparent";
+    });
+  }
+}
