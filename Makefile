@@ -7,6 +7,8 @@
 #   make test-remote stores in S3, on moto's server on this machine, in an environment of its own (.venv-remote)
 #   make viewer      the page of `vla-analyze view` from its sources in analyze/view/web (needs node and npm)
 #   make fuzz        made-up bytes for every parser of files, for SECONDS=3600, in an environment of its own (.venv-fuzz)
+#   make docs        the documentation site, into site/, in an environment of its own (.venv-docs)
+#   make pictures    the pictures of README and guides, from the run of make capture
 #   make test-slurm  an array job on the SLURM that sbatch reaches from here (opt-in; installs nothing)
 #   make setup       the whole environment        make setup-analyze   the laptop's part of it
 #
@@ -38,7 +40,7 @@ WORKERS ?= 2
 # An empty PYTHONDONTWRITEBYTECODE: where it is set, both processes compile all tests anew at every run.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: capture analyze test test-policies test-remote test-slurm fuzz test-thorough check unit package audit setup setup-analyze schemas viewer clean
+.PHONY: capture analyze test test-policies test-remote test-slurm fuzz test-thorough check unit package audit setup setup-analyze schemas docs pictures viewer clean
 
 capture: .venv/capture-installed
 	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --store $(STORE) \
@@ -90,6 +92,14 @@ test-slurm:
 # What is installed, against the databases of known vulnerabilities; ends with 2 where none of them is reachable.
 audit: .venv/capture-installed .venv-audit/installed
 	$(BIN)/python scripts/audit.py --program .venv-audit/bin/pip-audit
+
+# Strict: a link to a page or a heading that is not there is an error; then the built pages are read for more.
+docs: .venv-docs/installed
+	NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build --quiet
+	.venv-docs/bin/python scripts/check_site.py site
+
+pictures: .venv/analyze-installed
+	$(BIN)/python docs/make_pictures.py --run $(STORE)
 
 schemas: .venv/capture-installed
 	$(BIN)/python -m vla_attention.schemas.json_files
@@ -143,6 +153,12 @@ setup-analyze: .venv/analyze-installed
 	.venv-remote/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[remote]' 'moto[server]>=5' pytest hypothesis
 	@touch $@
 
+.venv-docs/installed: docs/requirements.txt
+	@echo "Installing mkdocs into .venv-docs ..."
+	$(PYTHON) -m venv .venv-docs
+	.venv-docs/bin/python -m pip install --quiet --disable-pip-version-check -r docs/requirements.txt
+	@touch $@
+
 .venv-audit/installed:
 	@echo "Installing pip-audit into .venv-audit ..."
 	$(PYTHON) -m venv .venv-audit
@@ -156,4 +172,4 @@ setup-analyze: .venv/analyze-installed
 	@touch $@
 
 clean:
-	rm -rf .venv .venv-transformers .venv-lerobot .venv-remote .venv-audit .venv-fuzz build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-transformers .venv-lerobot .venv-remote .venv-audit .venv-fuzz .venv-docs build site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

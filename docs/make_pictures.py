@@ -1,6 +1,9 @@
-"""Draw the pictures of `docs/interpreting.md` from made-up rows with a known truth, with the tool's own commands.
+"""Draw the pictures of README.md and of `docs/interpreting.md`, with the tool's own commands.
 
-Usage: python docs/make_pictures.py [--folder docs/pictures]
+Usage: python docs/make_pictures.py [--run runs/cubes.zarr] [--folder docs/pictures]
+
+Those of README.md are of the run of `make capture`; those of the guide are of made-up rows with a known truth.
+`make pictures` draws both.
 """
 
 from __future__ import annotations
@@ -69,12 +72,32 @@ def specialist(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray)
     return normalised(weights)
 
 
+def draw_run(store: Path, scratch: Path, folder: Path) -> None:
+    """Draw the pictures of README.md: a strip of one episode, and the layers."""
+    strip = ["overlay", "--task", "10", "--replans", "0", "1", "2", "3", "4"]
+    draw("overlay", store, strip, "overlay_task010_episode000", scratch / "overlay", folder)
+    draw("layers", store, ["ratios"], "layer_profile", scratch / "ratios", folder)
+
+
+def draw(name: str, store: Path, command: list[str], picture: str | None, scratch: Path, folder: Path) -> None:
+    """Run a command on a store and keep one of its pictures (None: its only one) as NAME.png."""
+    if analyze([command[0], str(store), *command[1:], "--output", str(scratch)]):
+        raise SystemExit(f"{name}: the analysis failed")
+    drawn = scratch / f"{picture}.png" if picture else next(scratch.rglob("*.png"))
+    shutil.copyfile(drawn, folder / f"{name}.png")
+    print(folder / f"{name}.png")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--folder", type=Path, default=Path(__file__).parent / "pictures")
-    folder = parser.parse_args().folder
+    parser.add_argument("--run", type=Path, help="the store of `make capture`; without it README.md keeps its pictures")
+    arguments = parser.parse_args()
+    folder = arguments.folder
     folder.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(prefix="pictures_"))
+    if arguments.run is not None:
+        draw_run(arguments.run, scratch / "run", folder)
     shape = StoreSpec(
         tokens=libero_tokens(6),
         num_layers=18,
@@ -90,12 +113,7 @@ def main() -> None:
     }
     for name, (plant, changes, command, picture) in cases.items():
         store = write_store(scratch / f"{name}.zarr", spec=shape, plant_rows=plant, suite="made_up", **changes)
-        output = scratch / name
-        if analyze([command[0], str(store), *command[1:], "--output", str(output)]):
-            raise SystemExit(f"{name}: the analysis failed")
-        drawn = output / f"{picture}.png" if picture else next(output.rglob("*.png"))
-        shutil.copyfile(drawn, folder / f"{name}.png")
-        print(folder / f"{name}.png")
+        draw(name, store, command, picture, scratch / name, folder)
     shutil.rmtree(scratch)
 
 

@@ -1,23 +1,33 @@
-"""The documents name files, modules, commands and make targets that exist."""
+"""The documents name files, modules, commands, options and make targets that exist, and every page is on the site."""
 
 from __future__ import annotations
 
 import re
+import shlex
+from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import yaml
 
-from vla_attention.analyze.commands import COMMANDS
+import vla_attention as va
+from scripts.site_hooks import OUTSIDE
+from vla_attention.analyze.commands import COMMANDS, DEFAULT_COMMAND
+from vla_attention.capture.arguments import build_parser
 from vla_attention.capture.policies.families import policy_families
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = [path for path in (*ROOT.glob("*.md"), *sorted((ROOT / "docs").glob("*.md"))) if path.is_file()]
+DOCUMENTS = [path for path in (*ROOT.glob("*.md"), *sorted((ROOT / "docs").rglob("*.md"))) if path.is_file()]
 #: Folders at the top of the checkout: a path in backticks that begins with one of these must exist.
 TOP_FOLDERS = sorted(path.name for path in ROOT.iterdir() if path.is_dir() and not path.name.startswith("."))
 #: Folders that runs make.
 MADE = ("runs", "results", "build", "dist")
+
+
+def page_name(document: Path) -> str:
+    return document.relative_to(ROOT).as_posix()
 
 
 def text_of(document: Path) -> str:
@@ -27,19 +37,21 @@ def text_of(document: Path) -> str:
 def exists(name: str) -> bool:
     """Whether a dotted name is a module, or something in one."""
     try:
-        return find_spec(name) is not None
+        if find_spec(name) is not None:
+            return True
     except ModuleNotFoundError:  # the part before the last dot is a module without submodules
-        holder, _, attribute = name.rpartition(".")
-        return hasattr(import_module(holder), attribute)
+        pass
+    holder, _, attribute = name.rpartition(".")
+    return hasattr(import_module(holder), attribute)
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+@pytest.mark.parametrize("document", DOCUMENTS, ids=page_name)
 def test_links_lead_to_files(document):
     for target in re.findall(r"\]\((?!https?:|#)([^)#]+)", text_of(document)):
         assert (document.parent / target).exists(), target
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+@pytest.mark.parametrize("document", DOCUMENTS, ids=page_name)
 def test_paths_in_backticks_exist(document):
     folders = "|".join(re.escape(name) for name in TOP_FOLDERS if name not in MADE)
     for path in re.findall(rf"`((?:{folders})/[\w./-]*)`", text_of(document)):
@@ -47,13 +59,13 @@ def test_paths_in_backticks_exist(document):
         assert (ROOT / written).exists(), path
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+@pytest.mark.parametrize("document", DOCUMENTS, ids=page_name)
 def test_modules_and_what_they_hold_exist(document):
     for name in re.findall(r"\bvla_attention(?:\.\w+)+", text_of(document)):
         assert exists(name), name
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+@pytest.mark.parametrize("document", DOCUMENTS, ids=page_name)
 def test_make_targets_exist(document):
     targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     for block in re.findall(r"```bash\n(.*?)```|`(make [^`]*)`", text_of(document), re.DOTALL):
@@ -61,9 +73,72 @@ def test_make_targets_exist(document):
             assert target in targets, target
 
 
-def test_the_readme_names_every_command_family_and_method():
-    readme = text_of(ROOT / "README.md")
+def test_the_guides_name_every_command_and_family():
+    commands = text_of(ROOT / "docs" / "commands.md")
     for command in COMMANDS:
-        assert re.search(rf"^\| .*`{command}( A B)?`", readme, re.MULTILINE), command
+        assert re.search(rf"^\| .*`{command}( A B)?`", commands, re.MULTILINE), command
     for family in policy_families():
-        assert f"vla-capture {family.name}" in readme, family.name
+        assert f"`vla-capture {family.name}`" in commands, family.name
+        assert f"`vla-capture {family.name}`" in text_of(ROOT / "docs" / "policies.md"), family.name
+
+
+def command_lines(document: Path) -> Iterator[list[str]]:
+    """The words of every line of a shell block that calls one of the programs.
+
+    Lines with variables are left out, and `rerun`, whose parser reads the store that is named (the tutorials run it).
+    """
+    for block in re.findall(r"^```(?:bash|sh)\n(.*?)^```", text_of(document), re.DOTALL | re.MULTILINE):
+        for line in block.replace("\\\n", " ").splitlines():
+            words = shlex.split(line, comments=True)
+            if words[:1] not in (["vla-analyze"], ["vla-capture"]) or words[1:2] == ["rerun"]:
+                continue
+            if not any("$" in word or word == "..." for word in words):
+                yield words
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=page_name)
+def test_the_parsers_take_every_command_line(document):
+    for program, *given in command_lines(document):
+        if program == "vla-capture":
+            parser = build_parser(given)
+        else:
+            name = given[0] if given[0] in COMMANDS else DEFAULT_COMMAND
+            given = given[given[0] in COMMANDS :]
+            parser = import_module(f"vla_attention.analyze.{name}.command").build_parser()
+            for option in ("--threads", "--no-cache"):  # which all commands get when they run
+                given = [word for word in given if word != option]
+        parser.parse_args(given)  # a mistake ends it with a sentence and 2
+
+
+def test_the_site_has_every_page_once():
+    def pages(entry: object) -> Iterator[str]:
+        if isinstance(entry, str):
+            yield entry
+        elif isinstance(entry, dict | list):
+            for part in entry.values() if isinstance(entry, dict) else entry:
+                yield from pages(part)
+
+    listed = list(pages(yaml.safe_load(text_of(ROOT / "mkdocs.yml"))["nav"]))
+    written = [path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")]
+    assert sorted(listed) == sorted([*written, *(page for page in OUTSIDE.values() if page.endswith(".md"))])
+
+
+def test_the_reference_shows_every_public_name():
+    """`va.record` is shown under the module that defines it."""
+    shown = re.findall(r"^<!-- docstring: (\S+) -->$", text_of(ROOT / "docs" / "api.md"), re.MULTILINE)
+    assert all(exists(name) for name in shown)
+    names = {name.rpartition(".")[2] for name in shown}
+    assert {*dir(va), *va.layouts.__all__} - names == {"__version__", "datasets", "layouts"}
+
+
+def test_the_readme_is_short_and_shows_pictures():
+    readme = text_of(ROOT / "README.md")
+    assert len(readme.splitlines()) <= 130
+    assert readme.index("docs/pictures/overlay.png") < readme.index("## ")
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=page_name)
+def test_pictures_have_a_text_and_are_small(document):
+    for text, target in re.findall(r"!\[(.*?)\]\((.*?)\)", text_of(document)):
+        assert len(text) > 15, target
+        assert (document.parent / target).stat().st_size < 300_000, target

@@ -1,0 +1,67 @@
+"""The tutorials of docs/: commands of blocks marked `bash`, blocks of Python and the TOML file, as they stand.
+
+Only plots are left out, which the tests of each command draw.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from tests.kit.lerobot_data_sets import H264, made_up_episodes, write_data_set
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.capture.__main__ import main as capture
+
+DOCS = Path(__file__).parents[2] / "docs"
+PROGRAMS = {"vla-capture": capture, "vla-analyze": analyze}
+#: Questions of `vla-analyze` that draw plots beside their text; a store in their place is the first one.
+PLOTTED = ("ratios", "heads", "words", "objects", "time", "deviation", "effects", "compare", "groups")
+
+
+def walk(page: str) -> int:
+    """Run the blocks of a tutorial in their order, in the working directory; returns the number of commands."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    commands = 0
+    for language, block in re.findall(r"^```(bash|python|toml)\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
+        if language == "toml":
+            Path(re.findall(r'^name = "(.*)"$', block, re.MULTILINE)[0] + ".toml").write_text(block)
+        elif language == "python":
+            exec(compile(block, page, "exec"), {})
+        else:
+            for line in block.replace("\\\n", " ").splitlines():
+                program, *arguments = shlex.split(line)
+                if (
+                    program == "vla-analyze"
+                    and arguments[0].endswith((".zarr", *PLOTTED))
+                    and "--list" not in arguments
+                ):
+                    arguments.append("--no-plots")
+                assert PROGRAMS[program](arguments) == 0, line
+                commands += 1
+    return commands
+
+
+@pytest.mark.simulator
+def test_your_checkpoint_and_then_your_question(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert walk("your-checkpoint.md") == 8
+    assert "touch the red cube" in capsys.readouterr().out
+    assert Path("results/mine/report.html").stat().st_size > 10_000
+    # The walk begins with what `make capture` makes, of which the first episode is the one of the walk before.
+    Path("runs/mine.zarr").rename("runs/cubes.zarr")
+    assert walk("your-question.md") > 10
+    printed = capsys.readouterr().out
+    assert "The ratio named / others is" in printed
+    assert "bit-equal" in printed
+
+
+def test_your_robots_data(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    cameras = ("observation.images.front", "observation.images.wrist")
+    episodes = made_up_episodes((12, 9, 7), cameras=cameras)
+    write_data_set(tmp_path / "data" / "so101_pick", "v3.0", episodes, video=H264)
+    assert walk("your-robot.md") == 9
+    assert "standard deviations of the data set's actions" in " ".join(capsys.readouterr().out.split())

@@ -1,0 +1,75 @@
+"""Every sentence that docs/errors quotes is printed somewhere: its fixed parts stand in one text of the sources."""
+
+from __future__ import annotations
+
+import ast
+import re
+from functools import lru_cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted((ROOT / "docs" / "errors").glob("*.md"))
+#: What a value in a text of the sources becomes; no text has it.
+VALUE = "\x00"
+#: Quotes of fewer fixed characters would be found by chance.
+FEWEST_CHARACTERS = 20
+
+
+def text_of(node: ast.expr) -> str:
+    """A text of the sources, with VALUE in the place of what is filled in."""
+    if isinstance(node, ast.Constant):
+        return node.value if isinstance(node.value, str) else VALUE
+    if isinstance(node, ast.JoinedStr):
+        return "".join(map(text_of, node.values))
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        return text_of(node.left) + text_of(node.right)
+    return VALUE
+
+
+@lru_cache(maxsize=1)
+def sources() -> str:
+    """All texts of the program, a line each."""
+    texts = [
+        text_of(node).replace("\n", " ")
+        for folder in ("schemas", "capture", "analyze")
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant | ast.JoinedStr | ast.BinOp)
+    ]
+    texts += [
+        line for path in (ROOT / "scripts").glob("*.sh") for line in path.read_text(encoding="utf-8").splitlines()
+    ]
+    return "\n".join(texts)
+
+
+def is_printed(quote: str) -> bool:
+    """Whether a text of the sources has the quote's fixed parts in their order; … is any value or text."""
+    parts = [re.escape(part) for part in quote.split("…")]
+    return re.search("[^\n]*?".join(parts), sources()) is not None
+
+
+def quotes(page: Path) -> list[str]:
+    return re.findall(r"^> (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_quoted_sentence_is_in_the_sources(page):
+    found = quotes(page)
+    assert page.stem == "index" or len(found) >= 8
+    for quote in found:
+        assert len(quote.replace("…", "").strip()) >= FEWEST_CHARACTERS, quote
+        assert is_printed(quote), quote
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_sentence_has_its_reason_and_what_to_do(page):
+    for section in page.read_text(encoding="utf-8").split("\n## ")[1:]:
+        assert re.findall(r"^(?:> |\*\*(.*?)\*\*)", section, re.MULTILINE) == ["", "Why.", "What to do."], section
+
+
+def test_a_sentence_that_nobody_prints_is_found():
+    assert is_printed("There is no checkpoint folder at '…'.")
+    assert not is_printed("There is no checkpoint folder near '…'.")
+    assert not is_printed("checkpoint folder at … There is no")
