@@ -61,6 +61,14 @@ def _zarr_works_without_threads() -> Any:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _nothing_is_flushed_to_the_disk() -> Any:
+    """No test can cut the power. An episode has some forty files and folders, at a millisecond or more each."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _handle: None)
+        yield
+
+
 @pytest.fixture
 def usual_signals() -> Iterator[None]:
     """Python's own handling of Ctrl-C and SIGTERM, whatever libraries and tests before have made of it."""

@@ -22,6 +22,7 @@ from typing import Any
 from vla_attention.analyze.copy.packing import Packing
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 from vla_attention.schemas.stores.digest import run_digest, with_digest
+from vla_attention.schemas.stores.durable_files import publish
 from vla_attention.schemas.stores.episode_files import files_of_no_array, refuse_links
 from vla_attention.schemas.stores.hub_address import HUB_PROTOCOL, MAIN, HubAddress
 from vla_attention.schemas.stores.partial_folders import partial_of, remove_dead_partials
@@ -225,13 +226,12 @@ def _copy_episode(
         if _part_of(file) in without:
             left += record.size
             continue
-        content = episode.sealed(file)  # raises when it differs from what was written
-        if file == "zarr.json" and without:
-            content = _without_arrays(content, without)
         place = folder / file
         place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_bytes(content)
-        copied += len(content)
+        if file == "zarr.json" and without:
+            copied += place.write_bytes(_without_arrays(episode.sealed(file), without))
+        else:
+            copied += episode.copy_file(file, place)
     seal = folder / SEAL_FILE
     if without:
         seal_episode(folder, episode.name, run, copied_from=_captured(episode))
@@ -291,9 +291,9 @@ def _part_of(path: str) -> str | None:
 
 
 def _rename_new(source: Path, target: Path) -> None:
-    """Rename a folder to a new name. When another copy was faster, its folder has the same content and stays."""
+    """Publish a folder, durably. When another copy was faster, its folder has the same content and stays."""
     try:
-        source.rename(target)
+        publish(source, target, durable=True)
     except OSError as error:
         if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
             raise

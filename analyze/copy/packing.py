@@ -7,11 +7,13 @@ the episode.
 
 from __future__ import annotations
 
+import shutil
 import zipfile
 from pathlib import Path
 
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.byte_source import Folder
+from vla_attention.schemas.stores.durable_files import publish_file
 from vla_attention.schemas.stores.packed_index import (
     INDEX_FILE,
     INDEX_FORMAT,
@@ -29,12 +31,15 @@ from vla_attention.schemas.stores.zip_members import ZipMembers
 SMALL_BYTES = 4096
 #: The index is written after so many episodes: after a power cut, at most these are packed again.
 _INDEX_EVERY = 50
+_BYTES_AT_ONCE = 1_000_000
 #: The first date that a zip can state: packing the same episode twice gives the same bytes.
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
 class Packing:
     """A packed store that episodes are added to. The index lists whole zips only, and is written now and then.
+
+    A zip is on the disk before the index lists it, so that a crash of the machine leaves no entry without its zip.
 
     It is there before the first zip: a copy that ends early is a packed store of the episodes that it has. The caller
     holds the lock of the store (`store_lock.py`), and calls `write_index` when it has ended.
@@ -73,12 +78,11 @@ class Packing:
     def add(self, name: str, folder: Path) -> None:
         """Pack a sealed episode from its folder."""
         path = self.target / packed_file(name)
-        path.parent.mkdir(parents=True, exist_ok=True)
         building = self.building / path.name
         tail = write_zip(folder, building)
         size = building.stat().st_size
         frame = ZipMembers(Folder(self.building), building.name, size, tail).frame_digest()
-        building.replace(path)
+        publish_file(building, path)  # before the index lists it
         self.episodes[name] = PackedEpisode(packed_file(name), size, tail, read_seal(folder).digest, frame)
         if len(self.episodes) % _INDEX_EVERY == 0:
             self.write_index()
@@ -88,7 +92,7 @@ class Packing:
         index = PackedIndex(INDEX_FORMAT, INDEX_VERSION, self.run, dict(sorted(self.episodes.items())))
         building = self.building / INDEX_FILE
         building.write_bytes(index.document())
-        building.replace(self.target / INDEX_FILE)
+        publish_file(building, self.target / INDEX_FILE)
 
 
 def write_zip(folder: Path, path: Path) -> int:
@@ -104,7 +108,10 @@ def write_zip(folder: Path, path: Path) -> int:
                 tail = 0
             elif not tail:
                 tail = packed.start_dir
-            packed.writestr(zipfile.ZipInfo(name, _DATE), file.read_bytes())
+            entry = zipfile.ZipInfo(name, _DATE)
+            entry.file_size = file.stat().st_size  # as `writestr` states it, which takes all bytes at once
+            with file.open("rb") as content, packed.open(entry, "w") as written:
+                shutil.copyfileobj(content, written, _BYTES_AT_ONCE)
         if not tail:
             tail = packed.start_dir
     return tail

@@ -17,6 +17,7 @@ from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.stores.checking import reports_of_store
 from vla_attention.schemas.errors import BadArgument, UserError, listing
 from vla_attention.schemas.stores.digest import with_digest
+from vla_attention.schemas.stores.durable_files import publish
 from vla_attention.schemas.stores.episode_files import refuse_links
 from vla_attention.schemas.stores.hub_address import HUB_PROTOCOL
 from vla_attention.schemas.stores.partial_folders import partial_of, remove_dead_partials
@@ -141,7 +142,7 @@ def _merge(
                 f"Cannot merge: {report.episode} of {origin[report.episode].path} is damaged: "
                 f"{report.problems[0].rstrip('.')}. Repair that store first."
             )
-    place.rename(target)
+    publish(place, target, durable=True)
     return Merged(len(built.episodes), linked, copied)
 
 
@@ -171,9 +172,10 @@ def _bring(episode: StoredEpisode, folder: Path, link: bool) -> tuple[int, int]:
             if link and _linked(episode, file, place):
                 linked += place.stat().st_size
                 continue
-            content = episode.source.whole(file) if file == SEAL_FILE else episode.sealed(file)
-            place.write_bytes(content)
-            copied += len(content)
+            if file == SEAL_FILE:
+                copied += place.write_bytes(episode.source.whole(file))
+            else:
+                copied += episode.copy_file(file, place)
     except CorruptEpisode as error:
         raise CorruptEpisode(f"Cannot merge: {error} Repair the store first.") from None
     return linked, copied

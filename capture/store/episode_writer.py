@@ -11,8 +11,8 @@ import zarr
 from numpy.typing import NDArray
 
 from vla_attention.capture.store.codecs import write_whole
-from vla_attention.capture.store.durable_files import naming_the_failure, publish
 from vla_attention.capture.store.recorded_rows import RecordedRows
+from vla_attention.capture.store.refused_writes import naming_the_failure
 from vla_attention.capture.store.site_writer import SiteWriter
 from vla_attention.capture.store.store_root import check_same_run, read_existing_root
 from vla_attention.schemas.errors import listing
@@ -29,6 +29,7 @@ from vla_attention.schemas.stores.content_rules import (
     sites_with_text,
 )
 from vla_attention.schemas.stores.digest import ArrayDigest
+from vla_attention.schemas.stores.durable_files import publish
 from vla_attention.schemas.stores.episode_checks import content_problems
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.root import read_run

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import zarr
 
-from vla_attention.capture.store.durable_files import publish
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.stores.digest import with_digest
+from vla_attention.schemas.stores.durable_files import publish
 from vla_attention.schemas.stores.partial_folders import (
     make_partial,
     partial_folder,

@@ -15,8 +15,8 @@ from typing import Literal, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.store.durable_files import naming_the_failure
 from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter
+from vla_attention.capture.store.refused_writes import naming_the_failure
 from vla_attention.capture.store.store_root import check_same_run, create_root, delete_store, read_existing_root
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stores.partial_folders import (

@@ -163,6 +163,15 @@ class Folder:
             raise not_regular(path, status.st_mode)
         return status.st_size
 
+    def check_not_sparse(self, file: str) -> None:
+        """Raise `NotRegular` for a large file of which hardly any byte is stored."""
+        handle, size = self._open(file)
+        try:
+            if size > CLAIMED_BYTES:
+                check_not_sparse(self.path / file, handle, size)
+        finally:
+            os.close(handle)
+
     def bound_to(self, digest: str) -> Folder:
         """See `ByteSource`."""
         return self

@@ -6,6 +6,7 @@ is opened.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
@@ -40,7 +41,7 @@ from vla_attention.schemas.stores.store_format import (
     episode_name,
     parse_episode_name,
 )
-from vla_attention.schemas.stores.store_url import StorePlace, store_place
+from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl, store_place
 from vla_attention.schemas.stores.zip_members import DamagedZip, ZipMembers
 
 if TYPE_CHECKING:
@@ -51,6 +52,9 @@ if TYPE_CHECKING:
     from vla_attention.schemas.stores.single_chunks import SingleChunk
 
 Read = TypeVar("Read")
+
+#: Decoded bytes of an array that are read at once where all of it is read and a part would do.
+READ_AT_ONCE_BYTES = 64_000_000
 
 
 @dataclass(frozen=True)
@@ -137,6 +141,13 @@ class StoredEpisode:
         except CorruptEpisode as error:
             raise CorruptEpisode(f"Episode {self.name} is damaged: {error}.") from None
 
+    def copy_file(self, file: str, path: Path) -> int:
+        """Write one file of the episode to `path`, and return its bytes; raises as `sealed` does."""
+        try:
+            return self.files.copy(file, path)
+        except CorruptEpisode as error:
+            raise CorruptEpisode(f"Episode {self.name} is damaged: {error}.") from None
+
     @cached_property
     def _opened(self) -> dict[str, zarr.Array[Any]]:
         return {}
@@ -197,10 +208,14 @@ class StoredEpisode:
     def reading_step(self, name: str) -> int:
         """Indices along the first axis of an array that are read at once without more memory than is stored for them.
 
-        They are those of a file. A file of which each chunk holds nothing but one number is read chunk by chunk.
+        They are those of a file. Large files that are here, and files of which each chunk holds nothing but one number,
+        are read chunk by chunk. Elsewhere a file is one request.
         """
         metadata = self._metadata(name)
         step = max(1, metadata.file_shape[0])
+        decoded = metadata.dtype.itemsize * math.prod((min(step, metadata.shape[0]), *metadata.shape[1:]))
+        if decoded > READ_AT_ONCE_BYTES and not isinstance(self.folder, StoreUrl):
+            return metadata.chunk_shape[0]
         try:
             metadata.check_reading((min(step, metadata.shape[0]), *metadata.shape[1:]))
         except CorruptEpisode:

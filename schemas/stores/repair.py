@@ -16,6 +16,7 @@ from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.byte_source import Folder
 from vla_attention.schemas.stores.claims import Claims, Holder, jobs_folder
 from vla_attention.schemas.stores.damaged_episodes import DamagedEpisode, look_at
+from vla_attention.schemas.stores.durable_files import publish_file
 from vla_attention.schemas.stores.packed_index import INDEX_FILE, read_index
 from vla_attention.schemas.stores.partial_folders import process_tag, remove_if_empty
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
@@ -206,11 +207,11 @@ def repair_groups(path: Path, dry_run: bool = False) -> list[str]:
 
 
 def _write_whole(path: Path, content: bytes) -> None:
-    """Write a file in one step."""
+    """Write a file in one step, which survives a crash of the machine."""
     building = path.with_name(f".{path.name}-{process_tag()}")
     try:
         building.write_bytes(content)
-        building.replace(path)
+        publish_file(building, path)
     except OSError as error:
         raise StoreError(f"Cannot write {path}: {error.strerror or error}.") from None
     finally:

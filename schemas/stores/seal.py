@@ -7,7 +7,9 @@ damaged, exchanged, cut off or edited. They are no signature: who can compute th
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,7 +43,7 @@ def seal_episode(folder: Path, name: str, run: str, copied_from: str = "") -> Ep
     records: dict[str, FileRecord] = {}
     for file in files:
         chunks = None if file.name == "zarr.json" else next((shards[at] for at in file.parents if at in shards), None)
-        records[file.relative_to(folder).as_posix()] = _file_record(file.read_bytes(), chunks)
+        records[file.relative_to(folder).as_posix()] = _file_record(file, chunks)
     seal = EpisodeSeal(name, run, records, digest="", copied_from=copied_from)
     seal = replace(seal, digest=seal_digest(to_json(seal)))
     (folder / SEAL_GROUP).mkdir(exist_ok=True)
@@ -76,12 +78,15 @@ def identity_problem(seal: EpisodeSeal, name: str, run: str) -> str | None:
     return None
 
 
-def _file_record(content: bytes, chunks: int | None) -> FileRecord:
-    record = FileRecord(len(content), bytes_digest(content))
-    if chunks is None:
-        return record
-    stored = content[-index_size(chunks) :]
-    index = read_index(stored, len(content))
-    ends = [int(offset + length) for offset, length in index]  # 0 for a chunk that was not written
-    checksums = [content[max(0, end - CHECKSUM_BYTES) : end].hex() or "00" * CHECKSUM_BYTES for end in ends]
-    return replace(record, index=bytes_digest(stored), chunks="".join(checksums))
+def _file_record(path: Path, chunks: int | None) -> FileRecord:
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        record = FileRecord(size, hashlib.file_digest(file, "sha256").hexdigest())
+        if chunks is None:
+            return record
+        stored = os.pread(file.fileno(), index_size(chunks), max(0, size - index_size(chunks)))
+        ends = [int(offset + length) for offset, length in read_index(stored, size)]  # 0: a chunk that was not written
+        lengths = [min(end, CHECKSUM_BYTES) for end in ends]
+        checksums = [os.pread(file.fileno(), n, end - n) for n, end in zip(lengths, ends, strict=True)]
+    listed = "".join(checksum.hex() or "00" * CHECKSUM_BYTES for checksum in checksums)
+    return replace(record, index=bytes_digest(stored), chunks=listed)

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from vla_attention.schemas.limits import DOCUMENT_BYTES
 from vla_attention.schemas.regular_files import NotRegular
-from vla_attention.schemas.stores.byte_source import ByteSource
+from vla_attention.schemas.stores.byte_source import ByteSource, Folder
 from vla_attention.schemas.stores.digest import bytes_digest
 from vla_attention.schemas.stores.remote_source import RemoteFailure
 from vla_attention.schemas.stores.shards import SealedShard
 from vla_attention.schemas.stores.store_format import CorruptEpisode, FileRecord
 from vla_attention.schemas.stores.zip_members import DamagedZip
+
+#: Bytes of a file that are in memory at once where no more than its digest is wanted.
+PART_BYTES = 16_000_000
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,54 @@ class SealedFiles:
                 raise CorruptEpisode(_lost(file, error)) from None
             if len(content) == record.size and bytes_digest(content) == record.sha256:
                 return content
-        raise CorruptEpisode(f"its {file} does not agree with its seal")
+        raise CorruptEpisode(_differs(file))
+
+    def check(self, file: str) -> None:
+        """Read a file part by part; raises `CorruptEpisode` as `whole` does."""
+        for _ in self._parts(file):
+            pass
+
+    def copy(self, file: str, path: Path) -> int:
+        """Write a file to `path` part by part, and return its bytes; raises `CorruptEpisode` as `whole` does.
+
+        What has been written when that is raised is of no use.
+        """
+        with path.open("wb") as copied:
+            for offset, part in self._parts(file):
+                copied.seek(offset)
+                copied.write(part)
+        return self._record(file).size
+
+    def _parts(self, file: str) -> Iterator[tuple[int, bytes]]:
+        """Offset and bytes of each part of a file; they are those of the seal when all of them have been taken.
+
+        A part may come twice, where a cache had damaged bytes.
+        """
+        record = self._record(file)
+        if record.size <= PART_BYTES:
+            yield 0, self.whole(file)
+            return
+        for fresh in (False, True) if self.source.remembers else (False,):
+            digest = hashlib.sha256()
+            try:
+                if isinstance(self.source, Folder):
+                    self.source.check_not_sparse(file)
+                for offset in range(0, record.size, PART_BYTES):
+                    length = min(PART_BYTES, record.size - offset)
+                    # One byte more at the end: a file that has grown is not the one that was sealed.
+                    last = offset + length == record.size
+                    part, more = self.source.parts(file, offset, (length, 1 if last else 0), fresh=fresh)
+                    if len(part) != length or more:
+                        break
+                    digest.update(part)
+                    yield offset, part
+            except RemoteFailure:
+                raise
+            except OSError as error:
+                raise CorruptEpisode(_lost(file, error)) from None
+            if digest.hexdigest() == record.sha256:
+                return
+        raise CorruptEpisode(_differs(file))
 
     def shard(self, file: str) -> SealedShard | None:
         """The shard in a file, of which single chunks can be read; None when the seal does not list its chunks."""
@@ -82,6 +134,10 @@ class SealedFiles:
         if record is None:
             raise CorruptEpisode(f"its {file} does not agree with its seal, which does not list it")
         return record
+
+
+def _differs(file: str) -> str:
+    return f"its {file} does not agree with its seal"
 
 
 def _lost(file: str, error: OSError) -> str:

@@ -134,9 +134,9 @@ def _problems_of_bytes(episode: StoredEpisode, known: Iterable[str]) -> Iterator
         # Every chunk of a shard has been compared with its checksum in the seal: it is not fetched a second time.
         if not (file.endswith("zarr.json") or _is_named(file, known) or (elsewhere and record.chunks)):
             try:
-                episode.sealed(file)
+                episode.files.check(file)
             except CorruptEpisode as error:
-                yield str(error)
+                yield f"Episode {episode.name} is damaged: {error}."
     if isinstance(episode.place, ZipMembers) and isinstance(episode.source, ZipMembers):
         expected = episode.place.frame
         if expected and episode.source.frame_digest() != expected:

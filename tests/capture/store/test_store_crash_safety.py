@@ -26,7 +26,7 @@ from tests.kit.crashes import PROCESSES, before_call, die, run_child
 from tests.kit.durable_stores import SPEC, leftovers, names, store_bytes, write_store
 from tests.kit.examples import examples
 from tests.kit.slow import slow_except
-from vla_attention.capture.store.durable_files import StoreWriteFailed
+from vla_attention.capture.store.refused_writes import StoreWriteFailed
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stores.reader import open_store

@@ -1,33 +1,10 @@
-"""Files that survive a crash: flushing to disk, and failures in one sentence."""
+"""Files and folders that survive a crash of the machine: on the disk before they have their name."""
 
 from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-
-from vla_attention.schemas.errors import UserError
-from vla_attention.schemas.stores.store_format import StoreError
-
-
-class StoreWriteFailed(StoreError, OSError):
-    """The operating system refused a write: the disk is full, a permission is missing, a device failed."""
-
-
-@contextmanager
-def naming_the_failure(what: str) -> Iterator[None]:
-    """Turn an error of the operating system into one sentence with what was being written."""
-    try:
-        yield
-    except OSError as error:
-        if isinstance(error, UserError):
-            raise
-        raise StoreWriteFailed(
-            f"Cannot write {what}: {error.strerror or error}. Nothing of this episode was kept, and the episodes "
-            "before it are unharmed; remove the cause and go on with --resume."
-        ) from error
 
 
 def publish(folder: Path, target: Path, durable: bool) -> None:
@@ -45,6 +22,19 @@ def publish(folder: Path, target: Path, durable: bool) -> None:
     folder.rename(target)
     if durable:
         _flush(target.parent)
+
+
+def publish_file(file: Path, target: Path) -> None:
+    """Rename a complete file to `target`, in place of one that is there; folders that `target` needs are made.
+
+    When it returns, content and name are on the disk: what is written next may rely on them after a crash.
+    """
+    made = [folder for folder in target.parents if not folder.exists()]
+    target.parent.mkdir(parents=True, exist_ok=True)
+    _flush(file)
+    file.replace(target)
+    for folder in (target.parent, *(folder.parent for folder in made)):
+        _flush(folder)
 
 
 def _flush(path: Path) -> None:
