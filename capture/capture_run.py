@@ -36,6 +36,7 @@ from vla_attention.capture.store.disk_estimate import DiskEstimate, describe, es
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.layers import select_layers
+from vla_attention.schemas.plurals import plural
 from vla_attention.schemas.stores.damaged_episodes import DamagedEpisodesLeft, find_damaged, what_to_do
 from vla_attention.schemas.stores.store_format import (
     FORMAT_NAME,
@@ -127,7 +128,7 @@ def run_capture(
     results, damaged, faults = _record_missing(settings, policy, device, termination or Termination())
     missing = f", {len(faults.dropped)} missing" if faults.dropped else ""
     solved = sum(result.success for result in results)
-    say(f"{len(results)} episodes added, {solved} solved{missing}. Store: {settings.store}")
+    say(f"{plural(len(results), 'episode')} added, {solved} solved{missing}. Store: {settings.store}")
     left = find_damaged(settings.store, damaged, settings.verify) if damaged else []
     if left and faults.dropped:
         raise EpisodesMissing(f"{describe_missing(faults.dropped)} {what_to_do(settings.store, left)}")

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.stores.checking import reports_of_store
 from vla_attention.schemas.errors import BadArgument, UserError, listing
@@ -52,11 +53,17 @@ class Merged:
 
 
 def merge_stores(
-    stores: Sequence[Store], target: Path, progress: Callable[[int], object] | None = None, *, link: bool = True
+    stores: Sequence[Store],
+    target: Path,
+    progress: Callable[[int], object] | None = None,
+    *,
+    link: bool = True,
+    packed: bool = False,
 ) -> Merged:
     """Make a store of the episodes of others; `progress` is called with 1 after each.
 
     link: files of stores of folders that are here are linked, where the file system can; otherwise they are copied.
+    packed: one zip an episode and an index of them, see `analyze/copy/packing.py`; nothing is shared then.
 
     Raises:
         BadArgument: fewer than two stores, two that hold the same episode, or a place that cannot be written.
@@ -69,7 +76,15 @@ def merge_stores(
         target.parent.mkdir(parents=True, exist_ok=True)
         remove_dead_partials(target)
         with partial_of(target, "merge") as building:
-            return _merge(stores, target, building / target.name, progress, link)
+            place = building / target.name
+            merged = _merge(stores, place, progress, link)
+            if packed:
+                zips = building / "packed" / target.name
+                zips.parent.mkdir()
+                copied = copy_store(open_store(place), zips, (), packed=True)
+                place, merged = zips, Merged(merged.episodes, 0, copied.copied_bytes)
+            publish(place, target, durable=True)
+            return merged
     except OSError as error:
         if isinstance(error, UserError) or error.errno is None:
             raise
@@ -120,9 +135,8 @@ def _short(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _merge(
-    stores: Sequence[Store], target: Path, place: Path, progress: Callable[[int], object] | None, link: bool
-) -> Merged:
+def _merge(stores: Sequence[Store], place: Path, progress: Callable[[int], object] | None, link: bool) -> Merged:
+    """Make the store at `place`, and read it back."""
     (place / EPISODES_GROUP).mkdir(parents=True)
     (place / "zarr.json").write_bytes(_root_document(stores))
     (place / EPISODES_DOCUMENT).write_bytes(group_document({}))
@@ -142,7 +156,6 @@ def _merge(
                 f"Cannot merge: {report.episode} of {origin[report.episode].path} is damaged: "
                 f"{report.problems[0].rstrip('.')}. Repair that store first."
             )
-    publish(place, target, durable=True)
     return Merged(len(built.episodes), linked, copied)
 
 

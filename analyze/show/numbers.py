@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from vla_attention.schemas.command_line import format_bytes as format_bytes  # shared with capture
+from vla_attention.schemas.plurals import plural as plural
 
 
 def format_number(value: float | None) -> str:
@@ -57,13 +58,6 @@ def format_percent_interval(low: float | None, high: float | None, decimals: int
 def interval_name(level: float) -> str:
     """The name of an interval of a level: `95% interval`."""
     return f"{100 * level:g}% interval"
-
-
-def plural(count: int, noun: str) -> str:
-    """`1 task`, `2 tasks`, `2 quantities`."""
-    if count == 1:
-        return f"1 {noun}"
-    return f"{count} {noun[:-1]}ies" if noun.endswith("ty") else f"{count} {noun}s"
 
 
 def solved_text(outcomes: Iterable[bool | None]) -> str:

@@ -13,6 +13,7 @@ from vla_attention.capture.jobs.worker_records import WorkerRecord, planned_task
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.plurals import plural
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.claims import Holder, holders
 from vla_attention.schemas.stores.damaged_episodes import DamagedEpisode, look_at
@@ -236,10 +237,11 @@ def _cells(task: TaskStatus) -> tuple[str, ...]:
 
 def _text(status: StoreStatus) -> str:
     tasks = status.tasks
-    committed = sum(task.committed for task in tasks)
+    committed, size = sum(task.committed for task in tasks), sum(task.bytes for task in tasks)
+    begun = sum(task.committed > 0 for task in tasks)
     lines = [
-        f"{status.store}: {status.suite}, policy {status.policy}, {committed} episodes of "
-        f"{sum(task.committed > 0 for task in tasks)} tasks, {format_bytes(sum(task.bytes for task in tasks))}"
+        f"{status.store}: {status.suite}, policy {status.policy}, {plural(committed, 'episode')} of "
+        f"{plural(begun, 'task')}, {format_bytes(size)}"
     ]
     rows = [("task", "episodes", "solved", "size", "last written (UTC)", "by", "instruction"), *map(_cells, tasks)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]

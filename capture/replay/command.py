@@ -10,6 +10,7 @@ from vla_attention.capture.replay.arguments import is_policy_file
 from vla_attention.capture.replay.policy_file import check_policy_file, load_policy_file
 from vla_attention.capture.replay.replay_plan import plan_replay
 from vla_attention.capture.rollout.progress import say
+from vla_attention.schemas.plurals import plural
 from vla_attention.schemas.threads import Threads
 
 
@@ -27,7 +28,7 @@ def run_replay(arguments: argparse.Namespace, threads: Threads, termination: Ter
         from vla_attention.capture.replay.file_replay import replay_with_file
 
         added = replay_with_file(arguments, plan, load_policy_file(file, device))
-    say(f"{added} episodes added. Store: {plan.store}")
+    say(f"{plural(added, 'episode')} added. Store: {plan.store}")
     plan.faults.raise_missing()
     base = getattr(arguments, "rerun_of", None)
     say(f"Next: vla-analyze {plan.store}" if base is None else f"Next: vla-analyze effects {base} {plan.store}")

@@ -25,6 +25,7 @@ from vla_attention.capture.store.disk_estimate import describe, estimate_disk
 from vla_attention.capture.store.episode_writer import ReplanRefused
 from vla_attention.capture.store.store_writer import WriteMode, refuse_existing
 from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.plurals import plural
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.damaged_episodes import find_damaged
 from vla_attention.schemas.stores.root import episode_folders
@@ -178,8 +179,8 @@ def announce(
     for line in announcement(identity):
         say(line)
     say(
-        f"Data set: {plan.data.name}, LeRobotDataset {info.version}, {len(info.episodes)} episodes of "
-        f"{len(info.tasks)} tasks at {info.fps:g} frames per second, robot {info.robot_type}."
+        f"Data set: {plan.data.name}, LeRobotDataset {info.version}, {plural(len(info.episodes), 'episode')} of "
+        f"{plural(len(info.tasks), 'task')} at {info.fps:g} frames per second, robot {info.robot_type}."
     )
     if source is not None:
         say(f"Columns: {'; '.join(f'{what} = {column}' for what, column in source.columns.items())}.")

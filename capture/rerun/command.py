@@ -24,6 +24,7 @@ from vla_attention.capture.run_settings import recording_settings
 from vla_attention.capture.store.store_writer import WriteMode, refuse_existing
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.plurals import plural
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.reader import Store
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX
@@ -69,7 +70,7 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
         say(f"Interventions: {interventions.describe()}.")
     say(rerun.describe_disk(target, [episode.attributes.num_replans for episode in base.episodes]))
     added = rerun.write(target, mode, interventions, allow_empty=arguments.allow_empty)
-    say(f"{added} episodes added. Store: {target}")
+    say(f"{plural(added, 'episode')} added. Store: {target}")
     rerun.faults.raise_missing()
     say(f"Next: vla-analyze {target}" if interventions.is_none else f"Next: vla-analyze effects {base.path} {target}")
     return 0

@@ -20,6 +20,7 @@ from vla_attention.capture.rollout.progress import EpisodeProgress, Progress
 from vla_attention.capture.rollout.simulation import SimulationFailed, naming_the_simulator
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import listing
+from vla_attention.schemas.plurals import plural
 from vla_attention.schemas.stores.claims import Claims, Holder
 from vla_attention.schemas.stores.store_format import StoreExists, episode_name
 from vla_attention.schemas.stores.worker import Worker
@@ -230,7 +231,7 @@ class EpisodeLoop:
         running = [f"{name} at step {step}" for name, step in sorted(self.positions.items())]
         dropped = f"dropped {listing(running, 40)}" if running else "no episode was in progress"
         return (
-            f"Stopped by SIGTERM: {dropped}; committed {len(self.results)} episodes ({committed}); "
+            f"Stopped by SIGTERM: {dropped}; committed {plural(len(self.results), 'episode')} ({committed}); "
             f"{left} of this process's {len(missing)} are missing."
         )
 

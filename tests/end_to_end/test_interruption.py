@@ -51,7 +51,7 @@ def test_sigterm_drops_the_episode_in_flight_and_resuming_completes_the_store(tm
         assert process.wait(60) == EXIT_TERMINATED, log.read_text()
     printed = log.read_text()
     assert "Stopped by SIGTERM: dropped task000_episode001 at step" in printed
-    assert "committed 1 episodes (task000_episode000); 1 of this process's 2 are missing" in printed
+    assert "committed 1 episode (task000_episode000); 1 of this process's 2 are missing" in printed
     assert "Traceback" not in printed
     assert "\r" not in printed  # no progress bar in a file
     assert not (tmp_path / "a.zarr.partial").exists()

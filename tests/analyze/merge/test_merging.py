@@ -175,3 +175,17 @@ def test_foreign_files_stay_behind(original, parts, tmp_path):
     merge_stores([open_store(part) for part in parts], tmp_path / "c.zarr")
     assert episode_bytes(tmp_path / "c.zarr") == episode_bytes(original)
     assert sorted(path.name for path in (tmp_path / "c.zarr").iterdir()) == ["episodes", "zarr.json"]
+
+
+def test_a_packed_store_can_be_made(parts, original, tmp_path, capsys):
+    assert analyze(["merge", *map(str, parts), "-o", str(tmp_path / "all.zarr"), "--packed"]) == 0
+    said = capsys.readouterr().out
+    assert ": 4 episodes (2 of " in said
+    assert "shared" not in said
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zarr", "all.zarr", "b.zarr"]
+    merged = open_store(tmp_path / "all.zarr")
+    assert_whole(tmp_path / "all.zarr")
+    assert len(list((tmp_path / "all.zarr").glob("episodes/*/*.zip"))) == 4
+    assert merged.attributes.provenance["merged_from"] == "a.zarr (2 episodes), b.zarr (2 episodes)"
+    copy_store(merged, tmp_path / "folders.zarr", ())
+    assert episode_bytes(tmp_path / "folders.zarr") == episode_bytes(original)

@@ -14,7 +14,7 @@ def test_a_stray_folder_does_not_stop_a_resumed_capture(scene, tmp_path, capsys)
     capsys.readouterr()
     assert record(store, 1, "--task-id", "0", "--num-episodes", "2", "--resume") == 0
     said = capsys.readouterr()
-    assert "1 episodes added" in said.out
+    assert "1 episode added" in said.out
     assert said.err == (
         f"vla-capture: Ignored in {store}, among its episodes: .DS_Store, old; they are no episodes. Move them out of "
         "the store.\n"

@@ -22,6 +22,7 @@ from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main
 from vla_attention.capture.jobs.status import store_status
 from vla_attention.capture.published.evaluate import evaluate_attention_ratio
+from vla_attention.schemas.plurals import plural
 from vla_attention.schemas.stores import repair
 from vla_attention.schemas.stores.claims import Claims, holders
 from vla_attention.schemas.stores.damaged_episodes import DamagedEpisodesLeft
@@ -301,7 +302,7 @@ def test_resuming_records_what_is_missing_and_says_what_is_damaged(tmp_path, mon
         assert main([*given, "--resume"]) == 2
         said = capsys.readouterr()
         assert f"{1 - added} of 3 episodes are complete already and 2 damaged; {added} to run." in said.out
-        assert f"{added} episodes added" in said.out
+        assert f"{plural(added, 'episode')} added" in said.out
         assert "Not recorded again without vla-capture repair: Episode task000_episode001 cannot be read" in said.out
         assert "2 of the episodes asked for are damaged: Episode task000_episode000 is damaged: it has lost" in said.err
         assert f"run vla-capture repair {store}, which" in said.err
