@@ -18,6 +18,7 @@ COMMANDS: dict[str, str] = {
     "deviation": "how far actions are from the data set's, beside attention",
     "overlay": "attention on the stored pictures: strips, GIF or MP4",
     "report": "one self-contained HTML file",
+    "view": "a page on which to explore attention: episodes, words, patches, heads, groups",
     "export": "tables as CSV or Parquet, masses or rows as NetCDF",
     "copy": "a copy of a store: smaller, or packed into few files, or from or to elsewhere",
     "merge": "one store of the episodes of several stores of one run",

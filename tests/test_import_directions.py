@@ -29,6 +29,7 @@ LEVELS = {
     "analyze.published": 3,
     "analyze.parse": 5,
     "analyze.report": 5,
+    "analyze.view": 5,
     "analyze.api": 6,
     "analyze.command_line": 7,
     "analyze.__main__": 8,

@@ -5,6 +5,9 @@ At most `SCREEN_LINES` lines with those about the files; `summary_text` has the 
 
 from __future__ import annotations
 
+import shlex
+import shutil
+import sys
 import textwrap
 from collections.abc import Mapping, Sequence
 from math import ceil
@@ -34,6 +37,7 @@ _MOST_GROUPS, _MOST_BLOCKS = 6, 2
 #: Notes leave room for so many tasks.
 _FEWEST_TASKS = 3
 _REST = f"in {WHOLE_TEXT}"
+_PROGRAM = "vla-analyze"
 #: Groups whose fractions stand in rows where there is no ratio.
 _MOST_FRACTIONS = 3
 
@@ -52,7 +56,21 @@ def screen_text(analysis: Analysis, folder: Path, files: Sequence[str]) -> str:
     notes = _notes(analysis, room - _FEWEST_TASKS - 3)
     above = [*answer, "", *notes, *([""] if notes else []), *tables]
     room -= len(notes) + bool(notes)
+    pages = _pages(analysis)
+    if room - len(pages) > _FEWEST_TASKS + 2:  # header, and that there are more
+        room, last = room - len(pages), [*last, *pages]
     return "\n".join([*above, *_tasks(analysis, room), "", *last])
+
+
+def _pages(analysis: Analysis) -> list[str]:
+    """The commands that show the same as pages, as they can be typed here."""
+    # `make analyze` calls a program that is not on the PATH.
+    program = sys.argv[0] if Path(sys.argv[0]).name == _PROGRAM and shutil.which(_PROGRAM) is None else _PROGRAM
+    stores = shlex.join(str(store.path) for store in analysis.question.stores)
+    lines = [f"One page of it: {program} report {stores} --open", f"To explore it: {program} view {stores}"]
+    if max(map(len, lines)) <= WIDTH:
+        return lines
+    return [f"One page of it: {program} report STORE --open; to explore it: {program} view STORE"]
 
 
 def _notes(analysis: Analysis, room: int) -> list[str]:

@@ -9,7 +9,7 @@ from vla_attention.analyze.report.report_settings import ReportSettings
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
-  vla-analyze report runs/libero_10.zarr
+  vla-analyze report runs/libero_10.zarr --open
   vla-analyze report runs/libero_10.zarr --grouping instruction --layers 9 13 17 --output paper/report.html
   vla-analyze report runs/a.zarr runs/b.zarr --episodes 8 --replans 10 --output results/both
   vla-analyze report runs/cosmos.zarr --site self
@@ -64,6 +64,7 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="PATH",
         help="folder, in which report.html is written, or a file FILE.html (default: results/STORE)",
     )
+    output.add_argument("--open", action="store_true", help="show the page in the browser")
     return parser
 
 
@@ -73,6 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from vla_attention.analyze.measures.question import ask
     from vla_attention.analyze.report.page import report_file, write_report
+    from vla_attention.analyze.show.browser import open_page
     from vla_attention.analyze.show.numbers import plural
     from vla_attention.schemas.stores.reader import open_store
 
@@ -83,5 +85,8 @@ def run(arguments: argparse.Namespace) -> int:
     for line in question.skipped:
         print(line)
     megabytes = path.stat().st_size / 1e6
-    print(f"{path}: {megabytes:.1f} MB on {plural(len(question.selected), 'episode')}. Open it in a browser.")
+    then = "" if arguments.open else " Open it in a browser."
+    print(f"{path}: {megabytes:.1f} MB on {plural(len(question.selected), 'episode')}.{then}")
+    if arguments.open and (refused := open_page(path)):
+        print(refused)
     return 0

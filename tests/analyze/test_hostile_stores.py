@@ -130,6 +130,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "deviation": ("STORE", "--output", "OUT"),
     "overlay": ("STORE", "OTHER", "--output", "OUT"),
     "report": ("STORE", "--output", "OUT", "--episodes", "1", "--tasks", "0", "--layers", "0"),
+    "view": ("STORE", "--site", "OUT"),
     "export": ("STORE", "--csv", "--output", "OUT"),
     "copy": ("STORE", "OUT/copy.zarr", "--without", "frames"),
     "merge": ("STORE", "OTHER", "--output", "OUT/merged.zarr"),

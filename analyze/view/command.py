@@ -1,0 +1,94 @@
+"""`vla-analyze view`: a local page on which the attention of a store is explored, or the same page as a static site."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from vla_attention.schemas.command_line import command_parser
+from vla_attention.schemas.stores.store_url import store_place
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from vla_attention.analyze.view.served_stores import ServedStore
+    from vla_attention.schemas.stores.store_url import StorePlace
+
+_EXAMPLES = """examples:
+  vla-analyze view runs/cubes.zarr
+  vla-analyze view runs/cubes.zarr reruns/cubes/no_text.zarr         a run beside its rerun
+  vla-analyze view hf://datasets/ORG/NAME/libero_10.zarr
+  vla-analyze view runs/cubes.zarr --port 8765 --no-open             on another machine, with ssh -L 8765:127.0.0.1:8765
+  vla-analyze view runs/cubes.zarr --site public/cubes               a folder for a web server
+
+The page is served to this machine only, to whoever has the printed link, until Ctrl-C. It asks nothing of any other
+place.
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of `vla-analyze view STORE ...`."""
+    from pathlib import Path
+
+    parser = command_parser(
+        "vla-analyze view",
+        "Explore attention in the browser: episodes, pictures, words, layers and heads, groups, two runs side by side.",
+        _EXAMPLES,
+    )
+    parser.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses")
+    parser.add_argument("--port", type=int, default=0, metavar="N", help="port of the page (default: any free one)")
+    parser.add_argument("--no-open", action="store_true", help="print the link only")
+    parser.add_argument(
+        "--site",
+        type=Path,
+        metavar="FOLDER",
+        help="write the page, and links to the stores, into a folder that any web server can serve, and stop",
+    )
+    return parser
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Serve the page until Ctrl-C, or write it."""
+    from contextlib import ExitStack
+
+    from vla_attention.analyze.view.served_stores import ServedStore
+    from vla_attention.analyze.view.static_site import check_site
+    from vla_attention.analyze.view.summaries import Summary
+    from vla_attention.schemas.stores.reader import open_store
+
+    if arguments.site is not None:
+        check_site(arguments.site, arguments.stores)
+    places: list[StorePlace] = list(dict.fromkeys(arguments.stores))
+    with ExitStack() as stack:
+        stores = [ServedStore(open_store(place), stack.enter_context(Summary())) for place in places]
+        for store in stores:
+            store.summary.begin(store.store)
+        if arguments.site is not None:
+            _write(arguments, stores)
+        else:
+            _serve(arguments, stores)
+    return 0
+
+
+def _write(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None:
+    import warnings
+
+    from vla_attention.analyze.view.static_site import write_site
+    from vla_attention.schemas.errors import Note
+
+    for store in stores:
+        if failed := store.summary.wait():
+            warnings.warn(f"Not every episode of {store.place} has numbers: {failed}", Note, stacklevel=2)
+    print(write_site(arguments.site, stores))
+
+
+def _serve(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None:
+    from vla_attention.analyze.show.browser import open_in_browser
+    from vla_attention.analyze.view.server import ViewerServer
+
+    with ViewerServer(stores, arguments.port) as server:
+        # At once, also into a file that somebody follows.
+        print(f"The page: {server.link}\nIt is served to this machine only, until Ctrl-C.", flush=True)
+        if not arguments.no_open:
+            open_in_browser(server.link)
+        server.serve_forever()

@@ -1,0 +1,135 @@
+"""What a request may name: the page's own files, its documents, and the files of a store. No I/O here."""
+
+from __future__ import annotations
+
+import hmac
+import re
+from dataclasses import dataclass
+from urllib.parse import unquote_to_bytes
+
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.safe_text import check_inner_path
+from vla_attention.schemas.stores.packed_index import INDEX_FILE
+from vla_attention.schemas.stores.store_format import EPISODES_GROUP
+
+#: The files of the page; the others in its folder say how it was built.
+PAGE_FILES = {
+    "index.html": "text/html; charset=utf-8",
+    "viewer.js": "text/javascript; charset=utf-8",
+    "viewer.css": "text/css; charset=utf-8",
+    "licenses.txt": "text/plain; charset=utf-8",
+}
+STORES_DOCUMENT = "stores.json"
+#: What of a store is served. Whatever else lies in its folder stays there.
+_STORE_FILES = ("zarr.json", INDEX_FILE, EPISODES_GROUP)
+_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
+_SUMMARY = re.compile(r"([0-9]{1,4})\.summary\.json")
+
+
+class NothingThere(LookupError):
+    """A path that names nothing that is served."""
+
+
+class WrongToken(PermissionError):
+    """A path that does not begin with the secret part of the link."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a request names.
+
+    Attributes:
+        page: a file of the page.
+        document: `stores.json`.
+        summary: the number of the store whose summary is asked for.
+        store: the number of the store whose file is asked for.
+        file: the path of that file in its store.
+    """
+
+    page: str = ""
+    document: bool = False
+    summary: int | None = None
+    store: int | None = None
+    file: str = ""
+
+
+def is_loopback(host: str) -> bool:
+    """Whether the host that a request names is this machine's loopback.
+
+    A site elsewhere can let its own name mean 127.0.0.1 (DNS rebinding); the browser then sends that name.
+    """
+    return _HOST.fullmatch(host) is not None
+
+
+def wanted(target: str, token: str, num_stores: int) -> Wanted:
+    """What the target of a request (`/TOKEN/PATH`) names.
+
+    Every part of the path is decoded once, and by itself: a slash, a backslash or a control character that appears then
+    is refused, as is `..`.
+
+    Raises:
+        WrongToken: it does not begin with the token.
+        NothingThere: nothing of that name is served.
+    """
+    path = target.partition("?")[0]
+    first, *parts = path.removeprefix("/").split("/")
+    if not path.startswith("/") or not hmac.compare_digest(first.encode("utf-8", "replace"), token.encode()):
+        raise WrongToken
+    if not parts:  # the link without its last slash; relative addresses of the page would miss the token
+        raise NothingThere
+    if parts == [""]:
+        return Wanted(page="index.html")
+    names = [_decoded(part) for part in parts]
+    if len(names) == 1 and names[0] in PAGE_FILES:
+        return Wanted(page=names[0])
+    if names == [STORES_DOCUMENT]:
+        return Wanted(document=True)
+    if names[0] != "stores" or len(names) < 2:
+        raise NothingThere
+    summary = _SUMMARY.fullmatch(names[1])
+    if len(names) == 2 and summary is not None and int(summary[1]) < num_stores:
+        return Wanted(summary=int(summary[1]))
+    if len(names) == 2 or names[2] not in _STORE_FILES or names[1] not in map(str, range(num_stores)):
+        raise NothingThere
+    return Wanted(store=int(names[1]), file="/".join(names[2:]))
+
+
+def _decoded(part: str) -> str:
+    try:
+        name = unquote_to_bytes(part).decode("utf-8")
+        check_inner_path(name)
+    except (UnicodeDecodeError, BadArgument):
+        raise NothingThere from None
+    if "/" in name:
+        raise NothingThere
+    return name
+
+
+_RANGE = re.compile(r"bytes=([0-9]{0,19})-([0-9]{0,19})")
+
+
+class BadRange(ValueError):
+    """A range that no byte of the file is in."""
+
+
+def byte_range(header: str | None, size: int) -> tuple[int, int] | None:
+    """The bytes [first, end) of a file of `size` bytes that a `Range` header asks for.
+
+    None is the whole file: without the header, with several ranges, or with one that is not understood; RFC 9110 has it
+    so.
+
+    Raises:
+        BadRange: no byte of the file is in it.
+    """
+    match = _RANGE.fullmatch(header.strip()) if header is not None else None
+    if match is None or match[0] == "bytes=-":
+        return None
+    if not match[1]:
+        first, end = max(0, size - int(match[2])), size
+    else:
+        first, end = int(match[1]), min(size, int(match[2]) + 1) if match[2] else size
+        if match[2] and int(match[2]) < first:
+            return None
+    if first >= end:
+        raise BadRange
+    return first, end

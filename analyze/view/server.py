@@ -1,0 +1,231 @@
+"""The viewer's web server: on the loopback only, for who has the link, and for files of the stores only.
+
+The link's secret part keeps out other users and programs of this machine, the check of the host keeps out sites that
+a browser has open, and the content security policy keeps the page from asking for anything elsewhere, whatever a store
+holds.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from typing import Any
+
+from vla_attention.analyze.view.paths import (
+    PAGE_FILES,
+    BadRange,
+    NothingThere,
+    Wanted,
+    WrongToken,
+    byte_range,
+    is_loopback,
+    wanted,
+)
+from vla_attention.analyze.view.served_stores import ServedStore, stores_document
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.stores.remote_source import RemoteFailure
+
+LOOPBACK = "127.0.0.1"
+_JSON = "application/json"
+#: A store's file is never anything that a browser shows or runs.
+_BYTES = "application/octet-stream"
+_TEXT = "text/plain; charset=utf-8"
+#: WebAssembly decompresses the chunks; the worker is the same script as the page.
+CONTENT_SECURITY_POLICY = (
+    "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self'; style-src 'self'; "
+    "img-src 'self' data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+_HEADERS = {
+    "Content-Security-Policy": CONTENT_SECURITY_POLICY,
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    # A store may be captured anew under its name, and the link be used by the next server on this port.
+    "Cache-Control": "no-store",
+}
+#: Seconds after which a connection on which nothing is said is closed.
+_SILENT_S = 60
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What is sent: a status, the bytes in pieces, how many they are, and further headers."""
+
+    status: int
+    kind: str
+    length: int
+    pieces: Iterable[bytes] = ()
+    headers: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, content: bytes, kind: str, status: int = HTTPStatus.OK, **headers: str) -> Answer:
+        """An answer of bytes that are there."""
+        return cls(status, kind, len(content), (content,), headers)
+
+    @classmethod
+    def refused(cls, status: int, sentence: str, **headers: str) -> Answer:
+        """An answer that is a sentence."""
+        return cls.of(f"{sentence}\n".encode(), _TEXT, status, **headers)
+
+
+class ViewerServer(ThreadingHTTPServer):
+    """The server of some stores. `link` opens the page; `sent` counts the bytes of the stores' files by path.
+
+    Raises `BadArgument` for a port that cannot be had; 0 is any free one.
+    """
+
+    daemon_threads = True
+
+    def __init__(self, stores: Sequence[ServedStore], port: int = 0, token: str | None = None) -> None:
+        if not 0 <= port < 2**16:
+            raise BadArgument(f"Cannot use --port {port}; expected a number from 1 to 65535, or 0 for any free port.")
+        self.stores = tuple(stores)
+        self.token = secrets.token_urlsafe(24) if token is None else token
+        self.page = _page()
+        self.sent: dict[str, int] = {}
+        try:
+            super().__init__((LOOPBACK, port), _Handler)
+        except OSError as error:
+            reason = error.strerror or error
+            raise BadArgument(f"Cannot use --port {port}: {reason}. Leave it out for any free port.") from None
+
+    @property
+    def link(self) -> str:
+        """The address of the page."""
+        return f"http://{LOOPBACK}:{self.server_address[1]}/{self.token}/"
+
+    def handle_error(self, *_: object) -> None:
+        """A browser that closes a connection is no error; every other one was answered."""
+
+    def answer(self, target: str, wanted_range: str | None) -> Answer:
+        """The answer to a request that was let in: `target` as it stands in the request, its `Range` header."""
+        try:
+            asked = wanted(target, self.token, len(self.stores))
+        except WrongToken:
+            return Answer.refused(403, "This is the page of vla-analyze view: open the whole link that it printed.")
+        except NothingThere:
+            return _nothing()
+        if asked.page:
+            return Answer.of(self.page[asked.page], PAGE_FILES[asked.page])
+        if asked.document:
+            for store in self.stores:
+                store.refresh()
+            return _json(stores_document(self.stores, with_paths=True))
+        if asked.summary is not None:
+            return _json(self.stores[asked.summary].summary.document())
+        try:
+            return self._file(asked, wanted_range)
+        except RemoteFailure as error:
+            return Answer.refused(502, str(error))
+        except OSError:
+            return _nothing()
+
+    def _file(self, asked: Wanted, wanted_range: str | None) -> Answer:
+        assert asked.store is not None
+        store = self.stores[asked.store]
+        size = store.size(asked.file)
+        try:
+            part = byte_range(wanted_range, size)
+        except BadRange:
+            about = {"Content-Range": f"bytes */{size}"}
+            return Answer.refused(416, f"The file has {size} bytes.", **about)
+        first, end = part or (0, size)
+        headers = {"Accept-Ranges": "bytes"}
+        if part is not None:
+            headers["Content-Range"] = f"bytes {first}-{end - 1}/{size}"
+        pieces = self._counted(f"{asked.store}/{asked.file}", store.pieces(asked.file, first, end))
+        return Answer(200 if part is None else 206, _BYTES, end - first, pieces, headers)
+
+    def _counted(self, name: str, pieces: Iterator[bytes]) -> Iterator[bytes]:
+        for piece in pieces:
+            self.sent[name] = self.sent.get(name, 0) + len(piece)
+            yield piece
+
+
+def _page() -> dict[str, bytes]:
+    folder = files("vla_attention.analyze.view") / "bundle"
+    return {name: (folder / name).read_bytes() for name in PAGE_FILES}
+
+
+def _json(document: dict[str, Any]) -> Answer:
+    return Answer.of(json.dumps(document, allow_nan=False).encode(), _JSON)
+
+
+def _nothing() -> Answer:
+    return Answer.refused(404, "There is nothing here.")
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """One connection."""
+
+    server: ViewerServer
+    protocol_version = "HTTP/1.1"
+    timeout = _SILENT_S
+
+    def do_GET(self) -> None:
+        """Answer with the bytes."""
+        self._answer()
+
+    def do_HEAD(self) -> None:
+        """Answer without the bytes."""
+        self._answer()
+
+    def _answer(self) -> None:
+        hosts = self.headers.get_all("Host", [])
+        if len(hosts) != 1 or not is_loopback(hosts[0].strip()):
+            self.send_error(403)
+            return
+        if "Content-Length" in self.headers or "Transfer-Encoding" in self.headers:
+            self.send_error(400)
+            return
+        answer = self.server.answer(self.path, self.headers.get("Range"))
+        self._send(answer)
+
+    def _send(self, answer: Answer) -> None:
+        pieces = iter(answer.pieces)
+        sent = 0
+        try:
+            # What cannot be read at all is said before anything is sent.
+            first = next(pieces, b"") if self.command != "HEAD" else b""
+        except RemoteFailure as error:
+            self._send(Answer.refused(502, str(error)))
+            return
+        except OSError:
+            self._send(_nothing())
+            return
+        self.send_response_only(answer.status)
+        headers = {"Content-Type": answer.kind, "Content-Length": str(answer.length), **_HEADERS, **answer.headers}
+        for name, value in headers.items():
+            self.send_header(name, value)
+        if self.close_connection:
+            self.send_header("Connection", "close")
+        self.end_headers()
+        if self.command == "HEAD":
+            return
+        try:
+            while first:
+                self.wfile.write(first)
+                sent += len(first)
+                first = next(pieces, b"")
+        finally:
+            # A file that became shorter, or a network that failed: the browser sees that the answer is not whole.
+            if sent != answer.length:
+                self.close_connection = True
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """Refuse a request, without a word of what it said, and close the connection."""
+        self.close_connection = True
+        self.command = getattr(self, "command", None) or "GET"
+        self.request_version = self.protocol_version  # of a request that is none, it is not known
+        headers = {"Allow": "GET, HEAD"} if code in (405, 501) else {}
+        status = 405 if code == 501 else code
+        self._send(Answer.refused(status, f"{HTTPStatus(status).phrase}.", **headers))
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Nothing is printed: the terminal shows the link."""

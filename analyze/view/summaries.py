@@ -1,0 +1,120 @@
+"""What Python's analysis says of each episode of a store, computed in a process of its own while pages are served.
+
+The numbers are those of `vla-analyze STORE`: the default grouping, all layers and heads, and what the cache of masses
+has is not measured again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import Any
+
+from vla_attention.schemas.safe_text import visible
+from vla_attention.schemas.stores.reader import Store
+from vla_attention.schemas.stores.store_format import parse_episode_name
+
+_MODULE = "vla_attention.analyze.view.summary_process"
+
+
+def empty_row(name: str) -> dict[str, Any]:
+    """The entry of an episode of which nothing but the name is known."""
+    task, episode = parse_episode_name(name)
+    unknown = dict.fromkeys(("instruction", "success", "replans", "ratio", "lift"))
+    return {"name": name, "task": task, "episode": episode, **unknown}
+
+
+class Summary:
+    """The summary of one store, as far as it is computed. A context manager: at its end the process has ended."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._rows: dict[str, dict[str, Any]] = {}
+        self._about: dict[str, str | None] = {"site": None, "grouping": None, "ratio": None, "failed": None}
+        self._complete = False
+        self._process: subprocess.Popen[str] | None = None
+        self._reader: threading.Thread | None = None
+
+    def __enter__(self) -> Summary:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end()
+
+    def begin(self, store: Store) -> None:
+        """Compute the summary of a store's episodes in the background; of another state of it, if one is under way."""
+        self._end()
+        with self._lock:
+            names = [episode.name for episode in store.episodes]
+            self._rows = {name: self._rows.get(name) or empty_row(name) for name in names}
+            self._complete = False
+            self._about["failed"] = None
+        # The module is found as this process found it.
+        variables = {**os.environ, "PYTHONPATH": os.pathsep.join(path or os.curdir for path in sys.path)}
+        command = [sys.executable, "-m", _MODULE, str(store.path)]
+        try:
+            self._process = subprocess.Popen(
+                command,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                stdin=subprocess.DEVNULL,
+                text=True,
+                encoding="utf-8",
+                env=variables,
+                start_new_session=True,  # Ctrl-C is for the server, which then ends this process
+            )
+        except OSError as error:
+            self._fail(f"Python could not be started a second time: {error.strerror or error}.")
+            return
+        self._reader = threading.Thread(target=self._read, args=(self._process,), daemon=True)
+        self._reader.start()
+
+    def document(self) -> dict[str, Any]:
+        """`NUMBER.summary.json`: the episodes in the store's order; numbers that are not there yet are null."""
+        with self._lock:
+            return {"complete": self._complete, **self._about, "episodes": list(self._rows.values())}
+
+    def wait(self) -> str | None:
+        """Wait until everything is computed; returns why an episode has no numbers, None where all of them have."""
+        if self._reader is not None:
+            self._reader.join()
+        with self._lock:
+            return self._about["failed"]
+
+    def _read(self, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        with process.stdout as lines:
+            for line in lines:
+                self._take(json.loads(line))
+        code = process.wait()
+        if process is self._process and code:
+            self._fail("The numbers of the episodes could not be computed; vla-analyze STORE says why.")
+        with self._lock:
+            self._complete = self._complete or process is self._process
+
+    def _take(self, part: Mapping[str, Any]) -> None:
+        with self._lock:
+            for row in part.get("episodes", ()):
+                if row["name"] in self._rows:
+                    self._rows[row["name"]] = row
+            self._about |= {name: part[name] for name in self._about if name in part}
+
+    def _fail(self, sentence: str) -> None:
+        with self._lock:
+            self._about["failed"] = self._about["failed"] or visible(sentence)
+            self._complete = True
+
+    def _end(self) -> None:
+        process, self._process = self._process, None
+        if process is not None:
+            with suppress(OSError):
+                process.kill()
+            process.wait()
+        if self._reader is not None:
+            self._reader.join()
+            self._reader = None

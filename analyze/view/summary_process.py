@@ -1,0 +1,108 @@
+"""The process that computes a summary: `python -m vla_attention.analyze.view.summary_process STORE`.
+
+It prints a line of JSON for some episodes at a time, and needs nobody who reads the last one: it ends when its output
+is closed.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import polars as pl
+
+from vla_attention.analyze.measures.aggregate import HEADLINE, overall_layer
+from vla_attention.analyze.measures.episodes import episode_tables_of
+from vla_attention.analyze.measures.question import Question, ask
+from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.measures.steps import measure_episodes
+from vla_attention.analyze.ratios.summary_text import ratio_definition
+from vla_attention.analyze.view.summaries import empty_row
+from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
+
+#: Episodes that are measured together; their numbers appear together.
+_AT_ONCE = 8
+
+
+def main(place: str) -> int:
+    """Print the summary of the store at a place; returns the exit code."""
+    warnings.simplefilter("ignore")
+    try:
+        store = open_store(place)
+        for part in summary_parts(store):
+            print(json.dumps(part, allow_nan=False), flush=True)
+    except BrokenPipeError:
+        return 1
+    except UserError as error:
+        print(json.dumps({"failed": str(error)}), flush=True)
+    return 0
+
+
+def summary_parts(store: Store) -> Iterator[dict[str, Any]]:
+    """The summary of a store in parts: entries of episodes, then of these with their numbers, and what is said of all.
+
+    An episode that cannot be read, or whose ratio is not defined, has no numbers; the first such sentence is `failed`.
+    """
+    failed = None
+    batches = [store.episodes[at : at + _AT_ONCE] for at in range(0, len(store.episodes), _AT_ONCE)]
+    for batch in batches:
+        yield {"episodes": [_described(episode) for episode in batch]}
+    for batch in batches:
+        try:
+            yield _measured(store, batch)
+            continue
+        except UserError:
+            pass
+        for episode in batch:  # one of them is the reason
+            try:
+                yield _measured(store, [episode])
+            except UserError as error:
+                failed = failed or str(error)
+                yield {"failed": failed}
+
+
+def _described(episode: StoredEpisode) -> dict[str, Any]:
+    row = empty_row(episode.name)
+    try:
+        attributes = episode.attributes
+    except UserError:
+        return row
+    known = {"instruction": attributes.instruction, "success": attributes.success, "replans": attributes.num_replans}
+    return row | known
+
+
+def _measured(store: Store, batch: Sequence[StoredEpisode]) -> dict[str, Any]:
+    """The entries of some episodes with their ratios over all layers and their lifts."""
+    question = ask([replace(store, episodes=tuple(batch))], AnalysisSettings())
+    cells = episode_tables_of(measure_episodes(question, progress=lambda _: None), question.grouping).cells
+    cells = cells.filter(pl.col("layer") == overall_layer(cells))
+    found = {(row["task_id"], row["episode_index"]): row for row in cells.iter_rows(named=True)}
+    rows = []
+    for episode in batch:
+        row = _described(episode)
+        numbers = found[row["task"], row["episode"]]
+        rows.append(row | {"ratio": _finite(numbers.get(HEADLINE)), "lift": _finite(numbers.get("ratio_lift"))})
+    return {"episodes": rows, **_about(question)}
+
+
+def _about(question: Question) -> dict[str, Any]:
+    has_ratio = question.grouping.ratio is not None
+    return {
+        "site": question.site,
+        "grouping": question.grouping.name,
+        "ratio": ratio_definition(question.grouping) if has_ratio else None,
+    }
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

@@ -1,0 +1,193 @@
+"""`vla-analyze view`: the numbers of its summary, the static site, its link, and its end."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import sys
+import webbrowser
+from pathlib import Path
+
+import pytest
+
+import vla_attention as va
+from tests.kit.http_ranges import serve
+from tests.kit.stopped_programs import after_call, run_stopped
+from tests.kit.viewer import ask, served
+from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.show.browser import has_screen, open_page
+from vla_attention.analyze.view.paths import PAGE_FILES
+from vla_attention.analyze.view.summary_process import summary_parts
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
+from vla_attention.testing.stores import StoreSpec, write_store
+
+SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory) -> Path:
+    return write_store(tmp_path_factory.mktemp("viewed") / "a.zarr", spec=SPEC)
+
+
+def test_the_summary_has_the_numbers_of_the_analysis(store):
+    with served(store, summaries=True) as running:
+        assert running.stores[0].summary.wait() is None
+        document = json.loads(ask(running, "stores/0.summary.json").body)
+    assert (document["complete"], document["failed"], document["site"]) == (True, None, "joint")
+    assert document["grouping"] == "default"
+    assert document["ratio"] == "visual / linguistic"
+    expected = va.open(store).ratios("episodes").filter(layer="layers_avg").sort("task_id", "episode_index")
+    for found, row in zip(document["episodes"], expected.iter_rows(named=True), strict=True):
+        assert found["name"] == f"task{row['task_id']:03d}_episode{row['episode_index']:03d}"
+        for name, column in (
+            ("task", "task_id"),
+            ("episode", "episode_index"),
+            ("instruction", "instruction"),
+            ("success", "success"),
+            ("replans", "num_replans"),
+            ("ratio", "geometric_mean"),
+            ("lift", "ratio_lift"),
+        ):
+            assert found[name] == row[column], name
+
+
+def test_before_the_numbers_there_are_the_episodes(store):
+    with served(store) as running:
+        running.stores[0].summary.begin(running.stores[0].store)
+        document = json.loads(ask(running, "stores/0.summary.json").body)
+        names = [entry["name"] for entry in json.loads(ask(running, "stores.json").body)["stores"][0]["episodes"]]
+    assert [row["name"] for row in document["episodes"]] == names
+
+
+def test_a_damaged_episode_has_no_numbers_and_the_others_have(store, tmp_path):
+    damaged = tmp_path / "a.zarr"
+    shutil.copytree(store, damaged)
+    (damaged / "episodes/task001_episode000/joint/key_role/zarr.json").unlink()
+    parts = list(summary_parts(open_store(damaged)))
+    (failed,) = [part["failed"] for part in parts if "failed" in part]
+    assert "task001_episode000" in failed
+    rows = {row["name"]: row for part in parts for row in part.get("episodes", ())}
+    assert [rows[name]["ratio"] is None for name in sorted(rows)] == [False, False, True, False]
+
+
+def test_a_site_without_both_sides_has_no_ratio(tmp_path):
+    store = write_site_store(tmp_path / "a.zarr", SiteStoreSpec(kind="split"))
+    *_, last = summary_parts(open_store(store))
+    assert "failed" not in last
+    assert last["episodes"][0]["replans"]
+    assert last["episodes"][0]["ratio"] is None
+
+
+def test_a_site_is_the_page_its_documents_and_a_link_to_the_store(store, tmp_path, capsys):
+    folder = tmp_path / "site"
+    for _ in range(2):  # a second time over the first
+        assert main(["view", str(store), "--site", str(folder)]) == 0
+        printed = capsys.readouterr().out
+        assert f"stores/0 (a link to {store})" in printed
+        assert "range requests" in printed
+    with served(store, summaries=True) as running:
+        running.stores[0].summary.wait()
+        for name in (*PAGE_FILES, "stores.json", "stores/0.summary.json", "stores/0/zarr.json"):
+            live, written = ask(running, name).body, (folder / name).read_bytes()
+            if name == "stores.json":
+                shown, wrote = json.loads(live), json.loads(written)
+                assert shown["stores"][0].pop("path") == str(store)  # on the web nobody needs it
+                assert shown == wrote
+            elif name.endswith(".json"):
+                assert json.loads(live) == json.loads(written), name
+            else:
+                assert live == written, name
+    assert (folder / "stores/0").resolve() == store
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()}
+    assert files == {*PAGE_FILES, "stores.json", "stores/0.summary.json"} | ({"stores/0"} & files)
+
+
+def test_a_site_of_a_store_elsewhere_names_its_address(store, tmp_path, capsys):
+    pytest.importorskip("aiohttp")
+    assert main(["copy", str(store), str(tmp_path / "p.zarr"), "--packed"]) == 0
+    with serve(tmp_path) as elsewhere:
+        assert main(["view", f"{elsewhere.url}/p.zarr", "--site", str(tmp_path / "site")]) == 0
+    assert "CORS" in capsys.readouterr().out
+    (entry,) = json.loads((tmp_path / "site/stores.json").read_text())["stores"]
+    assert entry["root"] == f"{elsewhere.url}/p.zarr/"
+    assert entry["packed"]
+
+
+@pytest.mark.parametrize("place", ["a.zarr", "file", "full", "hub/datasets"])
+def test_a_site_is_written_into_no_store_and_over_nothing_else(store, tmp_path, capsys, place):
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/mine").write_text("mine")
+    if place == "hub/datasets":
+        (tmp_path / place).mkdir(parents=True)
+        (tmp_path / place / "zarr.json").write_text("{}")
+    before = sorted(tmp_path.rglob("*"))
+    assert main(["view", str(store), "--site", str(tmp_path / place)]) == 2
+    assert "Cannot write a site into" in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_addresses_that_browsers_cannot_read_are_refused_for_a_site(tmp_path, capsys):
+    assert main(["view", "s3://bucket/a.zarr", "--site", str(tmp_path / "site")]) == 2
+    assert "Browsers cannot read s3://bucket/a.zarr" in capsys.readouterr().err
+
+
+def test_what_is_no_store_is_refused_with_a_sentence(tmp_path, capsys):
+    assert main(["view", str(tmp_path / "none.zarr"), "--no-open"]) == 2
+    assert "There is no store at" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("signal", "code", "word"), [("SIGINT", 130, "stopped"), ("SIGTERM", 143, "stopped by SIGTERM")]
+)
+def test_it_ends_with_one_sentence(store, signal, code, word):
+    moment = after_call("vla_attention.analyze.view.server", "ViewerServer", "service_actions")
+    done = run_stopped("vla_attention.analyze", ["view", str(store), "--no-open"], moment, signal=signal)
+    assert done.returncode == code
+    assert re.match(r"The page: http://127\.0\.0\.1:\d+/[\w-]{32}/\n", done.stdout)
+    assert done.stderr.strip() == f"vla-analyze view: {word}; nothing was left half written."
+
+
+def test_a_browser_is_opened_before_a_screen_only():
+    assert has_screen("linux", {"DISPLAY": ":0"})
+    assert has_screen("linux", {"WAYLAND_DISPLAY": "wayland-0"})
+    assert has_screen("darwin", {})
+    assert not has_screen("linux", {})
+    assert not has_screen("linux", {"DISPLAY": ""})
+    assert not has_screen("darwin", {"SSH_CONNECTION": "1 2 3 4"})
+
+
+def test_a_report_is_opened_or_the_reason_is_said(store, tmp_path, capsys, monkeypatch):
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", lambda address: opened.append(address) or True)
+    page = tmp_path / "report.html"
+    words = ["report", str(store), "--quick", "--episodes", "0", "--output", str(page), "--open"]
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert main(words) == 0
+    assert opened == [page.as_uri()]
+    assert capsys.readouterr().out.endswith("on 4 episodes.\n")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    assert (
+        open_page(page)
+        == f"There is no screen or no browser here, so {page} was not opened; copy it to where there is one."
+    )
+    assert opened == [page.as_uri()]
+
+
+def test_the_analysis_ends_by_naming_the_report_and_the_viewer(store, tmp_path, capsys, monkeypatch):
+    words = ["--no-plots", "--output", str(tmp_path / "out")]
+    long = tmp_path / f"{'long' * 20}.zarr"
+    shutil.copytree(store, long)
+    assert main([str(long), *words]) == 0
+    assert capsys.readouterr().out.endswith(
+        "One page of it: vla-analyze report STORE --open; to explore it: vla-analyze view STORE\n"
+    )
+    monkeypatch.chdir(store.parent)
+    assert main(["a.zarr", *words]) == 0
+    assert capsys.readouterr().out.endswith(
+        "One page of it: vla-analyze report a.zarr --open\nTo explore it: vla-analyze view a.zarr\n"
+    )
