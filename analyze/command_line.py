@@ -36,6 +36,22 @@ def _run(name: str, arguments: Sequence[str]) -> int:
     if not name:
         _refuse_misspelt_command(arguments)
     command = import_module(f"vla_attention.analyze.{name or DEFAULT_COMMAND}.command")
+    parsed = build_parser(name).parse_args(arguments)
+    # The libraries read the numbers when they are imported, which the command does.
+    use_threads(parsed.threads)
+    os.environ.update(dict.fromkeys(_ONE_THREAD_EACH, "1"))
+    try:
+        with _cache_of(parsed), _engine(parsed), _pictures(parsed):
+            code: int = command.run(parsed)
+        return code
+    except UserError as error:
+        raise _with_way_out(error, can_skip=hasattr(parsed, "skip_corrupt")) from error.__cause__
+
+
+def build_parser(name: str) -> argparse.ArgumentParser:
+    """The parser of one command with what all commands share; `""` is `vla-analyze STORE`."""
+    command = import_module(f"vla_attention.analyze.{name or DEFAULT_COMMAND}.command")
+    parser: argparse.ArgumentParser
     parser = command.build_parser(prog=f"vla-analyze {name}") if name == DEFAULT_COMMAND else command.build_parser()
     parser.add_argument(
         "--threads",
@@ -49,16 +65,7 @@ def _run(name: str, arguments: Sequence[str]) -> int:
             action="store_true",
             help="measure again what was measured before (see vla-analyze cache; VLA_CACHE=off does the same)",
         )
-    parsed = parser.parse_args(arguments)
-    # The libraries read the numbers when they are imported, which the command does.
-    use_threads(parsed.threads)
-    os.environ.update(dict.fromkeys(_ONE_THREAD_EACH, "1"))
-    try:
-        with _cache_of(parsed), _engine(parsed), _pictures(parsed):
-            code: int = command.run(parsed)
-        return code
-    except UserError as error:
-        raise _with_way_out(error, can_skip=hasattr(parsed, "skip_corrupt")) from error.__cause__
+    return parser
 
 
 def _cache_of(parsed: argparse.Namespace) -> AbstractContextManager[None]:

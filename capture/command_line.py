@@ -10,7 +10,11 @@ from pathlib import Path
 
 from vla_attention.capture.jobs.termination import EXIT_TERMINATED, Terminated, Termination, listening_for_sigterm
 from vla_attention.schemas.command_line import run_command
-from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.errors import BadArgument, MissingDependency, UserError
+from vla_attention.schemas.installing import INSTALL_CAPTURE
+
+#: Modules of the extra [capture] that are imported without a sentence of their own.
+_OF_CAPTURE = ("torch", "safetensors", "sentencepiece")
 
 
 class GpuMemoryFull(UserError, MemoryError):
@@ -56,6 +60,10 @@ def _until_terminated(command: Callable[[Termination], int], termination: Termin
     except UserError:
         raise
     except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and error.name in _OF_CAPTURE:
+            raise MissingDependency(
+                f"{error.name} is not installed, and this command needs it: {INSTALL_CAPTURE}."
+            ) from error
         if termination.requested:  # a library made an error of its own out of the interruption
             raise Terminated from None
         if type(error).__name__ == "OutOfMemoryError":  # torch's, which is not imported for it

@@ -150,6 +150,7 @@ def use_packages(laptop: Path, node: Path, folder: Path) -> None:
         for script in project["scripts"]:
             run(commands / script, "--help", cwd=folder, quiet=True)
 
+    use_examples(laptop, folder)
     made, store, output = folder / "made.zarr", folder / "store.zarr", folder / "results"
     for old in (made, store, output):
         shutil.rmtree(old, ignore_errors=True)
@@ -169,6 +170,25 @@ def use_packages(laptop: Path, node: Path, folder: Path) -> None:
     check(len(results) == 1, f"expected one results file in {output}, found {results}")
     run(laptop / "parse-attention-ratio-results", "--results", results[0], cwd=folder, quiet=True)
     print("captured a store and analysed it with the installed wheel")
+
+
+def use_examples(laptop: Path, folder: Path) -> None:
+    """What a first minute has: the stores that come along, by the one name that `uvx` knows, and no torch."""
+    examples = folder / "example"
+    shutil.rmtree(examples, ignore_errors=True)
+    run(laptop / "vla-attention", "example", examples, cwd=folder, quiet=True)
+    answer = run(laptop / "vla-attention", "analyze", examples / "cubes.zarr", "--output", folder / "first", quiet=True)
+    check("The ratio visual / linguistic is" in answer, f"the example's analysis says: {answer}")
+    script = run(laptop / "vla-attention", "completion", "bash", cwd=folder, quiet=True)
+    check("--num-episodes" in script, "the completion knows no options of vla-capture")
+    refused = subprocess.run(
+        [laptop / "vla-attention", "capture", "pi"], cwd=folder, text=True, capture_output=True, check=False
+    )
+    sentence = refused.stderr.strip()
+    check(
+        refused.returncode == 2 and "pip install 'vla-attention[capture]'" in sentence and "\n" not in sentence,
+        f"without torch, capture ends with {refused.returncode} and: {sentence}",
+    )
 
 
 def run(*command: object, cwd: Path | None = None, quiet: bool = False) -> str:

@@ -49,6 +49,7 @@ LEVELS = {
     "capture.__main__": 7,
     "capture.small_policy": 6,
     "testing": 2,
+    "example_stores": 1,
 }
 
 

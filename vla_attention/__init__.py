@@ -95,9 +95,9 @@ def inspect(policy: object, call: Callable[[], object]) -> CallTable:
         UserError: the policy cannot be watched; the sentence says why, and what to do.
     """
     # Imported here: `import vla_attention` loads no torch.
-    from vla_attention.capture.torch_policies.inspect_calls import inspect as inspect_calls
-
-    return inspect_calls(policy, call)
+    inspect_calls = _module_of_the_recorder("capture.torch_policies.inspect_calls").inspect
+    table: CallTable = inspect_calls(policy, call)
+    return table
 
 
 def __getattr__(name: str) -> Any:
@@ -114,12 +114,25 @@ def __getattr__(name: str) -> Any:
 
         return import_module("vla_attention.datasets")
     if name == "layouts":
-        from importlib import import_module
-
-        return import_module("vla_attention.capture.torch_policies.layouts")
+        return _module_of_the_recorder("capture.torch_policies.layouts")
     for module, names in _RECORDER.items():
         if name in names:
-            from importlib import import_module
-
-            return getattr(import_module(f"vla_attention.{module}"), name)
+            return getattr(_module_of_the_recorder(module), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def _module_of_the_recorder(name: str) -> Any:
+    """A module that needs torch; raises `MissingDependency`, an ImportError, where there is none."""
+    from importlib import import_module
+
+    try:
+        return import_module(f"vla_attention.{name}")
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        from vla_attention.schemas.errors import MissingDependency
+        from vla_attention.schemas.installing import INSTALL_CAPTURE
+
+        raise MissingDependency(
+            f"torch is not installed, and va.record and va.inspect need it: {INSTALL_CAPTURE}."
+        ) from error

@@ -312,7 +312,9 @@ def _jackknife(
 
 
 def _left_out_variance(values: NDArray[np.float64]) -> float:
-    """(n - 1) / n times the sum of squared deviations of the leave-one-out values (n,)."""
+    """(n - 1) / n times the sum of squared deviations of the leave-one-out values (n,); NaN where one is not finite."""
+    if not np.isfinite(values).all():  # without that unit all others agree, and a standardised mean is infinite
+        return math.nan
     return float((len(values) - 1) / len(values) * ((values - values.mean()) ** 2).sum())
 
 

@@ -30,6 +30,7 @@ from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.run_settings import RecordingSettings, RunSettings, run_settings
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.installing import INSTALL_CAPTURE
 from vla_attention.schemas.safe_text import print_line
 from vla_attention.schemas.threads import use_threads
 
@@ -73,7 +74,7 @@ def _findings(arguments: argparse.Namespace, settings: RunSettings, termination:
 
         from vla_attention.capture.device import load_torch
     except ImportError as error:
-        yield Finding("torch", "missing", f"torch cannot be loaded ({error}).", "Run 'make setup'.")
+        yield Finding("torch", "missing", f"torch cannot be loaded ({error}).", f"Install it: {INSTALL_CAPTURE}.")
         return
     yield find_memory()
     gpu = find_gpu(arguments.device, torch)

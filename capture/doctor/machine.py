@@ -15,6 +15,7 @@ from vla_attention.capture.doctor.findings import Finding
 from vla_attention.capture.memory import memory_limits
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.installing import INSTALL_CAPTURE
 from vla_attention.schemas.threads import Threads
 
 #: Seconds after which a check of drawing counts as hanging; the first picture of a GPU's driver can take half a minute.
@@ -143,7 +144,7 @@ def _run_program(program: str, environment: Mapping[str, str]) -> tuple[int, str
 def find_drawing(run_program: RunProgram = _run_program) -> Finding:
     """Draw a picture without a display, in a process of its own: drivers that do not fit end the whole process."""
     if importlib.util.find_spec("mujoco") is None:
-        return Finding("drawing", "missing", "MuJoCo is not installed.", "Run 'make setup'.")
+        return Finding("drawing", "missing", "MuJoCo is not installed.", f"Install it: {INSTALL_CAPTURE}.")
     backend = os.environ.get("MUJOCO_GL", "egl")
     code, output, errors = run_program(_DRAW, {**os.environ, "MUJOCO_GL": backend})
     if code:

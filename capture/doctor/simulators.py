@@ -11,6 +11,7 @@ from vla_attention.capture.environments.base import Suite
 from vla_attention.capture.environments.libero_installation import find_assets, package_folder
 from vla_attention.capture.environments.suites import list_tasks
 from vla_attention.schemas.errors import MissingDependency, UserError
+from vla_attention.schemas.installing import INSTALL_CAPTURE
 
 
 def find_simulator(suite: Suite, libero_assets: Path | None) -> list[Finding]:
@@ -27,7 +28,7 @@ def find_simulator(suite: Suite, libero_assets: Path | None) -> list[Finding]:
 
 def _robosuite() -> str:
     if importlib.util.find_spec("robosuite") is None:
-        raise MissingDependency("robosuite is not installed, and simulations need it; run 'make setup'.")
+        raise MissingDependency(f"robosuite is not installed, and simulations need it: {INSTALL_CAPTURE}.")
     from importlib.metadata import version
 
     return f"robosuite {version('robosuite')}, MuJoCo {version('mujoco')}."

@@ -25,6 +25,7 @@ from vla_attention.capture.environments.base import Suite, Task
 from vla_attention.capture.environments.robosuite_installation import import_robosuite, readable_device_choice
 from vla_attention.capture.foreign_files.regular_files import check_folder
 from vla_attention.schemas.errors import MissingDependency, UserError
+from vla_attention.schemas.installing import INSTALL_LIBERO
 
 ASSETS_VARIABLE = "VLA_LIBERO_ASSETS"
 #: The dataset on the Hugging Face hub that the package itself (hf-libero) downloads.
@@ -52,7 +53,7 @@ def package_folder() -> Path:
         inner = Path(location) / "libero"
         if (inner / "benchmark" / "libero_suite_task_map.py").is_file():
             return inner
-    raise MissingDependency("LIBERO (hf-libero) is not installed, and its task suites need it; run 'make setup'.")
+    raise MissingDependency(f"LIBERO (hf-libero) is not installed, and its task suites need it: {INSTALL_LIBERO}.")
 
 
 @functools.cache
@@ -138,7 +139,7 @@ def load_libero(assets: Path) -> dict[str, Any]:
         with readable_device_choice(), contextlib.redirect_stdout(io.StringIO()):
             environments = importlib.import_module("libero.libero.envs")
     except ImportError as error:
-        raise MissingDependency(f"LIBERO could not be loaded ({error}); run 'make setup'.") from error
+        raise MissingDependency(f"LIBERO could not be loaded ({error}): {INSTALL_LIBERO}.") from error
     classes: dict[str, Any] = environments.TASK_MAPPING
     return classes
 
@@ -157,7 +158,7 @@ def _import_with_own_configuration(assets: Path) -> ModuleType:
     try:
         return importlib.import_module("libero.libero")
     except ImportError as error:
-        raise MissingDependency(f"LIBERO could not be loaded ({error}); run 'make setup'.") from error
+        raise MissingDependency(f"LIBERO could not be loaded ({error}): {INSTALL_LIBERO}.") from error
     finally:
         if before is None:
             del os.environ["LIBERO_CONFIG_PATH"]

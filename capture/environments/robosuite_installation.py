@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from vla_attention.schemas.errors import MissingDependency
+from vla_attention.schemas.installing import INSTALL_CAPTURE
 
 
 def import_robosuite() -> None:
@@ -18,7 +19,7 @@ def import_robosuite() -> None:
         return
     spec = importlib.util.find_spec("robosuite")
     if spec is None or not spec.submodule_search_locations:
-        raise MissingDependency("robosuite is not installed, and simulations need it; run 'make setup'.")
+        raise MissingDependency(f"robosuite is not installed, and simulations need it: {INSTALL_CAPTURE}.")
     if sys.platform == "linux":
         os.environ.setdefault("MUJOCO_GL", "egl")  # must precede the first import of MuJoCo, which reads it
     # robosuite reads its settings during its import. By default it opens a log file with a fixed name in the common
@@ -38,7 +39,7 @@ def import_robosuite() -> None:
             import robosuite
     except ImportError as error:
         sys.modules.pop("robosuite.macros", None)
-        raise MissingDependency(f"robosuite could not be loaded ({error}); run 'make setup'.") from error
+        raise MissingDependency(f"robosuite could not be loaded ({error}): {INSTALL_CAPTURE}.") from error
     robosuite.macros = macros
 
 

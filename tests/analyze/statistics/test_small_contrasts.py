@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -43,6 +45,15 @@ def test_cliffs_delta_is_the_u_statistic_rescaled():
     assert cliffs_delta(FIRST, SECOND) == pytest.approx(2 * u / (len(FIRST) * len(SECOND)) - 1)
     assert cliffs_delta([1.0, 1.0], [1.0]) == 0
     assert cliffs_delta([], [1.0]) is None
+
+
+def test_a_task_without_which_all_pairs_agree_leaves_the_effect_without_an_interval():
+    tasks = [0, 0, 1, 1, 2, 2]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        effect = standardised_mean([-1.0, -1.0, -1.0, -1.0, 0.0, 0.0], tasks)
+    assert effect.value == pytest.approx(-2 / 3 / np.std([-1, -1, -1, -1, 0, 0], ddof=1) * (1 - 3 / (4 * 5 - 1)))
+    assert effect.error is None
 
 
 @given(SAMPLES, SAMPLES)

@@ -1,0 +1,111 @@
+"""Make the small stores that come with the package, and the reruns and the second run beside them.
+
+Usage: python scripts/make_example_stores.py [--folder vla_attention/example_stores] [--keep FOLDER]
+
+`cubes.zarr`              the shipped policy pi05_cubes, "touch the red (green, blue) cube", two episodes each
+`cubes_one_colour.zarr`   the same tasks, initial states and noise with a copy of that policy to which the three colour
+                          words are the same: their embeddings are replaced by their mean. Without pictures
+`cubes_reruns/`           the first episode of each task of cubes.zarr again: with other noise, without the pictures' or
+                          the instruction's keys, with these alone, without as many random keys, and without any
+                          query that reads the instruction. Actions and little attention
+
+Takes about two minutes on two cores. The same machine, libraries and number of threads give the same stores, but for
+the times and versions in their provenance. `tests/package/test_example_stores.py` reads what is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.capture.__main__ import main as capture
+
+ROOT = Path(__file__).resolve().parents[1]
+POLICY = ROOT / "capture/policies/pi/pi05_cubes"
+#: "touch the red cube", "touch the green cube", "touch the blue cube".
+TASKS = ("0", "1", "2")
+#: Enough for every episode of the shipped policy; the other one would search until the end.
+MOST_STEPS = "40"
+EMBEDDINGS = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
+COLOURS = ("red", "green", "blue")
+#: The two groups whose reruns are made.
+GROUPING = """\
+name = "see-read"
+[groups]
+visual = "role:image"
+linguistic = "role:instruction"
+"""
+
+
+def main() -> int:
+    """Make all stores; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--folder", type=Path, default=ROOT / "vla_attention/example_stores", help="where they are put")
+    parser.add_argument("--keep", type=Path, help="folder for the stores as they were recorded, kept afterwards")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="example_stores_") as temporary:
+        work = (Path(temporary) if given.keep is None else given.keep).resolve()
+        folder = given.folder.resolve()
+        work.mkdir(parents=True, exist_ok=True)
+        os.chdir(work)  # the stores name the checkpoint as it was given
+        make(folder)
+    return 0
+
+
+def make(folder: Path) -> None:
+    """Record here, and put packed copies into `folder`."""
+    store, other, reruns = Path("cubes.zarr"), Path("cubes_one_colour.zarr"), Path("cubes_reruns")
+    rollouts = ("--task-suite", "cubes", "--task-id", *TASKS, "--num-episodes", "2", "--max-steps", MOST_STEPS)
+    must(capture, "pi", *rollouts, "--store", store)
+    must(capture, "pi", "--checkpoint", one_colour(Path("one_colour")), *rollouts, "--no-frames", "--store", other)
+    grouping = Path("see-read.toml")
+    grouping.write_text(GROUPING)
+    recorded = ("--no-frames", "--no-contributions", "--layers", "0", "--heads", "0", "--denoise-steps", "last")
+    must(capture, "rerun", store, "--series", grouping, "--num-episodes", "1", *recorded, "--output-dir", reruns)
+    unread = ("--knockout", "role:instruction", "--knockout-queries", "all", "--name", "unread_linguistic")
+    must(
+        capture, "rerun", store, *unread, "--num-episodes", "1", *recorded, "--store", reruns / "unread_linguistic.zarr"
+    )
+    pack(store, folder / store.name)
+    pack(other, folder / other.name, "--without", "objects", "contributions")
+    for condition in sorted(reruns.glob("*.zarr")):
+        pack(condition, folder / reruns.name / condition.name, "--without", "objects")
+
+
+def one_colour(folder: Path) -> Path:
+    """A checkpoint folder like that of the shipped policy, to which all three colours are the same word."""
+    from safetensors.torch import load_file, save_file
+    from sentencepiece import SentencePieceProcessor
+
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(POLICY, folder)
+    tokens = SentencePieceProcessor(model_file=str(POLICY / "tokenizer.model"))
+    colours = [tokens.piece_to_id(f"▁{colour}") for colour in COLOURS]
+    weights = load_file(POLICY / "model.safetensors")
+    embeddings = weights[EMBEDDINGS]
+    embeddings[colours] = embeddings[colours].float().mean(dim=0).to(embeddings.dtype)
+    save_file(weights, folder / "model.safetensors")
+    return folder
+
+
+def pack(store: Path, copy: Path, *options: str) -> None:
+    """Put a packed copy of a store into its place."""
+    shutil.rmtree(copy, ignore_errors=True)
+    copy.parent.mkdir(parents=True, exist_ok=True)
+    must(analyze, "copy", store, copy, "--packed", *options)
+
+
+def must(program: object, *arguments: object) -> None:
+    """Run a command of ours; ends the program if it fails."""
+    code = program([str(argument) for argument in arguments])  # type: ignore[operator]
+    if code:
+        sys.exit(code)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,75 @@
+"""The stores that come along are whole, small, and what `scripts/make_example_stores.py` says."""
+
+from __future__ import annotations
+
+import pytest
+
+import vla_attention as va
+from tests.kit.paths import ROOT
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.example_stores import CUBES, FOLDER, ONE_COLOUR, RERUNS
+from vla_attention.example_stores.command import main
+
+STORES = [CUBES, ONE_COLOUR, *sorted(RERUNS.glob("*.zarr"))]
+
+
+def test_there_are_all_conditions():
+    assert [store.stem for store in STORES[2:]] == [
+        "noise",
+        "only_linguistic",
+        "only_visual",
+        "random_linguistic",
+        "unread_linguistic",
+        "without_linguistic",
+        "without_visual",
+    ]
+
+
+@pytest.mark.parametrize("store", STORES, ids=lambda path: path.stem)
+def test_every_store_is_whole(store, capsys):
+    assert analyze(["verify", str(store)]) == 0
+
+
+def test_they_are_small():
+    assert sum(path.stat().st_size for path in FOLDER.rglob("*") if path.is_file()) < 2.5e6
+
+
+def test_the_policy_is_the_one_that_comes_along():
+    from vla_attention.capture.policies.pi.shipped import CUBES_POLICY
+
+    policy = va.open(CUBES).attributes.policy
+    assert policy.name == CUBES_POLICY
+    assert policy.checkpoint == CUBES_POLICY
+
+
+def test_the_second_run_differs_in_its_weights_alone():
+    cubes, one_colour = va.open(CUBES), va.open(ONE_COLOUR)
+    assert cubes.attributes.policy.digest != one_colour.attributes.policy.digest
+    assert cubes.attributes.protocol == one_colour.attributes.protocol
+    assert cubes.compare(one_colour, "unpaired").height == 0
+    assert cubes.episodes["success"].all()
+    assert one_colour.episodes.filter(success=True)["instruction"].unique().to_list() == ["touch the blue cube"]
+
+
+def test_reruns_are_of_the_first_store():
+    episodes = va.open(CUBES).effects(sorted(RERUNS.glob("*.zarr")), "episodes")
+    assert episodes["episode_index"].unique().to_list() == [0]
+    assert episodes["task_id"].unique().sort().to_list() == [0, 1, 2]
+
+
+def test_no_store_names_a_place_of_the_machine_that_made_it():
+    for file in FOLDER.rglob("*"):
+        if file.is_file():
+            content = file.read_bytes()
+            assert b"/tmp/" not in content, file
+            assert str(ROOT).encode() not in content, file
+
+
+def test_copies_are_readable_and_none_is_written_over(tmp_path, capsys):
+    folder = tmp_path / "example"
+    assert main([str(folder)]) == 0
+    assert f"vla-attention analyze {folder / 'cubes.zarr'}" in capsys.readouterr().out
+    columns = ["instruction", "success", "num_replans"]
+    assert va.open(folder / "cubes.zarr").episodes[columns].equals(va.open(CUBES).episodes[columns])
+    assert main([str(folder)]) == 2
+    assert "cubes.zarr exists; remove it, or name another folder" in capsys.readouterr().err

@@ -1,0 +1,82 @@
+"""`vla-attention` hands its arguments on, and says what there is."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.metadata import version
+
+import pytest
+
+from tests.kit.lazy_imports import help_without_libraries
+from vla_attention.__main__ import COMMANDS, main
+from vla_attention.example_stores import CUBES
+
+
+@pytest.mark.parametrize(
+    "words", [[], ["--help"], ["analyze", "--help"], ["capture", "--help"], ["completion", "--help"]]
+)
+def test_help_imports_no_library(words):
+    assert help_without_libraries("vla_attention", words).startswith("usage:")
+
+
+def test_without_arguments_it_lists_every_command(capsys):
+    assert main([]) == 0
+    printed = capsys.readouterr().out
+    for command in COMMANDS:
+        assert f"\n  {command} " in printed
+
+
+def test_the_version_is_the_package_s(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"vla-attention {version('vla-attention')}\n"
+
+
+def test_analyze_is_vla_analyze(capsys):
+    assert main(["analyze", str(CUBES), "--list"]) == 0
+    assert "touch the red cube" in capsys.readouterr().out
+
+
+def test_capture_is_vla_capture(capsys):
+    assert main(["capture", "tasks", "cubes"]) == 0
+    assert "touch the red cube" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["anlyze"], "There is no command 'anlyze'. Did you mean 'analyze'?"),
+        (["nothing\x1b[31m"], "There is no command 'nothing\\x1b[31m'. Commands: example, analyze"),
+        (["analyze", "nowhere.zarr"], "nowhere.zarr"),
+        (["completion", "csh"], "invalid choice: 'csh'"),
+    ],
+)
+def test_a_mistake_is_one_sentence(words, said):
+    done = subprocess.run([sys.executable, "-m", "vla_attention", *words], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert said in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_without_torch_a_capture_says_how_to_install_it(tmp_path):
+    code = (
+        "import sys; sys.modules['torch'] = None\n"
+        "from vla_attention.__main__ import main\n"
+        f"sys.exit(main(['capture', 'pi', '--store', {str(tmp_path / 'new.zarr')!r}]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "pip install 'vla-attention[capture]'" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "new.zarr").exists()
+
+
+@pytest.mark.parametrize("use", ["va.record", "va.inspect(None, lambda: None)"])
+def test_without_torch_the_recorder_says_how_to_install_it(use):
+    code = f"import sys; sys.modules['torch'] = None\nimport vla_attention as va\ntry:\n    {use}\n" + (
+        "except ImportError as error:\n    print(type(error).__name__, error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("MissingDependency torch is not installed")
+    assert "pip install 'vla-attention[capture]'" in done.stdout

@@ -1,0 +1,18 @@
+"""Small stores that come along, to try questions on: `va.open(example_stores.CUBES)`.
+
+They are recordings of `pi05_cubes`, a pi0.5 of 1.5 million parameters for coloured cubes on a table (docs/cubes.md),
+packed into one file an episode. `scripts/make_example_stores.py` makes them, and says what is in them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+FOLDER = Path(__file__).parent
+#: "touch the red (green, blue) cube", two episodes each, with pictures.
+CUBES = FOLDER / "cubes.zarr"
+#: The same initial states and noise, by a copy of the policy to which the three colour words are the same. No pictures.
+ONE_COLOUR = FOLDER / "cubes_one_colour.zarr"
+#: The first episode of each task of `CUBES` again: with other noise, without the keys of the pictures or the
+#: instruction, and with these alone.
+RERUNS = FOLDER / "cubes_reruns"

@@ -1,0 +1,51 @@
+"""`vla-attention example`: copies of the small stores that come along, and first questions to them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from vla_attention.example_stores import CUBES, ONE_COLOUR, RERUNS
+from vla_attention.schemas.command_line import command_parser, run_command
+from vla_attention.schemas.errors import BadArgument
+
+PROGRAM = "vla-attention example"
+_EXAMPLES = """examples:
+  vla-attention example                copies into the folder example
+  vla-attention example ~/attention    copies into another one
+"""
+_QUESTIONS = """\
+{cubes}: 6 episodes of 'touch the red (green, blue) cube' by pi05_cubes, a small trained pi0.5
+{one_colour}: the same by a copy of it to which the three colours are one word
+{reruns}: its policy calls again, with other noise, without pictures or words, and with these alone
+
+Try:
+  vla-attention analyze {cubes}
+  vla-attention analyze words {cubes}
+  vla-attention analyze report {cubes}
+  vla-attention analyze compare {cubes} {one_colour}
+  vla-attention analyze effects {cubes} {reruns}
+  vla-attention view {cubes}
+"""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Copy the stores; returns the exit code."""
+    parser = command_parser(PROGRAM, "Copy the small stores that come along into a folder.", _EXAMPLES)
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("example"), metavar="FOLDER", help="where to")
+    folder: Path = parser.parse_args(argv).folder
+    return run_command(PROGRAM, lambda: _copy(folder), "a copy may be incomplete; remove it and copy again.")
+
+
+def _copy(folder: Path) -> int:
+    copies = {"cubes": CUBES, "one_colour": ONE_COLOUR, "reruns": RERUNS}
+    there = [folder / store.name for store in copies.values() if (folder / store.name).exists()]
+    if there:
+        raise BadArgument(f"{there[0]} exists; remove it, or name another folder: vla-attention example FOLDER.")
+    folder.mkdir(parents=True, exist_ok=True)
+    for store in copies.values():
+        # Files of an installation may be read-only; copies are their owner's.
+        shutil.copytree(store, folder / store.name, copy_function=shutil.copyfile)
+    print(_QUESTIONS.format(**{name: folder / store.name for name, store in copies.items()}), end="")
+    return 0
