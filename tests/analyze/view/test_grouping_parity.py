@@ -6,43 +6,19 @@ them are within 1e-12 of each other; what is an error is the same sentence in bo
 
 from __future__ import annotations
 
-import json
-import shutil
-import subprocess
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.kit.grouping_cases import AXES, grouping_cases
+from tests.kit.grouping_cases import grouping_cases
 from tests.kit.grouping_files import FILES, file_answer, made_up_texts
+from tests.kit.viewer_in_node import needs_node, run_in_node
 from vla_attention.schemas.errors import did_you_mean, shortened
 from vla_attention.schemas.groupings.words import split_words
 from vla_attention.schemas.visible_text import visible
 
-HERE = Path(__file__).resolve().parent
-SCRIPT = HERE.parents[2] / "analyze/view/bundle/viewer.js"
 NUM_CASES = 300
-NODE = shutil.which("node")
-needs_node = pytest.mark.skipif(NODE is None, reason="the page's script is run by node, which is not installed")
-
-
-def run_in_node(folder: Path, cases: dict[str, Any]) -> dict[str, list[Any]]:
-    """What the page's script makes of cases by kind; see `parity.mjs`."""
-    assert NODE is not None
-    module = folder / "viewer.mjs"  # by its ending node takes it for a module
-    module.write_bytes(SCRIPT.read_bytes())
-    (folder / "cases.json").write_text(json.dumps({**cases, "axes": AXES}, allow_nan=False), encoding="utf-8")
-    done = subprocess.run(
-        [NODE, HERE / "parity.mjs", module, folder / "cases.json", folder / "results.json"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    found: dict[str, list[Any]] = json.loads((folder / "results.json").read_text(encoding="utf-8"))
-    return found
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,6 @@
 /**
  * The grouping language and the measures, for tests: the page exports them, so that node can run what ships with the
- * cases on which Python decides (tests/analyze/view/test_grouping_parity.py).
+ * cases on which Python decides (tests/analyze/view/test_grouping_parity.py, test_group_edits.py).
  */
 export * from "./grouping/builtin_groupings";
 export * from "./grouping/grouping";
@@ -10,6 +10,9 @@ export * from "./grouping/selector_parser";
 export * from "./grouping/text";
 export * from "./grouping/tokens";
 export * from "./grouping/words";
+export * from "./groups/draft";
+export * from "./groups/rectangles";
+export * from "./groups/selector_edit";
 export * from "./measures/masses";
 export * from "./measures/ranks";
 export * from "./measures/replans";

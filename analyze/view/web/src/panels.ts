@@ -1,2 +1,2 @@
 /** The panels of the page: importing one registers it. */
-export {};
+import "./groups/panel";

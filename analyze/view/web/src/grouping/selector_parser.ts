@@ -24,12 +24,9 @@ export const KIND_NAMES = ["camera", "role", "span", "frame", "word", "words", "
 const PARENTHESES = 100;
 /** `s`: white space as Python takes it. */
 const s = `[${SPACE}]`;
-const ARGUMENT = [
-  `"[^"]*"`,
-  `'[^']*'`,
-  `[^${SPACE}&|()\\[\\]"']+[^${SPACE}&|()\\[\\]"]*(?:\\[[^\\]]*\\])?`,
-  "",
-].join("|");
+const BARE = `[^${SPACE}&|()\\[\\]"']+[^${SPACE}&|()\\[\\]"]*(?:\\[[^\\]]*\\])?`;
+const ARGUMENT = [`"[^"]*"`, `'[^']*'`, BARE, ""].join("|");
+const IS_BARE = new RegExp(`^${BARE}$`, "u");
 const TOKEN = new RegExp(
   `${s}*(?:(?<open>\\()|(?<close>\\))|(?<and>&)|(?<or>\\|)|(?<minus>-(?=${s}|$))|(?<star>\\*)` +
     `|(?<kind>[A-Za-z_]+):(?<argument>${ARGUMENT}))`,
@@ -93,6 +90,28 @@ export function atomsOf(selector: Selector): Atom[] {
 /** One text for each part, equal for equal parts. */
 export function atomKey(atom: Atom): string {
   return `${atom.kind}:${atom.argument}`;
+}
+
+/** The text of a part, with quotes where its name needs them; null where no quotes can hold the name. */
+export function atomText({ kind, argument }: Atom): string | null {
+  if (IS_BARE.test(argument)) return `${kind}:${argument}`;
+  if (!argument.includes('"')) return `${kind}:"${argument}"`;
+  return argument.includes("'") ? null : `${kind}:'${argument}'`;
+}
+
+/** A selector as text that `parseSelector` reads as the same tree. */
+export function selectorText(selector: Selector): string {
+  const texts = folded<{ text: string; level: number }>(
+    selector,
+    (part) => ({ text: part === EVERYTHING ? part : atomText(part)!, level: 2 }),
+    (operator, left, right) => {
+      const level = operator === "&" ? 1 : 0;
+      const inside = (part: { text: string; level: number }, least: number): string =>
+        part.level < least ? `(${part.text})` : part.text;
+      return { text: `${inside(left, level)} ${operator} ${inside(right, level + 1)}`, level };
+    },
+  );
+  return texts.text;
 }
 
 function unquoted(argument: string): string {

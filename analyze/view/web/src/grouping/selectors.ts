@@ -166,11 +166,21 @@ function objectProblem(argument: string, vocabulary: Vocabulary): string | null 
   return isClass ? null : missing("object", argument, vocabulary.objects);
 }
 
-function patchKeys(argument: string, tokens: EpisodeTokens): Membership {
+/** A region of a camera's patch grid: rows r0 to r1 and columns c0 to c1, the ends excluded. */
+export interface PatchRegion {
+  readonly camera: string;
+  readonly r0: number;
+  readonly r1: number;
+  readonly c0: number;
+  readonly c1: number;
+}
+
+/** The region that the argument of `patch:` names; throws `SelectorError` unless the camera's grid has it. */
+export function patchRegion(argument: string, layout: SiteDocument): PatchRegion {
   const match = PATCH.exec(argument)?.groups;
   if (!match) throw new SelectorError(`Cannot read selector 'patch:${argument}'; expected patch:CAMERA[r0:r1,c0:c1].`);
   const camera = match.camera!;
-  const span = cameraSpan(tokens.layout, camera);
+  const span = cameraSpan(layout, camera);
   if (!span.grid) throw new SelectorError(`Camera '${camera}' has no patch grid.`);
   const { rows, columns } = span.grid;
   const [r0, r1] = [Number(match.r0), Number(match.r1 || rows)];
@@ -181,6 +191,13 @@ function patchKeys(argument: string, tokens: EpisodeTokens): Membership {
         `${columns} columns of patches; expected 0 <= r0 < r1 <= ${rows} and 0 <= c0 < c1 <= ${columns}.`,
     );
   }
+  return { camera, r0, r1, c0, c1 };
+}
+
+function patchKeys(argument: string, tokens: EpisodeTokens): Membership {
+  const { camera, r0, r1, c0, c1 } = patchRegion(argument, tokens.layout);
+  const span = cameraSpan(tokens.layout, camera);
+  const { columns } = span.grid!;
   const member = noKeys(tokens);
   for (let row = r0; row < r1; row++) {
     member.bits.fill(1, span.start + row * columns + c0, span.start + row * columns + c1);

@@ -45,7 +45,7 @@ function knownOf(tokens: EpisodeTokens, site: SiteInfo): Known {
 }
 
 /** Segment masses (replan, segment) of one layer, mean over denoise steps and heads. */
-function meanAtoms(atoms: Atoms, layer: number, selection: Selection): Float64Array {
+export function meanAtoms(atoms: Atoms, layer: number, selection: Selection): Float64Array {
   const { replans, layers, denoise, heads, segments, values } = atoms;
   const mean = new Float64Array(replans * segments);
   const number = selection.denoise.length * selection.heads.length;

@@ -1,5 +1,5 @@
-// Runs the page's grouping language and measures in node: `node parity.mjs viewer.mjs CASES.json RESULTS.json`.
-// What Python makes of the same cases is in them, as `expected`; test_grouping_parity.py compares.
+// Runs what the page computes in node: `node viewer_in_node.mjs viewer.mjs CASES.json RESULTS.json`; see viewer_in_node.py.
+// What Python makes of groupings is in the cases, as `expected`.
 import { readFile, writeFile } from "node:fs/promises";
 
 globalThis.self = globalThis; // the page's script takes a place without a document for a worker
@@ -113,6 +113,12 @@ const answers = {
   near: ([word, names]) => engine.didYouMean(word, names),
   shown: (text) => [engine.visible(text), engine.quoted(text), engine.shortened(text, 20), engine.casefold(text)],
   words: (text) => engine.splitWords(text),
+  rectangles: ({ mask, rows, columns }) => engine.coveringRectangles(Uint8Array.from(mask), rows, columns),
+  rewritten: (text) => engine.selectorText(engine.parseSelector(text)),
+  painted: ({ text, layout, camera, patches, erase }) => engine.paintedPatches(text, layout, camera, patches, erase),
+  toggled: ({ text, atom }) => engine.toggledPart(text, atom),
+  drafts: (text) => engine.textOfDraft(engine.draftOfText(text)),
+  shell: (text) => engine.shellWord(text),
 };
 const results = {};
 for (const [kind, answer] of Object.entries(answers)) {
