@@ -69,11 +69,12 @@ def serve(folder: Path) -> Iterator[Served]:
                 self.answer(served.status if served.status != 200 else 404, b"")
                 return
             whole = file.read_bytes()
-            match = re.fullmatch(r"bytes=(\d+)-(\d*)", wanted) if served.ranges else None
+            match = re.fullmatch(r"bytes=(?:(\d+)-(\d*)|-(\d+))", wanted) if served.ranges else None
             if match is None:
                 self.answer(200, whole, path)
                 return
-            first, last = int(match[1]), min(int(match[2] or len(whole) - 1), len(whole) - 1)
+            first = max(0, len(whole) - int(match[3])) if match[3] else int(match[1])
+            last = min(int(match[2] or len(whole) - 1), len(whole) - 1)
             if first >= len(whole):
                 self.answer(416, b"", path, {"Content-Range": f"bytes */{len(whole)}"})
                 return

@@ -5,6 +5,7 @@ import { serveWorker } from "./store/worker";
 
 /** For tests; see there. */
 export * as engine from "./engine";
+export * as reading from "./reading";
 
 if (typeof document === "undefined") serveWorker();
 else {

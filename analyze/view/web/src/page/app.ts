@@ -64,7 +64,7 @@ export class App {
     this.#player = new Player(this.#view);
     this.#timeline = new Timeline((replan) => this.#view.update({ replan, playing: false }));
     this.#grid = new HeadGrid(this.#view);
-    this.#column.words.host.before(this.#player.host, this.#timeline.host);
+    this.#column.below.before(this.#player.host, this.#timeline.host);
     this.#build(main);
     listenForKeys({ view: this.#view, player: this.#player, list: this.#list, help: this.#help, shown: () => this.#shown });
     this.#view.subscribe((now, before) => this.#changed(now, before));

@@ -13,6 +13,8 @@ export interface EpisodeColumn {
   readonly host: HTMLElement;
   readonly pictures: PictureBoard;
   readonly words: WordStrip;
+  /** What is below the pictures: the page puts its timeline before it. */
+  readonly below: HTMLElement;
   show(shown: Shown): void;
   destroy(): void;
 }
@@ -43,11 +45,12 @@ export function episodeColumn(host: HTMLElement, explain: () => void, level: "h1
   const note = element("p", { class: "soft" });
   const corrections = element("p", { class: "warning", role: "status", hidden: true });
   host.classList.add("column");
-  host.append(title, about, corrections, pictures.host, legend.host, inspector.host, words.host, note, headline.host);
+  host.append(title, about, corrections, headline.figures, words.host, pictures.host, legend.host, inspector.host, note, headline.masses);
   return {
     host,
     pictures,
     words,
+    below: note,
     show(shown) {
       const { episode, store, replan } = shown;
       const { document } = episode;
@@ -57,7 +60,7 @@ export function episodeColumn(host: HTMLElement, explain: () => void, level: "h1
         episode.name,
         document.task_name,
         outcomeWord(document.success),
-        `replan ${replan} of ${episode.numReplans}${step === undefined ? "" : ` (step ${step})`}`,
+        `replan ${replan} (last: ${episode.numReplans - 1})${step === undefined ? "" : `, step ${step}`}`,
         averagedOver(shown),
         store.root.policy.untrained ? "untrained weights" : "",
         store.root.interventions.name ? `with the intervention ${store.root.interventions.name}` : "",
@@ -66,8 +69,8 @@ export function episodeColumn(host: HTMLElement, explain: () => void, level: "h1
         .join(" · ");
       corrections.hidden = !shown.corrections;
       corrections.textContent = shown.corrections;
+      pictures.onScale = (scale) => legend.show(scale, shown.state);
       pictures.show(shown);
-      legend.show(pictures.scale, shown.state);
       words.show(shown);
       headline.show(shown);
       inspector.show(shown);

@@ -9,6 +9,9 @@ const MOST_CELLS = 6000;
 /** The colours end at this factor on either side of 1, or at the largest. */
 const LEAST_FACTOR = Math.SQRT2;
 
+/** With more heads in a row, numbers could not be read. */
+const MOST_NUMBERED = 8;
+
 const LESS: readonly number[] = [166, 60, 0];
 const EVEN: readonly number[] = [247, 247, 247];
 const MORE: readonly number[] = [0, 80, 125];
@@ -21,6 +24,10 @@ export function factorColour(factor: number, most: number): { ground: string; in
   const end = place < 0 ? LESS : MORE;
   const mixed = EVEN.map((value, i) => Math.round(value + Math.abs(place) * (end[i]! - value)));
   return { ground: `rgb(${mixed.join(" ")})`, ink: Math.abs(place) > 0.55 ? "#fff" : "#222" };
+}
+
+function shortNumber(value: number): string {
+  return value >= 0.1 && value < 99.5 ? value.toPrecision(2) : formatNumber(value);
 }
 
 export class HeadGrid {
@@ -65,7 +72,7 @@ export class HeadGrid {
         const { ground, ink } = factorColour(lift, most);
         cell.style.background = ground;
         cell.style.color = ink;
-        cell.textContent = site.heads.length <= 8 ? formatNumber(lift) : "";
+        cell.textContent = site.heads.length <= MOST_NUMBERED ? shortNumber(lift) : "";
         const text = `layer ${layer}, head ${head}: ${chosen} ${formatPercent(fraction)}, lift ${formatNumber(lift)}`;
         cell.title = text;
         cell.setAttribute("aria-label", text);
@@ -82,6 +89,7 @@ export class HeadGrid {
 
   #build(layers: readonly number[], heads: readonly number[]): void {
     this.#cells.clear();
+    this.#table.style.minWidth = `${30 + 24 * heads.length}px`;
     const axis = (name: string, act: () => void, label: string): HTMLElement => {
       const made = button(name, act, { class: "axis", "aria-label": label });
       return made;

@@ -15,35 +15,33 @@ function figure(name: string, label: string): { host: HTMLElement; show(value: n
 }
 
 export class Headline {
-  readonly host = element("section", { class: "headline", "aria-label": "Ratio and masses of this replan" });
-  readonly #ratio = figure("ratio", "visual / linguistic attention");
-  readonly #uniform = figure("uniform-ratio", "uniform attention would give");
-  readonly #lift = figure("ratio-lift", "lift: ratio / uniform");
-  readonly #figures = element("div", { class: "figures" }, this.#ratio.host, this.#uniform.host, this.#lift.host);
+  /** The ratio, what uniform attention would give, and the lift. */
+  readonly figures = element("section", { class: "figures", "aria-label": "Ratio of this replan" });
+  /** The masses of all groups. */
+  readonly masses = element("section", { class: "masses", "aria-label": "Masses of this replan" });
+  readonly #ratio = figure("ratio", "ratio visual / linguistic");
+  readonly #uniform = figure("uniform-ratio", "uniform ratio");
+  readonly #lift = figure("ratio-lift", "lift");
+  readonly #meaning: HTMLElement;
   readonly #none = element("p", { class: "soft" });
   readonly #body = element("tbody");
 
   /** `explain` opens what the numbers mean. */
-  constructor(private readonly explain: () => void) {
+  constructor(explain: () => void) {
     const head = ["group", "keys", "mass", "fraction", "lift"].map((name) => element("th", { scope: "col" }, name));
-    this.host.append(
-      this.#figures,
-      this.#none,
-      element("table", { class: "masses numbers" }, element("thead", {}, element("tr", {}, ...head)), this.#body),
-      element(
-        "p",
-        { class: "soft" },
-        "A ratio depends on how many keys each side has: the lift does not. It says where attention went in these layers, " +
-          "not what the policy used, and not why it acted. ",
-        button("What a ratio can and cannot mean", () => this.explain(), { class: "link" }),
-        ".",
-      ),
+    this.#meaning = element(
+      "p",
+      { class: "soft" },
+      "Where attention went in these layers: not what the policy used, and not why it acted. ",
+      button("What a ratio can and cannot mean", explain, { class: "link" }),
     );
+    this.figures.append(this.#ratio.host, this.#uniform.host, this.#lift.host, this.#none, this.#meaning);
+    this.masses.append(element("table", { class: "numbers" }, element("thead", {}, element("tr", {}, ...head)), this.#body));
   }
 
   show({ numbers, replan, site }: Shown): void {
     const { ratio, groups } = numbers.replans[replan]!;
-    this.#figures.hidden = !ratio;
+    for (const part of [this.#ratio.host, this.#uniform.host, this.#lift.host, this.#meaning]) part.hidden = !ratio;
     this.#none.hidden = ratio !== undefined;
     if (ratio) {
       this.#ratio.show(ratio.value, formatNumber(ratio.value));

@@ -54,9 +54,8 @@ export class PictureBoard {
     return [...this.#drawn.keys()];
   }
 
-  get scale(): Scale | null {
-    return this.#scale;
-  }
+  /** Called with the scale whenever the pictures are painted. */
+  onScale: (scale: Scale | null) => void = () => undefined;
 
   /** Draw what is shown. */
   show(shown: Shown): void {
@@ -282,6 +281,7 @@ export class PictureBoard {
     if (!shown) return;
     const scales = [this, ...this.#others].map((board) => board.ownScale()).filter((scale): scale is Scale => scale !== null);
     this.#scale = scales.length ? scales.reduce((high, scale) => (scale.high > high.high ? scale : high)) : null;
+    this.onScale(this.#scale);
     if (!this.#scale) return;
     const { state } = shown;
     const values = this.#valuesOf(this.#preview ?? shown.row);

@@ -45,7 +45,7 @@ export class Player {
     this.#slider.max = String(this.#count - 1);
     this.#slider.value = String(replan);
     const step = episode.document.env_step[replan];
-    this.#text.textContent = `${replan + 1} / ${this.#count}`;
+    this.#text.textContent = `${replan} / ${this.#count - 1}`;
     this.#slider.setAttribute("aria-valuetext", `replan ${replan}${step === undefined ? "" : `, step ${step}`}`);
     if (this.view.get().playing) this.#next();
   }

@@ -130,6 +130,11 @@ async function readsWhole(episode: Episode, site: SiteInfo, selection: Selection
   return bytes <= WHOLE_EPISODE_BYTES || episode.numReplans <= 3 * (await episode.replansPerChunk(site.layout.name));
 }
 
+async function picturesOf(episode: Episode, site: SiteInfo, replan: number): Promise<Map<string, Picture | null>> {
+  const cameras = site.layout.spans.flatMap((span) => (span.camera && span.grid ? [span.camera] : []));
+  return new Map(await Promise.all(cameras.map(async (camera) => [camera, await episode.frame(camera, replan)] as const)));
+}
+
 /** Read all that a state shows of an episode. */
 export async function loadShown(store: Store, episode: Episode, state: ViewState): Promise<Shown> {
   const missing: string[] = [];
@@ -142,19 +147,21 @@ export async function loadShown(store: Store, episode: Episode, state: ViewState
   missing.push(...axes);
   const replan = Math.min(state.replan, episode.numReplans - 1);
   if (replan !== state.replan) missing.push(`the episode has no replan ${state.replan}: its last is ${replan}`);
+  // Everything is asked for at once: a server elsewhere takes its time for each answer.
   const reading = tokensOf(episode, site);
+  const pictures = picturesOf(episode, site, replan);
   const rows = readsWhole(episode, site, selection).then(async (whole) => {
     if (!whole) return { all: null, own: await episode.meanRow(name, selection, replan) };
     const all = (await episode.meanRows(name, selection)).values;
     return { all, own: all.subarray(replan * site.keys, (replan + 1) * site.keys) };
   });
-  const [tokens, { all, own }, numbers] = await Promise.all([
+  const [tokens, { all, own }, taken, numbers] = await Promise.all([
     reading,
     rows,
+    pictures,
     reading.then((known) => episodeNumbers(episode, site, known, selection)),
   ]);
-  const cameras = seenCameras(tokens);
-  const frames = new Map(await Promise.all(cameras.map(async (camera) => [camera, await episode.frame(camera, replan)] as const)));
+  const frames = new Map(seenCameras(tokens).map((camera) => [camera, taken.get(camera) ?? null]));
   const first = tokens.keyRole.replans === 1 ? 0 : replan * site.keys;
   const hasText = tokens.prompts.length > 0;
   const prompt = hasText ? (tokens.prompts[tokens.promptIndex.length ? tokens.promptIndex[replan]! : 0] ?? null) : null;

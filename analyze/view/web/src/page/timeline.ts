@@ -136,11 +136,11 @@ export class Timeline {
     const down = (value: number): number => top + HEIGHT - 4 - ((scale(value) - low) / (high - low)) * (HEIGHT - 8);
     const back = (value: number): number => (logarithmic ? 2 ** value : value);
     this.#drawing.append(svg("rect", { x: LEFT, y: top, width: Math.max(0, width - LEFT - RIGHT), height: HEIGHT, class: "plot" }));
-    this.#drawing.append(svg("text", { x: LEFT, y: top - 4, class: "row-title" }, title));
+    this.#drawing.append(svg("text", { x: LEFT + 4, y: top - 4, class: "row-title" }, title));
     for (const [value, y] of [[back(high), top + 10], [back(low), top + HEIGHT - 2]] as const) {
       this.#drawing.append(svg("text", { x: LEFT - 4, y, "text-anchor": "end", class: "tick" }, formatNumber(value)));
     }
-    let key = LEFT + 8 + 6.2 * title.length;
+    let key = LEFT + 14 + 6.2 * title.length;
     for (const one of series) {
       const path = (values: readonly (number | null)[]): string => {
         let text = "";

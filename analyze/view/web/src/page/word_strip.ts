@@ -35,6 +35,8 @@ export function measuresOfKeys(keys: readonly number[], shown: Pick<Shown, "row"
 
 /** A word's shade ends at this lift, or at the highest of the sentence. */
 const LEAST_TOP = 4;
+/** Opacity of a full shade in per cent: the word stays legible on it. */
+const MOST_SHADE = 65;
 
 export class WordStrip {
   readonly host = element("div", { class: "words" });
@@ -84,7 +86,7 @@ export class WordStrip {
       made.dataset.mass = String(mass);
       made.dataset.lift = String(lift);
       const part = Number.isFinite(lift) ? Math.min(lift / top, 1) : 0;
-      made.style.setProperty("--part", `${Math.round(100 * part)}%`);
+      made.style.setProperty("--part", `${Math.round(MOST_SHADE * part)}%`);
       made.lastElementChild!.textContent = Number.isFinite(lift) ? `×${formatNumber(lift)}` : "-";
       made.setAttribute(
         "aria-label",
@@ -92,7 +94,7 @@ export class WordStrip {
       );
     });
     this.#note.textContent = words.length
-      ? `Shade and number: attention on a word's keys per key, over the mean of the valid keys (×1 is uniform; full shade: ×${formatNumber(top)}).`
+      ? `Shade and number of a word: its lift (×1 is uniform, full shade ×${formatNumber(top)}).`
       : `The keys of site ${site.layout.name} spell no words.`;
   }
 
@@ -106,7 +108,7 @@ export class WordStrip {
     const text = characters(prompt.text);
     let at = 0;
     const rest = (until: number): void => {
-      if (until > at) this.#line.append(element("span", { class: "soft" }, text.slice(at, until).join("")));
+      if (until > at) this.#line.append(element("span", { class: "soft" }, text.slice(at, until).join("").replace(/\s+/g, " ")));
     };
     words.forEach((word, place) => {
       rest(word.start);
@@ -128,7 +130,7 @@ export class WordStrip {
   #drawMarks(): void {
     this.#buttons.forEach((made, place) => {
       const colours = [...this.#marks.values()].filter((mark) => mark.places.has(place)).map((mark) => mark.colour);
-      made.style.borderBottomColor = colours[0] ?? "transparent";
+      made.style.borderBottomColor = colours[0] ?? "";
     });
   }
 }

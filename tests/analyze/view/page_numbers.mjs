@@ -1,0 +1,77 @@
+// Reads stores with the page's own script: `node page_numbers.mjs viewer.mjs QUESTIONS.json ANSWERS.json`.
+// A question is a store at an address, an episode and a link's query; the answer what the page shows for it.
+import { readFile, writeFile } from "node:fs/promises";
+
+globalThis.self = globalThis; // the page's script takes a place without a document for a worker
+const [module, from, to] = process.argv.slice(2);
+const { reading, engine } = await import(module);
+
+const libraries = new Map();
+
+function libraryAt(base) {
+  if (!libraries.has(base)) libraries.set(base, new reading.Library([reading.inProcessPort(), reading.inProcessPort()], base));
+  return libraries.get(base);
+}
+
+const plain = (value) => (typeof value === "number" && !Number.isFinite(value) ? String(value) : value);
+const plainList = (values) => Array.from(values, plain);
+
+function ofReplan(values, names) {
+  const groups = Object.fromEntries(
+    names.map((name, i) => [name, ["mass", "fraction", "keys", "lift"].map((of) => plain(values.groups[of][i]))]),
+  );
+  const { ratio } = values;
+  return { groups, ratio: ratio ? [ratio.value, ratio.uniform, ratio.lift].map(plain) : null };
+}
+
+async function answerOf({ base, root, packed, episode, query }) {
+  const entry = { name: "store", root, episodes: [{ name: episode }], packed, summary: "" };
+  const store = await libraryAt(base).openStore(entry);
+  const opened = await store.openEpisode(episode);
+  const state = { ...reading.stateOfLink(query), episode };
+  const shown = await reading.loadShown(store, opened, state);
+  const { site, row, valid, tokens, replan, numbers, selection } = shown;
+  const names = [...numbers.grouping.groups.keys()];
+  const counts = tokens.keyCounts?.[tokens.keyCounts.length === 1 ? 0 : replan] ?? null;
+  const heads = await opened.headRows(site.layout.name, selection, replan);
+  const cells = site.layers.map((_, layer) =>
+    site.heads.map((_, head) => {
+      const cell = numbers.cell(replan, layer, head);
+      return Object.fromEntries(names.map((name, i) => [name, plain(cell.lift[i])]));
+    }),
+  );
+  const cameras = [...shown.frames].map(([camera, frame]) => {
+    const span = site.layout.spans.find((each) => each.camera === camera);
+    const view = reading.viewOf(store.root.policy.cameras, camera);
+    const all = reading.shownValues(row, valid, counts, state.measure);
+    const own = all.slice(span.start, span.stop);
+    const scale = reading.scaleFor(own, state.measure, 1);
+    const painting = { scale: { ...scale, high: 3 }, colours: reading.colourTable(state.colours), opacity: 0.8, smooth: state.smooth };
+    const { height, width, pixels } = reading.overlayPixels(frame, own, span, view, painting);
+    const things = reading.objectsAt(shown, camera, 0);
+    return { camera, values: plainList(own), high: scale.high, height, width, pixels: [...pixels], things, stored: frame !== null };
+  });
+  return {
+    link: reading.linkOfState(state),
+    site: site.layout.name,
+    corrections: shown.corrections,
+    row: plainList(row),
+    replans: numbers.replans.map((values) => ofReplan(values, names)),
+    cells,
+    cameras,
+    words: shown.words.map((word) => ({ text: word.text, keys: word.keys, ...reading.measuresOfKeys(word.keys, shown) })),
+    readers: shown.words.length ? reading.headsThatRead(heads, shown.words[0].keys, 3) : [],
+    events: await reading.eventsOf(store.root, opened),
+  };
+}
+
+const answers = [];
+for (const question of JSON.parse(await readFile(from, "utf8"))) {
+  try {
+    answers.push(await answerOf(question));
+  } catch (failure) {
+    const told = failure instanceof engine.UserError || failure.name === "StoreError" || failure.name === "NotThere";
+    answers.push({ failure: failure.message, told, at: told ? "" : failure.stack });
+  }
+}
+await writeFile(to, JSON.stringify(answers));

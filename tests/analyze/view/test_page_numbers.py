@@ -1,0 +1,212 @@
+"""What the page shows of a store is what Python computes: ratios, masses, patches, words, heads, pixels.
+
+The page's own script reads the golden stores over HTTP ranges, as a browser does, folders and zips.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs
+
+import numpy as np
+import polars as pl
+import pytest
+
+import vla_attention as va
+from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answers
+from tests.kit.golden_stores import FOLDER, NAMES
+from tests.kit.http_ranges import serve
+from vla_attention.analyze.measures.question import ask
+from vla_attention.analyze.measures.question_settings import settings_from_keywords
+from vla_attention.analyze.overlay.colours import Scale, overlay_image, scale_for
+from vla_attention.analyze.overlay.overlay_data import episode_overlay, ratios_of
+from vla_attention.analyze.overlay.overlay_study import study_overlay
+from vla_attention.analyze.show.patch_pictures import upright
+from vla_attention.analyze.stores.rows import layer_rows
+
+pytestmark = needs_node
+#: Sums are of float32 in another order.
+CLOSE = 2e-6
+QUERIES = {
+    "joint": (
+        "",
+        "?layer=1&denoise=2&head=3&replan=2",
+        "?layer=2&replan=1&measure=raw&smooth=1",
+        "?head=7&measure=rank",
+    ),
+    "cosmos": ("", "?site=cross&replan=1", "?site=self&layer=1&head=1&measure=raw"),
+    "library": ("?replan=1", "?layer=2&denoise=3&head=0"),
+    "packed": ("?layer=1&replan=2",),
+    "rerun": ("?head=2&replan=1",),
+}
+
+
+@pytest.fixture(scope="module")
+def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], dict[str, Any]]:
+    asked = [(name, query) for name in NAMES for query in QUERIES[name]]
+    with serve(FOLDER) as served:
+        questions = [
+            PageQuestion(f"{served.url}/", f"{name}.zarr/", query=query, packed=name == "packed")
+            for name, query in asked
+        ]
+        found = page_answers(tmp_path_factory.mktemp("page"), questions)
+    assert [answer.get("failure") for answer in found] == [None] * len(asked)
+    return dict(zip(asked, found, strict=True))
+
+
+def settings_of(query: str, site: str) -> tuple[dict[str, Any], int]:
+    """What a link's query asks of the analysis, and its replan."""
+    link = {name: values[0] for name, values in parse_qs(query.removeprefix("?")).items()}
+    names = {"layer": "layers", "head": "heads", "denoise": "denoise"}
+    return {"site": site, **{names[axis]: int(link[axis]) for axis in names if axis in link}}, int(
+        link.get("replan", 0)
+    )
+
+
+CASES = [(name, query) for name in NAMES for query in QUERIES[name]]
+each_case = pytest.mark.parametrize(("name", "query"), CASES)
+
+
+@each_case
+def test_ratio_and_masses_of_every_replan(answers, name, query):
+    answer = answers[name, query]
+    run = va.open(FOLDER / f"{name}.zarr")
+    asked, _ = settings_of(query, answer["site"])
+    which = (pl.col("task_id") == 0) & (pl.col("episode_index") == 0)
+    mean = pl.col("layer") == "layers_avg"
+    masses = run.masses("replans", grouping="default", **asked).filter(which & mean)
+    for replan, shown in enumerate(answer["replans"]):
+        rows = masses.filter(replan=replan)
+        assert rows["group"].to_list() == list(shown["groups"])
+        for row in rows.iter_rows(named=True):
+            expected = [
+                row[column] if row[column] is not None else math.nan for column in ("mass", "fraction", "keys", "lift")
+            ]
+            np.testing.assert_allclose(
+                [float(value) for value in shown["groups"][row["group"]]], expected, rtol=CLOSE, atol=1e-12
+            )
+    ratios = run.ratios("replans", grouping="default", **asked).filter(which & mean)
+    if "ratio" not in ratios.columns or ratios["ratio"].is_null().all():
+        assert answer["replans"][0]["ratio"] is None
+        return
+    shown = np.array([replan["ratio"] for replan in answer["replans"]], dtype=float)
+    np.testing.assert_allclose(shown, ratios.select("ratio", "uniform_ratio", "ratio_lift").to_numpy(), rtol=CLOSE)
+
+
+@each_case
+def test_the_lift_of_every_head(answers, name, query):
+    answer = answers[name, query]
+    run = va.open(FOLDER / f"{name}.zarr")
+    asked, replan = settings_of(query, answer["site"])
+    asked = {field: value for field, value in asked.items() if field in ("site", "denoise")}
+    mine = (pl.col("task_id") == 0) & (pl.col("episode_index") == 0) & (pl.col("replan") == replan)
+    masses = run.masses("steps", grouping="default", per_head=True, **asked).filter(mine)
+    cells = run.ratios("steps", grouping="default", per_head=True, **asked).filter(mine)
+    cell = ["layer", "head"]
+    valid = cells.group_by(cell, maintain_order=True).agg(pl.col("valid_mass").mean() / pl.col("num_valid").first())
+    of_groups = masses.group_by([*cell, "group"], maintain_order=True).agg(pl.col("mass", "keys").mean())
+    joined = of_groups.join(valid, on=cell, maintain_order="left")
+    expected = joined.select(pl.when(pl.col("keys") > 0).then(pl.col("mass") / pl.col("keys") / pl.col("valid_mass")))
+    shown = [float(value) for layer in answer["cells"] for head in layer for value in head.values()]
+    np.testing.assert_allclose(shown, expected.to_series().fill_null(math.nan).to_numpy(), rtol=CLOSE, atol=1e-12)
+
+
+@each_case
+def test_rows_patches_words_and_their_readers(answers, name, query):
+    answer = answers[name, query]
+    asked, replan = settings_of(query, answer["site"])
+    question = ask(
+        va.open(FOLDER / f"{name}.zarr").stores, settings_from_keywords(grouping="default", per_head=True, **asked)
+    )
+    item = question.selected[0]
+    read = layer_rows(item.episode, question.selection, answer["site"])
+    parts = [(part.layer, part.rows[replan].astype(np.float64)) for part in read]
+    by_head = np.zeros((len(question.selection.layers), *parts[0][1].shape))  # (layer, head, key)
+    for layer, rows in parts:
+        by_head[layer] += rows / len(question.selection.denoise)
+    mean = by_head.mean(axis=(0, 1))
+    np.testing.assert_allclose(answer["row"], mean, rtol=CLOSE, atol=1e-12)
+    valid = np.broadcast_to(item.valid, (item.tokens.num_replans, len(mean)))[replan]
+    uniform = mean[valid].sum() / np.broadcast_to(item.num_valid, item.tokens.num_replans)[replan]
+    prompts = item.tokens.words
+    words = prompts[item.tokens.prompt_index[replan]] if prompts else ()
+    assert [(word["text"], tuple(word["keys"])) for word in answer["words"]] == [
+        (word.text, word.keys) for word in words
+    ]
+    for shown, word in zip(answer["words"], words, strict=True):
+        mass = mean[list(word.keys)].sum()
+        np.testing.assert_allclose([shown["mass"], shown["lift"]], [mass, mass / len(word.keys) / uniform], rtol=CLOSE)
+    if words and "head" not in query:  # where one head is chosen, the others of its layer are looked at, too
+        heads = by_head[..., list(words[0].keys)].sum(axis=-1)
+        best = np.sort(heads.ravel())[::-1][:3]
+        np.testing.assert_allclose([reader["mass"] for reader in answer["readers"]], best, rtol=CLOSE)
+
+
+@each_case
+def test_pictures_have_the_pixels_of_vla_analyze_overlay(answers, name, query):
+    answer = answers[name, query]
+    if not answer["cameras"]:
+        assert answer["site"] == "cross"
+        return
+    asked, replan = settings_of(query, answer["site"])
+    study = study_overlay(va.open(FOLDER / f"{name}.zarr").stores, settings_from_keywords(grouping="default", **asked))
+    item = study.question.selected[0]
+    overlay = episode_overlay(study.question, item, list(study.overlay.maps), ratios_of(study.question, item))
+    assert [camera["camera"] for camera in answer["cameras"]] == list(overlay.maps)
+    lifts = overlay.values("lift")
+    for camera in answer["cameras"]:
+        values = np.array(camera["values"], dtype=float)
+        lift, mass = lifts[camera["camera"]][replan], overlay.maps[camera["camera"]][replan]
+        measure = parse_qs(query.removeprefix("?")).get("measure", ["lift"])[0]
+        if measure == "lift":
+            np.testing.assert_allclose(values, lift.ravel(), rtol=CLOSE)
+            np.testing.assert_allclose(camera["high"], scale_for(lift, "lift", 1).high)
+        elif measure == "raw":
+            np.testing.assert_allclose(values, 100 * mass.ravel(), rtol=CLOSE)
+        else:
+            assert (np.argsort(values, kind="stable") == np.argsort(mass.ravel(), kind="stable")).all()
+        shape = (camera["height"], camera["width"], 4)
+        pixels = np.array(camera["pixels"], dtype=np.uint8).reshape(shape)[..., :3]
+        frame = study.overlay.item.episode.read(f"frames/{camera['camera']}", replan) if camera["stored"] else None
+        expected = overlay_image(frame, values.reshape(lift.shape), Scale(3.0, ""), "smooth=1" in query, shape[:2])
+        turned = upright(expected, overlay.views[camera["camera"]])
+        # The page has colours of whole numbers, and a value at the border of two of the 256 may have either.
+        difference = np.abs(pixels.astype(int) - turned.astype(int))
+        assert difference.max() <= 4
+        assert (difference <= 1).mean() > 0.99
+
+
+def test_what_a_link_names_wrongly_is_corrected_with_a_sentence(tmp_path: Path):
+    with serve(FOLDER) as served:
+        found = page_answers(
+            tmp_path,
+            [PageQuestion(f"{served.url}/", "joint.zarr/", query="?layer=99&head=3&replan=44&site=nowhere&query=5")],
+        )[0]
+    assert found["corrections"] == (
+        "the episode has no site nowhere: joint is shown; query 5 was not recorded: the mean is shown; layer 99 was "
+        "not recorded: 2 is shown; the episode has no replan 44: its last is 2."
+    )
+
+
+def test_a_link_names_what_is_shown(answers):
+    for (_, query), answer in answers.items():
+        given, kept = parse_qs(query.removeprefix("?")), parse_qs(answer["link"].removeprefix("?"))
+        assert kept.pop("episode") == ["task000_episode000"]
+        assert given == kept
+
+
+def test_only_the_chunks_of_what_is_shown_are_read(tmp_path: Path):
+    from vla_attention.testing import StoreSpec, write_store
+
+    spec = StoreSpec(tasks=(0,), episodes=2, layers=(0, 1, 2, 3), denoise_steps=(0, 9))
+    write_store(tmp_path / "four.zarr", spec=spec)
+    with serve(tmp_path) as served:
+        page_answers(tmp_path, [PageQuestion(f"{served.url}/", "four.zarr/", query="?layer=2&denoise=9")])
+        parts = [wanted for path, wanted in served.requests if "/joint/rows/c" in path]
+        others = [path for path, _ in served.requests if "episode001" in path]
+    # The index of the shard and one chunk of eight; two workers have each an index.
+    chunks = [wanted for wanted in parts if not wanted.startswith("bytes=-")]
+    assert len(set(chunks)) == 1, parts
+    assert not others
