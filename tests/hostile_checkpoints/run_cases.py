@@ -53,6 +53,7 @@ def run(name: str, folder: Path) -> dict[str, object]:
         "name": name,
         "code": os.waitstatus_to_exitcode(status),
         "seconds": time.perf_counter() - began,
+        "processor_seconds": usage.ru_utime + usage.ru_stime,
         "bytes": usage.ru_maxrss * 1024 - int((folder / "resident").read_text()),
         "output": (folder / "output").read_text(encoding="utf-8", errors="replace"),
         "executed": (folder / TRACE).exists(),
