@@ -9,11 +9,14 @@ import textwrap
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from vla_attention.schemas.errors import Note, UserError
 from vla_attention.schemas.safe_text import visible, visible_output
 from vla_attention.schemas.stop_signals import run_until_stopped
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
 
 #: Columns of a help text's description.
 _HELP_WIDTH = 100
@@ -25,6 +28,15 @@ class OneSentenceParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the problem and where help is; exit code 2."""
         self.exit(2, f"{self.prog}: {message}. See {self.prog} --help.\n")
+
+    def _print_message(self, message: str, file: SupportsWrite[str] | None = None) -> None:
+        """Print a help text or a mistake; a help text that cannot be written is an `OSError`, which argparse hides."""
+        is_help = file is sys.stdout
+        if is_help:
+            sys.stdout.write(message)
+            sys.stdout.flush()
+        else:
+            super()._print_message(message, file)
 
 
 def command_parser(prog: str, description: str, examples: str = "", usage: str | None = None) -> OneSentenceParser:

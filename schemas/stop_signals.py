@@ -10,12 +10,14 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from types import FrameType
 from typing import Any, NoReturn
 
 #: The exit code of a stopped program is this and the number of the signal, as shells have it.
 EXIT_SIGNALLED = 128
+#: How names of threads begin that a stopped program leaves alone: they may wait for a server that sends nothing.
+UNAWAITED = "unawaited"
 #: After so many signals the process ends at once: what it does after the first of them does not end.
 _MOST_SIGNALS = 5
 #: Seconds until a signal is given again whose exception Python could not pass on.
@@ -117,7 +119,16 @@ def _listening(stop: _Stop) -> Iterator[None]:
 
 
 def end_program(code: int) -> NoReturn:
-    """Exit with a code. What a program does, it has done and said: from here on Ctrl-C ends it without a word."""
+    """Exit with a code. What a program does, it has done and said: from here on Ctrl-C ends it without a word.
+
+    A program that was stopped does not wait for threads called `UNAWAITED`.
+    """
+    waiting = any(thread.name.startswith(UNAWAITED) for thread in threading.enumerate())
+    if code >= EXIT_SIGNALLED and waiting:
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(code)
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     sys.exit(code)

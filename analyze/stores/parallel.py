@@ -18,6 +18,7 @@ from typing import Any, Protocol, TypeVar
 from vla_attention.analyze.stores.blas import one_blas_thread
 from vla_attention.analyze.stores.dask_scheduler import DaskScheduler
 from vla_attention.analyze.stores.worker_processes import WorkerProcesses
+from vla_attention.schemas.stop_signals import UNAWAITED
 from vla_attention.schemas.threads import threads_of_this_process
 
 Item = TypeVar("Item")
@@ -43,12 +44,27 @@ class Threads:
     def results(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """See `Engine`."""
         number = min(_MOST_AT_ONCE, threads_of_this_process().number)
-        executor = ThreadPoolExecutor(number)
-        with one_blas_thread():
-            try:
-                yield from in_order(lambda item: executor.submit(function, item), items, number * _BEGUN_AHEAD)
-            finally:
-                executor.shutdown(wait=True, cancel_futures=True)
+        with one_blas_thread(), stoppable_threads(number, "episodes") as executor:
+            yield from in_order(lambda item: executor.submit(function, item), items, number * _BEGUN_AHEAD)
+
+
+@contextmanager
+def stoppable_threads(number: int, name: str) -> Iterator[ThreadPoolExecutor]:
+    """Threads that the end of the block waits for, unless it is Ctrl-C or SIGTERM.
+
+    One of them may wait a minute for a server that sends nothing; the end of the program does not wait either
+    (`stop_signals.end_program`).
+    """
+    executor = ThreadPoolExecutor(number, thread_name_prefix=f"{UNAWAITED}-{name}")
+    try:
+        yield executor
+    except (KeyboardInterrupt, GeneratorExit):  # the latter where the one who takes the results was interrupted
+        executor.shutdown(wait=False, cancel_futures=True)
+        raise
+    except BaseException:
+        executor.shutdown(wait=True, cancel_futures=True)
+        raise
+    executor.shutdown(wait=True)
 
 
 _engine: ContextVar[Engine | None] = ContextVar("engine of episodes", default=None)

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 
-from vla_attention.analyze.stores.parallel import in_order
+from vla_attention.analyze.stores.parallel import in_order, stoppable_threads
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.store_url import StoreUrl
@@ -21,11 +21,8 @@ _AHEAD = 16
 
 def read_ahead(episodes: Iterable[StoredEpisode]) -> Iterator[StoredEpisode]:
     """The same episodes in their order; what cannot be read raises where the caller reads it."""
-    executor = ThreadPoolExecutor(_AHEAD, thread_name_prefix="ahead")
-    try:
+    with stoppable_threads(_AHEAD, "ahead") as executor:
         yield from in_order(lambda episode: _begun(executor, episode), episodes, _AHEAD)
-    finally:
-        executor.shutdown(wait=True, cancel_futures=True)
 
 
 def _begun(executor: ThreadPoolExecutor, episode: StoredEpisode) -> Future[StoredEpisode]:

@@ -11,8 +11,11 @@ import time
 
 import pytest
 
+from tests.kit.http_ranges import serve
 from tests.kit.stopped_programs import after_call, at_import, run_stopped
+from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.schemas.stop_signals import run_until_stopped, stops_kept_from_children
+from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import StoreSpec, write_store
 
 pytestmark = pytest.mark.usefixtures("usual_signals")
@@ -228,3 +231,31 @@ def test_a_capture_that_gets_sigterm_while_it_loads_says_one_sentence(tmp_path):
     assert done.stderr.count("\n") == 1
     assert done.stderr.startswith("vla-capture: stopped by SIGTERM. Complete episodes are kept")
     assert done.returncode == 75
+
+
+@pytest.mark.parametrize("words", [("--list",), ("--no-plots", "--no-cache")], ids=["list", "masses"])
+def test_a_server_that_sends_nothing_is_not_waited_for(store, tmp_path, words):
+    pytest.importorskip("aiohttp", reason="needs the extra remote")
+    copy_store(open_store(store), tmp_path / "served/a.zarr", (), packed=True)
+    asked, ended = threading.Event(), threading.Event()
+
+    def hang(path: str, content: bytes) -> bytes:
+        if path.endswith(".zip"):
+            asked.set()
+            ended.wait(50)  # less than the client waits
+        return content
+
+    with serve(tmp_path / "served") as served:
+        served.change = hang
+        command = [sys.executable, "-m", "vla_attention.analyze", f"{served.url}/a.zarr", *words]
+        program = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=tmp_path)
+        try:
+            assert asked.wait(60)
+            program.send_signal(signal.SIGINT)
+            said = program.communicate(timeout=40)[1]
+        finally:
+            ended.set()
+            program.kill()
+            program.wait()
+    assert (program.returncode, said.count("\n")) == (130, 2)
+    assert said == "\nvla-analyze: stopped; nothing was left half written.\n"
