@@ -74,7 +74,7 @@ def specialist(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray)
 
 def draw_run(store: Path, scratch: Path, folder: Path) -> None:
     """Draw the pictures of README.md: a strip of one episode, and the layers."""
-    strip = ["overlay", "--task", "10", "--replans", "0", "1", "2", "3", "4"]
+    strip = ["overlay", "--task", "10", "--replans", "0", "1", "2", "4"]
     draw("overlay", store, strip, "overlay_task010_episode000", scratch / "overlay", folder)
     draw("layers", store, ["ratios"], "layer_profile", scratch / "ratios", folder)
 

@@ -1,6 +1,7 @@
 """What mkdocs does beside its own work when it builds the documentation site; `mkdocs.yml` names this file.
 
-- Pages that stand outside of docs/ are on the site too: README.md is its first page. Links between both are translated.
+- Pages that stand outside of docs/ are on the site too: README.md is its first page. Links between both are translated,
+  and a link whose text is the name of its file gets the page's name in the list of pages.
 - `<!-- help of every command -->` becomes the help texts of the parsers, `<!-- docstring: NAME -->` the docstring of a
   public name, and `<!-- schema: NAME -->` the fields of a JSON Schema. Other readers of the Markdown see nothing there.
 
@@ -15,7 +16,7 @@ import posixpath
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,10 @@ OUTSIDE = {
 }
 _INSIDE = {there: here for here, there in OUTSIDE.items()}
 #: A block of code, which is left as it is, or the target of a link or picture.
-_LINK = re.compile(r"(?P<code>^```.*?^```)|(?P<before>\]\()(?P<target>[^)\s#]+)", re.MULTILINE | re.DOTALL)
+_LINK = re.compile(
+    r"(?P<code>^```.*?^```)|(?P<text>\[(?:docs/)?[\w/-]+\.md)?(?P<before>\]\()(?P<target>[^)\s#]+)",
+    re.MULTILINE | re.DOTALL,
+)
 _MARK = re.compile(r"^<!-- (?:(?P<help>help of every command)|(?P<kind>docstring|schema): (?P<name>[\w.]+)) -->$", re.M)
 #: The width of help texts, which argparse takes from the environment.
 _COLUMNS = "88"
@@ -47,13 +51,23 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
-def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
     """Translate the links of a page, and write what its marks stand for."""
-    return fill_marks(translate_links(markdown, page.file.src_uri))
+    return fill_marks(translate_links(markdown, page.file.src_uri, dict(names_of_pages(config["nav"]))))
 
 
-def translate_links(markdown: str, page: str) -> str:
-    """Return the page with links that are right on the site; `page`: its path there."""
+def names_of_pages(nav: Any) -> Iterator[tuple[str, str]]:
+    """Each page of the list of pages that has a name there, and this name."""
+    for entry in nav:
+        for name, below in entry.items() if isinstance(entry, dict) else ():
+            if isinstance(below, str):
+                yield below, name
+            else:
+                yield from names_of_pages(below)
+
+
+def translate_links(markdown: str, page: str, names: Mapping[str, str]) -> str:
+    """Return the page with links that are right on the site. `page`: its path there; `names`: page -> its name."""
     here = posixpath.dirname(_INSIDE.get(page, f"docs/{page}"))
 
     def translated(match: re.Match[str]) -> str:
@@ -64,7 +78,8 @@ def translate_links(markdown: str, page: str) -> str:
         there = OUTSIDE.get(path) or (path.removeprefix("docs/") if path.startswith("docs/") else None)
         if there is None:
             return match[0]  # mkdocs names it as a link that leads nowhere
-        return match["before"] + posixpath.relpath(there, posixpath.dirname(page) or ".")
+        text = f"[{names.get(there, match['text'][1:])}" if match["text"] else ""
+        return text + match["before"] + posixpath.relpath(there, posixpath.dirname(page) or ".")
 
     return _LINK.sub(translated, markdown)
 
