@@ -1,2 +1,3 @@
 /** The panels of the page: importing one registers it. */
 import "./groups/panel";
+import "./compare/panel";

@@ -116,6 +116,7 @@ export class App {
         stores: this.#stores,
         openStore: (which) => this.#openStore(which),
         announce: (text) => this.#announce(text),
+        explain: () => this.#help.open(true),
         pictures: this.#column.pictures,
         words: this.#column.words,
         timeline: this.#timeline,

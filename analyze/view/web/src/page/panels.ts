@@ -13,6 +13,8 @@ export interface PageContext {
   openStore(which: number): Promise<Store>;
   /** Say something to those who use a screen reader. */
   announce(text: string): void;
+  /** Open what a ratio can and cannot mean. */
+  explain(): void;
   readonly pictures: PictureBoard;
   readonly words: WordStrip;
   readonly timeline: Timeline;
