@@ -93,7 +93,7 @@ export class App {
         element("strong", {}, "Attention viewer"),
         element("span", { class: "soft store-name" }),
         themeButton(),
-        button("? Help", () => this.#help.open()),
+        button("Help", () => this.#help.open()),
       ),
       this.#failure,
       element("div", { class: "body" }, list, this.#episodePart),

@@ -7,7 +7,7 @@ import { outcomeWord, plural } from "./number_text";
 import { orientationNote, viewOf } from "./overlay";
 import { PictureBoard } from "./picture_board";
 import type { Shown } from "./shown";
-import { WordStrip } from "./word_strip";
+import { otherSites, WordStrip } from "./word_strip";
 
 export interface EpisodeColumn {
   readonly host: HTMLElement;
@@ -78,7 +78,8 @@ export function episodeColumn(host: HTMLElement, explain: () => void, level: "h1
       const missing = cameras.filter((camera) => !shown.frames.get(camera));
       note.textContent = cameras.length
         ? orientationNote(cameras.map((camera) => viewOf(store.root.policy.cameras, camera)), missing)
-        : `The keys of site ${shown.site.layout.name} are no patches of pictures.`;
+        : `The keys of site ${shown.site.layout.name} are no patches of pictures.` +
+          otherSites(episode, (span) => span.camera !== null && span.grid !== null);
     },
     destroy() {
       host.replaceChildren();

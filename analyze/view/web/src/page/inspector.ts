@@ -58,7 +58,7 @@ export function objectsAt(shown: Shown, camera: string, patch: number): ObjectOf
 }
 
 export class Inspector {
-  readonly host = element("p", { class: "inspector", "data-inspector": "" });
+  readonly host = element("p", { class: "inspector", role: "status", "data-inspector": "" });
   #shown: Shown | null = null;
   #asked = 0;
 

@@ -7,6 +7,7 @@ import type { ViewState } from "./state";
 
 const GREY = 128;
 const WIDTH = 256;
+const NEAREST = 0.15;
 
 export class Legend {
   readonly host = element("div", { class: "legend" });
@@ -30,12 +31,14 @@ export class Legend {
       pixels.data[4 * x + 3] = 255;
     }
     this.#bar.getContext("2d")!.putImageData(pixels, 0, 0);
-    const ticks: [number, string][] = [[0, "0"], [1, `${formatNumber(scale.high)}${scale.unit}${scale.unit === "%" && scale.high === 100 ? "" : " or more"}`]];
-    const uniform = scale.uniform === null ? null : scale.uniform / scale.high;
-    if (uniform !== null && scale.uniform !== null) ticks.splice(1, 0, [uniform, `uniform ${formatNumber(scale.uniform)}${scale.unit}`]);
+    const ticks: [number, string][] = [[1, `${formatNumber(scale.high)}${scale.unit}${scale.high === 100 ? "" : " or more"}`]];
+    const uniform = scale.uniform === null ? 0 : scale.uniform / scale.high;
+    if (scale.uniform !== null) ticks.unshift([uniform, `uniform ${formatNumber(scale.uniform)}${scale.unit}`]);
+    // Labels that are nearer than this would touch.
+    if (scale.uniform === null || uniform > NEAREST) ticks.unshift([0, "0"]);
     this.#ticks.replaceChildren(
       ...ticks.map(([place, text]) => {
-        const tick = element("span", { class: place === 1 ? "last" : place === 0 ? "first" : "" }, text);
+        const tick = element("span", { class: place === 1 ? "last" : place <= NEAREST ? "first" : "" }, text);
         tick.style.left = `${100 * place}%`;
         return tick;
       }),

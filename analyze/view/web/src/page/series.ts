@@ -14,6 +14,8 @@ export interface TimelineRow {
   title: string;
   series: TimelineSeries[];
   logarithmic: boolean;
+  /** Whether each line is named beside the title. */
+  named: boolean;
 }
 
 /** The rows of the chart of an episode. */
@@ -21,8 +23,9 @@ export function rowsOfTimeline({ grouping, present, replans }: EpisodeNumbers): 
   const rows = new Map<string, TimelineRow>();
   if (grouping.ratio) {
     rows.set("ratio", {
-      title: "ratio visual / linguistic (logarithmic; broken line: uniform)",
+      title: "ratio (logarithmic; broken: uniform)",
       logarithmic: true,
+      named: false,
       series: [
         {
           name: "ratio",
@@ -43,6 +46,6 @@ export function rowsOfTimeline({ grouping, present, replans }: EpisodeNumbers): 
       values: replans.map((replan) => replan.groups.mass[names.indexOf(name)]!),
       unit: "",
     }));
-  if (series.length) rows.set("masses", { title: "mass", logarithmic: false, series });
+  if (series.length) rows.set("masses", { title: "mass", logarithmic: false, named: true, series });
   return rows;
 }

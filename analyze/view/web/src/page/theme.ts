@@ -1,9 +1,10 @@
 /** Dark or light: as the system says, or as somebody chose here. */
-import { button } from "./dom";
+import { button, element } from "./dom";
 
 const THEMES = ["auto", "light", "dark"] as const;
 type Theme = (typeof THEMES)[number];
-const NAMES: Readonly<Record<Theme, string>> = { auto: "◐ as the system", light: "☀ light", dark: "☾ dark" };
+const NAMES: Readonly<Record<Theme, string>> = { auto: "as the system", light: "light", dark: "dark" };
+const SIGNS: Readonly<Record<Theme, string>> = { auto: "◐", light: "☀", dark: "☾" };
 const KEPT = "vla-attention-theme";
 
 function keptTheme(): Theme {
@@ -20,8 +21,8 @@ export function themeButton(): HTMLButtonElement {
   const apply = (): void => {
     if (theme === "auto") delete document.documentElement.dataset.theme;
     else document.documentElement.dataset.theme = theme;
-    made.textContent = NAMES[theme];
-    made.setAttribute("aria-label", `Colours of the page: ${NAMES[theme].slice(2)}. Press for the next.`);
+    made.replaceChildren(SIGNS[theme], element("span", { class: "if-wide" }, ` ${NAMES[theme]}`));
+    made.setAttribute("aria-label", `Colours of the page: ${NAMES[theme]}. Press for the next.`);
   };
   const made = button("", () => {
     theme = THEMES[(THEMES.indexOf(theme) + 1) % THEMES.length]!;

@@ -2,6 +2,7 @@
 import { element, svg } from "./dom";
 import type { EpisodeEvent } from "./events";
 import { formatNumber } from "./number_text";
+import type { TimelineRow } from "./series";
 
 export interface TimelineSeries {
   name: string;
@@ -10,12 +11,6 @@ export interface TimelineSeries {
   unit: string;
   /** What uniform attention gives, as a broken line. */
   uniform?: readonly (number | null)[];
-}
-
-interface Row {
-  title: string;
-  series: TimelineSeries[];
-  logarithmic: boolean;
 }
 
 const HEIGHT = 64;
@@ -33,7 +28,7 @@ export class Timeline {
   readonly #drawing = svg("svg", { class: "chart", role: "img" });
   readonly #table = element("details", { class: "as-table" }, element("summary", {}, "The same as a table"));
   readonly #extra = new Map<string, TimelineSeries>();
-  readonly #own = new Map<string, Row>();
+  readonly #own = new Map<string, TimelineRow>();
   #events: readonly EpisodeEvent[] = [];
   #steps: readonly number[] = [];
   #replan = 0;
@@ -67,7 +62,7 @@ export class Timeline {
   }
 
   /** The page's own lines of an episode. */
-  setEpisode(steps: readonly number[], events: readonly EpisodeEvent[], rows: ReadonlyMap<string, Row>): void {
+  setEpisode(steps: readonly number[], events: readonly EpisodeEvent[], rows: ReadonlyMap<string, TimelineRow>): void {
     this.#steps = steps;
     this.#events = events;
     this.#own.clear();
@@ -94,8 +89,8 @@ export class Timeline {
     return best;
   }
 
-  #rows(): Row[] {
-    const extra = [...this.#extra.values()].map((series) => ({ title: series.name, series: [series], logarithmic: false }));
+  #rows(): TimelineRow[] {
+    const extra = [...this.#extra.values()].map((series) => ({ title: series.name, series: [series], logarithmic: false, named: false }));
     return [...this.#own.values(), ...extra];
   }
 
@@ -122,7 +117,7 @@ export class Timeline {
     if (this.#table.open) this.#fillTable();
   }
 
-  #drawRow({ title, series, logarithmic }: Row, top: number, width: number, across: (replan: number) => number): void {
+  #drawRow({ title, series, logarithmic, named }: TimelineRow, top: number, width: number, across: (replan: number) => number): void {
     const scale = (value: number): number => (logarithmic ? Math.log2(value) : value);
     const all = series.flatMap((one) => [...one.values, ...(one.uniform ?? [])]).filter(finite);
     const given = all.filter((value) => !logarithmic || value > 0).map(scale);
@@ -160,7 +155,7 @@ export class Timeline {
           this.#drawing.append(svg("circle", { cx: across(i), cy: down(value), r: 2, fill: one.colour }));
         });
       }
-      if (series.length > 1) {
+      if (named) {
         const name = svg("text", { x: key, y: top - 4, class: "series-name" }, one.name);
         name.style.fill = one.colour;
         this.#drawing.append(name);
@@ -177,7 +172,7 @@ export class Timeline {
     this.#cursor.setAttribute("x2", String(x));
   }
 
-  #spoken(rows: readonly Row[]): string {
+  #spoken(rows: readonly TimelineRow[]): string {
     const series = rows.flatMap((row) => row.series).map((one) => {
       const values = one.values.filter(finite);
       if (!values.length) return `${one.name}: no values`;

@@ -1,6 +1,8 @@
 /** The prompt as text: the instruction's words shaded by the attention on their keys, the rest as it stands. */
 import { characters } from "../grouping/text";
 import type { Word } from "../grouping/words";
+import type { SpanDocument } from "../store/documents";
+import type { Episode } from "../store/episode";
 import { button, element } from "./dom";
 import { formatNumber, formatPercent } from "./number_text";
 import type { Shown } from "./shown";
@@ -31,6 +33,12 @@ export function measuresOfKeys(keys: readonly number[], shown: Pick<Shown, "row"
     pieces += own ? own[key]! : 1;
   }
   return { mass, lift: pieces > 0 ? mass / pieces / (valid / number) : NaN };
+}
+
+/** The sites whose keys have spans of a kind, to choose from: a sentence, empty where there is none. */
+export function otherSites(episode: Episode, has: (span: SpanDocument) => boolean): string {
+  const names = episode.sites.filter((each) => each.layout.spans.some(has)).map((each) => each.layout.name);
+  return names.length ? ` Choose site ${names.join(" or ")} for them.` : "";
 }
 
 /** A word's shade ends at this lift, or at the highest of the sentence. */
@@ -95,7 +103,7 @@ export class WordStrip {
     });
     this.#note.textContent = words.length
       ? `Shade and number of a word: its lift (×1 is uniform, full shade ×${formatNumber(top)}).`
-      : `The keys of site ${site.layout.name} spell no words.`;
+      : `The keys of site ${site.layout.name} spell no words.${otherSites(episode, (span) => span.kind === "text")}`;
   }
 
   #build({ prompt, words, episode }: Shown): void {

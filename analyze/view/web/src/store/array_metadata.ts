@@ -52,7 +52,7 @@ export function checkArray(document: unknown, path: string, shape: readonly numb
     const inner = namesOf(sharding.codecs, `the codecs of ${path}`).join(" ");
     const index = namesOf(sharding.index_codecs, `the codecs of the index of ${path}`).join(" ");
     if (inner !== CHAIN || index !== "bytes crc32c" || (sharding.index_location ?? "end") !== "end") {
-      refuse(path, `its codecs are ${visible(inner)}; this page reads ${CHAIN}`);
+      refuse(path, `its codecs are ${visible(inner)}, with an index of ${visible(index)}; this page reads ${CHAIN}`);
     }
     const inShard = product(outer.map((extent, i) => extent / chunk[i]!));
     if (16 * inShard > CLAIMED_BYTES) refuse(path, `a shard has ${inShard} chunks`);

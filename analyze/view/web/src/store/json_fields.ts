@@ -37,7 +37,9 @@ export function object(value: unknown, where: string): Fields {
 
 export function list(value: unknown, where: string, most: number): readonly unknown[] {
   if (!Array.isArray(value)) wrong(where, value, "a list");
-  if (value.length > most) wrong(where, `a list of ${value.length}`, `at most ${most}`);
+  if (value.length > most) {
+    throw new StoreError(`The store cannot be shown: ${where} is a list of ${value.length}; expected at most ${most}.`);
+  }
   return value;
 }
 
