@@ -6,6 +6,7 @@
 #   make test-policies   policies of transformers 5 and LeRobot, in environments of their own (.venv-transformers, .venv-lerobot)
 #   make test-remote stores in S3, on moto's server on this machine, in an environment of its own (.venv-remote)
 #   make viewer      the page of `vla-analyze view` from its sources in analyze/view/web (needs node and npm)
+#   make notebooks   the notebooks of examples/, run from beginning to end, in an environment of its own (.venv-notebooks)
 #   make fuzz        made-up bytes for every parser of files, for SECONDS=3600, in an environment of its own (.venv-fuzz)
 #   make docs        the documentation site, into site/, in an environment of its own (.venv-docs)
 #   make pictures    the pictures of README and guides, from the run of make capture
@@ -40,7 +41,7 @@ WORKERS ?= 2
 # An empty PYTHONDONTWRITEBYTECODE: where it is set, both processes compile all tests anew at every run.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: capture analyze test test-policies test-remote test-slurm fuzz test-thorough check unit package audit setup setup-analyze schemas docs pictures viewer clean
+.PHONY: capture analyze test test-policies test-remote test-slurm notebooks fuzz test-thorough check unit package audit setup setup-analyze schemas docs pictures viewer clean
 
 capture: .venv/capture-installed
 	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --store $(STORE) \
@@ -78,6 +79,10 @@ test-policies: .venv-transformers/installed .venv-lerobot/installed
 # moto brings fifty packages, and nothing else needs them.
 test-remote: .venv-remote/installed
 	.venv-remote/bin/pytest tests/schemas/stores/test_remote.py tests/schemas/stores/test_remote_services.py $(ARGS)
+
+# Executed, with their pictures, in results/notebooks.
+notebooks: .venv-notebooks/installed
+	.venv-notebooks/bin/python scripts/run_notebooks.py $(ARGS)
 
 # What it finds is kept in results/reliability/fuzz; mended findings belong into tests/fuzz/corpus.
 SECONDS ?= 3600
@@ -159,6 +164,12 @@ setup-analyze: .venv/analyze-installed
 	.venv-docs/bin/python -m pip install --quiet --disable-pip-version-check -r docs/requirements.txt
 	@touch $@
 
+.venv-notebooks/installed: pyproject.toml constraints.txt
+	@echo "Installing nbclient and ipykernel into .venv-notebooks ..."
+	$(PYTHON) -m venv .venv-notebooks
+	.venv-notebooks/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e . nbclient ipykernel
+	@touch $@
+
 .venv-audit/installed:
 	@echo "Installing pip-audit into .venv-audit ..."
 	$(PYTHON) -m venv .venv-audit
@@ -172,4 +183,4 @@ setup-analyze: .venv/analyze-installed
 	@touch $@
 
 clean:
-	rm -rf .venv .venv-transformers .venv-lerobot .venv-remote .venv-audit .venv-fuzz .venv-docs build site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-transformers .venv-lerobot .venv-remote .venv-audit .venv-notebooks .venv-fuzz .venv-docs build site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
