@@ -4,7 +4,7 @@
  */
 import { findGrouping } from "../grouping/builtin_groupings";
 import { conventionalRatio, type Grouping, makeGrouping, parseRatioArgument, withGroups } from "../grouping/grouping";
-import { checkNames, resolveChecked, type ResolvedGrouping, selectorWeights } from "../grouping/resolve";
+import { checkNames, resolve, resolveChecked, type ResolvedGrouping } from "../grouping/resolve";
 import { attempt, trimmed, UserError } from "../grouping/text";
 import { type EpisodeTokens, type Vocabulary, vocabularyOf } from "../grouping/tokens";
 
@@ -127,7 +127,7 @@ function problemOfLine({ name, selector }: GroupLine, tokens: EpisodeTokens, voc
   try {
     const grouping = makeGrouping({ name, groups: new Map([[name, [selector]]]) });
     checkNames(grouping, vocabulary);
-    selectorWeights(selector, tokens);
+    resolve(grouping, tokens);
   } catch (error) {
     if (error instanceof UserError) return error.message;
     throw error;

@@ -4,7 +4,7 @@
  */
 import "./panel.css";
 import { BUILTIN_NAMES } from "../grouping/builtin_groupings";
-import { readGroupingFile, writeGroupingFile } from "../grouping/grouping_files";
+import { readGroupingFile } from "../grouping/grouping_files";
 import { ofReplan } from "../grouping/resolve";
 import type { Atom } from "../grouping/selector_parser";
 import { attempt } from "../grouping/text";
@@ -16,7 +16,6 @@ import { sentenceOf } from "../store/errors";
 import { ClickTools } from "./click_tools";
 import { groupStyles } from "./colours";
 import {
-  argumentsOfDraft,
   type Draft,
   draftOfGrouping,
   draftOfText,
@@ -24,14 +23,14 @@ import {
   type Evaluated,
   evaluateDraft,
   type GroupLine,
-  shellWord,
   textOfDraft,
 } from "./draft";
 import { bytesOfRows, cutsSegments, type Place, placeKey, valuesOfEpisode } from "./episode_masses";
 import { LinesEditor } from "./lines_editor";
+import { Output } from "./output";
 import { Results } from "./results";
 import { paintedPatches, toggledPart } from "./selector_edit";
-import { aboutText, freeName, selectionArguments } from "./wording";
+import { aboutText, freeName } from "./wording";
 
 /** Rows of an episode that are read without being asked for. */
 const READ_AT_ONCE = 256_000_000;
@@ -53,11 +52,7 @@ class GroupsPanel implements PanelInstance {
   readonly #problem = element("p", { class: "problem", role: "status", hidden: true });
   readonly #note = element("p", { class: "soft", role: "status" });
   readonly #read = button("Read the rows", () => this.#measure(true), { hidden: true });
-  readonly #command = element("code", { class: "command", "data-command": "" });
-  readonly #copy = button("Copy the command", () => void this.#copyCommand());
-  readonly #save = button("Save as TOML", () => this.#saveFile());
-  readonly #source = element("p", { class: "soft" });
-  readonly #output = element("div", { class: "group-output" });
+  readonly #output: Output;
   #draft: Draft = EMPTY_DRAFT;
   #active = -1;
   #evaluated: Evaluated = { grouping: null, resolved: null, ofLines: [], ofWhole: "" };
@@ -66,6 +61,7 @@ class GroupsPanel implements PanelInstance {
   #measuredOf = "";
   #asked = 0;
   #resting: ReturnType<typeof setTimeout> | undefined;
+  #measuring = false;
   #outlines: string[] = [];
 
   constructor(
@@ -77,11 +73,7 @@ class GroupsPanel implements PanelInstance {
     this.#overlap.addEventListener("change", () => this.#edit({ overlap: this.#overlap.checked }));
     const file = element("input", { type: "file", accept: ".toml", "aria-label": "Open a grouping file" });
     file.addEventListener("change", () => void this.#openFile(file));
-    this.#output.append(
-      element("div", { class: "group-bar" }, this.#save, this.#copy),
-      this.#source,
-      this.#command,
-    );
+    this.#output = new Output((text) => page.announce(text));
     host.classList.add("groups");
     host.append(
       element(
@@ -103,7 +95,7 @@ class GroupsPanel implements PanelInstance {
       this.#note,
       this.#read,
       this.#results.host,
-      this.#output,
+      this.#output.host,
     );
     page.words.onWord((_, word) => {
       if (this.#isOpen) this.#toggle({ kind: "word", argument: word.text });
@@ -145,6 +137,7 @@ class GroupsPanel implements PanelInstance {
     this.#resting = setTimeout(() => {
       this.#resting = undefined;
       this.page.view.update({ grouping: textOfDraft(this.#draft) });
+      this.#settle();
     }, REST);
     this.#refresh();
   }
@@ -209,25 +202,10 @@ class GroupsPanel implements PanelInstance {
     } else this.#showProblem(found.error);
   }
 
-  #saveFile(): void {
-    const { grouping } = this.#evaluated;
-    if (!grouping) return;
-    const link = element("a", { download: `${fileStem(grouping.name)}.toml` });
-    link.href = URL.createObjectURL(new Blob([writeGroupingFile(grouping)], { type: "application/toml" }));
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
-  }
-
-  async #copyCommand(): Promise<void> {
-    try {
-      await navigator.clipboard.writeText(this.#command.textContent ?? "");
-      this.page.announce("The command is copied.");
-      this.#copy.textContent = "Copied";
-      setTimeout(() => (this.#copy.textContent = "Copy the command"), 1500);
-    } catch {
-      getSelection()?.selectAllChildren(this.#command);
-      this.page.announce("The browser does not let this page copy: the command is selected, press Ctrl+C.");
-    }
+  /** Say to tests whether the link, the marks and the numbers are those of what is typed. */
+  #settle(): void {
+    if (this.#resting === undefined && !this.#measuring) this.host.dataset.settled = "1";
+    else delete this.host.dataset.settled;
   }
 
   // What is drawn.
@@ -254,16 +232,18 @@ class GroupsPanel implements PanelInstance {
     this.#showProblem(ofWhole);
     this.#outline(ofName);
     const empty = !grouping && !ofWhole && !ofLines.some((problem) => problem);
-    this.#output.hidden = !grouping;
-    if (grouping) this.#showCommand(shown, grouping.name);
+    const { entry } = shown.store;
+    this.#output.show(grouping, this.#draft, entry.path ?? entry.name, this.#place());
     this.#results.markOld(!grouping);
     if (empty) {
       this.#asked++;
+      this.#measuring = false;
       this.#measuredOf = "";
       this.#results.clear();
       this.#read.hidden = true;
       this.#note.textContent = "";
     } else if (grouping && resolved) this.#measure(false);
+    this.#settle();
   }
 
   #showProblem(sentence: string): void {
@@ -291,17 +271,20 @@ class GroupsPanel implements PanelInstance {
       return;
     }
     const now = ++this.#asked;
-    delete this.host.dataset.measured;
+    this.#measuring = true;
     valuesOfEpisode(grouping, resolved, place).then(
       (replans) => {
         if (now !== this.#asked) return;
+        this.#measuring = false;
         this.#note.textContent = "";
         this.#results.markOld(false);
         this.#results.show({ grouping, replans, about: aboutText(place) }, this.#shown!.replan);
-        this.host.dataset.measured = key;
+        this.#settle();
       },
       (failure: unknown) => {
         if (now !== this.#asked) return;
+        this.#measuring = false;
+        this.#settle();
         this.#measuredOf = "";
         this.#note.textContent = sentenceOf(failure);
       },
@@ -331,22 +314,6 @@ class GroupsPanel implements PanelInstance {
       this.page.words.mark(`group:${name}`, new Set(places), colours.get(name)!);
     }
   }
-
-  #showCommand(shown: Shown, name: string): void {
-    const given = argumentsOfDraft(this.#draft);
-    const file = ["--grouping", `${fileStem(name)}.toml`];
-    const words = ["vla-analyze", storePath(shown), ...(given ?? file), ...selectionArguments(this.#place())];
-    this.#source.textContent = given ? "The same numbers by" : "The same numbers by, after the file is saved,";
-    this.#command.textContent = words.map(shellWord).join(" ");
-  }
-}
-
-function storePath({ store }: Shown): string {
-  return (store.entry as { path?: string }).path ?? store.entry.name;
-}
-
-function fileStem(name: string): string {
-  return name.replace(/[^\w+.-]/g, "_").slice(0, 60) || "grouping";
 }
 
 registerPanel({

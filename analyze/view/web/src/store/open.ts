@@ -15,6 +15,8 @@ export interface StoreEntry {
   packed: boolean;
   /** Address of what Python measured of every episode, relative to the page. */
   summary: string;
+  /** Where the store is, as it was given to `vla-analyze view`; unknown on a site. */
+  path?: string;
 }
 
 export interface EpisodeSummary {
@@ -67,6 +69,7 @@ export async function openStores(): Promise<StoreEntry[]> {
     return {
       name: text(entry.name, `stores[${i}].name`),
       root: text(entry.root, `stores[${i}].root`),
+      ...(entry.path === undefined ? {} : { path: text(entry.path, `stores[${i}].path`) }),
       packed: flag(entry.packed, `stores[${i}].packed`),
       summary: text(entry.summary, `stores[${i}].summary`),
       episodes: list(entry.episodes, `stores[${i}].episodes`, MOST_EPISODES).map((one) => ({
