@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mimetypes
 import re
 import threading
 from collections.abc import Callable, Iterator
@@ -87,6 +88,8 @@ def serve(folder: Path) -> Iterator[Served]:
             self.send_response(status)
             for name, value in (more or {}).items():
                 self.send_header(name, value)
+            # Browsers run no script that is not called one.
+            self.send_header("Content-Type", mimetypes.guess_type(path)[0] or "application/octet-stream")
             self.send_header("Content-Length", str(len(content if served.announce else changed)))
             self.end_headers()
             if self.command == "GET":
