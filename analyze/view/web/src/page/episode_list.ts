@@ -95,6 +95,7 @@ export class EpisodeList {
     const solved = outcomes.filter((each) => each.success).length;
     const parts = [rows.length === all.length ? plural(all.length, "episode") : `${rows.length} of ${plural(all.length, "episode")}`];
     if (outcomes.length) parts.push(`${solved} of ${outcomes.length} solved`);
+    if (this.#summary?.ratio) parts.push(`number: ratio ${this.#summary.ratio}, geometric mean over replans and layers`);
     if (rows.length > MOST_ROWS) parts.push(`the first ${MOST_ROWS} are listed`);
     if (this.#summary?.failed) parts.push(`ratios are missing: ${this.#summary.failed}`);
     else if (this.#summary && !this.#summary.complete) parts.push("ratios are being measured");
@@ -107,18 +108,18 @@ export class EpisodeList {
     const outcome = row.success === undefined ? "" : row.success === null ? "?" : row.success ? "✓" : "✗";
     const kind = row.success === true ? "solved" : row.success === false ? "failed" : "unknown";
     const made = button("", () => this.view.update({ episode: row.name, replan: 0, playing: false }), { "data-episode": row.name });
+    const ratio = row.ratio === undefined ? "" : formatNumber(row.ratio);
+    const said = (text: string): HTMLElement => element("span", { class: "unseen" }, text);
     made.append(
-      element("span", { class: `outcome ${kind}`, "aria-hidden": "true" }, outcome),
+      element("span", { class: `outcome ${kind}` }, element("span", { "aria-hidden": "true" }, outcome), said(row.success === undefined ? "" : `${outcomeWord(row.success)} `)),
       element(
         "span",
         { class: "what" },
         element("span", {}, row.instruction || row.name),
         element("small", { class: "soft" }, row.instruction ? row.name : ""),
       ),
-      element("span", { class: "ratio", "data-ratio": row.ratio ?? "" }, row.ratio === undefined ? "" : formatNumber(row.ratio)),
+      element("span", { class: "ratio", "data-ratio": row.ratio ?? "" }, said(ratio ? " ratio " : ""), ratio),
     );
-    const spoken = [row.name, row.instruction, row.success === undefined ? "" : outcomeWord(row.success), row.ratio ? `ratio ${formatNumber(row.ratio)}` : ""];
-    made.setAttribute("aria-label", spoken.filter(Boolean).join(", "));
     return element("li", {}, made);
   }
 }

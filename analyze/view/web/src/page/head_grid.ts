@@ -73,7 +73,7 @@ export class HeadGrid {
         cell.style.background = ground;
         cell.style.color = ink;
         cell.textContent = site.heads.length <= MOST_NUMBERED ? shortNumber(lift) : "";
-        const text = `layer ${layer}, head ${head}: ${chosen} ${formatPercent(fraction)}, lift ${formatNumber(lift)}`;
+        const text = `lift ${shortNumber(lift)} of ${chosen} in layer ${layer}, head ${head} (${formatPercent(fraction)} of its attention)`;
         cell.title = text;
         cell.setAttribute("aria-label", text);
         cell.dataset.value = String(lift);

@@ -3,11 +3,13 @@ import { button, element } from "./dom";
 import { formatNumber, formatPercent } from "./number_text";
 import type { Shown } from "./shown";
 
-function figure(name: string, label: string): { host: HTMLElement; show(value: number, text: string): void } {
+function figure(name: string, label: string): { host: HTMLElement; show(value: number, text: string, more?: string): void } {
   const number = element("output", { "data-number": name });
+  const about = element("span", { class: "soft" }, label);
   return {
-    host: element("div", { class: "figure" }, number, element("span", { class: "soft" }, label)),
-    show(value, text) {
+    host: element("div", { class: "figure" }, number, about),
+    show(value, text, more = "") {
+      about.textContent = `${label}${more}`;
       number.dataset.value = String(value);
       number.textContent = text;
     },
@@ -39,14 +41,16 @@ export class Headline {
     this.masses.append(element("table", { class: "numbers" }, element("thead", {}, element("tr", {}, ...head)), this.#body));
   }
 
-  show({ numbers, replan, site }: Shown): void {
+  show({ numbers, replan, site, selection }: Shown): void {
     const { ratio, groups } = numbers.replans[replan]!;
     for (const part of [this.#ratio.host, this.#uniform.host, this.#lift.host, this.#meaning]) part.hidden = !ratio;
     this.#none.hidden = ratio !== undefined;
     if (ratio) {
-      this.#ratio.show(ratio.value, formatNumber(ratio.value));
+      // As in the tables of vla-analyze: ratios of layers are averaged, and lifts geometrically.
+      const several = selection.layers.length > 1;
+      this.#ratio.show(ratio.value, formatNumber(ratio.value), several ? ", mean of layers" : "");
       this.#uniform.show(ratio.uniform, formatNumber(ratio.uniform));
-      this.#lift.show(ratio.lift, `×${formatNumber(ratio.lift)}`);
+      this.#lift.show(ratio.lift, `×${formatNumber(ratio.lift)}`, several ? ", geometric mean of layers" : "");
     } else {
       this.#none.textContent = `Site ${site.layout.name} has no ratio: its keys are not both pictures and words.`;
     }

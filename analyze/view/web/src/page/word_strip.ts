@@ -44,7 +44,7 @@ export function otherSites(episode: Episode, has: (span: SpanDocument) => boolea
 /** A word's shade ends at this lift, or at the highest of the sentence. */
 const LEAST_TOP = 4;
 /** Opacity of a full shade in per cent: the word stays legible on it. */
-const MOST_SHADE = 65;
+const MOST_SHADE = 52;
 
 export class WordStrip {
   readonly host = element("div", { class: "words" });
@@ -90,16 +90,13 @@ export class WordStrip {
     const top = Math.max(LEAST_TOP, ...finite);
     measures.forEach(({ mass, lift }, i) => {
       const made = this.#buttons[i]!;
-      const word = words[i]!;
       made.dataset.mass = String(mass);
       made.dataset.lift = String(lift);
       const part = Number.isFinite(lift) ? Math.min(lift / top, 1) : 0;
       made.style.setProperty("--part", `${Math.round(MOST_SHADE * part)}%`);
-      made.lastElementChild!.textContent = Number.isFinite(lift) ? `×${formatNumber(lift)}` : "-";
-      made.setAttribute(
-        "aria-label",
-        `${word.text}: ${formatPercent(mass, 2)} of the attention, ${formatNumber(lift)} times uniform attention`,
-      );
+      const [, said, number] = made.children as unknown as [HTMLElement, HTMLElement, HTMLElement];
+      number.textContent = Number.isFinite(lift) ? `×${formatNumber(lift)}` : "-";
+      said.textContent = `: ${formatPercent(mass, 2)} of the attention, ${formatNumber(lift)} times uniform attention`;
     });
     this.#note.textContent = words.length
       ? `Shade and number of a word: its lift (×1 is uniform, full shade ×${formatNumber(top)}).`
@@ -122,7 +119,7 @@ export class WordStrip {
       rest(word.start);
       at = word.stop;
       const made = button("", () => this.#clicked.forEach((listen) => listen(place, word)), { "data-word": place, class: "word" });
-      made.append(element("span", {}, word.text), element("small", { "aria-hidden": "true" }));
+      made.append(element("span", {}, word.text), element("span", { class: "unseen" }), element("small", { "aria-hidden": "true" }));
       const over = (on: boolean) => (): void => this.#hovered.forEach((listen) => listen(on ? place : null));
       made.addEventListener("pointerenter", over(true));
       made.addEventListener("pointerleave", over(false));
