@@ -1,8 +1,11 @@
-"""Pictures as a moving one: GIF through pillow, MP4 through imageio-ffmpeg. Each file appears whole."""
+"""Pictures as a moving one: GIF through pillow, MP4 through the ffmpeg of imageio-ffmpeg. Each file appears whole."""
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Iterable, Iterator
+from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 from typing import Literal
 
@@ -11,10 +14,17 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.show.output_files import replacing
 from vla_attention.schemas.errors import BadArgument, MissingDependency
+from vla_attention.schemas.safe_text import visible
 
 VideoFormat = Literal["gif", "mp4"]
 #: Colours in a GIF, which has one table for all pictures.
 _GIF_COLORS = 255
+#: Quality of H.264, from 0 to 51, the worst.
+_CRF = 15
+
+
+class FfmpegFailed(Exception):
+    """ffmpeg ended with an error, of which this is the last line."""
 
 
 def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, kind: VideoFormat) -> Path:
@@ -23,11 +33,15 @@ def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, kin
     Raises:
         BadArgument: no picture, pictures of different sizes, or a rate outside 0.1 to 50 pictures a second.
         MissingDependency: MP4 without imageio-ffmpeg.
+        OSError: the file cannot be written.
     """
     if not 0.1 <= fps <= 50:
         raise BadArgument(f"Cannot write {fps} pictures a second; expected --fps from 0.1 to 50.")
-    with replacing(path) as temporary:
-        (write_gif if kind == "gif" else write_mp4)(temporary, frames, fps)
+    try:
+        with replacing(path) as temporary:
+            (write_gif if kind == "gif" else write_mp4)(temporary, frames, fps)
+    except FfmpegFailed as error:
+        raise BadArgument(f"ffmpeg could not write {path}: {visible(str(error))}; choose --video gif.") from None
     return path
 
 
@@ -61,25 +75,50 @@ def write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> No
 
 
 def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> None:
-    """Write H.264 that every player shows (4:2:0, even sides: an odd last row or column is repeated)."""
+    """Write H.264 that every player shows (4:2:0, even sides: an odd last row or column is repeated).
+
+    ffmpeg is started here and not by imageio-ffmpeg, which does not tell that it has failed: on a full disk, a part of
+    a video would pass for all of it.
+
+    Raises:
+        FfmpegFailed: ffmpeg ended with an error.
+    """
     check_video("mp4")
+    pictures = _same_size(frames)
+    first = next(pictures)
+    height, width = (side + side % 2 for side in first.shape[:2])
+    program = subprocess.Popen(
+        _ffmpeg(path, width, height, fps),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        process_group=0,  # Ctrl-C is for this process, which then ends ffmpeg
+    )
+    with program:
+        assert program.stdin is not None
+        try:
+            for picture in chain((first,), pictures):
+                margins = ((0, height - picture.shape[0]), (0, width - picture.shape[1]), (0, 0))
+                program.stdin.write(np.pad(picture, margins, mode="edge").tobytes())
+            said = program.communicate()[1]
+        except BrokenPipeError:  # it has ended; why is in what it says
+            said = program.communicate()[1]
+        except BaseException:
+            program.kill()
+            raise
+    if program.returncode != 0:
+        lines = said.decode(errors="replace").strip().splitlines() or [f"exit code {program.returncode}"]
+        raise FfmpegFailed(lines[-1])
+
+
+def _ffmpeg(path: Path, width: int, height: int, fps: float) -> list[str]:
+    """The command that makes a video of raw pictures from its standard input."""
     import imageio_ffmpeg
 
-    writer = None
-    try:
-        for frame in _same_size(frames):
-            height, width = frame.shape[:2]
-            even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-            if writer is None:
-                writer = imageio_ffmpeg.write_frames(
-                    str(path), (even.shape[1], even.shape[0]), fps=fps, codec="libx264", macro_block_size=2, quality=7,
-                    ffmpeg_log_level="error", output_params=["-f", "mp4", "-movflags", "+faststart"],
-                )  # fmt: skip
-                writer.send(None)
-            writer.send(np.ascontiguousarray(even))
-    finally:
-        if writer is not None:
-            writer.close()
+    rate = str(Fraction(fps).limit_denominator())
+    given = f"-f rawvideo -vcodec rawvideo -s {width}x{height} -pix_fmt rgb24 -r {rate} -i -"
+    made = f"-an -vcodec libx264 -pix_fmt yuv420p -crf {_CRF} -v error -f mp4 -movflags +faststart"
+    return [imageio_ffmpeg.get_ffmpeg_exe(), "-y", *given.split(), *made.split(), str(path)]
 
 
 def _same_size(frames: Iterable[NDArray[np.uint8]]) -> Iterator[NDArray[np.uint8]]:

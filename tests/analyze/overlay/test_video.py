@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -40,6 +41,38 @@ def test_an_mp4_has_even_sides_and_every_picture(tmp_path: Path) -> None:
     assert len(frames) == 3
     for frame, color in zip(frames, COLORS, strict=True):
         np.testing.assert_allclose(frame[10, 10], color, atol=12)
+
+
+def noise() -> list[np.ndarray]:
+    generator = np.random.default_rng(0)
+    return [generator.integers(0, 255, (64, 64, 3), dtype=np.uint8) for _ in range(8)]
+
+
+def test_a_disk_that_takes_no_more_is_an_error_and_leaves_no_part_of_an_mp4(tmp_path: Path) -> None:
+    """ffmpeg is another process: its error has to be asked for."""
+    pytest.importorskip("imageio_ffmpeg", reason="needs the extra [video]")
+    assert write_video(tmp_path / "whole.mp4", noise(), 5, "mp4").stat().st_size > 20_000
+    code = (
+        "import resource, sys; from pathlib import Path\n"
+        "from tests.analyze.overlay.test_video import noise, write_video\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\n"
+        "try:\n    write_video(Path(sys.argv[1]), noise(), 5, 'mp4')\n"
+        "except OSError as error:\n    print(error)\n"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "a.mp4")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout == f"[Errno 27] File too large: '{tmp_path / 'a.mp4'}'\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["whole.mp4"]
+
+
+def test_what_ffmpeg_says_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the extra [video]")
+    (tmp_path / "ffmpeg").write_text("#!/bin/sh\necho 'no such encoder' >&2\nexit 8\n")
+    (tmp_path / "ffmpeg").chmod(0o755)
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(tmp_path / "ffmpeg"))
+    with pytest.raises(BadArgument, match=r"could not write .*a\.mp4: no such encoder; choose --video gif"):
+        write_video(tmp_path / "a.mp4", noise(), 5, "mp4")
+    assert [path.name for path in tmp_path.iterdir()] == ["ffmpeg"]
 
 
 @pytest.mark.parametrize("fps", [0, 51, float("nan")])
