@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 
 from tests.analyze.test_hostile_stores import WORDS
+from tests.kit.slow import slow_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.errors import Note
+from vla_attention.schemas.interventions import Interventions, NoiseChange
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
+from vla_attention.testing.stores import StoreSpec, rerun_source, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, contributions=True)
 NAMED = "among its episodes: README.md, notes, task000_episode007, task0_episode1, task1\\x1b; they are no episodes."
@@ -29,22 +33,49 @@ def add_strays(store: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory) -> Path:
-    path = write_store(tmp_path_factory.mktemp("strays") / "a.zarr", spec=SPEC)
-    add_strays(path)
-    return path
+def stores(tmp_path_factory) -> Path:
+    """Stores with strays: a.zarr, another of the same run, a rerun, two parts of a run, and one of a data set."""
+    folder = tmp_path_factory.mktemp("strays")
+    store = write_store(folder / "a.zarr", spec=SPEC)
+    for name in ("other", "one", "two"):
+        shutil.copytree(store, folder / f"{name}.zarr")
+    for name, left in (("one", 0), ("two", 1)):
+        for episode in (folder / f"{name}.zarr/episodes").glob(f"task00{left}_*"):
+            shutil.rmtree(episode)
+    noise = Interventions("noise", noise=NoiseChange(1))
+    write_store(folder / "rerun.zarr", spec=SPEC, rerun_of=rerun_source(store), interventions=noise)
+    write_site_store(folder / "data.zarr", SiteStoreSpec(dataset_actions=0.5, protocol="dataset"))
+    for path in folder.glob("*.zarr"):
+        add_strays(path)
+    return folder
 
 
-@pytest.mark.parametrize("command", ["ratios", "groups", "export", "copy"])
-def test_a_command_names_them_and_goes_on(store, tmp_path, monkeypatch, capsys, command):
+@pytest.fixture(scope="module")
+def store(stores) -> Path:
+    return stores / "a.zarr"
+
+
+#: The stores of a command that takes others than a.zarr, or two.
+STORES = {"effects": ("a", "rerun"), "deviation": ("data",), "merge": ("one", "two"), "overlay": ("one", "two")}
+#: Commands that draw unless they are told not to.
+DRAWING = ("ratios", "words", "objects", "effects", "deviation", "overlay")
+#: `verify` and `repair` name strays in their own way.
+READING = [command for command in WORDS if command not in ("verify", "repair", "cache")]
+
+
+@pytest.mark.parametrize("command", slow_except(("groups", "export", "copy", "merge"), READING))
+def test_a_command_names_them_and_goes_on(stores, tmp_path, monkeypatch, capsys, command):
     monkeypatch.setenv("VLA_CACHE", "off")
-    words = {"STORE": str(store), "OTHER": str(store), "OUT": str(tmp_path), "OUT/copy.zarr": str(tmp_path / "c.zarr")}
-    given = [words.get(word, word) for word in WORDS[command]]
-    given = [word for index, word in enumerate(given) if not (word == str(store) and str(store) in given[:index])]
+    first, second = (*STORES.get(command, ("a", "other")), "")[:2]
+    words = {"STORE": str(stores / f"{first}.zarr"), "OTHER": str(stores / f"{second}.zarr")}
+    given = [words.get(word, word).replace("OUT", str(tmp_path / "out")) for word in WORDS[command]]
+    given = [word for word in given if word != "--save-viz"] + ["--no-plots"] * (command in DRAWING)
     assert analyze([command, *given]) == 0
     said = capsys.readouterr().err
-    assert said.count(NAMED) == 1
-    assert said.startswith(f"vla-analyze {command}: Ignored in {store}, ")
+    for path in {word for word in given if word in words.values()}:
+        (line,) = [line for line in said.splitlines() if f"Ignored in {path}, " in line]
+        assert line.startswith(f"vla-analyze {command}: Ignored in ")
+        assert NAMED in line
 
 
 def test_capture_status_names_them(store, capsys):
