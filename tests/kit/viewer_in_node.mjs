@@ -117,6 +117,9 @@ const answers = {
   rewritten: (text) => engine.selectorText(engine.parseSelector(text)),
   painted: ({ text, layout, camera, patches, erase }) => engine.paintedPatches(text, layout, camera, patches, erase),
   toggled: ({ text, atom }) => engine.toggledPart(text, atom),
+  ranks: ({ row, valid }) => numbers(engine.keyRanks(Float64Array.from(row), Uint8Array.from(valid))),
+  lifts: ({ row, valid, counts }) =>
+    numbers(engine.keyLifts(Float64Array.from(row), Uint8Array.from(valid), counts && Float64Array.from(counts))),
   drafts: (text) => engine.textOfDraft(engine.draftOfText(text)),
   shell: (text) => engine.shellWord(text),
 };

@@ -73,6 +73,28 @@ def test_names_texts_and_words_are_treated_alike(tmp_path):
 
 
 @needs_node
+def test_lifts_and_ranks_of_single_keys(tmp_path):
+    generator = np.random.default_rng(7)
+    rows = np.round(generator.dirichlet(np.ones(12), 40), 2)  # with equal values
+    valid = generator.random((40, 12)) < 0.8
+    counts = np.where(generator.random((40, 12)) < 0.3, 0.5, 1.0)
+    given = [
+        {"row": row.tolist(), "valid": known.astype(int).tolist(), "counts": count.tolist() if i % 2 else None}
+        for i, (row, known, count) in enumerate(zip(rows, valid, counts, strict=True))
+    ]
+    found = run_in_node(tmp_path, {"ranks": given, "lifts": given})
+    for i, (row, known, count) in enumerate(zip(rows, valid, counts, strict=True)):
+        own = row[known]
+        below, same = (own[:, None] > own).sum(axis=1), (own[:, None] == own).sum(axis=1)
+        ranks = (below + (same - 1) / 2) / (len(own) - 1)
+        assert np.array(found["ranks"][i], dtype=float)[known] == pytest.approx(ranks)
+        number = count if i % 2 else np.ones(12)
+        lifts = own / number[known] / (own.sum() / number[known].sum())
+        assert np.array(found["lifts"][i], dtype=float)[known] == pytest.approx(lifts)
+        assert np.isnan(np.array(found["ranks"][i] + found["lifts"][i], dtype=float)).sum() == 2 * (~known).sum()
+
+
+@needs_node
 def test_grouping_files_are_read_and_refused_alike(tmp_path):
     """What is no TOML is refused by both, in each reader's own words; all else is the same sentence."""
     found = run_in_node(tmp_path, {"episodes": [], "files": [{"text": text, "path": "a b/x.toml"} for text in FILES]})

@@ -137,6 +137,9 @@ def test_clicked_groups_have_the_numbers_of_the_command(store, tmp_path):
         panel.get_by_text("New group").click()
         panel.locator("button.brush").click()
         paint(page, "left_wrist_0_rgb", (0.2, 0.2), (0.8, 0.2))
+        paint(page, "left_wrist_0_rgb", (0.2, 0.8), (0.2, 0.8))
+        panel.locator("button.erase").click()
+        paint(page, "left_wrist_0_rgb", (0.2, 0.8), (0.2, 0.8))
         panel.locator("button.brush").click()
         groups = groups_of(panel)
         assert groups["plate_1"] == "object:plate_1"

@@ -40,8 +40,19 @@ export function touches(left: Membership, right: Membership): boolean {
   return intersection(left, right).bits.includes(1);
 }
 
-/** Area of each key's cells, (replan, key, 1 + object) float32; they sum to 1. Cell 0 is what no object covers. */
+const areas = new WeakMap<EpisodeTokens, Float32Array>();
+
+/**
+ * Area of each key's cells, (replan, key, 1 + object) float32; they sum to 1. Cell 0 is what no object covers. Kept with
+ * the tokens: every stroke of a brush asks for it.
+ */
 export function cellCoverage(tokens: EpisodeTokens): Float32Array {
+  let area = areas.get(tokens);
+  if (!area) areas.set(tokens, (area = areasOfCells(tokens)));
+  return area;
+}
+
+function areasOfCells(tokens: EpisodeTokens): Float32Array {
   const { numReplans: replans, keys, objects } = tokens;
   const cells = 1 + objects.length;
   let covered = 0;
@@ -71,8 +82,22 @@ export function cellCoverage(tokens: EpisodeTokens): Float32Array {
   return area;
 }
 
-/** Weight of each key, (replan or 1, key) float32: whether it is a member, or the covered area of its chosen cells. */
-export function weightsOfCells(member: Membership, area: Float32Array | null): { replans: number; values: Float32Array } {
+/** Weight of each key, (replan or 1, key) float32. */
+export interface KeyWeights {
+  readonly replans: number;
+  readonly values: Float32Array;
+}
+
+const weightsOf = new WeakMap<Membership, KeyWeights>();
+
+/** Weight of each key: whether it is a member, or the covered area of its chosen cells. Kept with the membership. */
+export function weightsOfCells(member: Membership, area: Float32Array | null): KeyWeights {
+  let weights = weightsOf.get(member);
+  if (!weights) weightsOf.set(member, (weights = addedCells(member, area)));
+  return weights;
+}
+
+function addedCells(member: Membership, area: Float32Array | null): KeyWeights {
   const { keys, cells } = member;
   if (cells === 1 || area === null) return { replans: member.replans, values: Float32Array.from(member.bits) };
   const replans = area.length / (keys * cells);
@@ -87,25 +112,25 @@ export function weightsOfCells(member: Membership, area: Float32Array | null): {
   return { replans, values };
 }
 
+const lanes = new Float32Array(8);
+
 /** A sum of float32 values, rounded after every addition, in the order in which numpy adds neighbours pairwise. */
 export function float32Sum(values: Float32Array, start: number, count: number): number {
-  const add = (a: number, b: number): number => Math.fround(a + b);
   if (count < 8) {
     let sum = 0;
-    for (let i = 0; i < count; i++) sum = add(sum, values[start + i]!);
+    for (let i = 0; i < count; i++) sum = Math.fround(sum + values[start + i]!);
     return sum;
   }
   if (count > 128) {
     const half = Math.floor(count / 2) - (Math.floor(count / 2) % 8);
-    return add(float32Sum(values, start, half), float32Sum(values, start + half, count - half));
+    return Math.fround(float32Sum(values, start, half) + float32Sum(values, start + half, count - half));
   }
-  const lanes = Array.from(values.subarray(start, start + 8));
+  for (let lane = 0; lane < 8; lane++) lanes[lane] = values[start + lane]!;
   let i = 8;
-  for (; i < count - (count % 8); i += 8) {
-    for (let lane = 0; lane < 8; lane++) lanes[lane] = add(lanes[lane]!, values[start + i + lane]!);
-  }
-  const [a, b, c, d, e, f, g, h] = lanes as [number, number, number, number, number, number, number, number];
-  let sum = add(add(add(a, b), add(c, d)), add(add(e, f), add(g, h)));
-  for (; i < count; i++) sum = add(sum, values[start + i]!);
+  for (; i < count - (count % 8); i += 8) for (let lane = 0; lane < 8; lane++) lanes[lane]! += values[start + i + lane]!;
+  // Storing in a Float32Array rounds.
+  for (let apart = 1; apart < 8; apart *= 2) for (let lane = 0; lane < 8; lane += 2 * apart) lanes[lane]! += lanes[lane + apart]!;
+  let sum = lanes[0]!;
+  for (; i < count; i++) sum = Math.fround(sum + values[start + i]!);
   return sum;
 }

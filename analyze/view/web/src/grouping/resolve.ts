@@ -88,7 +88,7 @@ export function resolve(grouping: Grouping, tokens: EpisodeTokens): ResolvedGrou
 
 /** Weight of each key in the group of one selector, (key) of each replan or once. */
 export function selectorWeights(text: string, tokens: EpisodeTokens): Float32Array[] {
-  const member = evaluated(parseSelector(text), tokens);
+  const member = evaluated(text, tokens);
   const { replans, values } = weightsOfCells(member, member.cells > 1 ? cellCoverage(tokens) : null);
   return Array.from({ length: replans }, (_, replan) => values.slice(replan * tokens.keys, (replan + 1) * tokens.keys));
 }
@@ -118,15 +118,17 @@ function memberships(grouping: Grouping, tokens: EpisodeTokens): Map<string, Mem
       members.set(group, taken); // keeps the order; replaced below
       continue;
     }
-    let member = noKeys(tokens);
+    let member: Membership | null = null;
     for (const selector of selectors) {
       try {
-        member = union(member, evaluated(parseSelector(selector), tokens));
+        const own = evaluated(selector, tokens);
+        member = member ? union(member, own) : own;
       } catch (error) {
         if (error instanceof SelectorError) throw new SelectorError(`Group '${group}': ${error.message}`);
         throw error;
       }
     }
+    member ??= noKeys(tokens);
     if (!grouping.overlap && touches(taken, member)) throw overlapping(group, member, members, tokens);
     members.set(group, member);
     taken = union(taken, member);
@@ -163,7 +165,20 @@ function describedKey(key: number, tokens: EpisodeTokens): string {
   return `key ${key} of span '${span.name}'${text === undefined ? "" : `, ${quoted(text)}`}`;
 }
 
-function evaluated(selector: Selector, tokens: EpisodeTokens): Membership {
+/** Selectors whose keys are kept with an episode's tokens. */
+const MOST_KEPT = 100;
+const evaluatedOf = new WeakMap<EpisodeTokens, Map<string, Membership>>();
+
+/** The keys of a selector. Kept: where one group is painted, the others are the same. */
+function evaluated(text: string, tokens: EpisodeTokens): Membership {
+  let kept = evaluatedOf.get(tokens);
+  if (!kept || kept.size >= MOST_KEPT) evaluatedOf.set(tokens, (kept = new Map()));
+  let member = kept.get(text);
+  if (!member) kept.set(text, (member = keysOfSelector(parseSelector(text), tokens)));
+  return member;
+}
+
+function keysOfSelector(selector: Selector, tokens: EpisodeTokens): Membership {
   const found = new Map<string, Membership>(); // long unions say the same more than once
   const leaf = (part: Atom | typeof EVERYTHING): Membership => {
     if (part === EVERYTHING) return everyKey(tokens);

@@ -29,6 +29,8 @@ export class GroupChart {
   #content: ChartContent = { title: "", uniform: null, lines: [] };
   #replan = 0;
   #right = 100;
+  /** Of the part with the lines, in pixels. */
+  #width = 1;
   #cursor: SVGLineElement | null = null;
   #drag = false;
 
@@ -67,16 +69,12 @@ export class GroupChart {
     return this.#content.lines[0]?.values.length ?? 0;
   }
 
-  #width(): number {
-    return Math.max(1, this.#drawing.clientWidth - LEFT - this.#right);
-  }
-
   #across(replan: number): number {
-    return LEFT + (this.#count > 1 ? (replan / (this.#count - 1)) * this.#width() : this.#width() / 2);
+    return LEFT + (this.#count > 1 ? (replan / (this.#count - 1)) * this.#width : this.#width / 2);
   }
 
   #point(event: PointerEvent): void {
-    const part = (event.clientX - this.#drawing.getBoundingClientRect().left - LEFT) / this.#width();
+    const part = (event.clientX - this.#drawing.getBoundingClientRect().left - LEFT) / this.#width;
     this.choose(Math.round(Math.min(Math.max(part, 0), 1) * Math.max(this.#count - 1, 0)));
   }
 
@@ -88,6 +86,7 @@ export class GroupChart {
     if (!width || !lines.length) return;
     const longest = Math.max(...lines.map((line) => Array.from(line.name).length));
     this.#right = Math.min(16 + 7 * longest, width * 0.3);
+    this.#width = Math.max(1, width - LEFT - this.#right);
     this.#drawing.setAttribute("viewBox", `0 0 ${width} ${HEIGHT}`);
     const finite = [...lines.flatMap((line) => line.values), ...(uniform === null ? [] : [uniform])].filter(Number.isFinite);
     const ticks = roundTicks(Math.max(0, ...finite));
@@ -96,7 +95,7 @@ export class GroupChart {
     this.#axes(ticks, down, title);
     if (uniform !== null && uniform <= high) {
       const [x1, y] = [LEFT, down(uniform)];
-      this.#drawing.append(svg("line", { x1, x2: LEFT + this.#width(), y1: y, y2: y, class: "uniform" }));
+      this.#drawing.append(svg("line", { x1, x2: LEFT + this.#width, y1: y, y2: y, class: "uniform" }));
     }
     for (const line of lines) this.#line(line, down);
     this.#names(lines, down);
@@ -107,7 +106,7 @@ export class GroupChart {
   }
 
   #axes(ticks: readonly number[], down: (value: number) => number, title: string): void {
-    const right = LEFT + this.#width();
+    const right = LEFT + this.#width;
     for (const tick of ticks) {
       this.#drawing.append(
         svg("line", { x1: LEFT, x2: right, y1: down(tick), y2: down(tick), class: "grid" }),
@@ -170,7 +169,7 @@ export class GroupChart {
     ends.forEach(({ line }, i) => {
       const least = TOP + 4 + i * NAME_HEIGHT;
       const y = Math.max(places[i]! - below, Math.min(least, places[i]!));
-      const text = svg("text", { x: LEFT + this.#width() + 6, y: y + 4, class: "name" }, line.name);
+      const text = svg("text", { x: LEFT + this.#width + 6, y: y + 4, class: "name" }, line.name);
       text.style.fill = onPage(line.style.colour);
       this.#drawing.append(text);
     });

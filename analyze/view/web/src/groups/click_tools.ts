@@ -21,13 +21,14 @@ export class ClickTools {
   readonly host = element("div", { class: "click-tools" });
   readonly #note = element("p", { class: "soft" });
   readonly #brush = button("Brush on the pictures", () => this.#switch(), { "aria-pressed": "false", class: "brush" });
+  readonly #erase = button("Erase", () => this.#switchErase(), { "aria-pressed": "false", class: "erase", hidden: true });
   readonly #lists = element("div");
   #buttons: { made: HTMLButtonElement; atom: Atom }[] = [];
   #built: unknown = null;
   #brushing = false;
 
   constructor(private readonly on: ClickListener) {
-    this.host.append(this.#note, this.#brush, this.#lists);
+    this.host.append(this.#note, element("div", { class: "group-bar" }, this.#brush, this.#erase), this.#lists);
   }
 
   /** Draw the names of an episode, pressed where the active group's selector has them. */
@@ -39,6 +40,11 @@ export class ClickTools {
     for (const { made, atom } of this.#buttons) made.setAttribute("aria-pressed", String(hasPart(selector, atom)));
   }
 
+  /** Whether the brush takes patches out, as it does with Shift: a finger has no keys. */
+  get erases(): boolean {
+    return this.#erase.getAttribute("aria-pressed") === "true";
+  }
+
   /** Put the brush away. */
   stop(): void {
     if (this.#brushing) this.#switch();
@@ -47,8 +53,14 @@ export class ClickTools {
   #switch(): void {
     this.#brushing = !this.#brushing;
     this.#brush.setAttribute("aria-pressed", String(this.#brushing));
-    this.#brush.textContent = this.#brushing ? "Brush is on: drag over a picture (Shift erases)" : "Brush on the pictures";
+    this.#brush.textContent = this.#brushing ? "Brush is on: drag over a picture" : "Brush on the pictures";
+    this.#erase.hidden = !this.#brushing;
+    this.#erase.setAttribute("aria-pressed", "false");
     this.on.brush(this.#brushing);
+  }
+
+  #switchErase(): void {
+    this.#erase.setAttribute("aria-pressed", String(!this.erases));
   }
 
   #build(tokens: EpisodeTokens): void {

@@ -106,6 +106,10 @@ export interface Evaluated {
   readonly ofWhole: string;
 }
 
+/** What is wrong with lines, by their text: a stroke of the brush changes one of them. */
+const problems = new WeakMap<EpisodeTokens, Map<string, string>>();
+const MOST_KEPT = 100;
+
 /** A draft on an episode's keys, with what is wrong beside the line that it is about. */
 export function evaluateDraft(draft: Draft, tokens: EpisodeTokens): Evaluated {
   const vocabulary = vocabularyOf([tokens]);
@@ -123,7 +127,16 @@ export function evaluateDraft(draft: Draft, tokens: EpisodeTokens): Evaluated {
   return { grouping: null, resolved: null, ofLines: beside, ofWhole: place < 0 ? found.error : "" };
 }
 
-function problemOfLine({ name, selector }: GroupLine, tokens: EpisodeTokens, vocabulary: Vocabulary): string {
+function problemOfLine(line: GroupLine, tokens: EpisodeTokens, vocabulary: Vocabulary): string {
+  let kept = problems.get(tokens);
+  if (!kept || kept.size >= MOST_KEPT) problems.set(tokens, (kept = new Map()));
+  const text = `${line.name}=${line.selector}`;
+  const problem = kept.get(text) ?? foundProblem(line, tokens, vocabulary);
+  kept.set(text, problem);
+  return problem;
+}
+
+function foundProblem({ name, selector }: GroupLine, tokens: EpisodeTokens, vocabulary: Vocabulary): string {
   try {
     const grouping = makeGrouping({ name, groups: new Map([[name, [selector]]]) });
     checkNames(grouping, vocabulary);

@@ -182,8 +182,9 @@ class GroupsPanel implements PanelInstance {
       return;
     }
     this.page.pictures.brush({
-      paint: (camera, patches, erase) => {
+      paint: (camera, patches, withShift) => {
         const { layout } = this.#shown!.site;
+        const erase = withShift || this.#tools.erases;
         this.#change(this.#target("patches"), (selector) => paintedPatches(selector, layout, camera, patches, erase));
       },
       end: () => undefined,
