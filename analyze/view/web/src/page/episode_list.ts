@@ -118,7 +118,8 @@ export class EpisodeList {
         element("span", {}, row.instruction || row.name),
         element("small", { class: "soft" }, row.instruction ? row.name : ""),
       ),
-      element("span", { class: "ratio", "data-ratio": row.ratio ?? "" }, said(ratio ? " ratio " : ""), ratio),
+      said(ratio ? " ratio " : ""),
+      element("span", { class: "ratio", "data-ratio": row.ratio ?? "" }, ratio),
     );
     return element("li", {}, made);
   }
