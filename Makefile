@@ -10,6 +10,7 @@
 #   make fuzz        made-up bytes for every parser of files, for SECONDS=3600, in an environment of its own (.venv-fuzz)
 #   make docs        the documentation site, into site/, in an environment of its own (.venv-docs)
 #   make pictures    the pictures of README and guides, from the run of make capture
+#   make screenshots the pictures of the viewer's page in docs/viewer.md, from the same run, in this machine's Chromium
 #   make test-slurm  an array job on the SLURM that sbatch reaches from here (opt-in; installs nothing)
 #   make setup       the whole environment        make setup-analyze   the laptop's part of it
 #
@@ -41,7 +42,7 @@ WORKERS ?= 2
 # An empty PYTHONDONTWRITEBYTECODE: where it is set, both processes compile all tests anew at every run.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: capture analyze test test-policies test-remote test-slurm notebooks fuzz test-thorough check unit package audit setup setup-analyze schemas docs pictures viewer clean
+.PHONY: capture analyze test test-policies test-remote test-slurm notebooks fuzz test-thorough check unit package audit setup setup-analyze schemas docs pictures screenshots viewer clean
 
 capture: .venv/capture-installed
 	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --store $(STORE) \
@@ -105,6 +106,9 @@ docs: .venv-docs/installed
 
 pictures: .venv/analyze-installed
 	$(BIN)/python docs/make_pictures.py --run $(STORE)
+
+screenshots: .venv/capture-installed
+	$(BIN)/python docs/make_screenshots.py $(STORE)
 
 schemas: .venv/capture-installed
 	$(BIN)/python -m vla_attention.schemas.json_files

@@ -26,7 +26,8 @@ function linesOf(left: Shown, right: Shown): Line[] {
   }
   const names = [...new Set([...left.numbers.present, ...right.numbers.present])];
   for (const name of names) {
-    lines.push({ name: `mass-${name}`, label: `mass of ${name}`, left: massOf(left, name), right: massOf(right, name), factor: false });
+    const [one, other] = [massOf(left, name), massOf(right, name)];
+    if (one || other) lines.push({ name: `mass-${name}`, label: `mass of ${name}`, left: one, right: other, factor: false });
   }
   return lines;
 }
