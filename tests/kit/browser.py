@@ -6,9 +6,12 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests.kit.viewer import served
 
 #: Debian's; playwright brings one of its own only where it is asked to download it.
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -33,7 +36,7 @@ class Watched:
 
     def settle(self) -> None:
         """Wait until the present state is drawn."""
-        self.page.wait_for_selector(READY)
+        wait_until_ready(self.page)
 
     def wait_for_link(self, part: str) -> None:
         """Wait until the link names something, and what it names is drawn."""
@@ -65,14 +68,32 @@ def chromium() -> Iterator[Any]:
 @contextmanager
 def watched_page(browser: Any, width: int = 1280, height: int = 900, **options: Any) -> Iterator[Watched]:
     """A new page of a size; options are those of playwright's `new_context`."""
-    context = browser.new_context(viewport={"width": width, "height": height}, **options)
+    context = browser.new_context(**{"viewport": {"width": width, "height": height}, **options})
     try:
         page = context.new_page()
         page.set_default_timeout(PATIENCE)
         watched = Watched(page)
         page.on("console", lambda said: said.type in ("error", "warning") and watched.complaints.append(said.text))
+        page.on("response", lambda got: got.status >= 400 and watched.complaints.append(f"{got.status} {got.url}"))
         page.on("pageerror", lambda error: watched.complaints.append(str(error)))
         page.on("request", lambda request: watched.requests.append(request.url))
         yield watched
     finally:
         context.close()
+
+
+@contextmanager
+def shown_page(*stores: Path, query: str = "", **options: Any) -> Iterator[Any]:
+    """The page of stores, drawn, in a browser of its own. At the end a test fails on what it complained of.
+
+    `query`: of the page's link, with its question mark. `options`: of playwright's `new_context`.
+    """
+    with served(*stores) as server, chromium() as browser, watched_page(browser, 1300, 1400, **options) as watched:
+        watched.open(f"{server.link}{query}")
+        yield watched.page
+        assert not watched.complaints, watched.complaints
+
+
+def wait_until_ready(page: Any) -> None:
+    """Wait until everything of the present state is drawn."""
+    page.wait_for_selector(READY)

@@ -19,10 +19,10 @@ import polars as pl
 import pytest
 
 import vla_attention as va
-from tests.kit.viewer_pages import needs_browser, shown_page, wait_until_ready
+from tests.kit.browser import needs_chromium, shown_page, wait_until_ready
 from vla_attention.testing import StoreSpec, write_site_store, write_store
 
-pytestmark = [pytest.mark.slow, needs_browser]
+pytestmark = [pytest.mark.slow, needs_chromium]
 CLOSE = 1e-6
 
 
