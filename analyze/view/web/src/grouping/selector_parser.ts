@@ -26,7 +26,7 @@ const PARENTHESES = 100;
 const s = `[${SPACE}]`;
 const BARE = `[^${SPACE}&|()\\[\\]"']+[^${SPACE}&|()\\[\\]"]*(?:\\[[^\\]]*\\])?`;
 const ARGUMENT = [`"[^"]*"`, `'[^']*'`, BARE, ""].join("|");
-const IS_BARE = new RegExp(`^${BARE}$`, "u");
+const BEGINS_BARE = new RegExp(`^${BARE}`, "u");
 const TOKEN = new RegExp(
   `${s}*(?:(?<open>\\()|(?<close>\\))|(?<and>&)|(?<or>\\|)|(?<minus>-(?=${s}|$))|(?<star>\\*)` +
     `|(?<kind>[A-Za-z_]+):(?<argument>${ARGUMENT}))`,
@@ -94,7 +94,8 @@ export function atomKey(atom: Atom): string {
 
 /** The text of a part, with quotes where its name needs them; null where no quotes can hold the name. */
 export function atomText({ kind, argument }: Atom): string | null {
-  if (IS_BARE.test(argument)) return `${kind}:${argument}`;
+  // Compared in length: with an end in the expression, long texts would take time in their square.
+  if (BEGINS_BARE.exec(argument)?.[0].length === argument.length) return `${kind}:${argument}`;
   if (!argument.includes('"')) return `${kind}:"${argument}"`;
   return argument.includes("'") ? null : `${kind}:'${argument}'`;
 }

@@ -279,7 +279,7 @@ class GroupsPanel implements PanelInstance {
         this.#measuring = false;
         this.#note.textContent = "";
         this.#results.markOld(false);
-        this.#results.show({ grouping, replans, about: aboutText(place) }, this.#shown!.replan);
+        this.#results.show({ grouping, replans, about: aboutText(place), layers: place.selection.layers.length }, this.#shown!.replan);
         this.#settle();
       },
       (failure: unknown) => {

@@ -21,6 +21,8 @@ export interface Measured {
   readonly replans: readonly ReplanValues[];
   /** What the numbers are of, in words. */
   readonly about: string;
+  /** How many layers they are means over. */
+  readonly layers: number;
 }
 
 export class Results {
@@ -139,12 +141,14 @@ export class Results {
     const number = (name: string, value: number, before = ""): HTMLElement =>
       element("output", { "data-number": `group-${name}`, "data-value": String(value) }, `${before}${formatNumber(value)}`);
     const left = whole.numNonfinite ? ` (${whole.numNonfinite} of ${replans.length} replans have no finite ratio)` : "";
+    // As in the tables: the mean ratio as the published scripts define it, the lift without preference for either side.
+    const several = this.#measured!.layers > 1;
     this.#ratio.replaceChildren(
-      "Ratio ",
+      several ? "Mean of the layers' ratios " : "Ratio ",
       number("ratio", now.ratio.value),
       ", uniform attention would give ",
       number("uniform-ratio", now.ratio.uniform),
-      ", lift ",
+      several ? ", lift of their geometric mean " : ", lift ",
       number("ratio-lift", now.ratio.lift, "×"),
       ". Episode, geometric mean: ",
       number("ratio-mean", whole.geometricMean),
