@@ -109,12 +109,19 @@ def help_texts() -> str:
 
 def _commands() -> Iterator[tuple[str, str]]:
     """Every (program, command or "") that has a help text."""
+    yield "vla-attention", ""
     for program in ("vla-analyze", "vla-capture"):
         yield program, ""
         yield from ((program, command) for command in commands_of(program))
     yield from ((program, "") for program in PUBLISHED)
 
 
+#: Our programs -> their modules.
+MODULES = {
+    "vla-attention": "vla_attention",
+    "vla-analyze": "vla_attention.analyze",
+    "vla-capture": "vla_attention.capture",
+}
 #: The published scripts' names -> the module and the function of this program.
 PUBLISHED = {
     "parse-attention-ratio-results": ("analyze.__main__", "parse_attention_ratio_results"),
@@ -139,7 +146,7 @@ def printed_help(program: str, command: str) -> str:
         start = f"import sys; sys.argv[0] = {program!r}; from vla_attention.{module} import {function}; {function}()"
         run = ["-c", start]
     else:
-        run = ["-m", f"vla_attention.{program.removeprefix('vla-')}"]
+        run = ["-m", MODULES[program]]
     done = subprocess.run(
         [sys.executable, *run, *command.split(), "--help"],
         cwd=ROOT,
