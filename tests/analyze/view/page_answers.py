@@ -29,18 +29,25 @@ class PageQuestion:
     packed: bool = False
 
 
-def page_answers(folder: Path, questions: Sequence[PageQuestion]) -> list[dict[str, Any]]:
-    """What the page shows for each question (see `page_numbers.mjs`); `folder` is for files in between."""
+def run_in_node(script: str, folder: Path, given: Any) -> str:
+    """What a script of this folder writes, which gets the page's module, JSON, and where to write; files in between."""
     assert NODE is not None
     module = folder / "viewer.mjs"  # by its ending node takes it for a module
     module.write_bytes(SCRIPT.read_bytes())
-    (folder / "questions.json").write_text(json.dumps([asdict(question) for question in questions]))
+    (folder / "given.json").write_text(json.dumps(given))
     done = subprocess.run(
-        [NODE, HERE / "page_numbers.mjs", module, folder / "questions.json", folder / "answers.json"],
+        [NODE, HERE / script, module, folder / "given.json", folder / "found.json"],
         capture_output=True,
         text=True,
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    answers: list[dict[str, Any]] = json.loads((folder / "answers.json").read_text())
+    return (folder / "found.json").read_text()
+
+
+def page_answers(folder: Path, questions: Sequence[PageQuestion]) -> list[dict[str, Any]]:
+    """What the page shows for each question (see `page_numbers.mjs`)."""
+    answers: list[dict[str, Any]] = json.loads(
+        run_in_node("page_numbers.mjs", folder, [asdict(question) for question in questions])
+    )
     return answers

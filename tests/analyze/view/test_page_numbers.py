@@ -13,6 +13,7 @@ from urllib.parse import parse_qs
 import numpy as np
 import polars as pl
 import pytest
+import zarr
 
 import vla_attention as va
 from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answers
@@ -25,6 +26,7 @@ from vla_attention.analyze.overlay.overlay_data import episode_overlay, ratios_o
 from vla_attention.analyze.overlay.overlay_study import study_overlay
 from vla_attention.analyze.show.patch_pictures import upright
 from vla_attention.analyze.stores.rows import layer_rows
+from vla_attention.testing import StoreSpec, write_store
 
 pytestmark = needs_node
 #: Sums are of float32 in another order.
@@ -198,8 +200,6 @@ def test_a_link_names_what_is_shown(answers):
 
 
 def test_only_the_chunks_of_what_is_shown_are_read(tmp_path: Path):
-    from vla_attention.testing import StoreSpec, write_store
-
     spec = StoreSpec(tasks=(0,), episodes=2, layers=(0, 1, 2, 3), denoise_steps=(0, 9))
     write_store(tmp_path / "four.zarr", spec=spec)
     with serve(tmp_path) as served:
@@ -210,3 +210,21 @@ def test_only_the_chunks_of_what_is_shown_are_read(tmp_path: Path):
     chunks = [wanted for wanted in parts if not wanted.startswith("bytes=-")]
     assert len(set(chunks)) == 1, parts
     assert not others
+
+
+def test_single_queries_and_their_mean(tmp_path: Path):
+    spec = StoreSpec(tasks=(0,), episodes=1, queries="all", num_action_queries=3)
+    write_store(tmp_path / "all.zarr", spec=spec)
+    rows = zarr.open_group(tmp_path / "all.zarr", mode="r")["episodes/task000_episode000/joint/rows"][:]
+    with serve(tmp_path) as served:
+        queries = ("?query=1&replan=2&layer=2", "?replan=2&layer=2", "?query=2")
+        found = page_answers(tmp_path, [PageQuestion(f"{served.url}/", "all.zarr/", query=query) for query in queries])
+    expected = [rows[2, 1, :, :, 1], rows[2, 1], rows[0, :, :, :, 2]]  # layer 2 is the second that was recorded
+    for answer, own in zip(found, expected, strict=True):
+        mean = own.astype(np.float64).reshape(-1, own.shape[-1]).mean(axis=0)
+        np.testing.assert_allclose(answer["row"], mean, rtol=CLOSE, atol=1e-12)
+    ratios = va.open(tmp_path / "all.zarr").ratios("replans", grouping="default", layers=2)
+    mean_of_queries = ratios.filter(layer="layers_avg")["ratio"].to_numpy()
+    np.testing.assert_allclose(
+        [float(replan["ratio"][0]) for replan in found[1]["replans"]], mean_of_queries, rtol=CLOSE
+    )

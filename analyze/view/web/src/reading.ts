@@ -7,6 +7,7 @@ export { colourTable } from "./page/colour_maps";
 export { overlayPixels, patchAt, placeOfPatch, scaleFor, shownValues, viewOf } from "./page/overlay";
 export { closingReplan, eventsOf } from "./page/events";
 export { found } from "./page/episode_list";
+export { patchesBetween } from "./page/patch_outlines";
 export { loadShown } from "./page/shown";
 export { linkOfState, stateOfLink } from "./page/state";
 export { measuresOfKeys } from "./page/word_strip";

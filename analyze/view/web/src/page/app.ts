@@ -1,4 +1,6 @@
 /** The page: its parts, and what happens when the state changes. */
+import "./theme.css";
+import "./parts.css";
 import "./viewer.css";
 import "../panels";
 import { sentenceOf, StoreError } from "../store/errors";
@@ -247,11 +249,17 @@ export class App {
       if (asked !== this.#asked) return;
       const quietly = (reading: Promise<unknown>): void => void reading.catch(() => undefined);
       for (const camera of frames.keys()) if (replan + 1 < episode.numReplans) quietly(episode.frame(camera, replan + 1));
-      if (selection.layers.length > 1 || !allRows) return;
-      for (const layer of [selection.layers[0]! + 1, selection.layers[0]! - 1]) {
-        if (layer < 0 || layer >= site.layers.length) continue;
-        quietly(episode.meanRows(site.layout.name, { ...selection, layers: [layer] }));
-      }
+      if (!allRows) return;
+      const beside = (axis: "layers" | "denoise", count: number): void => {
+        if (selection[axis].length > 1) return;
+        for (const place of [selection[axis][0]! + 1, selection[axis][0]! - 1]) {
+          if (place < 0 || place >= count) continue;
+          quietly(episode.meanRows(site.layout.name, { ...selection, [axis]: [place] }));
+        }
+      };
+      beside("layers", site.layers.length);
+      // With a mean over layers this would read half of the episode.
+      if (selection.layers.length === 1) beside("denoise", site.denoise.length);
     });
   }
 }

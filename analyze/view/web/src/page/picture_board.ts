@@ -3,6 +3,7 @@ import type { CameraDocument, SpanDocument } from "../store/documents";
 import { colourTable } from "./colour_maps";
 import { element } from "./dom";
 import { type Painting, type Scale, overlayPixels, patchAt, placeOfPatch, scaleFor, shownValues, viewOf } from "./overlay";
+import { patchesBetween, strokePatches } from "./patch_outlines";
 import type { Shown } from "./shown";
 
 export type PatchListener = (camera: string, patch: number, replan: number) => void;
@@ -175,17 +176,10 @@ export class PictureBoard {
   #paintTo(camera: string, drawn: Drawn, patch: number): void {
     const painting = this.#painting!;
     if (painting.camera !== camera || painting.last === patch) return;
-    const { columns } = drawn.span.grid!;
     const from = painting.last < 0 ? patch : painting.last;
-    const [row, column] = [Math.floor(from / columns), from % columns];
-    const [down, across] = [Math.floor(patch / columns) - row, (patch % columns) - column];
-    const steps = Math.max(Math.abs(down), Math.abs(across), 1);
-    const patches = new Set<number>();
-    for (let i = 0; i <= steps; i++) {
-      patches.add((row + Math.round((i * down) / steps)) * columns + column + Math.round((i * across) / steps));
-    }
+    const patches = patchesBetween(from, patch, drawn.span.grid!.columns);
     painting.last = patch;
-    this.#brush!.paint(camera, [...patches], painting.erase);
+    this.#brush!.paint(camera, patches, painting.erase);
   }
 
   /** Enter begins the cursor, arrows move it, space paints or clicks, Escape ends it. */
@@ -332,47 +326,13 @@ export class PictureBoard {
       context.drawImage(painted, 0, 0, width, height);
       for (const { colour, members } of this.#outlines.values()) {
         const own = members.get(camera);
-        if (own) this.#stroke(context, drawn, (patch) => (own[patch] ?? 0) >= 128, colour, 2 * devicePixelRatio);
+        if (own) strokePatches(context, drawn, (patch) => (own[patch] ?? 0) >= 128, colour, 2 * devicePixelRatio);
       }
       const hovered = drawn.patch;
       if (hovered >= 0) {
-        this.#stroke(context, drawn, (patch) => patch === hovered, "#000", 4 * devicePixelRatio);
-        this.#stroke(context, drawn, (patch) => patch === hovered, "#fff", 2 * devicePixelRatio);
+        strokePatches(context, drawn, (patch) => patch === hovered, "#000", 4 * devicePixelRatio);
+        strokePatches(context, drawn, (patch) => patch === hovered, "#fff", 2 * devicePixelRatio);
       }
     }
-  }
-
-  /** Lines along the border of the member patches. */
-  #stroke(
-    context: CanvasRenderingContext2D,
-    { span, view, canvas }: Drawn,
-    member: (patch: number) => boolean,
-    colour: string,
-    width: number,
-  ): void {
-    const { rows, columns } = span.grid!;
-    context.strokeStyle = colour;
-    context.lineWidth = width;
-    context.beginPath();
-    for (let patch = 0; patch < rows * columns; patch++) {
-      if (!member(patch)) continue;
-      const [left, top, across, down] = placeOfPatch(patch, span, view);
-      const [x, y] = [left * canvas.width, top * canvas.height];
-      const [right, bottom] = [x + across * canvas.width, y + down * canvas.height];
-      const row = Math.floor(patch / columns);
-      const column = patch % columns;
-      const is = (r: number, c: number): boolean => r >= 0 && c >= 0 && r < rows && c < columns && member(r * columns + c);
-      const side = view.mirrored ? 1 : -1;
-      const over = view.upright ? -1 : 1;
-      const line = (x0: number, y0: number, x1: number, y1: number): void => {
-        context.moveTo(x0, y0);
-        context.lineTo(x1, y1);
-      };
-      if (!is(row, column + side)) line(x, y, x, bottom);
-      if (!is(row, column - side)) line(right, y, right, bottom);
-      if (!is(row + over, column)) line(x, y, right, y);
-      if (!is(row - over, column)) line(x, bottom, right, bottom);
-    }
-    context.stroke();
   }
 }

@@ -1,131 +1,33 @@
 /** One episode: its attributes, and what is read of its arrays. Everything comes from the workers and is kept a while. */
 import type { ArrayName } from "./array_reader";
 import { ByteCache } from "./cache";
-import type {
-  AxesDocument,
-  EpisodeDocument,
-  PieceDocument,
-  PromptDocument,
-  RootDocument,
-  SegmentDocument,
-  SiteDocument,
-  SpanDocument,
-} from "./documents";
+import type { AxesDocument, EpisodeDocument, PromptDocument, RootDocument, SiteDocument } from "./documents";
 import { numKeys, parseAxes } from "./documents";
 import { StoreError } from "./errors";
 import { ARRAY_IN_PAGE_BYTES, DOCUMENT_BYTES } from "./limits";
+import type {
+  Atoms,
+  Coverage,
+  HeadRows,
+  KeyRole,
+  MeanRows,
+  Picture,
+  RowBlock,
+  Selection,
+  Series,
+  SiteInfo,
+} from "./episode_values";
 import type { Place } from "./messages";
+import { promptAtSite } from "./prompt_at_site";
 import type { Found, ReaderPool } from "./reader_pool";
 
 /** What the page keeps of what workers gave it, over all episodes. */
 const KEPT_BYTES = 192_000_000;
 const kept = new ByteCache<Promise<unknown>>(KEPT_BYTES);
 
-/** A site of an episode. `layers`, `denoise` and `heads` are the recorded numbers, in the order of the axes. */
-export interface SiteInfo {
-  layout: SiteDocument;
-  keys: number;
-  layers: number[];
-  denoise: number[];
-  heads: number[];
-  /** Length of the query axis. */
-  numQueries: number;
-  /** Action queries of the policy at this site, for keys that not all of them see. */
-  numActionQueries: number;
-  segments: SegmentDocument[];
-}
-
-/** Positions on the axes that means are over. */
-export interface Selection {
-  layers: readonly number[];
-  denoise: readonly number[];
-  heads: readonly number[];
-  query: number | "mean";
-}
-
-export interface KeyRole {
-  replans: number;
-  keys: number;
-  codes: Uint8Array;
-}
-
-/** Rows of one layer and denoise step, (replan, head, query, key), from `firstReplan` on. */
-export interface RowBlock {
-  firstReplan: number;
-  replans: number;
-  heads: number;
-  queries: number;
-  keys: number;
-  values: Float32Array;
-}
-
-/** Masses of segments (replan, layer, denoise, head, segment), mean over the queries or of one. */
-export interface Atoms {
-  replans: number;
-  layers: number;
-  denoise: number;
-  heads: number;
-  segments: number;
-  values: Float32Array;
-}
-
-/** Mean rows (replan, key) of the whole episode. */
-export interface MeanRows {
-  replans: number;
-  keys: number;
-  values: Float32Array;
-}
-
-/** Rows (layer, head, key) of one replan; `layers` are the positions that were asked for. */
-export interface HeadRows {
-  layers: readonly number[];
-  heads: number;
-  keys: number;
-  values: Float32Array;
-}
-
-export interface Picture {
-  height: number;
-  width: number;
-  /** (row, column, 3). */
-  values: Uint8Array;
-}
-
-/** Share of each patch's area that each object covers, (replan, patch, object). */
-export interface Coverage {
-  replans: number;
-  patches: number;
-  objects: number;
-  values: Float32Array;
-}
-
-export interface Series {
-  replans: number;
-  size: number;
-  /** (replan, ...). */
-  values: Float64Array;
-  shape: readonly number[];
-}
+export type * from "./episode_values";
 
 const product = (shape: readonly number[]): number => shape.reduce((all, extent) => all * extent, 1);
-
-/** The prompt with its pieces at the keys of one site; the same as schemas/layout.py, `prompt_at`. */
-export function promptAtSite(sites: readonly SiteDocument[], layout: SiteDocument, prompt: PromptDocument): PromptDocument {
-  const textsOf = (site: SiteDocument): SpanDocument[] => site.spans.filter((span) => span.kind === "text");
-  const first = sites.find((site) => textsOf(site).length > 0) ?? layout;
-  const own = new Map(textsOf(layout).map((span) => [span.name, span]));
-  const texts = textsOf(first);
-  if (texts.every((span) => own.get(span.name)?.start === span.start && own.get(span.name)?.stop === span.stop)) return prompt;
-  const pieces: PieceDocument[] = [];
-  for (const piece of prompt.pieces) {
-    const span = texts.find((each) => each.start <= piece.key && piece.key < each.stop);
-    const there = span && own.get(span.name);
-    if (span && there && piece.key - span.start < there.stop - there.start) {
-      pieces.push({ ...piece, key: piece.key - span.start + there.start });
-    }
-  }
-  return { ...prompt, pieces };
-}
 
 export class Episode {
   readonly numReplans: number;
