@@ -237,6 +237,9 @@ def test_texts_of_a_store_are_text(browser, tmp_path):
         assert watched.page.locator("img, iframe, object, embed, script:not([src])").count() == 0
         assert SCRIPT in INSTRUCTION
         assert SCRIPT in watched.page.inner_text("h1")
+        for shown in ("h1", ".episodes li"):
+            assert "\\u{202e}" in watched.page.inner_text(shown)
+            assert "\u202e" not in watched.page.inner_text(shown)
         assert watched.page.locator("body script").count() == 0
 
 

@@ -3,7 +3,7 @@ import "./theme.css";
 import "./parts.css";
 import "./viewer.css";
 import "../panels";
-import { sentenceOf, StoreError } from "../store/errors";
+import { sentenceOf, StoreError, visible } from "../store/errors";
 import { Library, openStores, type Store, type StoreEntry, type Summary, summaryOf } from "../store/open";
 import { workerPort } from "../store/reader_pool";
 import { Controls } from "./controls";
@@ -234,7 +234,7 @@ export class App {
     }
     this.#timeline.setReplan(shown.replan);
     for (const panel of this.#panels) panel.update(shown);
-    if (before?.episode !== shown.episode) document.title = `${shown.episode.name}: ${shown.episode.document.instruction.slice(0, 80)}`;
+    if (before?.episode !== shown.episode) document.title = `${shown.episode.name}: ${visible(shown.episode.document.instruction).slice(0, 80)}`;
     if (!shown.state.playing) {
       const ratio = shown.numbers.replans[shown.replan]!.ratio;
       this.#announce(`Replan ${shown.replan}${ratio ? `, ratio ${ratio.value.toPrecision(3)}` : ""}`);

@@ -1,4 +1,5 @@
 /** Pictures, words and numbers of one episode at one replan: the page's own, and that of an episode beside it. */
+import { visible } from "../store/errors";
 import { element } from "./dom";
 import { Headline } from "./headline";
 import { Inspector } from "./inspector";
@@ -54,7 +55,7 @@ export function episodeColumn(host: HTMLElement, explain: () => void, level: "h1
     show(shown) {
       const { episode, store, replan } = shown;
       const { document } = episode;
-      title.textContent = document.instruction || episode.name;
+      title.textContent = visible(document.instruction) || episode.name;
       const step = document.env_step[replan];
       about.textContent = [
         episode.name,

@@ -1,4 +1,5 @@
 /** Episodes and tasks with success and ratio: searched, sorted, and chosen from. */
+import { visible } from "../store/errors";
 import { button, choice, element } from "./dom";
 import { formatNumber, outcomeWord, plural } from "./number_text";
 import type { EpisodeSummary, StoreEntry, Summary } from "../store/open";
@@ -115,7 +116,7 @@ export class EpisodeList {
       element(
         "span",
         { class: "what" },
-        element("span", {}, row.instruction || row.name),
+        element("span", {}, visible(row.instruction ?? "") || row.name),
         element("small", { class: "soft" }, row.instruction ? row.name : ""),
       ),
       said(ratio ? " ratio " : ""),
