@@ -162,11 +162,13 @@ def test_clicked_groups_have_the_numbers_of_the_command(store, tmp_path):
 def test_a_grouping_of_whole_segments_at_one_layer_and_head(store, tmp_path):
     text = quote("@base cameras\nlinguistic = role:instruction\nbegin = role:bos | role:template")
     query = f"?episode=task001_episode000&layer=3&head=1&denoise=9&grouping={text}"
-    with shown_page(store, query=query) as page:
+    with shown_page(store, query=query, permissions=["clipboard-read", "clipboard-write"]) as page:
         panel = panel_of(page)
         measured(panel)
         command = panel.locator("[data-command]").text_content()
         assert command.endswith("--tasks 1 --layers 3 --denoise 9 --heads 1")
+        panel.get_by_text("Copy the command").click()
+        page.wait_for_function("async (text) => (await navigator.clipboard.readText()) === text", arg=command)
         settings = {"grouping": "cameras", "groups": groups_of(panel), "layers": 3, "denoise": 9, "heads": 1}
         compare_with_command(page, panel, tmp_path, "3", **settings)
 
