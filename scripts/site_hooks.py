@@ -56,14 +56,17 @@ def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
     return fill_marks(translate_links(markdown, page.file.src_uri, dict(names_of_pages(config["nav"]))))
 
 
-def names_of_pages(nav: Any) -> Iterator[tuple[str, str]]:
-    """Each page of the list of pages that has a name there, and this name."""
+def names_of_pages(nav: Any, section: str = "") -> Iterator[tuple[str, str]]:
+    """Each page of the list of pages and its name there; one without a name has that of its section."""
     for entry in nav:
-        for name, below in entry.items() if isinstance(entry, dict) else ():
+        if isinstance(entry, str):
+            yield entry, section
+            continue
+        for name, below in entry.items():
             if isinstance(below, str):
                 yield below, name
             else:
-                yield from names_of_pages(below)
+                yield from names_of_pages(below, name)
 
 
 def translate_links(markdown: str, page: str, names: Mapping[str, str]) -> str:

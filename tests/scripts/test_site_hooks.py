@@ -22,8 +22,8 @@ def test_links_are_those_of_the_site():
 
 
 def test_a_link_with_the_name_of_its_file_gets_the_name_of_the_page():
-    names = dict(names_of_pages(["index.md", {"Guides": [{"Store": "store.md"}, {"More": [{"Scale": "scale.md"}]}]}]))
-    assert names == {"store.md": "Store", "scale.md": "Scale"}
+    names = dict(names_of_pages([{"Guides": [{"Store": "store.md"}, {"More": ["more.md", {"Scale": "scale.md"}]}]}]))
+    assert names == {"store.md": "Store", "more.md": "More", "scale.md": "Scale"}
     assert translate_links("[docs/store.md](docs/store.md#tree)", "index.md", names) == "[Store](store.md#tree)"
     assert translate_links("[store.md](../store.md), [a](../scale.md)", "errors/stores.md", names) == (
         "[Store](../store.md), [a](../scale.md)"
