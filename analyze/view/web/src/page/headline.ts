@@ -21,7 +21,7 @@ export class Headline {
   readonly figures = element("section", { class: "figures", "aria-label": "Ratio of this replan" });
   /** The masses of all groups. */
   readonly masses = element("section", { class: "masses", "aria-label": "Masses of this replan" });
-  readonly #ratio = figure("ratio", "ratio visual / linguistic");
+  readonly #ratio = figure("ratio", "visual / linguistic");
   readonly #uniform = figure("uniform-ratio", "uniform ratio");
   readonly #lift = figure("ratio-lift", "lift");
   readonly #meaning: HTMLElement;
@@ -48,9 +48,9 @@ export class Headline {
     if (ratio) {
       // As in the tables of vla-analyze: ratios of layers are averaged, and lifts geometrically.
       const several = selection.layers.length > 1;
-      this.#ratio.show(ratio.value, formatNumber(ratio.value), several ? ", mean of layers" : "");
+      this.#ratio.show(ratio.value, formatNumber(ratio.value), several ? " (mean of layers)" : "");
       this.#uniform.show(ratio.uniform, formatNumber(ratio.uniform));
-      this.#lift.show(ratio.lift, `×${formatNumber(ratio.lift)}`, several ? ", geometric mean of layers" : "");
+      this.#lift.show(ratio.lift, `×${formatNumber(ratio.lift)}`, several ? " (geometric mean)" : "");
     } else {
       this.#none.textContent = `Site ${site.layout.name} has no ratio: its keys are not both pictures and words.`;
     }

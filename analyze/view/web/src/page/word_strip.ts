@@ -118,7 +118,11 @@ export class WordStrip {
     words.forEach((word, place) => {
       rest(word.start);
       at = word.stop;
-      const made = button("", () => this.#clicked.forEach((listen) => listen(place, word)), { "data-word": place, class: "word" });
+      const click = (): void => {
+        this.#hovered.forEach((listen) => listen(place)); // a finger that is lifted has left, and gives no focus everywhere
+        this.#clicked.forEach((listen) => listen(place, word));
+      };
+      const made = button("", click, { "data-word": place, class: "word" });
       made.append(element("span", {}, word.text), element("span", { class: "unseen" }), element("small", { "aria-hidden": "true" }));
       const over = (on: boolean) => (): void => this.#hovered.forEach((listen) => listen(on ? place : null));
       made.addEventListener("pointerenter", over(true));

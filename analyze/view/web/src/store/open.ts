@@ -1,7 +1,7 @@
 /** Stores beside the page: what `stores.json` lists, their roots, and their episodes. */
 import { type EpisodeDocument, type RootDocument, parseEpisode, parseRoot } from "./documents";
 import { Episode } from "./episode";
-import { StoreError } from "./errors";
+import { StoreError, visible } from "./errors";
 import { type Fields, flag, list, name, object, parseDocument, text, whole } from "./json_fields";
 import { DOCUMENT_BYTES, ROOT_BYTES, ZIP_TAIL_BYTES } from "./limits";
 import type { Place } from "./messages";
@@ -160,7 +160,7 @@ export class Store {
 
   async #open(episode: string): Promise<Episode> {
     if (!this.entry.episodes.some((each) => each.name === episode)) {
-      throw new StoreError(`The store ${this.entry.name} has no episode ${episode}.`);
+      throw new StoreError(`The store ${this.entry.name} has no episode ${visible(episode)}; choose one from the list.`);
     }
     const place = await this.#placeOf(episode);
     const document: EpisodeDocument = parseEpisode(await this.pool.document(place, "zarr.json", DOCUMENT_BYTES), episode);
