@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from vla_attention.capture.policies.cosmos.locate import T5_TOKENIZER
+from vla_attention.capture.policies.hub import first_line
 from vla_attention.schemas.errors import BadArgument, MissingDependency, UserError
 
 
@@ -63,7 +64,7 @@ class T5Encoder:
                 self._model = library.T5EncoderModel.from_pretrained(
                     str(self.folder), local_files_only=True, dtype=torch.float32
                 ).eval()
-            except (OSError, ValueError, RuntimeError) as error:
-                first = str(error).splitlines()[0]
-                raise EncoderUnusable(f"The T5 encoder at '{self.folder}' cannot be loaded ({first}).") from error
+            except Exception as error:  # safetensors and pickle have errors of their own
+                why = first_line(error)
+                raise EncoderUnusable(f"The T5 encoder at '{self.folder}' cannot be loaded ({why}).") from error
         return self._model
