@@ -109,8 +109,10 @@ def _import_everything() -> None:
     import vla_attention.capture.policies.cosmos.build
     import vla_attention.capture.policies.cosmos.parity
     import vla_attention.capture.policies.pi.build  # noqa: F401
+    from vla_attention.capture.environments.robosuite_installation import import_robosuite
 
     torch.set_num_threads(1)
+    import_robosuite()  # half a second of each case of LIBERO
     dummy()
 
 

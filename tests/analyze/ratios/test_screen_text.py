@@ -15,7 +15,7 @@ SMALL = StoreSpec(replans=1, heads=(0,), frames=False, contributions=True)
 SHAPES = {
     "one episode": {"tasks": (0,), "episodes": 1},
     "ten tasks": {"tasks": tuple(range(10)), "layers": tuple(range(18)), "num_layers": 18},
-    "ninety tasks": {"tasks": tuple(range(90)), "episodes": 1, "layers": (0,)},
+    "sixty tasks": {"tasks": tuple(range(60)), "episodes": 1, "layers": (0,)},
     "forty layers": {"layers": tuple(range(40)), "num_layers": 40},
     "without contributions": {"contributions": False, "tasks": tuple(range(12))},
 }

@@ -110,11 +110,11 @@ def test_every_part_of_the_model_gets_a_gradient(model, demonstrations, tokenize
 
 
 def test_the_loss_falls(demonstrations, tmp_path):
-    settings = TrainingSettings(steps=60, batch_size=8, log_every=10, evaluate_every=60)
+    settings = TrainingSettings(steps=40, batch_size=8, log_every=10, evaluate_every=40)
     train(demonstrations, INSTRUCTIONS, tmp_path, settings, say=quiet)
     with (tmp_path / "log.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [int(row["step"]) for row in rows] == [10, 20, 30, 40, 50, 60]
+    assert [int(row["step"]) for row in rows] == [10, 20, 30, 40]
     assert float(rows[-1]["train_flow"]) < 0.6 * float(rows[0]["train_flow"])
     assert float(rows[-1]["held_out_total"]) > 0
     assert (tmp_path / "loss.png").stat().st_size > 10_000
