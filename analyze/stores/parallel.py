@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import partial
@@ -29,6 +29,8 @@ _MOST_AT_ONCE = 4
 #: Episodes that are begun beyond the one whose result is waited for, for each thread or worker: results of later
 #: episodes are kept until those of earlier ones are there.
 _BEGUN_AHEAD = 2
+#: Seconds after which a wait for a result looks whether the program was stopped.
+_LOOK_UP_S = 0.2
 
 
 class Engine(Protocol):
@@ -128,10 +130,21 @@ def in_order(submit: Callable[[Item], Future[Result]], items: Iterable[Item], be
     begun: deque[Future[Result]] = deque()
     for item in items:
         if len(begun) >= begun_at_once:
-            yield begun.popleft().result()
+            yield _awaited(begun.popleft())
         begun.append(submit(item))
     while begun:
-        yield begun.popleft().result()
+        yield _awaited(begun.popleft())
+
+
+def _awaited(future: Future[Result]) -> Result:
+    """The future's result; the wait for it ends at Ctrl-C.
+
+    It looks up now and then: where the system hands the signal to another thread, the one that waits sleeps on, and a
+    server may send nothing for a minute.
+    """
+    while not future.done():
+        wait([future], timeout=_LOOK_UP_S)
+    return future.result()
 
 
 def _refuse_local(function: Callable[..., Any]) -> None:
