@@ -88,7 +88,10 @@ def test_ratio_and_lift_are_pythons_in_one_layer_and_over_all(view, server, stor
     for link, layer in (("replan=1", "layers_avg"), ("replan=1&layer=4", "4")):
         view.open(f"{server.link}?{link}")
         (row,) = ratios.filter(layer=layer).iter_rows(named=True)
-        assert view.value(f'{MAIN} [data-number="ratio"]') == pytest.approx(row["ratio"], rel=1e-5)
+        # Of several layers the geometric mean, whose quotient with the uniform ratio is the lift.
+        ratio = row["ratio_lift"] * row["uniform_ratio"]
+        assert view.value(f'{MAIN} [data-number="ratio"]') == pytest.approx(ratio, rel=1e-5)
+        assert view.value(f'{MAIN} [data-number="ratio-lift"]') == pytest.approx(row["ratio_lift"], rel=1e-5)
         assert view.value(f'{MAIN} [data-number="uniform-ratio"]') == pytest.approx(row["uniform_ratio"], rel=1e-6)
 
 

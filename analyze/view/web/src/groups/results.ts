@@ -94,7 +94,7 @@ export class Results {
     const present = presentGroups(this.#measured);
     const lines =
       measure === "ratio"
-        ? [{ name: "ratio", style: { colour: "#0072B2", dash: "" }, values: replans.map((one) => one.ratio!.value) }]
+        ? [{ name: "ratio", style: { colour: "#0072B2", dash: "" }, values: replans.map((one) => one.ratio!.geometric) }]
         : present.map((group) => ({
             name: names[group]!,
             style: styles[group]!,
@@ -141,14 +141,14 @@ export class Results {
     const number = (name: string, value: number, before = ""): HTMLElement =>
       element("output", { "data-number": `group-${name}`, "data-value": String(value) }, `${before}${formatNumber(value)}`);
     const left = whole.numNonfinite ? ` (${whole.numNonfinite} of ${replans.length} replans have no finite ratio)` : "";
-    // As in the tables: the mean ratio as the published scripts define it, the lift without preference for either side.
+    // Of several layers both are geometric means, so that the lift is the ratio over the uniform one.
     const several = this.#measured!.layers > 1;
     this.#ratio.replaceChildren(
-      several ? "Mean of the layers' ratios " : "Ratio ",
-      number("ratio", now.ratio.value),
+      several ? "Ratio (geometric mean of layers) " : "Ratio ",
+      number("ratio", now.ratio.geometric),
       ", uniform attention would give ",
       number("uniform-ratio", now.ratio.uniform),
-      several ? ", lift of their geometric mean " : ", lift ",
+      ", lift ",
       number("ratio-lift", now.ratio.lift, "×"),
       ". Episode, geometric mean: ",
       number("ratio-mean", whole.geometricMean),

@@ -46,11 +46,12 @@ export class Headline {
     for (const part of [this.#ratio.host, this.#uniform.host, this.#lift.host, this.#meaning]) part.hidden = !ratio;
     this.#none.hidden = ratio !== undefined;
     if (ratio) {
-      // As in the tables of vla-analyze: ratios of layers are averaged, and lifts geometrically.
+      // Of several layers both are geometric means, so that the lift is the ratio over the uniform one.
       const several = selection.layers.length > 1;
-      this.#ratio.show(ratio.value, formatNumber(ratio.value), several ? " (mean of layers)" : "");
+      const mean = several ? " (geometric mean of layers)" : "";
+      this.#ratio.show(ratio.geometric, formatNumber(ratio.geometric), mean);
       this.#uniform.show(ratio.uniform, formatNumber(ratio.uniform));
-      this.#lift.show(ratio.lift, `×${formatNumber(ratio.lift)}`, several ? " (geometric mean)" : "");
+      this.#lift.show(ratio.lift, `×${formatNumber(ratio.lift)}`);
     } else {
       this.#none.textContent = `Site ${site.layout.name} has no ratio: its keys are not both pictures and words.`;
     }
