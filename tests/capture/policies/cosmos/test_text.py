@@ -231,19 +231,3 @@ def test_the_encoder_library_is_optional(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(MissingDependency, match="--t5-encoder needs the transformers library"):
         T5Encoder(tmp_path).encode([5, 1], 8, 4)
-
-
-def test_a_small_t5_gives_zeros_after_the_text(tmp_path):
-    transformers = pytest.importorskip("transformers")
-    config = transformers.T5Config(vocab_size=1024, d_model=8, d_kv=4, d_ff=16, num_layers=1, num_heads=2)
-    model = transformers.T5EncoderModel(config).eval()
-    model.save_pretrained(tmp_path)
-    found = T5Encoder(tmp_path).encode([7, 9, 1], 6, 8)
-    assert found.shape == (1, 6, 8)
-    assert (found[:, 3:] == 0).all()
-    mask = torch.tensor([[1, 1, 1, 0, 0, 0]])
-    with torch.no_grad():
-        padded = model(input_ids=torch.tensor([[7, 9, 1, 0, 0, 0]]), attention_mask=mask).last_hidden_state
-    torch.testing.assert_close(found[:, :3], padded[:, :3].bfloat16())
-    with pytest.raises(EncoderUnusable, match="gives 8 numbers a position, but the policy reads 16"):
-        T5Encoder(tmp_path).encode([7, 1], 6, 16)
