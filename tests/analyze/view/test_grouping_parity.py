@@ -34,7 +34,7 @@ def differences(expected: Any, found: Any, where: str = "") -> list[str]:
     if isinstance(expected, list) and isinstance(found, list) and len(expected) == len(found) and expected:
         if all(isinstance(value, (int, float)) for value in (*expected, *found)):
             one, other = np.array(expected, np.float64), np.array(found, np.float64)
-            wrong = np.abs(one - other) > 1e-12 * np.abs(one)
+            wrong = ~np.isclose(other, one, rtol=1e-12, atol=0, equal_nan=True)
             return [f"{where}[{i}]: {one[i]!r}, not {other[i]!r}" for i in np.flatnonzero(wrong)[:3]]
         pairs = zip(expected, found, strict=True)
         return [text for i, (a, b) in enumerate(pairs) for text in differences(a, b, f"{where}[{i}]")]
