@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -105,4 +106,6 @@ def _finite(value: float | None) -> float | None:
 
 
 if __name__ == "__main__":
+    if hasattr(os, "nice"):  # not on Windows
+        os.nice(10)  # the first picture goes before the list's numbers
     sys.exit(main(sys.argv[1]))
