@@ -25,7 +25,7 @@ Try:
   vla-attention analyze words {cubes}
   vla-attention analyze report {cubes}
   vla-attention analyze compare {cubes} {one_colour}
-  vla-attention analyze effects {cubes} {reruns}
+  vla-attention analyze effects {cubes} {reruns} --dimensions 0 1 2
   vla-attention view {cubes}
 """
 
