@@ -346,8 +346,8 @@ SERIES: dict[str, tuple[int, Callable[[Series, list[int]], Iterator[dict[str, An
 }
 #: How many cases of each series a whole run has. In some of the first ones the capture ends before it is killed.
 COUNTS = {
-    "SIGKILL, one simulator": 160,
-    "SIGKILL, two simulators": 70,
+    "SIGKILL, one simulator": 200,
+    "SIGKILL, two simulators": 80,
     "SIGTERM, one simulator": 10,
     "SIGTERM, two simulators": 5,
     "Ctrl-C, one simulator": 10,
