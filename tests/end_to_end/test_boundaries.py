@@ -77,9 +77,13 @@ def test_a_process_that_ends_at_a_boundary_leaves_whole_stores(stores, tmp_path,
     total = int((tmp_path / "changes").read_text())
     assert total > 3 * SAMPLES
     given = ["one.zarr", "other.zarr"] if name == "capture" else ["a.zarr", "one.zarr", "other.zarr"]
+    killed = 0
     for number in (*sorted(Random(name).sample(range(total - 1), SAMPLES - 1)), total - 1):
         folder = begin(number)
-        assert run_child(work_and_end, name, folder, number) == -signal.SIGKILL
+        code = run_child(work_and_end, name, folder, number)
+        # Threads make some folders twice or once: the number of changes differs by a few.
+        assert code == -signal.SIGKILL or (code == 0 and number >= total - 5), (number, code)
+        killed += code != 0
         target = folder / ("a.zarr" if name == "capture" else "out.zarr")
         for store in [*given, *([target.name] if target.exists() else [])]:
             assert verify_store(open_store(folder / store)) == [], (number, store)
@@ -87,3 +91,4 @@ def test_a_process_that_ends_at_a_boundary_leaves_whole_stores(stores, tmp_path,
         for store in (*given, target.name):
             assert store_bytes(folder / store) == store_bytes(whole / store), (number, store)
         assert leftovers(target) == []
+    assert killed >= SAMPLES - 1
