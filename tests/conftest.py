@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import sys
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -53,29 +51,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(scope="session", autouse=True)
 def _zarr_works_without_threads() -> Any:
-    """zarr hands every call to a thread with its event loop, and every chunk to a pool of threads.
-
-    For the small chunks of tests, passing them between threads takes a third of the time.
-    """
-    import zarr.core.sync
-
-    in_another_thread, loop = zarr.core.sync.sync, asyncio.new_event_loop()
+    """zarr hands every chunk to a pool of threads, which for the small chunks of tests is a third of its time."""
 
     async def call(function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Any:
         return function(*arguments, **options)
 
-    def sync(coroutine: Any, *arguments: Any, **options: Any) -> Any:
-        if threading.current_thread() is not threading.main_thread():
-            return in_another_thread(coroutine, *arguments, **options)
-        return loop.run_until_complete(coroutine)
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(asyncio, "to_thread", call)
-        for name, module in list(sys.modules.items()):
-            if name.startswith("zarr.") and getattr(module, "sync", None) is in_another_thread:
-                patch.setattr(module, "sync", sync)
         yield
-    loop.close()
 
 
 @pytest.fixture(scope="session", autouse=True)
