@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vla_attention.schemas.errors import listing
+from vla_attention.schemas.plurals import plural
 from vla_attention.schemas.stores.completeness import check_presence
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import StoreError
@@ -29,7 +30,7 @@ class DamagedEpisode:
         first = self.problems[0].rstrip(".")
         first = first if self.name in first else f"Episode {self.name} is damaged: {first}"
         others = len(self.problems) - 1
-        more = f" (and {others} more fault{'s' if others > 1 else ''})" if others else ""
+        more = f" (and {plural(others, 'more fault')})" if others else ""
         return f"{first}{more}."
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,10 @@ from typing import Any
 import pytest
 
 import vla_attention.testing.stores as kit
+from tests.kit.browser import CHROMIUM, needs_chromium
 from vla_attention.analyze.__main__ import main
 
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(BROWSER is None, reason="no Chromium on the PATH")]
+pytestmark = [pytest.mark.slow, needs_chromium]
 
 #: Runs before the page's own script, and after it everything that a user would do; the findings go into the page.
 _LISTEN = """<script>
@@ -96,11 +95,11 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def browse(page: Path, *options: str) -> dict[str, Any]:
     """What the page says of itself after it was used."""
-    assert BROWSER is not None
+    assert CHROMIUM is not None
     profile = f"--user-data-dir={page.parent / 'profile'}"
     setup = ["--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run", profile]
     offline = ["--virtual-time-budget=8000", "--host-resolver-rules=MAP * ~NOTFOUND"]
-    command = [BROWSER, *setup, *offline, *options, "--dump-dom", page.as_uri()]
+    command = [CHROMIUM, *setup, *offline, *options, "--dump-dom", page.as_uri()]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     match = re.search(r'<pre id="probe">(.*?)</pre>', done.stdout, re.DOTALL)
     assert match is not None, done.stderr[-2000:]
