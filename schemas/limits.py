@@ -73,7 +73,7 @@ EXPANSION = 100
 WHOLE_FILE_BYTES = 256_000_000
 #: Bytes at the end of a packed episode's zip: metadata, small files and the directory.
 ZIP_TAIL_BYTES = 64_000_000
-#: Files of an episode; see "Few files" in docs/store.md: 46, up to version 4 about a hundred.
+#: Files of an episode; see "Few files" in docs/store.md: 46.
 EPISODE_FILES = 10_000
 #: Bytes of an array; numpy counts them in 64 bits.
 ARRAY_BYTES = 2**50

@@ -24,7 +24,7 @@ from vla_attention.schemas.stores.store_format import CorruptEpisode, FileRecord
 
 #: Types of numbers that a store holds.
 TYPES = ("uint8", "int32", "int64", "float32", "float64")
-#: Codecs of the format and of its drafts; all are in the core of Zarr v3.
+#: Codecs of the format; all are in the core of Zarr v3.
 CODECS = ("bytes", "blosc", "crc32c", "sharding_indexed")
 _COMPRESSORS = ("lz4", "zstd")
 #: Bytes of a `zarr.json` whose description is kept; real ones have up to 2 kB.

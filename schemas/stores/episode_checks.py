@@ -120,8 +120,6 @@ def _row_sums(episode: StoredEpisode, name: str, shape: tuple[int, ...]) -> NDAr
 
 def _axis_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
     """The numbers of layers, denoise steps and heads in the attributes of every site are those of the run."""
-    if root.numbers_in_arrays:
-        return  # they are arrays
     for site in root.sites:
         given = group_attributes(episode.sealed(f"{site.name}/zarr.json"))
         expected = to_json(root.recording.of_site(site).axis_numbers)

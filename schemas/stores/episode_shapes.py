@@ -43,8 +43,6 @@ def expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dict
         if recording.contributions:
             parts = len(attributes.segments.get(site.name, ())) + 1
             shapes[f"{site.name}/contribution"] = (*cells[:3], parts, parts)
-        if root.numbers_in_arrays:
-            shapes |= {f"{site.name}/{axis}": (len(given),) for axis, given in recording.axis_numbers.items()}
     return shapes
 
 

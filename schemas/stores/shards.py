@@ -219,7 +219,7 @@ class ShardedLayers:
     Attributes:
         shape: shape of the array.
         block: extent of a chunk along the replans.
-        blocks_per_shard: how many of them a file has; up to version 4 of the format one.
+        blocks_per_shard: how many of them a file has.
         keys: the array's `chunk_key_encoding`.
         shard: gives the shard in a file of the array, by its path in the array; None when the seal lists no chunks.
     """

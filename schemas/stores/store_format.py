@@ -2,8 +2,7 @@
 
 The format is frozen: within a version nothing here changes (`docs/store.md`, "Versions"). A new version raises
 `STORE_VERSION` and changes the dataclasses below; a new field has a default, with which stores of lower versions are
-read. Then write the JSON Schema files again (`python -m vla_attention.schemas.json_files`). Stores that were written
-before version 1 are in `draft_versions.py`.
+read. Then write the JSON Schema files again (`python -m vla_attention.schemas.json_files`).
 
 NAME.zarr/                            attributes: `RootAttributes`
   episodes/task003_episode007/        attributes: `EpisodeAttributes`; listed = complete
@@ -328,11 +327,6 @@ class RootAttributes:
         """The version in words."""
         return f"version {self.store_version}"
 
-    @property
-    def numbers_in_arrays(self) -> bool:
-        """Whether numbers along one axis (`NUMBERS`, `Recording.axis_numbers`) are arrays: in drafts they may be."""
-        return False
-
     def site(self, name: str) -> SiteLayout:
         """The site of that name; the error lists the existing ones."""
         for site in self.sites:
@@ -418,7 +412,7 @@ class EpisodeAttributes:
 
     The last five fields are numbers of each replan, and the noise level or flow time of each recorded denoise step;
     `env_step` counts the waiting steps too, `prompt_index` is the number of a prompt, `dataset_action_count` how many
-    of `dataset_actions` there are. Empty where they are not known, and in drafts in which they are arrays.
+    of `dataset_actions` there are. Empty where they are not known.
     """
 
     task_id: int
