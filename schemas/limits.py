@@ -54,7 +54,7 @@ AXIS = 10_000
 QUERIES = 100_000
 #: Places of a replan: layers x denoise steps x heads x queries. Cosmos with all queries has 450,000.
 PLACES = 10_000_000
-#: Queries x keys of a growing span, for which each number of keys is counted in float64.
+#: Queries x keys of a growing span, for which version 1 counts each key in float64.
 GROWING_CELLS = 1_000_000
 #: Replans of an episode: fourteen hours at 20 calls a second.
 REPLANS = 1_000_000
@@ -73,7 +73,7 @@ EXPANSION = 100
 WHOLE_FILE_BYTES = 256_000_000
 #: Bytes at the end of a packed episode's zip: metadata, small files and the directory.
 ZIP_TAIL_BYTES = 64_000_000
-#: Files of an episode; see "Few files" in docs/store.md: 46.
+#: Files of an episode; see "Few files" in docs/store.md: 52.
 EPISODE_FILES = 10_000
 #: Bytes of an array; numpy counts them in 64 bits.
 ARRAY_BYTES = 2**50

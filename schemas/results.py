@@ -61,8 +61,9 @@ class StepRatio:
 
     `total_mass` is what the fractions are of: the sum of all groups' masses (for a ratio of latent frames, of the two
     frames' masses). `num_visual_tokens` and `num_text_tokens` are the numbers of keys on the two sides, fractional
-    where objects cover parts of patches; their quotient is the ratio that uniform attention gives. The three are absent
-    in files of the published scripts and in ours from before. The last four fields are set only for a ratio of latent
+    where objects cover parts of patches; their quotient is the ratio that uniform attention gives, and they are null
+    where it is another one, because queries, layers or heads see different keys. The three are absent in files of the
+    published scripts and in ours from before. The last four fields are set only for a ratio of latent
     frames (see `FrameProxy`).
     """
 

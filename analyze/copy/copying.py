@@ -253,7 +253,7 @@ def _root_document(store: Store, without: tuple[str, ...]) -> bytes:
         provenance[FETCHED_FROM] = str(store.path)
     if without:
         _leave_out(recording, provenance, without, store.run)
-    return group_document(with_digest(attributes) if store.attributes.store_version else attributes)
+    return group_document(with_digest(attributes))
 
 
 def _leave_out(recording: dict[str, Any], provenance: dict[str, str], without: Sequence[str], run: str) -> None:

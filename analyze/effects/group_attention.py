@@ -50,7 +50,7 @@ def group_attention(
     unless given.
 
     A group is read at the question's site, or where it has no keys there and the user chose no site, at the next one
-    that has. `lift` is mass per key / mass per valid key, `norm` that of the group's contribution where the group is
+    that has. `lift` is that of `masses.group_measures`, `norm` that of the group's contribution where the group is
     made of whole segments and contributions were recorded.
     """
     names = [site.name for site in question.stores[0].attributes.sites]
@@ -156,10 +156,17 @@ def _of_group(
     if not (layers and denoise and heads):
         return np.full((replans, len(MEASURES)), np.nan)
     cells = np.ix_(range(replans), layers, denoise, heads)
-    mass = measured.mass[..., number][cells].mean(axis=(1, 2, 3))
-    valid = measured.valid_mass[cells].mean(axis=(1, 2, 3))
+    mass, valid, uniform_mass, uniform_valid = (
+        np.broadcast_to(values, measured.valid_mass.shape)[cells].mean(axis=(1, 2, 3))
+        for values in (
+            measured.mass[..., number],
+            measured.valid_mass,
+            measured.uniform_mass[..., number],
+            measured.uniform_valid,
+        )
+    )
     keys = resolved.num_keys[:, number : number + 1]
-    found = group_measures(mass[:, None], valid, keys, measured.num_valid)
+    found = group_measures(mass[:, None], valid, keys, uniform_mass[:, None], uniform_valid)
     columns = (
         mass,
         found.lift[:, 0],

@@ -7,6 +7,7 @@ averaged.
     mass       (sample, layer, denoise, head, group)   sum of probability x weight
     row_sum    (sample, layer, denoise, head)          sum of the row, before storage rounded it
     num_keys   (sample, group), num_valid (sample)     keys of the group; keys that can hold information
+    uniform_mass   as mass: what uniform attention gives; uniform_valid as row_sum: what it gives all valid keys
     rows       (sample, layer, denoise, head, key)     only on request: the probabilities themselves
     key_role   (sample, key)                           with rows: codes of `vla_attention.schemas.layout.Role`
 
@@ -84,6 +85,10 @@ def masses_array(question: Question, progress: Callable[[int], object] | None = 
     row_sum = np.concatenate([one.row_sum for one in measured])
     keys = np.concatenate([np.broadcast_to(one.num_keys, (len(one.mass), one.num_keys.shape[1])) for one in measured])
     valid = np.concatenate([np.broadcast_to(one.num_valid, len(one.mass)) for one in measured])
+    uniform, of_valid = (
+        np.concatenate([np.broadcast_to(getattr(one, name), getattr(one, like).shape) for one in measured])
+        for name, like in (("uniform_mass", "mass"), ("uniform_valid", "valid_mass"))
+    )
     cells = _MASS_DIMENSIONS[:-1]
     dataset: xarray.Dataset = xr.Dataset(
         {
@@ -93,6 +98,8 @@ def masses_array(question: Question, progress: Callable[[int], object] | None = 
                 ("sample", "group"), keys, {"long_name": "number of keys, fractional for objects"}
             ),
             "num_valid": ("sample", valid, {"long_name": "number of valid keys"}),
+            "uniform_mass": (_MASS_DIMENSIONS, uniform, {"long_name": "mass that uniform attention gives"}),
+            "uniform_valid": (cells, of_valid, {"long_name": "mass that uniform attention gives all valid keys"}),
         },
         coords={**_sample_coordinates(question), **_axis_coordinates(question), "group": list(question.grouping.names)},
         attrs=_attributes(question),
@@ -145,7 +152,7 @@ def write_netcdf(
     h5netcdf = _needed("h5netcdf")
     _needed("h5py")
     masses = masses_array(question, progress)
-    compressed = {name: {"zlib": True, "complevel": 4} for name in ("mass", "row_sum")}
+    compressed = {name: {"zlib": True, "complevel": 4} for name in ("mass", "row_sum", "uniform_mass", "uniform_valid")}
     with writing("the arrays", path), replacing(path) as temporary, untold_file(temporary) as untold:
 
         def advance(episodes: int) -> None:

@@ -9,7 +9,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.masses import ratio
+from vla_attention.analyze.measures.baselines import uniform_keys, uniform_masses
+from vla_attention.analyze.measures.masses import uniform_ratio
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.schemas.groupings.grouping import REST, Grouping
@@ -39,7 +40,8 @@ class GroupPreview:
             them there are, `episodes` in how many episodes the group takes at least one of them.
         overlaps: one row per pair of groups that share keys, with `keys_min`, `keys_mean`, `keys_max`; empty for
             disjoint groups.
-        uniform_ratio: (lowest, highest) ratio that uniform attention gives over all replans, None without a ratio.
+        uniform_ratio: (lowest, highest) ratio that uniform attention gives over all replans and selected layers, None
+            without a ratio.
     """
 
     groups: pl.DataFrame
@@ -63,7 +65,7 @@ def preview_groups(question: Question) -> GroupPreview:
         groups=_groups_table(question, names, resolved),
         words=_words_table(question, names, resolved),
         overlaps=_overlaps_table(question),
-        uniform_ratio=_uniform_ratio(grouping, resolved),
+        uniform_ratio=_uniform_ratio(question, resolved),
     )
 
 
@@ -159,13 +161,15 @@ def _overlaps_table(question: Question) -> pl.DataFrame:
     return pl.DataFrame(rows, schema=_OVERLAP_SCHEMA, orient="row")
 
 
-def _uniform_ratio(grouping: Grouping, resolved: Sequence[ResolvedGrouping]) -> tuple[float, float] | None:
+def _uniform_ratio(question: Question, resolved: Sequence[ResolvedGrouping]) -> tuple[float, float] | None:
+    grouping = question.grouping
     if grouping.ratio is None:
         return None
-    top = [grouping.names.index(name) for name in grouping.ratio.numerator]
-    bottom = [grouping.names.index(name) for name in grouping.ratio.denominator]
     values = np.concatenate(
-        [ratio(item.num_keys[:, top].sum(axis=1), item.num_keys[:, bottom].sum(axis=1)) for item in resolved]
+        [
+            uniform_ratio(uniform_masses(uniform_keys(item, question.selection), one.weights), grouping).ravel()
+            for item, one in zip(question.selected, resolved, strict=True)
+        ]
     )
     defined = values[~np.isnan(values)]
     return (float(defined.min()), float(defined.max())) if defined.size else None

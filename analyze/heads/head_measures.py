@@ -35,18 +35,19 @@ def episode_heads(measured: MeasuredEpisode, grouping: Grouping) -> Tables:
         groups: the same names, group, fraction and lift (see `masses.group_measures`).
     """
     mass, valid_mass = measured.mass.mean(axis=2), measured.valid_mass.mean(axis=2)
-    measures = group_measures(mass, valid_mass, measured.num_keys, measured.num_valid)
+    uniform_mass, uniform_valid = measured.uniform_mass.mean(axis=2), measured.uniform_valid.mean(axis=2)
+    measures = group_measures(mass, valid_mass, measured.num_keys, uniform_mass, uniform_valid)
     cells: dict[str, NDArray[Any]] = {}
     if grouping.ratio is not None:
         above, below = sides(mass, grouping)
         total = mass.sum(axis=-1)
         with np.errstate(divide="ignore", invalid="ignore"):
             log2 = np.log2(ratio(above, below))
-            uniform = np.log2(uniform_ratio(measured.num_keys, grouping))
+            uniform = np.log2(uniform_ratio(uniform_mass, grouping))
             cells["numerator_fraction"] = finite_mean(above / total)
             cells["denominator_fraction"] = finite_mean(below / total)
             cells["log2_ratio"] = finite_mean(log2)
-            cells["log2_lift"] = finite_mean(log2 - uniform[:, None, None])
+            cells["log2_lift"] = finite_mean(log2 - uniform)
         cells["numerator_mass"], cells["denominator_mass"] = above.mean(axis=0), below.mean(axis=0)
         cells["num_nonfinite"] = (~np.isfinite(log2)).sum(axis=0)
     groups = {"fraction": finite_mean(measures.fraction), "lift": finite_mean(measures.lift)}

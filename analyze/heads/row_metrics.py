@@ -26,7 +26,7 @@ from vla_attention.analyze.measures.masses import masses
 from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
-from vla_attention.analyze.measures.sinks import KeyShares, SinkRule
+from vla_attention.analyze.measures.sinks import KeyShares, SinkRule, UniformShares
 from vla_attention.analyze.measures.steps import with_valid
 from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.parallel import each_episode
@@ -75,7 +75,7 @@ class RowMeasures:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays by name, in C order."""
-        found = {"entropy": self.entropy, "top": self.top, "above": self.shares.above, "held": self.shares.held}
+        found = {"entropy": self.entropy, "top": self.top, **vars(self.shares)}
         if self.mass is not None:
             found["mass"] = self.mass
         return {name: np.ascontiguousarray(array) for name, array in found.items()}
@@ -83,7 +83,7 @@ class RowMeasures:
     @classmethod
     def of(cls, arrays: Mapping[str, NDArray[Any]]) -> RowMeasures:
         """The measures with these `arrays`."""
-        shares = KeyShares(arrays["above"], arrays["held"])
+        shares = KeyShares(arrays["above"], arrays["held"], arrays["uniform"])
         return cls(arrays["entropy"], arrays["top"], arrays.get("mass"), shares)
 
     @classmethod
@@ -92,6 +92,7 @@ class RowMeasures:
         item: SelectedEpisode,
         selection: Selection,
         options: RowOptions,
+        uniform: UniformShares,
         num_entropies: int,
         num_masses: int | None = None,
     ) -> RowMeasures:
@@ -101,7 +102,7 @@ class RowMeasures:
             np.empty((*cells, num_entropies), np.float32),
             np.empty((*cells, len(options.top)), np.float32),
             None if num_masses is None else np.empty((*cells, num_masses), np.float32),
-            KeyShares.empty(selection, item.tokens.layout.num_keys),
+            KeyShares.empty(item, selection, uniform),
         )
 
 
@@ -112,6 +113,7 @@ def measure_rows(
     site: str,
     options: RowOptions,
     shown: Sequence[str],
+    uniform: UniformShares,
     out: RowMeasures,
 ) -> None:
     """Read an episode's rows once, a layer and a denoise step at a time; rows are means over the stored queries.
@@ -123,14 +125,14 @@ def measure_rows(
         site: the softmax family.
         options: what is measured.
         shown: the groups inside which an entropy is wanted, over their valid keys.
+        uniform: what uniform attention gives the episode's keys.
         out: is filled; with masses where it has an array for them.
     """
     valid = item.valid
     weights = with_valid(resolved.weights, valid)
     # Half of the keys of a usual site are never valid: without them the measures take half the time.
     used = np.flatnonzero(valid.any(axis=0))
-    inside, counts = valid[:, used], item.key_counts
-    of_used = None if counts is None else counts[:, used]
+    inside = valid[:, used]
     columns = [*(resolved.names.index(name) for name in shown), weights.shape[2] - 1]
     within = np.ascontiguousarray(weights[:, used][:, :, columns] * inside[:, :, None])
     for part in layer_rows(item.episode, selection, site, per_head=True):
@@ -139,7 +141,9 @@ def measure_rows(
         out.top[:, part.layer, part.denoise] = top_mass(rows, inside, options.top)
         if out.mass is not None:
             out.mass[:, part.layer, part.denoise] = masses(part.rows, weights)
-        out.shares.add(part.layer, rows, inside, options.rule.factor, selection, used, of_used)
+        limit = options.rule.factor * uniform.at(part.layer, part.denoise)
+        limit = limit[..., used] if limit.shape[-1] > 1 else limit
+        out.shares.add(part.layer, rows, inside, limit, selection, used)
 
 
 def row_tables(
@@ -278,8 +282,9 @@ def _episode_measures(
     num_masses: int | None,
 ) -> dict[str, NDArray[Any]]:
     """The arrays of `measure_rows` of one episode."""
-    out = RowMeasures.empty(pair[0], selection, options, len(shown) + 1, num_masses)
-    measure_rows(*pair, selection, site, options, shown, out)
+    uniform = UniformShares.of(pair[0], selection)
+    out = RowMeasures.empty(pair[0], selection, options, uniform, len(shown) + 1, num_masses)
+    measure_rows(*pair, selection, site, options, shown, uniform, out)
     return out.arrays()
 
 

@@ -1,12 +1,12 @@
 """Ratios of contribution norms over episodes, beside what uniform attention would give.
 
 The baseline. A part i of the keys (a segment) adds the vector c_i, which attention has weighted; its mass is m_i, the
-mean over heads and queries. Its n_i keys would get the mass n_i / N from attention that is uniform over the N valid
-keys of the site, and would then add about
+mean over heads and queries. Uniform attention would give it the part s_i of what it gives all valid keys of the site
+(`schemas/groupings/key_counts.py`; n_i / N where all queries see the same N keys), and it would then add about
 
-    (n_i / N) / m_i * c_i
+    s_i / m_i * c_i
 
-so that the norm of a side is sqrt(uᵀ G u) with u_i = (n_i / N) / m_i for its parts. For uniform attention this is the
+so that the norm of a side is sqrt(uᵀ G u) with u_i = s_i / m_i for its parts. For uniform attention this is the
 norm itself, and lift = ratio / uniform ratio is 1. Between parts it is exact where attention is even inside each of
 them. Otherwise the mean value of a part as attention weights it stands for the plain mean of its values, and the mean
 over heads for each head: the store has no values of single keys. So the lift tells how attention is shared out between
@@ -17,11 +17,13 @@ much of one direction they are. Unlike masses, both may be given for sides at di
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.measures.baselines import uniform_keys, uniform_masses
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, in_larger_parts
 from vla_attention.analyze.measures.masses import ratio
 from vla_attention.analyze.measures.selected import SelectedEpisode
@@ -74,10 +76,11 @@ def uniform_weights(item: SelectedEpisode, site: str, selection: Selection) -> A
     root = item.store.attributes
     segments, tokens = item.episode.attributes.segments[site], item.episode.tokens(root, site)
     members = segment_members(tokens.layout, tokens.static_roles, segments) & tokens.valid[:, :, None]
-    counts = tokens.key_counts
-    # (replan or 1, segment)
-    keys = members.sum(axis=1, dtype=np.float64) if counts is None else (members * counts[:, :, None]).sum(axis=1)
-    share = (keys / keys.sum(axis=1, keepdims=True))[:, None, None]
+    # All stored heads and all keys, also where some were taken out: contributions are of all.
+    whole = replace(selection, heads=tuple(range(len(root.recording_of(site).heads))), per_head=False)
+    here = replace(item, tokens=tokens, without=())
+    uniform = uniform_masses(uniform_keys(here, whole), members.astype(np.float32))[:, :, :, 0]
+    share = uniform / uniform.sum(axis=-1, keepdims=True)
     mass = segment_masses(item, site, selection)
     if not has_all_heads(root, site):
         mass = np.full_like(mass, np.nan)

@@ -64,6 +64,10 @@ def replan_values(measured: MeasuredEpisode | Sequence[MeasuredEpisode], groupin
         np.concatenate([_every_replan(getattr(one, name), len(one.mass)) for one in episodes])
         for name in ("num_keys", "num_valid")
     )
+    uniform_mass, uniform_valid = (
+        np.concatenate([_every_replan(_of_layers(getattr(one, name), layers), len(one.mass)) for one in episodes])
+        for name in ("uniform_mass", "uniform_valid")
+    )
     cells: dict[str, NDArray[Any]] = {
         "row_sum": row_sum,
         "valid_mass": valid_mass,
@@ -74,12 +78,34 @@ def replan_values(measured: MeasuredEpisode | Sequence[MeasuredEpisode], groupin
         of_layers = ratio(above, below)[:, : len(episodes[0].selection.layers)]
         left_out = ~np.isfinite(of_layers)
         value = layers.with_average(of_layers, mean=finite_mean)
-        uniform = uniform_ratio(num_keys, grouping)[:, None]
+        of_uniform = uniform_ratio(uniform_mass, grouping)[:, : len(episodes[0].selection.layers)]
+        uniform = _uniform_with_average(of_uniform, of_layers, layers)
         cells |= {"numerator_mass": above, "denominator_mass": below, "uniform_ratio": uniform, "ratio": value}
         cells["nonfinite_layers"] = layers.with_average(left_out.astype(np.int64), mean=np.sum)
         # The mean of logarithms over layers has no preference for either side; the published mean of ratios has.
         cells |= relative_to_uniform(layers.with_average(of_layers, mean=finite_geometric_mean), uniform)
-    return ReplanValues(cells, lambda: group_measures(mass, valid_mass, num_keys, num_valid).columns())
+    return ReplanValues(
+        cells, lambda: group_measures(mass, valid_mass, num_keys, uniform_mass, uniform_valid).columns()
+    )
+
+
+def _of_layers(values: Array, layers: LayerAxis) -> Array:
+    """Values (replan, layer or 1, denoise, head, ...) as means over denoise steps and heads, with "layers_avg"."""
+    means = values.mean(axis=(2, 3))
+    return layers.with_average(np.broadcast_to(means, (len(means), layers.num_layers, *means.shape[2:])))
+
+
+def _uniform_with_average(uniform: Array, ratios: Array, layers: LayerAxis) -> Array:
+    """Uniform ratios (replan, layer) with that of "layers_avg" as the last.
+
+    It is the geometric mean of the layers whose ratio has a logarithm, of all layers where none has; where all layers
+    have the same, this one, finite or not.
+    """
+    known = np.isfinite(logs_of(ratios))
+    counted = np.where(known | ~known.any(axis=1, keepdims=True), uniform, np.nan)
+    average = layers.with_average(counted, mean=finite_geometric_mean)[:, -1:]
+    same = (uniform == uniform[:, :1]).all(axis=1, keepdims=True)
+    return np.concatenate([uniform, np.where(same, uniform[:, :1], average)], axis=1)
 
 
 def _every_replan(values: NDArray[Any], replans: int) -> NDArray[Any]:

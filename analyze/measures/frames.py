@@ -157,6 +157,11 @@ class LayerAxis:
         return cls((*labels, LAYERS_AVG), (*numbers, None), (*blocks, None), once)
 
     @property
+    def num_layers(self) -> int:
+        """Number of layers, without the average."""
+        return sum(number is not None for number in self.numbers)
+
+    @property
     def columns(self) -> Axis:
         """Labels `layer`, `layer_number` and `block`."""
         return {"layer": self.labels, "layer_number": self.numbers, "block": self.blocks}

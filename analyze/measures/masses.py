@@ -53,31 +53,32 @@ def group_measures(
     mass: NDArray[np.float64],
     valid_mass: NDArray[np.float64],
     num_keys: NDArray[np.float64],
-    num_valid: NDArray[np.int64] | NDArray[np.float64],
+    uniform_mass: NDArray[np.float64],
+    uniform_valid: NDArray[np.float64],
 ) -> GroupMeasures:
     """Fractions, densities and lifts of masses.
 
     fraction = mass / sum of the masses of all groups; density = mass / number of keys;
-    lift = density / (mass of all valid keys / their number), so that attention that is uniform over the valid keys
-    gives 1. Keys that not all queries see count for less (`schemas/groupings/key_counts.py`). Keys of a null sink
-    (Cosmos's padded text) are not valid: their mass is not in the mass of all valid keys.
+    lift = (mass / the mass that uniform attention gives) / (the same of all valid keys), so that attention that is
+    uniform at each query gives 1 (`schemas/groupings/key_counts.py`). Keys of a null sink (Cosmos's padded text) are
+    not valid: their mass is not in the mass of all valid keys.
 
     Args:
         mass: (replan, ..., group).
         valid_mass: (replan, ...), sum over all valid keys.
         num_keys: (replan or 1, group), fractional where objects cover parts of patches.
-        num_valid: (replan or 1,).
+        uniform_mass: what uniform attention gives the groups; as `mass`, or with axes of length 1.
+        uniform_valid: what it gives all valid keys; as `valid_mass`, or with axes of length 1.
 
     Returns:
-        Measures; density and lift of a group without keys, and every fraction of a row without any mass, is NaN.
+        Measures; density of a group without keys, lift of a group of which no query sees a key, and every fraction of a
+        row without any mass, is NaN.
     """
-    middle = (1,) * (mass.ndim - 2)
-    keys = num_keys.reshape(num_keys.shape[0], *middle, num_keys.shape[1])
-    valid = num_valid.reshape(num_valid.shape[0], *middle, 1)
+    keys = num_keys.reshape(num_keys.shape[0], *(1,) * (mass.ndim - 2), num_keys.shape[1])
     with np.errstate(divide="ignore", invalid="ignore"):
         fraction = mass / mass.sum(axis=-1, keepdims=True)
         density = np.where(keys > 0, mass / keys, np.nan)
-        lift = density / (valid_mass[..., None] / valid)
+        lift = np.where(uniform_mass > 0, mass / uniform_mass, np.nan) / (valid_mass / uniform_valid)[..., None]
     return GroupMeasures(mass, fraction, density, lift, keys)
 
 
@@ -96,12 +97,12 @@ def sides(values: NDArray[np.float64], grouping: Grouping) -> tuple[NDArray[np.f
     return values[..., top].sum(axis=-1), values[..., bottom].sum(axis=-1)
 
 
-def uniform_ratio(num_keys: NDArray[np.float64], grouping: Grouping) -> NDArray[np.float64]:
-    """The ratio that uniform attention gives: keys of the numerator / keys of the denominator.
+def uniform_ratio(uniform_mass: NDArray[np.float64], grouping: Grouping) -> NDArray[np.float64]:
+    """The ratio that uniform attention gives (...), from what it gives the groups (..., group), see `group_measures`.
 
-    num_keys: (replan or 1, group). Returns (replan or 1,); infinite or NaN as in `ratio`.
+    Infinite or NaN as in `ratio`.
     """
-    return ratio(*sides(num_keys, grouping))
+    return ratio(*sides(uniform_mass, grouping))
 
 
 def relative_to_uniform(value: NDArray[np.float64], uniform: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:

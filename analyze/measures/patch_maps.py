@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.analyze.measures.baselines import uniform_keys
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
@@ -32,3 +33,11 @@ def mean_rows(item: SelectedEpisode, selection: Selection, site: str) -> NDArray
         if selection.is_first_of_block(part.layer):
             total, count = total + part.rows.mean(axis=1, dtype=np.float64), count + 1
     return np.asarray(total) / count
+
+
+def mean_uniform(item: SelectedEpisode, selection: Selection) -> NDArray[np.float64]:
+    """What `mean_rows` is for uniform attention, shape (replan or 1, key)."""
+    uniform = uniform_keys(item, selection).mean(axis=(2, 3))
+    once = [i for i in range(len(selection.blocks)) if selection.is_first_of_block(i)]
+    means: NDArray[np.float64] = (uniform[:, once] if uniform.shape[1] > 1 else uniform).mean(axis=1)
+    return means

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.groupings.grouping import Grouping
-from vla_attention.schemas.groupings.key_counts import num_valid_keys
 from vla_attention.schemas.groupings.resolve import EmptyGroup, ResolvedGrouping, check_names, counted_keys, resolve
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary, collect_vocabulary
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
@@ -38,14 +37,10 @@ class SelectedEpisode:
         return valid
 
     @property
-    def key_counts(self) -> NDArray[np.float64] | None:
-        """For how many keys each key counts (replan or 1, key); None where every key counts for one."""
-        return self.tokens.key_counts_of(self.valid)
-
-    @property
-    def num_valid(self) -> NDArray[np.int64] | NDArray[np.float64]:
+    def num_valid(self) -> NDArray[np.int64]:
         """Number of keys that can hold information and were not taken out, shape (replan or 1,)."""
-        return num_valid_keys(self.valid, self.key_counts)
+        number: NDArray[np.int64] = self.valid.sum(axis=1)
+        return number
 
 
 def load_tokens(chosen: Sequence[tuple[Store, StoredEpisode]], site: str) -> list[SelectedEpisode]:
@@ -151,6 +146,6 @@ def _without(resolved: ResolvedGrouping, item: SelectedEpisode) -> ResolvedGroup
     return ResolvedGrouping(
         names=resolved.names,
         weights=weights,
-        num_keys=counted_keys(weights, item.key_counts),
+        num_keys=counted_keys(weights, item.tokens.existing),
         num_valid=item.num_valid,
     )

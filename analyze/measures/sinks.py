@@ -1,7 +1,8 @@
 """Sinks: keys that take far more than their share in a head, and masses without the widespread ones.
 
-The rule. In a row whose n valid keys hold the mass S, the uniform share of a key is S / n. A key is a sink of one head
-of one layer, for one task, when over the rows of that head (every selected replan and denoise step; episodes weigh the
+The rule. In a row whose valid keys hold the mass S, the uniform share of a key is what uniform attention gives it of S:
+S / n where every query sees the same n of them (`schemas/groupings/key_counts.py`). A key is a sink of one head of one
+layer, for one task, when over the rows of that head (every selected replan and denoise step; episodes weigh the
 same)
 
     by multiple   it takes more than `factor` times its uniform share in at least the share `share` of the rows, or
@@ -32,6 +33,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.measures.baselines import uniform_keys
 from vla_attention.analyze.measures.kept import measured_once
 from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
 from vla_attention.analyze.measures.question import Question
@@ -43,7 +45,6 @@ from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import BadArgument, listing
-from vla_attention.schemas.groupings.key_counts import num_valid_keys
 from vla_attention.schemas.groupings.resolve import describe_key
 from vla_attention.schemas.layout import Role
 
@@ -92,34 +93,36 @@ class KeyShares:
     Attributes:
         above: share of the rows in which the key takes more than the factor, shape (layer, head, key) float32.
         held: mean over rows of the key's share in the mass of the valid keys, shape (layer, head, key) float32.
+        uniform: mean over rows of what uniform attention gives the key of that mass, shape (layer or 1, head or 1, key)
+            float32: 1 / the number of valid keys where every query sees the same.
     """
 
     above: NDArray[np.float32]
     held: NDArray[np.float32]
+    uniform: NDArray[np.float32]
 
     @classmethod
-    def empty(cls, selection: Selection, num_keys: int) -> KeyShares:
-        """Zeros, to which `add` adds."""
-        shape = (len(layers_once(selection)), len(selection.heads), num_keys)
-        return cls(np.zeros(shape, np.float32), np.zeros(shape, np.float32))
+    def empty(cls, item: SelectedEpisode, selection: Selection, uniform: UniformShares) -> KeyShares:
+        """Zeros, to which `add` adds, and what uniform attention gives."""
+        shape = (len(layers_once(selection)), len(selection.heads), item.tokens.layout.num_keys)
+        return cls(np.zeros(shape, np.float32), np.zeros(shape, np.float32), uniform.means(selection))
 
     def add(
         self,
         layer: int,
         rows: NDArray[np.float32],
         valid: NDArray[np.bool_],
-        factor: float,
+        limit: NDArray[np.float64],
         selection: Selection,
         keys: NDArray[np.int64] | slice = slice(None),
-        counts: NDArray[np.float64] | None = None,
     ) -> None:
         """Count the rows (replan, head, key) of a layer (position in the selection) at one of its denoise steps.
 
-        A block that was named by two layer numbers counts once. `keys`: which keys the rows are of. `counts`: for how
-        many keys each of them counts, see `key_sums`.
+        A block that was named by two layer numbers counts once. `limit`: see `key_sums`. `keys`: which keys the rows
+        are of.
         """
         if selection.is_first_of_block(layer):
-            above, held = key_sums(rows, valid, factor, counts)
+            above, held = key_sums(rows, valid, limit)
             count, at = rows.shape[0] * len(selection.denoise), layers_once(selection).index(layer)
             self.above[at][:, keys] += (above / count).astype(np.float32)
             self.held[at][:, keys] += (held / count).astype(np.float32)
@@ -149,20 +152,46 @@ def layers_once(selection: Selection) -> list[int]:
     return [i for i in range(len(selection.layers)) if selection.is_first_of_block(i)]
 
 
+@dataclass(frozen=True)
+class UniformShares:
+    """What uniform attention gives every key of an episode, as a share of what it gives all valid keys.
+
+    Attributes:
+        shares: (replan or 1, layer or 1, denoise or 1, head or 1, key); 0 for a key that no query sees.
+    """
+
+    shares: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, item: SelectedEpisode, selection: Selection) -> UniformShares:
+        """Those of an episode; heads are kept apart."""
+        uniform = uniform_keys(item, replace(selection, per_head=True))
+        of_valid = (uniform * item.valid[:, None, None, None]).sum(axis=-1, keepdims=True)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return cls(np.where(of_valid > 0, uniform / of_valid, 0.0))
+
+    def at(self, layer: int, denoise: int) -> NDArray[np.float64]:
+        """Shares (replan or 1, head or 1, key) at positions of the selection; one for all keys where they are alike."""
+        _, layers, steps, _, _ = self.shares.shape
+        here = self.shares[:, layer if layers > 1 else 0, denoise if steps > 1 else 0]
+        highest = here.max(axis=-1, keepdims=True)
+        return highest if ((here == 0) | (here >= highest * (1.0 - _ROUNDING))).all() else here
+
+    def means(self, selection: Selection) -> NDArray[np.float32]:
+        """`KeyShares.uniform`."""
+        means: NDArray[np.float32] = self.shares.mean(axis=(0, 2)).astype(np.float32)
+        return means[layers_once(selection)] if len(means) > 1 else means
+
+
 def key_sums(
-    rows: NDArray[np.float32],
-    valid: NDArray[np.bool_],
-    factor: float,
-    counts: NDArray[np.float64] | None = None,
+    rows: NDArray[np.float32], valid: NDArray[np.bool_], limit: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Number of rows in which a key takes more than factor / n of the mass of the n valid keys, and its summed share.
+    """Number of rows in which a key takes more than its limit of the mass of the valid keys, and its summed share.
 
     Args:
         rows: probabilities (replan, head, key).
         valid: (replan or 1, key). A row without any mass counts for nothing.
-        factor: multiple of the uniform share.
-        counts: for how many keys each key counts (replan or 1, key), see `schemas/groupings/key_counts.py`; its uniform
-            share is as much smaller. None: every key for one.
+        limit: share (replan or 1, head or 1, key or 1).
 
     Returns:
         Two arrays of shape (head, key): number of rows, and the sum over rows of p_k / S.
@@ -171,21 +200,20 @@ def key_sums(
     total = seen.sum(axis=2, dtype=np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.where(total > 0, 1.0 / total, 0.0).astype(np.float32)
-        limit = np.where(total > 0, factor * total / num_valid_keys(valid, counts)[:, None], np.inf)
     # Sums in float32 err by some 1e-6: with a factor of 1, keys that share evenly must not exceed their share.
-    limit = (limit * (1.0 + _ROUNDING)).astype(np.float32)
-    scale = np.float32(1.0) if counts is None else counts.astype(np.float32)[:, None, :]
-    above = (seen > limit[:, :, None] * scale).sum(axis=0)
+    most = np.where(total > 0, total, np.inf)[:, :, None] * (limit * (1.0 + _ROUNDING))
+    above = (seen > most.astype(np.float32)).sum(axis=0)
     held = np.matmul(inverse.T[:, None, :], seen.transpose(1, 0, 2))[:, 0]
     return above, held.astype(np.float64)
 
 
 def episode_key_shares(item: SelectedEpisode, selection: Selection, site: str, rule: SinkRule) -> KeyShares:
     """Read an episode's rows once."""
-    valid, counts = item.valid, item.key_counts
-    shares = KeyShares.empty(selection, valid.shape[1])
+    valid, uniform = item.valid, UniformShares.of(item, selection)
+    shares = KeyShares.empty(item, selection, uniform)
     for part in layer_rows(item.episode, selection, site, per_head=True):
-        shares.add(part.layer, part.rows, valid, rule.factor, selection, counts=counts)
+        limit = rule.factor * uniform.at(part.layer, part.denoise)
+        shares.add(part.layer, part.rows, valid, limit, selection)
     return shares
 
 
@@ -196,11 +224,11 @@ def search_of(question: Question, shares: Sequence[KeyShares], rule: SinkRule) -
         keys: one row per (task, key that is valid in one of its episodes): suite, task_id, num_episodes; key, span,
             role (the commonest over the replans at which the key is valid), patch_row, patch_column (null unless the
             key is a patch), description (in words); num_valid (mean number of valid keys); share_of_rows (in which it
-            takes more than the factor), mean_mass (share of the valid keys' mass), times_uniform (mean_mass x
-            num_valid), largest_mass (mean mass in the head where it is largest), sink_heads (heads of layers in which
-            it is a sink), heads_by_mass (in which it is one by mass), num_heads (all heads of the selected layers),
-            widespread (sink_heads / num_heads is at least the rule's `heads`), value_ratio (see `sink_kinds`; null
-            where it cannot be told).
+            takes more than the factor), mean_mass (share of the valid keys' mass), times_uniform (mean_mass / what
+            uniform attention gives the key; null for one that no query sees), largest_mass (mean mass in the head where
+            it is largest), sink_heads (heads of layers in which it is a sink), heads_by_mass (in which it is one by
+            mass), num_heads (all heads of the selected layers), widespread (sink_heads / num_heads is at least the
+            rule's `heads`), value_ratio (see `sink_kinds`; null where it cannot be told).
         heads: one row per (task, key, layer, head) where the key is a sink: suite, task_id, key, layer, block, head,
             share_of_rows, mean_mass, by_mass.
     """
@@ -209,18 +237,19 @@ def search_of(question: Question, shares: Sequence[KeyShares], rule: SinkRule) -
     frames, heads = [], []
     for (suite, task), positions in _tasks(question).items():
         items = [question.selected[i] for i in positions]
-        above, held = np.zeros((2, *shares[positions[0]].held.shape))
+        above, held, uniform = np.zeros((3, *shares[positions[0]].held.shape))
         for i in positions:
             of_episode = shares[i]
             above += of_episode.above
             held += of_episode.held
+            uniform += of_episode.uniform
         above /= len(items)
         held /= len(items)
+        uniform /= len(items)
         valid = [item.valid for item in items]
         num_valid = float(np.mean([item.num_valid.mean() for item in items]))
-        counted = _mean_counts(items, valid)
         keys = np.flatnonzero(np.any([part.any(axis=0) for part in valid], axis=0))
-        by_mass = held > np.maximum(rule.mass, 2.0 * counted / num_valid)
+        by_mass = held > np.maximum(rule.mass, 2.0 * uniform)
         # A share is a mean of quotients: rounding must not put one half below 0.5.
         is_sink = by_mass | (above >= rule.share - _ROUNDING)
         count = is_sink.sum(axis=(0, 1))
@@ -228,6 +257,8 @@ def search_of(question: Question, shares: Sequence[KeyShares], rule: SinkRule) -
         described = pl.DataFrame([_describe(int(key), items, valid) for key in keys], schema=_DESCRIPTION, orient="row")
         labels = [pl.lit(suite).alias("suite"), pl.lit(task, dtype=pl.Int64).alias("task_id")]
         mean_mass = held.mean(axis=(0, 1))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            times_uniform = mean_mass / uniform.mean(axis=(0, 1))
         frames.append(
             described.select(
                 *labels,
@@ -236,7 +267,7 @@ def search_of(question: Question, shares: Sequence[KeyShares], rule: SinkRule) -
                 pl.lit(num_valid).alias("num_valid"),
                 pl.Series("share_of_rows", above.mean(axis=(0, 1))[keys]),
                 pl.Series("mean_mass", mean_mass[keys]),
-                pl.Series("times_uniform", mean_mass[keys] * num_valid / counted[keys]),
+                pl.Series("times_uniform", times_uniform[keys]).fill_nan(None),
                 pl.Series("largest_mass", held.max(axis=(0, 1))[keys]),
                 pl.Series("sink_heads", count[keys]),
                 pl.Series("heads_by_mass", by_mass.sum(axis=(0, 1))[keys]),
@@ -280,8 +311,7 @@ def search_sinks(question: Question, rule: SinkRule | None = None) -> SinkSearch
 
 
 def _share_arrays(item: SelectedEpisode, selection: Selection, site: str, rule: SinkRule) -> dict[str, NDArray[Any]]:
-    shares = episode_key_shares(item, selection, site, rule)
-    return {"above": shares.above, "held": shares.held}
+    return vars(episode_key_shares(item, selection, site, rule))
 
 
 def without_sinks(question: Question, sinks: pl.DataFrame, rule: SinkRule) -> Question:
@@ -364,18 +394,6 @@ def describe_sinks(sinks: pl.DataFrame, num_tasks: int, rule: SinkRule, num_vali
         f"Without sinks: {listing(named, 6)} {'is' if len(named) == 1 else 'are'} out of every group and of the valid "
         f"keys (but not of norms of contributions). A sink takes {of_rule}.{also}"
     )
-
-
-def _mean_counts(items: Sequence[SelectedEpisode], valid: Sequence[NDArray[np.bool_]]) -> NDArray[np.float64]:
-    """For how many keys each key counts, mean over the replans at which it is valid, (key,); 1 at the others."""
-    total = np.zeros(valid[0].shape[1])
-    number = np.zeros_like(total)
-    for item, part in zip(items, valid, strict=True):
-        counts, shape = item.key_counts, (item.tokens.num_replans, len(total))
-        own = np.broadcast_to(part, shape)
-        total += (own * np.broadcast_to(1.0 if counts is None else counts, shape)).sum(axis=0)
-        number += own.sum(axis=0)
-    return np.where((number > 0) & (total > 0), total / np.maximum(number, 1), 1.0)
 
 
 #: Columns that describe a key.

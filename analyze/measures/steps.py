@@ -11,6 +11,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.measures.baselines import uniform_keys, uniform_masses
 from vla_attention.analyze.measures.frames import (
     EPISODE_KEYS,
     Axis,
@@ -50,7 +51,7 @@ from vla_attention.schemas.groupings.resolve import ResolvedGrouping, check_name
 from vla_attention.schemas.segments import segment_members, weights_on_segments
 
 #: The arrays of a `MeasuredEpisode`.
-MEASURED_ARRAYS = ("mass", "valid_mass", "row_sum", "num_keys", "num_valid")
+MEASURED_ARRAYS = ("mass", "valid_mass", "row_sum", "num_keys", "num_valid", "uniform_mass", "uniform_valid")
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,8 @@ class MeasuredEpisode:
         row_sum: (replan, layer, denoise, head), sums of the rows before storage rounded them.
         num_keys: (replan or 1, group), fractional where objects cover parts of patches.
         num_valid: (replan or 1,), number of valid keys.
+        uniform_mass, uniform_valid: `mass` and `valid_mass` of uniform attention; axes along which nothing changes may
+            have length 1.
     """
 
     item: SelectedEpisode
@@ -74,7 +77,9 @@ class MeasuredEpisode:
     valid_mass: NDArray[np.float64]
     row_sum: NDArray[np.float64]
     num_keys: NDArray[np.float64]
-    num_valid: NDArray[np.int64] | NDArray[np.float64]
+    num_valid: NDArray[np.int64]
+    uniform_mass: NDArray[np.float64]
+    uniform_valid: NDArray[np.float64]
 
     def over_heads(self) -> MeasuredEpisode:
         """The same with heads averaged."""
@@ -84,6 +89,8 @@ class MeasuredEpisode:
             mass=self.mass.mean(axis=3, keepdims=True),
             valid_mass=self.valid_mass.mean(axis=3, keepdims=True),
             row_sum=self.row_sum.mean(axis=3, keepdims=True),
+            uniform_mass=self.uniform_mass.mean(axis=3, keepdims=True),
+            uniform_valid=self.uniform_valid.mean(axis=3, keepdims=True),
         )
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -93,12 +100,15 @@ class MeasuredEpisode:
     def at_denoise(self, position: int) -> MeasuredEpisode:
         """One denoise step alone, by its position in the selection."""
         part, selection = slice(position, position + 1), self.selection
+        of_uniform = part if self.uniform_valid.shape[2] > 1 else slice(None)
         return replace(
             self,
             selection=replace(selection, denoise=selection.denoise[part], denoise_steps=selection.denoise_steps[part]),
             mass=self.mass[:, :, part],
             valid_mass=self.valid_mass[:, :, part],
             row_sum=self.row_sum[:, :, part],
+            uniform_mass=self.uniform_mass[:, :, of_uniform],
+            uniform_valid=self.uniform_valid[:, :, of_uniform],
         )
 
 
@@ -119,7 +129,7 @@ def measure_episode(
         mass = np.empty((*row_sum.shape, weights.shape[2]))
         for part in layer_rows(item.episode, selection, site):
             mass[:, part.layer, part.denoise] = masses(part.rows, weights)
-    return measured_from(item, resolved, selection, mass, row_sum)
+    return measured_from(item, resolved, selection, mass, row_sum, weights)
 
 
 def measured_from(
@@ -128,12 +138,20 @@ def measured_from(
     selection: Selection,
     mass: NDArray[np.float64],
     row_sum: NDArray[np.float64],
+    weights: NDArray[np.float32] | None = None,
 ) -> MeasuredEpisode:
-    """A `MeasuredEpisode` from masses (replan, layer, denoise, head, group + 1); the last mass is of all valid keys."""
+    """A `MeasuredEpisode` from masses (replan, layer, denoise, head, group + 1); the last mass is of all valid keys.
+
+    weights: `with_valid`, made here unless they are given.
+    """
+    if weights is None:
+        weights = with_valid(resolved.weights, item.valid)
+    uniform = uniform_masses(uniform_keys(item, selection), weights)
     # In C order, as they come from the cache and from other processes: numpy's sums depend on the order in memory.
-    groups, valid = np.ascontiguousarray(mass[..., :-1]), np.ascontiguousarray(mass[..., -1])
+    arrays = (mass[..., :-1], mass[..., -1], row_sum, uniform[..., :-1], uniform[..., -1])
+    groups, valid, row_sum, of_groups, of_valid = map(np.ascontiguousarray, arrays)
     return MeasuredEpisode(
-        item, selection, groups, valid, np.ascontiguousarray(row_sum), resolved.num_keys, resolved.num_valid
+        item, selection, groups, valid, row_sum, resolved.num_keys, resolved.num_valid, of_groups, of_valid
     )
 
 
@@ -255,11 +273,11 @@ def _step_cells(measured: MeasuredEpisode, grouping: Grouping) -> pl.DataFrame:
     cells = {
         "row_sum": measured.row_sum,
         "valid_mass": measured.valid_mass,
-        "num_valid": _per_replan(measured.num_valid),
+        "num_valid": measured.num_valid[:, None, None, None],
     }
     if grouping.ratio is not None:
         above, below = sides(mass, grouping)
-        value, uniform = ratio(above, below), _per_replan(uniform_ratio(measured.num_keys, grouping))
+        value, uniform = ratio(above, below), uniform_ratio(measured.uniform_mass, grouping)
         cells |= {"numerator_mass": above, "denominator_mass": below, "ratio": value, "uniform_ratio": uniform}
         cells |= relative_to_uniform(value, uniform)
     return long_table(
@@ -276,13 +294,10 @@ def _step_groups(measured: MeasuredEpisode, grouping: Grouping) -> pl.DataFrame:
         head_axis(selection),
         {"group": grouping.names},
     ]
-    measures = group_measures(mass, measured.valid_mass, measured.num_keys, measured.num_valid)
+    measures = group_measures(
+        mass, measured.valid_mass, measured.num_keys, measured.uniform_mass, measured.uniform_valid
+    )
     return long_table(measured.item, axes, measures.columns())
-
-
-def _per_replan(values: NDArray[np.int64] | NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values (replan or 1,) as (replan or 1, 1, 1, 1)."""
-    return values[:, None, None, None]  # type: ignore[return-value]
 
 
 def row_sums(item: SelectedEpisode, selection: Selection, site: str) -> NDArray[np.float64]:

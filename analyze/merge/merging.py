@@ -115,6 +115,12 @@ def _check(stores: Sequence[Store], target: Path) -> None:
 def _check_same_run(one: Store, other: Store) -> None:
     if one.run == other.run and _left_out(one) == _left_out(other):
         return
+    versions = [store.attributes.version_text for store in (one, other)]
+    if versions[0] != versions[1]:
+        raise RunMismatch(
+            f"Cannot merge {one.path} and {other.path}: the one is of {versions[0]} and the other of {versions[1]} of "
+            "the store format, and no store has episodes of both. Analyses take several stores: give them both."
+        )
     found = [
         f"{where} is {_short(here)} in the one and {_short(there)} in the other"
         for where, here, there in run_differences(one.attributes, other.attributes)
@@ -165,7 +171,7 @@ def _root_document(stores: Sequence[Store]) -> bytes:
     attributes["provenance"]["merged_from"] = ", ".join(
         f"{_named(store.path)} ({plural(len(store.episodes), 'episode')})" for store in stores
     )
-    return group_document(with_digest(attributes) if stores[0].attributes.store_version else attributes)
+    return group_document(with_digest(attributes))
 
 
 def _named(place: StorePlace) -> str:

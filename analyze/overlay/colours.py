@@ -62,20 +62,20 @@ def patch_values(
     """The values that an overlay shows, from the masses of patches.
 
     share: 100 x mass / summed mass of all image keys of the replan, in per cent.
-    lift: mass / (mean mass of a valid key of the replan): uniform attention over the valid keys gives 1.
+    lift: mass / the mass that uniform attention gives, which has lift 1 in every patch.
 
     Args:
         mass: (replan, row, column).
         image_mass: (replan,), mass of all image keys of all cameras.
-        uniform_mass: (replan,), mass of all valid keys / their number.
+        uniform_mass: (replan, row, column), what uniform attention gives the patches.
         measure: lift or share.
 
     Returns:
         (replan, row, column); NaN where the divisor is 0.
     """
-    below = uniform_mass if measure == "lift" else np.asarray(image_mass) / 100.0
+    below = np.asarray(uniform_mass) if measure == "lift" else np.asarray(image_mass)[:, None, None] / 100.0
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(mass, dtype=np.float64) / np.asarray(below)[:, None, None]
+        return np.asarray(mass, dtype=np.float64) / below
 
 
 def scale_for(values: NDArray[np.floating], measure: Measure, num_patches: int) -> Scale:
@@ -89,7 +89,7 @@ def scale_for(values: NDArray[np.floating], measure: Measure, num_patches: int) 
     top = float(np.quantile(finite, _TOP_QUANTILE)) if finite.size else 0.0
     high = _round_up(max(top, _LEAST_TOP * uniform))
     if measure == "lift":
-        return Scale(high, "lift of a patch (mass / mean mass of a valid key)", uniform)
+        return Scale(high, "lift of a patch (mass / mass of uniform attention)", uniform)
     return Scale(high, "share of a patch in all image attention (%)", uniform, "%")
 
 

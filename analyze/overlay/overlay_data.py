@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.aggregate import overall_layer, replans_of
 from vla_attention.analyze.measures.frames import Axis, long_table, rows_of_episode
-from vla_attention.analyze.measures.patch_maps import mean_rows, seen_cameras
+from vla_attention.analyze.measures.patch_maps import mean_rows, mean_uniform, seen_cameras
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, check_replan
 from vla_attention.analyze.overlay.colours import (
@@ -44,7 +44,7 @@ class EpisodeOverlay:
         views: how each shown camera's picture was turned.
         maps: by camera, mass of every patch (replan, row, column) in the stored orientation.
         image_mass: mass of all image keys of all cameras, (replan,).
-        uniform_mass: mass of all valid keys / their number, (replan,).
+        uniform_mass: by camera, what uniform attention gives every patch, (replan, row, column).
         num_image_keys: image keys of all cameras.
         ratio: ratio of the question's grouping at each replan (replan,), NaN where undefined; None when it has no
             ratio.
@@ -57,7 +57,7 @@ class EpisodeOverlay:
     views: dict[str, PolicyCameraView]
     maps: dict[str, NDArray[np.float64]]
     image_mass: NDArray[np.float64]
-    uniform_mass: NDArray[np.float64]
+    uniform_mass: dict[str, NDArray[np.float64]]
     num_image_keys: int
     ratio: NDArray[np.float64] | None
     uniform_ratio: NDArray[np.float64] | None
@@ -75,7 +75,7 @@ class EpisodeOverlay:
     def values(self, measure: Measure) -> dict[str, NDArray[np.float64]]:
         """By camera, what overlays show (replan, row, column); see `overlays.patch_values`."""
         return {
-            camera: patch_values(mass, self.image_mass, self.uniform_mass, measure)
+            camera: patch_values(mass, self.image_mass, self.uniform_mass[camera], measure)
             for camera, mass in self.maps.items()
         }
 
@@ -138,14 +138,19 @@ def episode_overlay(
     tokens = item.tokens
     mean = mean_rows(item, question.selection, question.site)
     image = tokens.static_roles == int(Role.IMAGE)
-    valid = np.broadcast_to(item.valid, mean.shape)
+    # As much mass as the valid keys have, shared out as uniform attention does.
+    valid, uniform_keys = item.valid, mean_uniform(item, question.selection)
+    uniform_keys = uniform_keys * ((mean * valid).sum(axis=1) / (uniform_keys * valid).sum(axis=1))[:, None]
     attributes = item.store.attributes.policy
     by_name = {view.name: view for view in attributes.cameras}
-    maps, views = {}, {}
+    maps, of_uniform, views = {}, {}, {}
     for camera in cameras:
         span = tokens.layout.camera_span(camera)
         assert span.grid is not None
-        maps[camera] = mean[:, span.start : span.stop].reshape(-1, span.grid.rows, span.grid.columns)
+        maps[camera], of_uniform[camera] = (
+            keys[:, span.start : span.stop].reshape(-1, span.grid.rows, span.grid.columns)
+            for keys in (mean, uniform_keys)
+        )
         views[camera] = by_name.get(camera, PolicyCameraView(camera, camera, True, False))
     ratio = uniform = None
     if question.grouping.ratio is not None:
@@ -159,7 +164,7 @@ def episode_overlay(
         views=views,
         maps=maps,
         image_mass=(mean * image).sum(axis=1),
-        uniform_mass=(mean * valid).sum(axis=1) / item.num_valid,
+        uniform_mass=of_uniform,
         num_image_keys=int(image.sum(axis=1).max()),
         ratio=ratio,
         uniform_ratio=uniform,

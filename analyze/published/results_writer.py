@@ -13,8 +13,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.frames import EPISODE_KEYS, LAYERS_AVG, Tables
-from vla_attention.analyze.measures.masses import sides
+from vla_attention.analyze.measures.frames import EPISODE_KEYS, LAYERS_AVG, Tables, float_values
+from vla_attention.analyze.measures.masses import ratio, sides
 from vla_attention.analyze.show.output_files import replacing
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.results import FrameProxy, ResultsError, loop_counter, results_file_name
@@ -136,6 +136,10 @@ def _with_sides(replans: Tables, grouping: Grouping, proxy: FrameProxy | None) -
     queries = 1 if proxy is None else proxy.num_queries
     total = visual + linguistic if proxy else pl.Series(replans.values("mass").sum(axis=1))
     above, below = sides(replans.values("keys"), grouping)
+    # Their quotient is read as the ratio of uniform attention, which it is where all queries see the same keys.
+    uniform = float_values(cells["uniform_ratio"])
+    same = ~np.isfinite(uniform) | np.isclose(uniform, ratio(above, below), rtol=1e-5)
+    above, below = (np.where(same, keys, np.nan) for keys in (above, below))
     table = cells.with_columns(
         pl.col("env_step").alias("step"),
         pl.when(pl.col("ratio").is_finite()).then(pl.col("ratio")).alias(_RATIO),
@@ -144,7 +148,7 @@ def _with_sides(replans: Tables, grouping: Grouping, proxy: FrameProxy | None) -
         (visual / total).fill_nan(None).alias("visual_fraction"),
         (linguistic / total).fill_nan(None).alias("linguistic_fraction"),
         (total * queries).alias("total_mass"),
-        *(pl.Series(name, keys) for name, keys in zip(_KEYS, (above, below), strict=True)),
+        *(pl.Series(name, keys).fill_nan(None) for name, keys in zip(_KEYS, (above, below), strict=True)),
     )
     if _ACTION in grouping.names:
         of_action = replans.of_group(_ACTION)

@@ -11,6 +11,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.measures.baselines import uniform_keys, uniform_masses
 from vla_attention.analyze.measures.frames import EPISODE_KEYS, LayerAxis, head_axis, long_table
 from vla_attention.analyze.measures.kept import measured_once
 from vla_attention.analyze.measures.masses import finite_mean, group_measures, masses
@@ -55,7 +56,7 @@ def words_table(question: Question) -> pl.DataFrame:
             pieces    number of keys
             mass      sum of the rows over these keys, mean over denoise steps and heads
             density   mass / pieces
-            lift      density / (mass of all valid keys / their number): 1 is what uniform attention gives
+            lift      as of a group, see `masses.group_measures`: 1 is what uniform attention gives
             share     mass / mass of all linguistic keys (bos, template, instruction, text; null where there is none)
         `density`, `lift` and `share` are computed per replan from masses that were averaged over denoise steps and
         heads (for "layers_avg" also over layers), as everywhere in `vla_attention.analyze.measures`.
@@ -125,9 +126,11 @@ def _episode_words(item: SelectedEpisode, mass: NDArray[np.float64], selection: 
     items = _episode_items(item)
     layers = LayerAxis.of(selection, average_one=False)
     mass = layers.with_average(mass)
-    keys = counted_keys(items.weights, item.key_counts)
-    valid = keys[:, -1] if item.key_counts is not None else keys[:, -1].astype(np.int64)
-    measures = group_measures(mass[..., :-2], mass[..., -1], keys[:, :-2], valid)
+    keys = counted_keys(items.weights, item.tokens.existing)
+    uniform = uniform_masses(uniform_keys(item, selection), items.weights).mean(axis=2)
+    if uniform.shape[1] > 1:
+        uniform = layers.with_average(uniform)
+    measures = group_measures(mass[..., :-2], mass[..., -1], keys[:, :-2], uniform[..., :-2], uniform[..., -1])
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.where(mass[..., -2:-1] > 0, measures.mass / mass[..., -2:-1], np.nan)
     outside = np.array([name in {Role.STATE.label, Role.IMAGE.label} for _, name, _, _ in items.names])

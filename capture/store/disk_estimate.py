@@ -73,6 +73,8 @@ def estimate_disk(
         segments = sum(_SEGMENTS_OF_SPAN.get(span.kind, 1) for span in site.spans)
         total += rows_of_site * site.num_keys * bytes_per_number(recording.mantissa_bits) + chunks * _CHUNK_OVERHEAD
         total += rows_of_site * 4 * (segments + 1) * _INCOMPRESSIBLE + site.num_keys
+        # What uniform attention gives is one row a replan where all queries see the same keys.
+        total += 4 * site.num_keys * _INCOMPRESSIBLE + _CHUNK_OVERHEAD
         total += chunks * 4 * (segments + 1) ** 2 * _INCOMPRESSIBLE if recording.contributions else 0
         total += sum(_BYTES_PER_PIECE * span.num_keys for span in site.spans if span.kind == "text")
         total += sum(_COVERAGE_BYTES_PER_PATCH * span.num_keys for span in site.spans if span.camera is not None)

@@ -154,6 +154,7 @@ class EpisodeWriter:
             yield from site.problems(record.rows[name], record.key_role[name], replan)
             prompt = prompt_at(sites, site.layout, record.prompt)
             yield from piece_role_problems(site.layout, record.key_role[name], prompt, replan, only_site=only_site)
+            yield from site.unseen_problems(record.rows[name], record.key_role[name], replan)
         if record.prompt not in self.prompts:
             yield from prompt_problems(sites, record.prompt)
         for camera, frame in record.frames.items():
@@ -200,8 +201,8 @@ class EpisodeWriter:
         """
         with naming_the_failure(self.what):
             self._check_store()
-            for name, site in self.sites.items():
-                self.digests[f"{name}/rows"] = site.finish()
+            for site in self.sites.values():
+                self.digests |= site.finish()
             self._write_side_arrays()
             self.group.update_attributes(to_json(self._attributes(success, num_steps)))
             run = read_run(self.store)[1]

@@ -17,8 +17,12 @@ class RecordedRows:
     contribution: (layer, denoise, part, part) float32, or None when contributions are not recorded. Entry (i, j) is the
         inner product of what parts i and j of the keys add to the residual stream, averaged over the action queries;
         the last part is the block's whole attention update.
+    uniform: what uniform attention gives in the place of each row, (layer, denoise, head, query, key) float32, see
+        `schemas/groupings/key_counts.py`; an axis along which nothing changes may have length 1. None: every query sees
+        every key whose role is none of `UNSEEN_ROLES`.
     """
 
     rows: NDArray[np.float32]
     row_sum: NDArray[np.float32]
     contribution: NDArray[np.float32] | None = None
+    uniform: NDArray[np.float32] | None = None

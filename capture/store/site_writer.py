@@ -13,6 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 from vla_attention.capture.store.codecs import create_rows, replans_per_block
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.shard_writer import ShardWriter
+from vla_attention.schemas.groupings.key_counts import uniform_of_roles
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import ROLE_DTYPE, SiteLayout
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, round_mantissa
@@ -23,6 +24,8 @@ from vla_attention.schemas.stores.content_rules import (
     role_problems,
     row_problems,
     row_sum_problems,
+    uniform_problems,
+    unseen_problems,
 )
 from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.store_format import (
@@ -66,6 +69,7 @@ class SiteWriter:
         self.roles: list[NDArray[np.uint8]] = []
         self.masses: list[tuple[tuple[Segment, ...], NDArray[np.float32]]] = []
         self.contributions: list[NDArray[np.float32]] = []
+        self.uniforms: list[NDArray[np.float32]] = []
         self.segments: tuple[Segment, ...] = ()
         group.create_group(layout.name, attributes=to_json(recording.axis_numbers))
 
@@ -84,6 +88,11 @@ class SiteWriter:
         elif gram is not None and not faults:
             parts = len(segments_of(self.layout, key_role)) + 1
             faults += _array_faults(f"{name}/contribution", gram, (*self.shape[:2], parts, parts), np.float32)
+        uniform = _uniform(recorded, key_role)
+        if uniform.ndim != rows.ndim or not all(
+            given in (1, length) for given, length in zip(uniform.shape, wanted, strict=True)
+        ):
+            faults.append(f"{name}/uniform has the shape {uniform.shape}; expected {wanted}, or 1 in place of a length")
         if faults:
             yield from faults  # the numbers of wrong shapes have no places that could be named
             return
@@ -93,8 +102,14 @@ class SiteWriter:
         )
         yield from row_sum_problems(f"{name}/row_sum", recorded.row_sum[None], recording, replan)
         yield from absent_problems(self.layout, rows[None], key_role[None], recording, replan)
+        yield from uniform_problems(f"{name}/uniform", uniform[None], replan)
         if gram is not None:
             yield from gram_problems(f"{name}/contribution", gram[None], recording, replan)
+
+    def unseen_problems(self, recorded: RecordedRows, key_role: NDArray[np.uint8], replan: int) -> Iterator[str]:
+        """The same of mass on keys that no query sees."""
+        name, uniform = f"{self.layout.name}/rows", _uniform(recorded, key_role)
+        yield from unseen_problems(name, recorded.rows[None], uniform[None], self.recording, replan)
 
     def append(self, recorded: RecordedRows, key_role: NDArray[np.uint8]) -> None:
         """Add the next replan, in which `problems` found nothing. Rows as in `RecordedRows`; roles (key,)."""
@@ -106,6 +121,7 @@ class SiteWriter:
         self.masses.append((segments, segment_masses(recorded.rows, members)))
         self.row_sums.append(recorded.row_sum)
         self.roles.append(key_role)
+        self.uniforms.append(_uniform(recorded, key_role))
         self.pending.append(round_mantissa(recorded.rows, self.bits))
         if len(self.pending) == self.block:
             self._flush()
@@ -119,8 +135,8 @@ class SiteWriter:
         self.rows.append(rows)
         self.rows_digest.update(rows)
 
-    def finish(self) -> ArrayRecord:
-        """Write the last rows and all other arrays of the site; returns shape and digest of the rows."""
+    def finish(self) -> dict[str, ArrayRecord]:
+        """Write the last rows and all other arrays of the site; returns shape and digest of those in shards."""
         if self.pending:
             self._flush()
         if self.rows is None:
@@ -136,9 +152,32 @@ class SiteWriter:
         self.write(f"{name}/atoms", atoms, ATOM_AXES)
         if self.contributions:
             self._write_contributions(column)
+        uniform = self._write_uniform()
         self.write(f"{name}/row_sum", np.stack(self.row_sums), ROW_AXES[:-1])
         self.write(f"{name}/key_role", np.stack(self.roles), ("replan", "key"))
-        return ArrayRecord(rows.shape, self.rows_digest.hexdigest())
+        return {f"{name}/rows": ArrayRecord(rows.shape, self.rows_digest.hexdigest()), f"{name}/uniform": uniform}
+
+    def _write_uniform(self) -> ArrayRecord:
+        """Write what uniform attention gives, once along every axis along which it is the same."""
+        cells = np.broadcast_shapes(*(uniform.shape for uniform in self.uniforms))
+        uniform = np.stack([np.broadcast_to(of_replan, cells) for of_replan in self.uniforms])
+        for axis in range(uniform.ndim - 1):
+            first = uniform.take([0], axis=axis)
+            uniform = first if (uniform == first).all() else uniform
+        # In the layout of rows: masks may differ in as many ways, and an analysis reads its layers only.
+        name, shape = f"{self.layout.name}/uniform", uniform.shape
+        block = replans_per_block(4 * int(np.prod(shape[3:])), len(uniform))
+        shard = ShardWriter(self.folder / name, shape[1:], block)
+        for first_replan in range(0, len(uniform), block):
+            shard.append(uniform[first_replan : first_replan + block])
+        shard.finish()
+        # Axes of one name have one length in a group, or xarray does not open it.
+        lengths = (len(self.roles), *self.shape, self.layout.num_keys)
+        axes = [axis if n == m else f"any_{axis}" for axis, n, m in zip(ROW_AXES, shape, lengths, strict=True)]
+        create_rows(self.group, name, shape, block, axes)
+        digest = ArrayDigest()
+        digest.update(uniform)
+        return ArrayRecord(shape, digest.hexdigest())
 
     def _write_contributions(self, column: dict[Segment, int]) -> None:
         size = len(column) + 1
@@ -148,6 +187,13 @@ class SiteWriter:
             at = [*(column[segment] for segment in segments), size - 1]
             grams[replan][..., np.ix_(at, at)[0], np.ix_(at, at)[1]] = gram
         self.write(f"{self.layout.name}/contribution", grams, CONTRIBUTION_AXES)
+
+
+def _uniform(recorded: RecordedRows, key_role: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """`RecordedRows.uniform`, made from the roles (key,) where it is None."""
+    if recorded.uniform is not None:
+        return recorded.uniform
+    return uniform_of_roles(key_role).astype(np.float32)[None, None, None, None]
 
 
 def _array_faults(name: str, values: NDArray[Any], shape: tuple[int, ...], dtype: DTypeLike) -> Iterator[str]:

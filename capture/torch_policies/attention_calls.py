@@ -69,7 +69,10 @@ class CallTensors(Protocol):
         ...
 
     def allowed(self, queries: Positions) -> Tensor:
-        """Return (batch, query, key) bool: keys that the policy's mask lets the query see in any head."""
+        """Return (batch, head or 1, query, key) bool: keys that the policy's own mask lets the query see.
+
+        The axis of heads may have length 1 where all of them have the same mask.
+        """
         ...
 
 
@@ -103,7 +106,7 @@ class AttentionCall:
             return self.tensors.rows(queries, batch)
 
     def allowed(self, queries: Positions = slice(None)) -> Tensor:
-        """Return (batch, query, key) bool: keys that the policy's mask lets the query see in any head."""
+        """Return (batch, head or 1, query, key) bool: keys that the policy's own mask lets the query see."""
         with _exact():
             return self.tensors.allowed(queries)
 

@@ -62,13 +62,13 @@ class LogitTensors:
         return normalised(logits)
 
     def allowed(self, queries: Positions) -> Tensor:
-        """Return (batch, query, key) bool."""
+        """Return (batch, head or 1, query, key) bool."""
         batch, keys = self.key.shape[0], self.key.shape[2]
         numbers = self._numbers(queries)
-        seen = torch.ones((batch, len(numbers), keys), dtype=torch.bool, device=self.query.device)
+        seen = torch.ones((batch, 1, len(numbers), keys), dtype=torch.bool, device=self.query.device)
         if self.mask is not None:
             mask = part(self.mask, queries, slice(None))
-            seen &= (mask if mask.dtype is torch.bool else mask > MASKED_BELOW).any(1)
+            seen = seen & (mask if mask.dtype is torch.bool else mask > MASKED_BELOW)
         if self.causal:
             seen &= causal_mask(numbers, keys)
         return seen

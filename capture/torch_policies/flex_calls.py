@@ -78,12 +78,12 @@ class FlexTensors:
         return logits.masked_fill(~_over_places(self.mask, False)(*places, *self.mask_buffers), float("-inf"))
 
     def allowed(self, queries: Positions) -> Tensor:
-        """Return (batch, query, key) bool."""
+        """Return (batch, head, query, key) bool."""
         numbers = position_numbers(queries, self.query.shape[2], self.query.device)
         batches = torch.arange(self.query.shape[0], device=self.query.device)
         places = self._places(batches, numbers)
         full = (len(batches), self.query.shape[1], len(numbers), self.key.shape[2])
-        return _over_places(self.mask, False)(*places, *self.mask_buffers).expand(full).any(1)
+        return _over_places(self.mask, False)(*places, *self.mask_buffers).expand(full)
 
     def _places(self, batches: Tensor, queries: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         device = self.query.device

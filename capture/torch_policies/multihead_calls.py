@@ -109,13 +109,13 @@ class MultiheadTensors:
         return self.kernel.rows(queries, batch)
 
     def allowed(self, queries: Positions) -> Tensor:
-        """Return (batch, query, key) bool."""
+        """Return (batch, head or 1, query, key) bool."""
         given, (batch, heads, count, _) = self.given, self.kernel.outputs.shape
         keys = given["key"].shape[0] if given["static_k"] is None else given["static_k"].shape[1]
-        seen = (_mask_logits(given, batch, heads, count, keys) > MASKED_BELOW).any(1)
+        seen = _mask_logits(given, batch, heads, count, keys) > MASKED_BELOW
         extra = (given["bias_k"] is not None) + bool(given["add_zero_attn"])
-        seen = torch.nn.functional.pad(seen.expand(batch, count, keys), (0, extra), value=True)
-        return seen[:, position_numbers(queries, count, seen.device)]
+        seen = torch.nn.functional.pad(seen.expand(batch, -1, count, keys), (0, extra), value=True)
+        return seen[:, :, position_numbers(queries, count, seen.device)]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
-from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit, KnownCalls
 from vla_attention.capture.torch_policies.knockouts import SessionKnockouts
@@ -453,8 +452,7 @@ class RecordedRun:
         for site in self._sites:
             of_site = found[site.name]
             roles = text.roles(row, site, prompt, of_site.present, of_site.valid)
-            rows, gram = of_site.rows, final_contribution(site, of_site, roles)
-            stored[site.name] = RecordedRows(rows.rows, rows.row_sum, gram)
+            stored[site.name] = replace(of_site.rows, contribution=final_contribution(site, of_site, roles))
             key_role[site.name] = roles
         recorded = inputs.dataset_actions
         if recorded is not None and actions is not None:

@@ -45,6 +45,7 @@ class RowsDoNotMatch(UserError, ArithmeticError):
 class SiteRows:
     """What one replan of one episode gave at one site.
 
+    rows: with what uniform attention gives.
     present, valid: (key,) bool; keys that some recorded call had, and that some action query could see.
     early_roles: (key,) the roles for which contributions were made, which know of no masks; None without contributions.
     """
@@ -59,12 +60,14 @@ class SiteRows:
 class _Collected:
     """Of one site: tensors by (block, denoise step), each (row, head, query, key); autoregressive: several.
 
-    grams: by (block, denoise step, row of the batch), (part, part). seen: (row of the batch, key) bool.
+    uniform: what uniform attention gives in the place of `rows`, (row, head or 1, query, key). Equal ones are one
+    tensor, of `kinds`. grams: by (block, denoise step, row of the batch), (part, part).
     """
 
     rows: dict[tuple[int, int], list[Tensor]] = field(default_factory=dict)
+    uniform: dict[tuple[int, int], list[Tensor]] = field(default_factory=dict)
+    kinds: list[Tensor] = field(default_factory=list)
     grams: dict[tuple[int, int, int], list[Tensor]] = field(default_factory=dict)
-    seen: Tensor | None = None
     roles: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
     parts: dict[int, list[slice | Tensor]] = field(default_factory=dict)
 
@@ -202,21 +205,27 @@ class ReplanRecorder:
             )
         self.largest_error = max(self.largest_error, error)
         self._check_error(error, call, rows, place)
-        allowed = call.allowed(queries).any(dim=1)
+        seen = call.allowed(queries)
+        uniform = seen / seen.sum(dim=-1, keepdim=True).clamp(min=1)
         keys = None if place.keys is None else torch.from_numpy(place.keys).to(rows.device)
         if keys is not None:
-            rows, allowed = _spread(rows, keys, site.keys.num_keys), _spread(allowed, keys, site.keys.num_keys)
-        collected.seen = allowed if collected.seen is None else collected.seen | allowed
+            rows, uniform = _spread(rows, keys, site.keys.num_keys), _spread(uniform, keys, site.keys.num_keys)
         if recording.contributions:
             self._take_contributions(call, rows, keys, place, site, cell)
-        chosen = rows
-        if len(self.rows) < self.batch:
-            chosen = chosen.index_select(0, torch.tensor(self.rows, device=rows.device))
-        if recording.heads != tuple(range(call.shape.heads)):
-            chosen = chosen.index_select(1, torch.tensor(recording.heads, device=rows.device))
-        if recording.queries == "mean" and not self.layout.autoregressive:
-            chosen = chosen.mean(dim=2, keepdim=True)
+        chosen = self._chosen(rows, recording)
         collected.rows.setdefault(cell, []).append(chosen.cpu() if chosen.numel() > _LARGE_COPY else chosen)
+        collected.uniform.setdefault(cell, []).append(_kind_of(self._chosen(uniform, recording), collected.kinds))
+
+    def _chosen(self, values: Tensor, recording: Recording) -> Tensor:
+        """What is recorded (row, head or 1, query, key) of values (batch, head or 1, query, key)."""
+        if len(self.rows) < self.batch:
+            values = values.index_select(0, torch.tensor(self.rows, device=values.device))
+        heads = values.shape[1]
+        if heads > 1 and recording.heads != tuple(range(heads)):
+            values = values.index_select(1, torch.tensor(recording.heads, device=values.device))
+        if recording.queries == "mean" and not self.layout.autoregressive:
+            values = values.mean(dim=2, keepdim=True)
+        return values
 
     def _check_error(self, error: float, call: AttentionCall, rows: Tensor, place: CallPlace) -> None:
         shape, precision = call.shape, call.precision
@@ -277,8 +286,7 @@ class ReplanRecorder:
             site, collected = self.layout.site(name), self._collected[name]
             cells = [(block, step) for block in recording.layers for step in recording.denoise_steps]
             stacked = self._stacked(collected, cells, recording)
-            assert collected.seen is not None
-            seen = collected.seen.cpu().numpy()
+            uniform = self._uniform(collected, cells, recording)
             for position, row in enumerate(self.rows):
                 rows = np.ascontiguousarray(stacked[:, position])
                 rows = rows.reshape(len(recording.layers), len(recording.denoise_steps), *rows.shape[1:])
@@ -289,10 +297,11 @@ class ReplanRecorder:
                     gram = torch.stack(grams).cpu().numpy()
                     contribution = gram.reshape(*rows.shape[:2], *gram.shape[1:])
                 row_sum = rows.sum(axis=-1, dtype=np.float64).astype(np.float32)
+                own = np.ascontiguousarray(uniform[:, :, position])
                 found[position][site.name] = SiteRows(
-                    RecordedRows(rows, row_sum, contribution),
+                    RecordedRows(rows, row_sum, contribution, own),
                     self.order.present[site.name],
-                    seen[row],
+                    np.asarray((own > 0).any(axis=(0, 1, 2, 3))),
                     collected.roles.get(row),
                 )
         return found
@@ -301,15 +310,33 @@ class ReplanRecorder:
         self, collected: _Collected, cells: Sequence[tuple[int, int]], recording: Recording
     ) -> NDArray[np.float32]:
         """All rows of a site, (cell, row of the batch, head, query, key), moved off the device in one transfer."""
-        each = []
-        for cell in cells:
-            tensors = collected.rows[cell]
-            joined = tensors[0] if len(tensors) == 1 else torch.cat(tensors, dim=2)
-            if self.layout.autoregressive and recording.queries == "mean":
-                joined = joined.mean(dim=2, keepdim=True)
-            each.append(joined)
+        each = [self._joined(collected.rows[cell], recording) for cell in cells]
         result: NDArray[np.float32] = torch.stack(each).cpu().numpy()
         return result
+
+    def _uniform(
+        self, collected: _Collected, cells: Sequence[tuple[int, int]], recording: Recording
+    ) -> NDArray[np.float32]:
+        """What uniform attention gives, (layer or 1, denoise or 1, row of the batch, head or 1, query, key)."""
+        calls = [tuple(id(tensor) for tensor in collected.uniform[cell]) for cell in cells]
+        first = dict(zip(calls, cells, strict=True))
+        kinds = {call: self._joined(collected.uniform[cell], recording).cpu() for call, cell in first.items()}
+        if len(kinds) == 1:
+            (only,) = kinds.values()
+            return only.numpy()[None, None]
+        heads = max(kind.shape[1] for kind in kinds.values())
+        each = torch.stack([kinds[call].expand(-1, heads, -1, -1) for call in calls]).numpy()
+        result: NDArray[np.float32] = each.reshape(len(recording.layers), len(recording.denoise_steps), *each.shape[1:])
+        return result
+
+    def _joined(self, tensors: Sequence[Tensor], recording: Recording) -> Tensor:
+        """One tensor (row, head, query, key) of those of the calls of a block at one denoise step."""
+        if len(tensors) > 1:
+            heads = max(tensor.shape[1] for tensor in tensors)
+            tensors = [torch.cat([tensor.expand(-1, heads, -1, -1) for tensor in tensors], dim=2)]
+        if self.layout.autoregressive and recording.queries == "mean":
+            return tensors[0].mean(dim=2, keepdim=True)
+        return tensors[0]
 
     def _check_finite(self, rows: NDArray[np.float32], recording: Recording, site: str, where: str) -> None:
         finite = np.isfinite(rows.sum(axis=-1))
@@ -380,6 +407,20 @@ def final_contribution(site: RecordedSite, found: SiteRows, key_role: NDArray[np
 def _members(site: RecordedSite, roles: NDArray[np.uint8], segment: Segment) -> NDArray[np.bool_]:
     members: NDArray[np.bool_] = segment_members(site.keys, roles[None], (segment,))[0, :, 0]
     return members
+
+
+#: Kinds of masks that a call is compared with, so that equal ones are kept once; policies have one or two.
+_MOST_KINDS = 8
+
+
+def _kind_of(uniform: Tensor, kinds: list[Tensor]) -> Tensor:
+    """The equal one of the tensors that are kept, or this one, which is kept then."""
+    for kind in kinds:
+        if kind.shape == uniform.shape and torch.equal(kind, uniform):
+            return kind
+    if len(kinds) < _MOST_KINDS:
+        kinds.append(uniform)
+    return uniform
 
 
 def _spread(values: Tensor, keys: Tensor, count: int, axis: int = -1) -> Tensor:

@@ -139,12 +139,15 @@ class SoftmaxTensors:
         return normalised(logits if softmax.change is None else logits + part(softmax.change, queries, batch))
 
     def allowed(self, queries: Positions) -> Tensor:
-        """Return (batch, query, key) bool: where the logits are those of no mask in any head."""
+        """Return (batch, head or 1, query, key) bool: where the logits are those of no mask.
+
+        Where the logits are gone, a key that has any mass in any head is seen.
+        """
         if self.softmax.logits is None or self.softmax.logits.shape[-1] != self.product.axes.sizes[-1]:
-            return (self.rows(queries, slice(None)) > 0).any(1)
+            return (self.rows(queries, slice(None)) > 0).any(1, keepdim=True)
         logits = self._part(self._in_order(self.softmax.logits.detach()), queries, slice(None)).float()
         highest = logits.amax(-1, keepdim=True)
-        return ((logits > highest + MASKED_BELOW) & (highest > MASKED_BELOW)).any(1)
+        return (logits > highest + MASKED_BELOW) & (highest > MASKED_BELOW)
 
     def _in_order(self, tensor: Tensor) -> Tensor:
         product, keys = self.product, self.product.axes.key

@@ -1,20 +1,17 @@
-"""For how many keys each key counts: the one definition of what uniform attention gives where keys come and go.
+"""What uniform attention gives to every key: the one definition behind every baseline, lift and uniform ratio.
 
-Numbers of keys are the baseline of every lift and of every uniform ratio. Three kinds of keys count differently:
+A query that attends uniformly gives 1 / N to each of the N keys that its mask lets it see, and nothing to the others. A
+stored row is a mean over action queries, and uniform attention is averaged in the same way:
 
-    every query sees it     1
-    absent at the replan    0
-    of a growing span       a part of 1, because only the later queries see it
+    u_k = mean over the action queries behind a row of 1 / N_q where query q sees key k, and of 0 where it does not
 
-The part follows from attention that is uniform, at each query, over the valid keys that exist for it. With N_q of them
-at query q of Q, a key k has the mean mass
+so that attention that is uniform at each query gives every group with a key that some query sees
 
-    u_k = 1/Q · sum over the queries q that see k of 1 / N_q
+    lift = (mass of the group / sum of its u) / (mass of the valid keys / sum of their u) = 1.
 
-and a key that all queries see has u = 1/Q · sum over q of 1 / N_q. The key counts u_k / u. The mass of a group under
-uniform attention then is its number of keys / the number of valid keys, as everywhere else, and the number of valid
-keys is the harmonic mean of N_q. Query q sees the first q + `growing_offset` keys of a growing span; each absent key of
-the span makes the queries of its replan one fewer.
+From version 2 on a store holds u (`SITE/uniform`), because masks may differ between queries, layers, heads and denoise
+steps. Version 1 has roles alone: there u follows from the keys that some query of some layer sees
+(`uniform_of_version_1`), which is the same where all see the same.
 """
 
 from __future__ import annotations
@@ -24,11 +21,29 @@ from numpy.typing import NDArray
 
 from vla_attention.schemas.layout import Role, SiteLayout
 
+#: Roles of keys that no action query sees. A null sink is seen, though it holds nothing.
+UNSEEN_ROLES = (Role.MASKED_IMAGE, Role.PADDING, Role.ABSENT)
 
-def key_counts(
+
+def uniform_rows(seen: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Rows (..., query, key) of uniform attention from the keys that each query sees; 0 for a query without any."""
+    number = seen.sum(axis=-1, keepdims=True)
+    rows: NDArray[np.float64] = seen / np.maximum(number, 1)
+    return rows
+
+
+def uniform_of_roles(key_role: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """u (..., key) of a policy whose action queries all see every key but the `UNSEEN_ROLES`, from role codes."""
+    return uniform_rows(~np.isin(key_role, [int(role) for role in UNSEEN_ROLES]))
+
+
+def uniform_of_version_1(
     layout: SiteLayout, key_role: NDArray[np.uint8], valid: NDArray[np.bool_], num_queries: int
-) -> NDArray[np.float64] | None:
-    """For how many keys each key counts, shape (replan or 1, key); None where every key counts for one.
+) -> NDArray[np.float64]:
+    """u (replan or 1, key) of a store of version 1: 1 / N over the valid keys, and as much for every key that exists.
+
+    Keys of a growing span get a part of that. Query q sees the first q + `growing_offset` of them, and each absent one
+    makes the queries of its replan one fewer.
 
     Args:
         layout: the site's spans.
@@ -36,28 +51,20 @@ def key_counts(
         valid: keys that can hold information, (replan or 1, key).
         num_queries: action queries of a replan that generates all tokens of the growing span.
     """
-    absent = key_role == Role.ABSENT
-    if layout.growing_span is None:
-        return np.where(absent, 0.0, 1.0) if absent.any() else None
-    replans = max(len(key_role), len(valid))
-    absent, valid = (np.broadcast_to(values, (replans, values.shape[1])) for values in (absent, valid))
-    return np.stack([_counts_of_replan(layout, *of, num_queries) for of in zip(absent, valid, strict=True)])
-
-
-def num_valid_keys(
-    valid: NDArray[np.bool_], counts: NDArray[np.float64] | None
-) -> NDArray[np.int64] | NDArray[np.float64]:
-    """The number of valid keys (replan or 1,) from `valid` (replan or 1, key) and the `key_counts`."""
-    if counts is None or not ((counts > 0) & (counts < 1)).any():
-        whole: NDArray[np.int64] = valid.sum(axis=1)
-        return whole
-    numbers: NDArray[np.float64] = (valid * counts).sum(axis=1)
-    return numbers
+    counts = np.where(key_role == Role.ABSENT, 0.0, 1.0)
+    if layout.growing_span is not None:
+        replans = max(len(key_role), len(valid))
+        absent, valid = (np.broadcast_to(values, (replans, valid.shape[1])) for values in (counts == 0, valid))
+        counts = np.stack([_counts_of_replan(layout, *of, num_queries) for of in zip(absent, valid, strict=True)])
+    number = (valid * counts).sum(axis=1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(number > 0, counts / number, 0.0)
 
 
 def _counts_of_replan(
     layout: SiteLayout, absent: NDArray[np.bool_], valid: NDArray[np.bool_], num_queries: int
 ) -> NDArray[np.float64]:
+    """For how much of a key that all queries see each key (key,) counts at one replan."""
     growing = layout.growing_span
     assert growing is not None
     inside = slice(growing.start, growing.stop)

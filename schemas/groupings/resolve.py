@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from vla_attention.schemas.errors import shortened
 from vla_attention.schemas.groupings.grouping import REST, Grouping, GroupingError
-from vla_attention.schemas.groupings.key_counts import num_valid_keys
 from vla_attention.schemas.groupings.selector_parser import (
     Atom,
     Everything,
@@ -45,15 +44,15 @@ class ResolvedGrouping:
     Attributes:
         names: group names, in the order of the group axis.
         weights: weight of each key in each group, shape (replan or 1, key, group) float32, 0..1.
-        num_keys: number of keys of each group (the sum of its weights; keys that not all queries see count for less,
-            see `key_counts`), shape (replan or 1, group) float64.
-        num_valid: number of keys that can hold information, counted in the same way, shape (replan or 1,).
+        num_keys: number of keys of each group (the sum of its weights over keys that exist), shape (replan or 1, group)
+            float64.
+        num_valid: number of keys that can hold information, shape (replan or 1,).
     """
 
     names: tuple[str, ...]
     weights: NDArray[np.float32]
     num_keys: NDArray[np.float64]
-    num_valid: NDArray[np.int64] | NDArray[np.float64]
+    num_valid: NDArray[np.int64]
 
 
 def check_names(grouping: Grouping, vocabulary: Vocabulary, layout: SiteLayout) -> None:
@@ -78,8 +77,8 @@ def resolve(grouping: Grouping, tokens: EpisodeTokens) -> ResolvedGrouping:
     return ResolvedGrouping(
         names=grouping.names,
         weights=stacked,
-        num_keys=counted_keys(stacked, tokens.key_counts),
-        num_valid=num_valid_keys(tokens.valid, tokens.key_counts),
+        num_keys=counted_keys(stacked, tokens.existing),
+        num_valid=tokens.valid.sum(axis=1),
     )
 
 
@@ -97,11 +96,11 @@ def stack_over_keys(weights: Sequence[NDArray[np.float32]]) -> NDArray[np.float3
     return np.broadcast_to(stacked, (replans, keys, len(weights)))
 
 
-def counted_keys(weights: NDArray[np.float32], counts: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    """Numbers of keys (replan or 1, group) from weights (replan or 1, key, group) and the `key_counts`."""
-    if counts is None and weights.strides[0] == 0:  # the same at all replans, see `stack_over_keys`
+def counted_keys(weights: NDArray[np.float32], existing: NDArray[np.bool_] | None) -> NDArray[np.float64]:
+    """Numbers of keys (replan or 1, group) from weights (replan or 1, key, group) and `EpisodeTokens.existing`."""
+    if existing is None and weights.strides[0] == 0:  # the same at all replans, see `stack_over_keys`
         return np.repeat(weights[:1].sum(axis=1, dtype=np.float64), len(weights), axis=0)
-    counted = weights if counts is None else weights * counts[:, :, None]
+    counted = weights if existing is None else weights * existing[:, :, None]
     numbers: NDArray[np.float64] = counted.sum(axis=1, dtype=np.float64)
     return numbers
 

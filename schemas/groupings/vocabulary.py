@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from vla_attention.schemas.cached_property import cached_property
 from vla_attention.schemas.errors import BadArgument, listing, shortened
-from vla_attention.schemas.groupings.key_counts import key_counts
 from vla_attention.schemas.groupings.words import Word, words_of
 from vla_attention.schemas.layout import INVALID_ROLES, Prompt, Role, SiteLayout
 from vla_attention.schemas.safe_text import check_name, visible
@@ -57,7 +56,7 @@ class EpisodeTokens:
         prompt_index: which prompt each replan had, shape (replan,).
         objects: the scene's objects, in the order of the coverage's last axis.
         coverage: per camera the area of each patch that each object covers, shape (replan, patch, object), 0..1.
-        num_queries: action queries of a replan; needed where the layout has a growing span.
+        num_queries: action queries of a replan; needed for version 1, where the layout has a growing span.
     """
 
     layout: SiteLayout
@@ -97,13 +96,10 @@ class EpisodeTokens:
         return ~np.isin(self.static_roles, [int(role) for role in INVALID_ROLES])
 
     @cached_property
-    def key_counts(self) -> NDArray[np.float64] | None:
-        """For how many keys each key counts, see `key_counts.key_counts`."""
-        return self.key_counts_of(self.valid)
-
-    def key_counts_of(self, valid: NDArray[np.bool_]) -> NDArray[np.float64] | None:
-        """The same where other keys (replan or 1, key) count as valid."""
-        return key_counts(self.layout, self.static_roles, valid, self.num_queries)
+    def existing(self) -> NDArray[np.bool_] | None:
+        """Keys that exist, shape (replan or 1, key); None where all do."""
+        absent = self.static_roles == Role.ABSENT
+        return ~absent if absent.any() else None
 
 
 @dataclass(frozen=True)

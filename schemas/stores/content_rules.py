@@ -113,6 +113,46 @@ def absent_problems(
             return
 
 
+def uniform_problems(name: str, uniform: NDArray[np.float32], first_replan: int = 0) -> Iterator[str]:
+    """What uniform attention gives (replan, layer, denoise, head, query, key): rows of a softmax, too."""
+    bad = ~np.isfinite(uniform) | (uniform < 0)
+    if bad.any():
+        replan = first_replan + int(np.argwhere(bad)[0][0])
+        yield f"{name} holds numbers that are NaN, infinite or negative, the first at replan {replan}"
+        return
+    sums = uniform.sum(axis=-1, dtype=np.float64)
+    far = np.abs(sums - 1) > ROW_SUM_TOLERANCE
+    if far.any():
+        replan = first_replan + int(np.argwhere(far)[0][0])
+        yield f"{name} sums to {sums[far][0]:.4g} instead of 1, the first time at replan {replan}"
+
+
+def unseen_problems(
+    name: str,
+    rows: NDArray[np.float32],
+    uniform: NDArray[np.float32],
+    recording: Recording,
+    first_replan: int = 0,
+) -> Iterator[str]:
+    """Rows (replan, layer, denoise, head, query, key): no mass for a key that no query behind the row sees.
+
+    uniform: what uniform attention gives; axes along which nothing changes have length 1.
+    """
+    unseen = uniform == 0
+    if not unseen.any():
+        return
+    if unseen.shape[1:-1] == (1, 1, 1, 1):
+        keys = np.flatnonzero(unseen.any(axis=(0, 1, 2, 3, 4)))
+        given = ((rows[..., keys] != 0) & unseen[..., keys]).any(axis=-1)
+    else:
+        given = ((rows != 0) & unseen).any(axis=-1)
+    if given.any():
+        yield (
+            f"{name} gives mass to a key that no query sees, as {name.rpartition('/')[0]}/uniform says, "
+            f"{_where(given, recording, first_replan)}"
+        )
+
+
 def row_sum_problems(
     name: str, row_sum: NDArray[np.floating], recording: Recording, first_replan: int = 0
 ) -> Iterator[str]:

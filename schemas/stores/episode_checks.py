@@ -26,10 +26,12 @@ from vla_attention.schemas.stores.content_rules import (
     row_problems,
     row_sum_problems,
     sites_with_text,
+    uniform_problems,
+    unseen_problems,
 )
 from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.episode_files import files_of_no_array
-from vla_attention.schemas.stores.episode_shapes import expected_shapes
+from vla_attention.schemas.stores.episode_shapes import expected_shapes, shape_problems
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.root import group_attributes
 from vla_attention.schemas.stores.store_format import (
@@ -58,10 +60,9 @@ def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[s
     for name in sorted(set(shapes) - set(listed)):
         yield f"{name} is not in the episode"
     for name, shape in listed.items():
-        expected = shapes.get(name, (attributes.num_replans,))
-        if shape[: len(expected)] != expected:
-            yield f"{name} has the shape {shape}; expected {expected}"
-        elif name not in numbers:
+        wrong = list(shape_problems(name, shape, shapes.get(name, (attributes.num_replans,))))
+        yield from wrong
+        if not wrong and name not in numbers:
             yield from _guarded(_array_problems(root, episode, name, attributes.arrays[name].sha256))
     for check in (_axis_problems, _token_problems, _camera_problems, _counter_problems):
         yield from _guarded(check(root, episode))
@@ -87,6 +88,7 @@ def _array_problems(root: RootAttributes, episode: StoredEpisode, name: str, sha
     site = next((site for site in root.sites if site.name == site_name), None)
     recording = root.recording if site is None else root.recording.of_site(site)
     sums = _row_sums(episode, name, array.shape[:-1]) if kind in ("rows", "atoms") else None
+    uniform = _uniform(episode, site_name) if kind == "rows" and root.store_version > 1 else None
     digest, problems = ArrayDigest(), list[str]()
     step = episode.reading_step(name)
     for first in range(0, array.shape[0], step):
@@ -100,8 +102,13 @@ def _array_problems(root: RootAttributes, episode: StoredEpisode, name: str, sha
             if kind == "rows" and site is not None and not problems:
                 roles = episode.read(f"{site_name}/key_role", slice(first, first + step))
                 problems += absent_problems(site, values, roles, recording, first)
+                if uniform is not None:
+                    of_block = uniform[first : first + step] if len(uniform) > 1 else uniform
+                    problems += unseen_problems(name, values, of_block, recording, first)
         elif kind == "row_sum":
             problems += row_sum_problems(name, values, recording, first)
+        elif kind == "uniform":
+            problems += uniform_problems(name, values, first)
         elif kind == "contribution":
             problems += gram_problems(name, values, recording, first)
     if digest.hexdigest() != sha256:
@@ -116,6 +123,17 @@ def _row_sums(episode: StoredEpisode, name: str, shape: tuple[int, ...]) -> NDAr
     except CorruptEpisode:
         return None
     return sums if sums.shape == shape else None
+
+
+def _uniform(episode: StoredEpisode, site: str) -> NDArray[np.float32] | None:
+    """What uniform attention gives; None when it is damaged, or does not fit (reported by their own checks)."""
+    try:
+        uniform: NDArray[np.float32] = episode.read(f"{site}/uniform")
+    except CorruptEpisode:
+        return None
+    rows = episode.shape_of(f"{site}/rows")
+    fits = uniform.ndim == len(rows) and all(n in (1, m) for n, m in zip(uniform.shape, rows, strict=True))
+    return uniform if fits else None
 
 
 def _axis_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:

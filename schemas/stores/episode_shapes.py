@@ -16,6 +16,8 @@ from vla_attention.schemas.stores.store_format import (
 )
 
 _ROLES = frozenset(role.label for role in Role)
+#: Arrays of a site whose axes, but for the last, have length 1 where nothing changes along them.
+_MAY_BE_ONE = ("uniform",)
 
 
 def expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dict[str, tuple[int, ...]]:
@@ -40,10 +42,23 @@ def expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dict
         shapes[f"{site.name}/row_sum"] = cells
         shapes[f"{site.name}/atoms"] = (*cells, len(attributes.segments.get(site.name, ())))
         shapes[f"{site.name}/key_role"] = (replans, site.num_keys)
+        if root.store_version > 1:
+            shapes[f"{site.name}/uniform"] = (*cells, site.num_keys)
         if recording.contributions:
             parts = len(attributes.segments.get(site.name, ())) + 1
             shapes[f"{site.name}/contribution"] = (*cells[:3], parts, parts)
     return shapes
+
+
+def shape_problems(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> Iterator[str]:
+    """Whether an array has another shape than its first axes must have (`expected_shapes`), as a sentence."""
+    one_will_do = name.rpartition("/")[2] in _MAY_BE_ONE
+    if one_will_do and len(shape) == len(expected) and shape[-1:] == expected[-1:]:
+        if all(given in (1, length) for given, length in zip(shape, expected, strict=True)):
+            return
+        yield f"{name} has the shape {shape}; expected {expected}, or 1 in place of a length but the last"
+    elif shape[: len(expected)] != expected:
+        yield f"{name} has the shape {shape}; expected {expected}"
 
 
 def misfits(root: RootAttributes, attributes: EpisodeAttributes) -> Iterator[str]:
@@ -61,8 +76,6 @@ def misfits(root: RootAttributes, attributes: EpisodeAttributes) -> Iterator[str
             if span.camera is not None:
                 shapes[f"objects/{span.camera}"] = (replans, span.num_keys, len(attributes.objects))
     for name, shape in listed.items():
-        expected = shapes.get(name, (replans,))
-        if shape[: len(expected)] != expected:
-            yield f"{name} has the shape {shape}; expected {expected}"
+        yield from shape_problems(name, shape, shapes.get(name, (replans,)))
     if not all(0 <= number < len(attributes.prompts) for number in attributes.prompt_index):
         yield "prompt_index names prompts that the attributes do not have"

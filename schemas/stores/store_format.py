@@ -1,6 +1,6 @@
 """The store format: its version, the names, axes and attributes of `NAME.zarr`, and its errors. No I/O here.
 
-The format is frozen: within a version nothing here changes (`docs/store.md`, "Versions"). A new version raises
+Within a version nothing here changes once a release wrote it (`docs/store.md`, "Versions"). A new version raises
 `STORE_VERSION` and changes the dataclasses below; a new field has a default, with which stores of lower versions are
 read. Then write the JSON Schema files again (`python -m vla_attention.schemas.json_files`).
 
@@ -10,6 +10,7 @@ NAME.zarr/                            attributes: `RootAttributes`
     joint/rows                        (replan, layer, denoise, head, query, key) float32
     joint/row_sum                     (replan, layer, denoise, head, query) float32
     joint/atoms                       (replan, layer, denoise, head, query, segment) float32
+    joint/uniform                     as `rows`, float32; an axis along which nothing changes has length 1
     joint/key_role                    (replan, key) uint8
     state                             (replan, state_dim); only where it is known
     actions                           (replan, horizon, action_dim), as given to the environment; only where known
@@ -48,7 +49,7 @@ from vla_attention.schemas.segments import Segment
 
 FORMAT_NAME = "vla-attention"
 #: A whole number, the root attribute `store_version`. A reader accepts every version up to its own.
-STORE_VERSION = 1
+STORE_VERSION = 2
 STORE_SUFFIX = ".zarr"
 EPISODES_GROUP = "episodes"
 #: The document of that group. It states nothing but that it is a group.
@@ -410,9 +411,12 @@ class EpisodeAttributes:
     the one that solved the task; 0 where it is not known. The instruction and the prompts are any text; what is shown
     of them is made `safe_text.visible`.
 
-    The last five fields are numbers of each replan, and the noise level or flow time of each recorded denoise step;
-    `env_step` counts the waiting steps too, `prompt_index` is the number of a prompt, `dataset_action_count` how many
-    of `dataset_actions` there are. Empty where they are not known.
+    `task_family`: what the task shares with others of the same sentence template; empty where nobody knows it, and in
+    version 1.
+
+    `NUMBERS` are of each replan, and the noise level or flow time of each recorded denoise step; `env_step` counts the
+    waiting steps too, `prompt_index` is the number of a prompt, `dataset_action_count` how many of `dataset_actions`
+    there are. Empty where they are not known.
     """
 
     task_id: int
@@ -434,10 +438,12 @@ class EpisodeAttributes:
     noise_seed: tuple[int, ...] = ()
     dataset_action_count: tuple[int, ...] = ()
     denoise_time: tuple[float, ...] = ()
+    task_family: str = ""
 
     def __post_init__(self) -> None:
         """Check the task's name, the names of arrays, which are paths, and the lengths."""
         check_name("task", self.task_name)
+        check_text("task's family", self.task_family)
         check_free_text("instruction", self.instruction)
         check_at_most("The number of replans", self.num_replans, REPLANS)
         check_at_most("The number of prompts", len(self.prompts), REPLANS)

@@ -108,10 +108,10 @@ def _group_problems(store: Store, file: str) -> Iterator[str]:
     if file == EPISODES_DOCUMENT:
         if attributes:
             yield "it has attributes, and the group of episodes has none"
-    elif store.attributes.digest and store.attributes.digest != seal_digest(attributes):
-        yield "it was changed: its own digest does not fit"
-    elif not store.attributes.digest and store.attributes.store_version:
+    elif not store.attributes.digest:
         yield "it has lost its own digest"
+    elif store.attributes.digest != seal_digest(attributes):
+        yield "it was changed: its own digest does not fit"
 
 
 def _problems(store: Store, episode: StoredEpisode, quick: bool) -> list[str]:

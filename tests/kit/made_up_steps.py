@@ -201,12 +201,16 @@ def _measured(part: pl.DataFrame, grouping: Grouping) -> MeasuredEpisode:
     def of(names: Sequence[str], table: pl.DataFrame = part) -> Any:
         return table.select(pl.col(names).cast(pl.Float64)).to_numpy()
 
+    num_keys = of([f"{name}_keys" for name in grouping.names], replans)
+    num_valid = replans["num_valid"].to_numpy()
     return MeasuredEpisode(
         item=item,
         selection=selection,
         mass=of([f"{name}_mass" for name in grouping.names]).reshape(*shape, -1),
         valid_mass=of(["valid_mass"]).reshape(shape),
         row_sum=of(["row_sum"]).reshape(shape),
-        num_keys=of([f"{name}_keys" for name in grouping.names], replans),
-        num_valid=replans["num_valid"].to_numpy(),
+        num_keys=num_keys,
+        num_valid=num_valid,
+        uniform_mass=(num_keys / num_valid[:, None])[:, None, None, None],
+        uniform_valid=np.ones((1, 1, 1, 1)),
     )

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 import vla_attention as va
+from tests.kit.uniform_attention import check_uniform, zeroed_queries
 from tests.policies.word_tokenizer import INSTRUCTION, WordTokenizer
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
@@ -169,6 +170,14 @@ def softmax_rows(query: Tensor, key: Tensor, scale: float, mask: Tensor | None =
     if mask is not None:
         logits = logits.masked_fill(~mask, float("-inf"))
     return torch.softmax(logits, dim=-1).detach().numpy()
+
+
+def check_uniform_attention(case: PolicyCase, path: Path, **settings: Any) -> None:
+    """Queries that are zero attend uniformly: every group with a key that some query sees has lift 1, at every site."""
+    with zeroed_queries(case.policy):
+        for queries in ("mean", "all"):
+            record(case, path / queries, queries=queries, **settings)
+            check_uniform(path / queries / "run.zarr")
 
 
 def check_analysis(path: Path, sites: Sequence[str], *, ratios: bool = True) -> None:

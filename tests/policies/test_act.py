@@ -14,6 +14,7 @@ from tests.policies.policy_checks import (
     PolicyCase,
     check_analysis,
     check_rows,
+    check_uniform_attention,
     record,
     roles_of,
     rows_of,
@@ -84,3 +85,7 @@ def test_a_knockout_takes_the_keys_mass_away(case, tmp_path):
 def test_the_analysis_answers_without_a_ratio(case, tmp_path):
     record(case, tmp_path, tokenizer=None)
     check_analysis(tmp_path, ["cross", "self"], ratios=False)
+
+
+def test_queries_of_zero_have_lift_1(case, tmp_path):
+    check_uniform_attention(case, tmp_path, tokenizer=None)

@@ -66,7 +66,7 @@ def test_generation_is_seen_and_stays_as_it_is(model, attention, dtype):
     for shape, rows, allowed in zip(seen.shapes, seen.rows, seen.allowed, strict=True):
         assert (shape.batch, shape.heads) == (2, 4)
         if shape.queries == 1:
-            assert (rows[~allowed[:, None].expand(rows.shape)] == 0).all()
+            assert (rows[~allowed.expand(rows.shape)] == 0).all()
             torch.testing.assert_close(rows.sum(-1), torch.ones(rows.shape[:-1]), rtol=0, atol=2e-6)
             # Gemma's layers see a window of three keys, which the padding has left.
             if model is llama:

@@ -14,6 +14,7 @@ from tests.policies.policy_checks import (
     PolicyCase,
     check_analysis,
     check_rows,
+    check_uniform_attention,
     record,
     roles_of,
     rows_of,
@@ -99,3 +100,7 @@ def test_the_analysis_answers_at_both_sites(case, tmp_path):
 def test_ids_without_a_picture_for_each_camera_are_refused(case):
     with pytest.raises(ValueError, match="hold 2 runs of placeholders"):
         va.layouts.gr00t(case.policy, case.observation["eagle_input_ids"][0], cameras=["top"])
+
+
+def test_queries_of_zero_have_lift_1(case, tmp_path):
+    check_uniform_attention(case, tmp_path)

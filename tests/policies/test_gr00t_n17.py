@@ -10,7 +10,16 @@ import torch
 from torch import Tensor, nn
 
 import vla_attention as va
-from tests.policies.policy_checks import PolicyCase, check_rows, kept_outputs, record, roles_of, rows_of, softmax_rows
+from tests.policies.policy_checks import (
+    PolicyCase,
+    check_rows,
+    check_uniform_attention,
+    kept_outputs,
+    record,
+    roles_of,
+    rows_of,
+    softmax_rows,
+)
 from tests.policies.word_tokenizer import INSTRUCTION, WordTokenizer
 
 WIDTH, HEADS, DIM, CHUNK, STEPS, PLACEHOLDER, PATCHES, BLOCKS = 16, 2, 8, 4, 2, 98, 4, 6
@@ -150,3 +159,7 @@ def test_a_ratio_inside_a_text_only_block_has_a_sentence_or_no_number(case, tmp_
     run = va.open(tmp_path / "run.zarr")
     for site in ("cross_text", "cross_image", "self"):
         assert run.masses(site=site).height > 0
+
+
+def test_queries_of_zero_have_lift_1(case, tmp_path):
+    check_uniform_attention(case, tmp_path)

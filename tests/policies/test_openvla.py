@@ -15,6 +15,7 @@ from tests.policies.policy_checks import (
     changed_spans,
     check_analysis,
     check_rows,
+    check_uniform_attention,
     kept_outputs,
     record,
     roles_of,
@@ -131,3 +132,8 @@ def test_the_analysis_answers(name, request, tmp_path):
 def test_a_number_of_patches_without_a_root_is_refused(one):
     with pytest.raises(ValueError, match="needs square pictures, but there are 250 patches"):
         va.layouts.openvla(one.policy, patches=250)
+
+
+@pytest.mark.parametrize("name", ["one", "chunked"])
+def test_queries_of_zero_have_lift_1(name, request, tmp_path):
+    check_uniform_attention(request.getfixturevalue(name), tmp_path)

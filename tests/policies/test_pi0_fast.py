@@ -19,6 +19,7 @@ from tests.policies.policy_checks import (
     changed_spans,
     check_analysis,
     check_rows,
+    check_uniform_attention,
     kept_outputs,
     record,
     roles_of,
@@ -122,3 +123,7 @@ def test_the_state_s_digits_in_the_prompt_are_state(case):
         *["template", "instruction", "instruction", "template"],
         *["state", "state", "template"],
     ]
+
+
+def test_queries_of_zero_have_lift_1(case, tmp_path):
+    check_uniform_attention(case, tmp_path)

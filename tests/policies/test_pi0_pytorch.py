@@ -22,6 +22,7 @@ from tests.policies.policy_checks import (
     changed_spans,
     check_analysis,
     check_rows,
+    check_uniform_attention,
     kept_outputs,
     record,
     roles_of,
@@ -129,3 +130,7 @@ def test_openpi_s_server_and_client_record_what_a_call_without_them_gives(case, 
     assert facts == [(2, True, 9), (2, False, 9)]
     np.testing.assert_array_equal(store.episodes[0].read("frames/top")[0], picture)
     np.testing.assert_array_equal(store.episodes[1].read("actions")[1], plain.astype(np.float64))
+
+
+def test_queries_of_zero_have_lift_1(case, tmp_path):
+    check_uniform_attention(case, tmp_path)

@@ -16,6 +16,7 @@ from tests.policies.policy_checks import (
     changed_spans,
     check_analysis,
     check_rows,
+    check_uniform_attention,
     kept_outputs,
     record,
     roles_of,
@@ -116,3 +117,7 @@ def test_the_analysis_answers(case, tmp_path):
 def test_another_policy_is_refused_by_name():
     with pytest.raises(ValueError, match="PI0ForConditionalGeneration, but a Linear was given"):
         va.layouts.pi0_transformers(torch.nn.Linear(2, 2))
+
+
+def test_queries_of_zero_have_lift_1(case, tmp_path):
+    check_uniform_attention(case, tmp_path)

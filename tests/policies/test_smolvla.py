@@ -17,6 +17,7 @@ from tests.policies.policy_checks import (
     changed_spans,
     check_analysis,
     check_rows,
+    check_uniform_attention,
     record,
     roles_of,
     rows_of,
@@ -183,3 +184,7 @@ def test_what_the_layout_cannot_cover_is_refused(tmp_path):
         va.layouts.smolvla(padded)
     with pytest.raises(NotThisPolicy, match="for SmolVLAPolicy, but a Linear was given"):
         va.layouts.smolvla(torch.nn.Linear(2, 2))
+
+
+def test_queries_of_zero_have_lift_1(case, tmp_path):
+    check_uniform_attention(case, tmp_path)

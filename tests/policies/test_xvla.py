@@ -15,6 +15,7 @@ from tests.policies.policy_checks import (
     changed_spans,
     check_analysis,
     check_rows,
+    check_uniform_attention,
     kept_outputs,
     record,
     roles_of,
@@ -77,3 +78,7 @@ def test_a_knockout_takes_the_keys_mass_away(case, tmp_path):
 def test_the_analysis_answers(case, tmp_path):
     record(case, tmp_path)
     check_analysis(tmp_path, ["joint"])
+
+
+def test_queries_of_zero_have_lift_1(case, tmp_path):
+    check_uniform_attention(case, tmp_path)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from vla_attention.capture.store.episode_writer import EpisodeStart, ReplanRecord
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.store_writer import open_run
+from vla_attention.schemas.groupings.key_counts import uniform_rows
 from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.layout import INVALID_ROLES, PatchGrid, Piece, Prompt, Role, SiteLayout, Span
 from vla_attention.schemas.segments import segment_members, segments_of
@@ -260,8 +261,9 @@ def _rows(
         logits[..., key_role == Role.IMAGE] += spec.bias(*episode)
     weights = np.exp(logits) * exists
     rows = weights / weights.sum(axis=-1, keepdims=True)
+    uniform = uniform_rows(exists)[None, None, None]
     if spec.queries == "mean":
-        rows = rows.mean(axis=3, keepdims=True)
+        rows, uniform = (of_all.mean(axis=3, keepdims=True) for of_all in (rows, uniform))
     rows = rows.astype(np.float32)
     gram = None
     if spec.contributions:
@@ -270,4 +272,4 @@ def _rows(
         vectors = mass[..., None] * generator.normal(size=(*mass.shape, 4))
         parts = np.concatenate([vectors, vectors.sum(axis=2, keepdims=True)], axis=2)
         gram = np.einsum("ldaw,ldbw->ldab", parts, parts).astype(np.float32)
-    return RecordedRows(rows, rows.sum(axis=-1, dtype=np.float64).astype(np.float32), gram)
+    return RecordedRows(rows, rows.sum(axis=-1, dtype=np.float64).astype(np.float32), gram, uniform.astype(np.float32))

@@ -41,6 +41,9 @@ from vla_attention.testing.tokens import INSTRUCTIONS, random_rows, small_layout
 
 #: Task, episode, the episode's tokens and random rows (replan, layer, denoise, head, query, key) to the rows to store.
 PlantRows = Callable[[int, int, EpisodeTokens, NDArray[np.float32]], NDArray[np.floating]]
+#: The episode's tokens and the lengths (layer, denoise, head, query) to what uniform attention gives, (replan, layer,
+#: denoise, head, query, key); lengths but that of keys may be 1 where nothing changes.
+PlantUniform = Callable[[EpisodeTokens, tuple[int, int, int, int]], NDArray[np.floating]]
 #: Task, episode and the episode's tokens to covered areas by camera, (replan, patch, object).
 PlantCoverage = Callable[[int, int, EpisodeTokens], Mapping[str, NDArray[np.float32]]]
 #: Task, episode and number of replans to actions (replan, horizon, action_dim).
@@ -57,8 +60,9 @@ class StoreSpec:
     of replans); otherwise each episode has those of `small_tokens`. `prompts`: "changing" (state digits, as in pi0.5)
     or "same". `seed` decides all random numbers. `layers` are blocks of `num_layers`; the other fields of the recording
     are as in `Recording`. `interventions` and `rerun_of` (see `rerun_source`) are what the store says that its run
-    changed and repeated. The `plant_` functions replace rows, coverage, actions and outcomes; without them rows are
-    random and episodes of odd numbers are solved.
+    changed and repeated. The `plant_` functions replace rows, what uniform attention gives, coverage, actions and
+    outcomes; without them rows are random, every query sees every key that is not masked, and episodes of odd numbers
+    are solved.
     """
 
     suite: str = "made_up"
@@ -83,6 +87,7 @@ class StoreSpec:
     rerun_of: RerunSource | None = None
     tokens: EpisodeTokens | None = None
     plant_rows: PlantRows | None = None
+    plant_uniform: PlantUniform | None = None
     plant_coverage: PlantCoverage | None = None
     plant_actions: PlantActions | None = None
     plant_success: PlantSuccess | None = None
@@ -218,6 +223,10 @@ def episode_records(spec: StoreSpec, task: int, episode: int) -> tuple[EpisodeSt
     rows = random_rows(tokens, spec.cells, int(generator.integers(2**31)))
     if spec.plant_rows is not None:
         rows = spec.plant_rows(task, episode, tokens, rows).astype(np.float32)
+    uniform = None
+    if spec.plant_uniform is not None:
+        uniform = spec.plant_uniform(tokens, spec.cells).astype(np.float32)
+        uniform = np.broadcast_to(uniform, (tokens.num_replans, *uniform.shape[1:]))
     actions = None if spec.plant_actions is None else spec.plant_actions(task, episode, tokens.num_replans)
     assert tokens.prompt_index is not None
     covered = tokens.coverage or {}
@@ -241,6 +250,7 @@ def episode_records(spec: StoreSpec, task: int, episode: int) -> tuple[EpisodeSt
                         rows[replan],
                         rows[replan].sum(axis=-1, dtype=np.float64).astype(np.float32),
                         gram_of(contribution_vectors(spec, tokens, seed, replan)) if spec.contributions else None,
+                        None if uniform is None else uniform[replan],
                     )
                 },
                 key_role={"joint": tokens.key_role[replan]},
@@ -262,6 +272,11 @@ def episode_records(spec: StoreSpec, task: int, episode: int) -> tuple[EpisodeSt
         provenance={"host": "made-up"},
     )
     return start, records
+
+
+def every_key_seen(tokens: EpisodeTokens, _cells: tuple[int, int, int, int]) -> NDArray[np.float64]:
+    """`PlantUniform` of queries that see all keys, masked ones too, as Cosmos's null keys are seen."""
+    return np.full((1,) * 5 + (tokens.layout.num_keys,), 1.0 / tokens.layout.num_keys)
 
 
 def expected_arrays(spec: StoreSpec, task: int, episode: int) -> dict[str, NDArray[Any]]:

@@ -18,7 +18,7 @@ from vla_attention.analyze.heads.entropy import effective_keys, entropies, top_m
 from vla_attention.analyze.heads.row_metrics import RowOptions, groups_with_valid_keys, row_metrics
 from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.schemas.groupings.grouping import Grouping
-from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.stores import StoreSpec, every_key_seen, write_store
 from vla_attention.testing.strategies import episode_tokens, groupings
 
 
@@ -78,6 +78,7 @@ def test_the_table_of_rows_equals_scipy_and_sorting_on_raw_rows(data):
     spec = StoreSpec(
         tokens=tokens,
         plant_rows=leaky,
+        plant_uniform=every_key_seen,
         tasks=(0,),
         episodes=1,
         queries=data.draw(st.sampled_from(["mean", "all"])),
@@ -126,7 +127,9 @@ def test_the_table_of_rows_equals_scipy_and_sorting_on_raw_rows(data):
 
 def test_keys_that_are_padding_at_some_replans_are_in_no_entropy_of_a_group_there(tmp_path):
     """A third state digit is there at some replans; at the others its key is padding, and takes mass nonetheless."""
-    spec = StoreSpec(tasks=(0,), episodes=2, replans=4, plant_rows=leaky, mantissa_bits=23)
+    spec = StoreSpec(
+        tasks=(0,), episodes=2, replans=4, plant_rows=leaky, plant_uniform=every_key_seen, mantissa_bits=23
+    )
     path = write_store(tmp_path / "a.zarr", spec=spec)
     grouping = Grouping("g", {"text": ("span:prompt",), "rest": ("*",)})
     tables = row_metrics(question_about(path, grouping))

@@ -21,7 +21,7 @@ from vla_attention.analyze.heads.row_metrics import RowOptions
 from vla_attention.analyze.measures.frames import Tables
 from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
-from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.stores import StoreSpec, every_key_seen, write_store
 from vla_attention.testing.strategies import episode_tokens, groupings
 from vla_attention.testing.tokens import small_layout
 
@@ -57,6 +57,7 @@ def test_numbers_of_heads_equal_loops_over_raw_rows(data):
     spec = StoreSpec(
         tokens=tokens,
         plant_rows=leaky,
+        plant_uniform=every_key_seen,
         tasks=(0, 1),
         episodes=1,
         layer_labels=(0, 2, 4),

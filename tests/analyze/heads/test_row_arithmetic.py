@@ -91,7 +91,7 @@ def test_top_mass_is_the_share_of_the_largest_valid_keys(drawn, counts):
 def test_counts_of_keys_far_above_their_share_are_those_of_a_loop(drawn, factor):
     rows, weights = drawn
     valid = weights[:, :, 0] > 0
-    above, held = key_sums(rows, valid, factor)
+    above, held = key_sums(rows, valid, factor / np.maximum(valid.sum(axis=1), 1)[:, None, None])
     expected_above, expected_held = np.zeros(rows.shape[1:]), np.zeros(rows.shape[1:])
     for replan, head in np.ndindex(rows.shape[:2]):
         mask = valid[min(replan, len(valid) - 1)]

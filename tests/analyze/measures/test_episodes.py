@@ -35,7 +35,7 @@ def test_masses_give_what_the_table_of_replans_gives(missing, at_once, with_rati
             **{name: getattr(one, name)[: 1 + i % 3] for name in ("mass", "valid_mass", "row_sum")},
             **{
                 name: values[: 1 + i % 3] if len(values := getattr(one, name)) > 1 else values
-                for name in ("num_keys", "num_valid")
+                for name in ("num_keys", "num_valid", "uniform_mass")
             },
         )
         for i, one in enumerate(measured)

@@ -28,7 +28,7 @@ from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.segments import segment_members, segments_of
 from vla_attention.testing import stores as made_up
-from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.stores import StoreSpec, every_key_seen, write_store
 from vla_attention.testing.strategies import episode_tokens, groupings
 from vla_attention.testing.tokens import site_layout, small_layout, small_tokens, spell_prompt, tokens_of
 
@@ -58,7 +58,12 @@ def test_sinks_are_the_keys_that_a_loop_over_raw_rows_finds(data):
         data.draw(st.sampled_from([0.25, 0.6])),
     )
     spec = StoreSpec(
-        tokens=tokens, plant_rows=leaky, tasks=(0, 1), episodes=1, queries=data.draw(st.sampled_from(["mean", "all"]))
+        tokens=tokens,
+        plant_rows=leaky,
+        plant_uniform=every_key_seen,
+        tasks=(0, 1),
+        episodes=1,
+        queries=data.draw(st.sampled_from(["mean", "all"])),
     )
     with tempfile.TemporaryDirectory() as folder:
         path = write_store(Path(folder) / "a.zarr", spec=spec)
@@ -69,8 +74,8 @@ def test_sinks_are_the_keys_that_a_loop_over_raw_rows_finds(data):
     for raw in raws:
         above, held = shares_of(raw, rule.factor)
         of_task = found.filter(task_id=raw.order[0])
-        num_valid = raw.valid.sum(axis=1).mean()
-        by_mass = held > max(rule.mass, 2 / num_valid)
+        uniform = (1 / raw.valid.sum(axis=1)).mean()
+        by_mass = held > max(rule.mass, 2 * uniform)
         sinks = by_mass | (above >= rule.share - 1e-9)
         assert sorted(of_task["key"]) == np.flatnonzero(sinks.any(axis=(0, 1))).tolist()
         assert of_task["mean_mass"].is_sorted(descending=True)
@@ -81,7 +86,7 @@ def test_sinks_are_the_keys_that_a_loop_over_raw_rows_finds(data):
             key = row["key"]
             assert row["share_of_rows"] == pytest.approx(above[..., key].mean(), rel=1e-5)
             assert row["mean_mass"] == pytest.approx(held[..., key].mean(), rel=1e-4)
-            assert row["times_uniform"] == pytest.approx(held[..., key].mean() * num_valid, rel=1e-4)
+            assert row["times_uniform"] == pytest.approx(held[..., key].mean() / uniform, rel=1e-4)
             assert row["largest_mass"] == pytest.approx(held[..., key].max(), rel=1e-4)
             assert row["sink_heads"] == sinks[..., key].sum()
             assert row["heads_by_mass"] == by_mass[..., key].sum()
@@ -159,7 +164,13 @@ def test_without_sinks_every_measure_is_that_of_the_other_keys(data):
     tokens = data.draw(episode_tokens())
     grouping = data.draw(groupings(tokens))
     spec = StoreSpec(
-        tokens=tokens, plant_rows=leaky, tasks=(0, 1), episodes=1, layer_labels=(0, 2, 4), mantissa_bits=23
+        tokens=tokens,
+        plant_rows=leaky,
+        plant_uniform=every_key_seen,
+        tasks=(0, 1),
+        episodes=1,
+        layer_labels=(0, 2, 4),
+        mantissa_bits=23,
     )
     rule = SinkRule(1.9, 0.2)
     with tempfile.TemporaryDirectory() as folder:

@@ -33,6 +33,7 @@ from vla_attention.analyze.statistics.intervals import (
     ratio_of_means_over_episodes,
 )
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
+from vla_attention.testing.stores import every_key_seen
 from vla_attention.testing.tokens import OBJECTS
 
 SIZE, BOWL = 16, 0
@@ -87,7 +88,8 @@ def look_at_the_bowl(task: int, episode: int, tokens: EpisodeTokens, rows: np.nd
 
 def stored(path: Path, **changes) -> Path:
     spec = {"tokens": bowl_tokens(replans=6), "tasks": (0,), "episodes": 8, "layers": (0,), "denoise_steps": (0,)}
-    return write_bowl_store(path, **{**spec, "plant_coverage": near_the_middle, **changes})
+    spec |= {"plant_coverage": near_the_middle, "plant_uniform": every_key_seen}
+    return write_bowl_store(path, **{**spec, **changes})
 
 
 def bowl_of(path: Path) -> dict:

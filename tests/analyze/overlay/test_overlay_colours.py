@@ -60,11 +60,11 @@ def test_a_bright_patch_lies_on_the_object_that_the_person_sees(
     np.testing.assert_array_equal(changed, expected)
 
 
-def test_values_are_shares_of_image_attention_and_lifts_over_the_mean_valid_key() -> None:
+def test_values_are_shares_of_image_attention_and_lifts_over_uniform_attention() -> None:
     mass = np.array([[[0.1, 0.3]], [[0.2, 0.0]]])
-    image, mean_key = np.array([0.5, 0.0]), np.array([0.05, 0.1])
-    np.testing.assert_allclose(patch_values(mass, image, mean_key, "lift"), [[[2, 6]], [[2, 0]]])
-    share = patch_values(mass, image, mean_key, "share")
+    image, uniform = np.array([0.5, 0.0]), np.array([[[0.05, 0.1]], [[0.1, 0.0]]])
+    np.testing.assert_allclose(patch_values(mass, image, uniform, "lift"), [[[2, 3]], [[2, np.nan]]])
+    share = patch_values(mass, image, uniform, "share")
     np.testing.assert_allclose(share[0], [[20, 60]])
     assert np.isinf(share[1, 0, 0])
     assert np.isnan(share[1, 0, 1])

@@ -25,7 +25,7 @@ from vla_attention.testing.stores import StoreSpec, reseal_root, write_store
 #: Both episodes of a task have arrays of the same shapes; rows are in three blocks.
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=9, contributions=True, prompts="same")
 ARRAYS = (
-    *(f"joint/{name}" for name in ("atoms", "contribution", "key_role", "row_sum", "rows")),
+    *(f"joint/{name}" for name in ("atoms", "contribution", "key_role", "row_sum", "rows", "uniform")),
     *(f"{kind}/{camera}" for kind in ("frames", "objects") for camera in ("base_0_rgb", "left_wrist_0_rgb")),
     *("actions", "state"),
 )

@@ -1,7 +1,7 @@
 """How many files and folders captured episodes have: clusters and hubs count them.
 
-Not here, because they need packages of their own: policies of LeRobot and GR00T (`tests/policies`). Each site takes 9
-files, 11 with contributions, as the sites here do.
+Not here, because they need packages of their own: policies of LeRobot and GR00T (`tests/policies`). Each site takes 11
+files, 13 with contributions, as the sites here do.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def still_scene(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_pi_its_reruns_and_replays(tmp_path):
     store = tmp_path / "run.zarr"
     run("pi", *WHERE, *TINY, "--queries", "all", "--denoise-steps", "all", "--contributions", "--store", store)
-    assert check_few(store, 27) == 27
+    assert check_few(store, 29) == 29
     run("rerun", store, "--knockout", "camera:base_0_rgb", "--store", tmp_path / "without.zarr")
     check_few(tmp_path / "without.zarr")
     data = write_data_set(tmp_path / "data", "v3.0", episodes_of_store(store, CAMERAS))

@@ -198,7 +198,7 @@ def codec_chains(codecs: list[dict]) -> list[list[dict]]:
 
 def test_core_codecs_only_and_a_checksum_on_every_chunk(written):
     documents = array_documents(written[0])
-    assert len(documents) == 4 * 10
+    assert len(documents) == 4 * 11
     for name, document in documents.items():
         assert document["zarr_format"] == 3
         assert document["storage_transformers"] == []

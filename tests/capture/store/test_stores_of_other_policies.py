@@ -107,11 +107,13 @@ def test_replans_that_are_refused(tmp_path, spec, changes, says):
 )
 def test_verify_reports_what_the_writer_let_through(tmp_path, monkeypatch, spec, changes, says):
     with monkeypatch.context() as patch:
-        patch.setattr("vla_attention.capture.store.site_writer.absent_problems", lambda *_: iter(()))
-        patch.setattr(episode_checks, "absent_problems", lambda *_: iter(()))
+        for rule in ("absent_problems", "unseen_problems"):
+            patch.setattr(f"vla_attention.capture.store.site_writer.{rule}", lambda *_: iter(()))
+            patch.setattr(episode_checks, rule, lambda *_: iter(()))
         append(tmp_path / "a.zarr", spec, changes)
     faults = verify_store(open_store(tmp_path / "a.zarr"))
-    assert [says in fault.problem for fault in faults] == [True]
+    assert [says in fault.problem for fault in faults] == [True, False]
+    assert "gives mass to a key that no query sees, as joint/uniform says" in faults[1].problem
 
 
 def test_arrays_that_nobody_knows_are_missing_and_no_fault(tmp_path):

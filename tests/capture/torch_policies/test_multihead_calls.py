@@ -78,7 +78,8 @@ def test_rows_and_results(data):
     # Of bfloat16, rows are of the queries and keys as the call projected and rounded them.
     torch.testing.assert_close(rows, weights, rtol=1e-4, atol=1e-5 if dtype is torch.float32 else 2e-2)
     torch.testing.assert_close(rows.sum(-1), torch.ones(rows.shape[:-1]))
-    assert torch.equal(seen.allowed[0][..., :keys], ~gone.expand(batch, 4, queries, keys).all(1))
+    allowed = seen.allowed[0][..., :keys].expand(batch, 4, queries, keys)
+    assert torch.equal(allowed, ~gone.expand(batch, 4, queries, keys))
     assert (rows[..., :keys][gone.expand(batch, 4, queries, keys)] == 0).all()
     # The output per head, projected, is what the module returned.
     projected = policy.attention.out_proj(output.float())

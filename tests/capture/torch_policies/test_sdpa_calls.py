@@ -86,7 +86,7 @@ def test_rows_and_results(case):
         torch.testing.assert_close(rows.double(), reference, rtol=1e-4, atol=2e-6)
         if logits is not None:
             keep = (logits > -5000).expand(case["batch"], 1, case["queries"], case["keys"])
-            assert torch.equal(allowed, keep[:, 0])
+            assert torch.equal(allowed, keep.expand(allowed.shape))
             assert (rows[~keep.expand(rows.shape)] == 0).all()
         else:
             assert allowed.all()
@@ -107,7 +107,9 @@ def test_rows_of_some_queries_and_batch_rows():
             places = range(5)[queries] if isinstance(queries, slice) else queries
             torch.testing.assert_close(some, rows[batch][:, :, list(places)], rtol=1e-6, atol=1e-7)
             assert call.product_error(some, queries, batch) < 2e-6
-        assert torch.equal(call.allowed(queries), torch.ones(3, len(some[0, 0]), 7, dtype=torch.bool))
+        assert torch.equal(
+            call.allowed(queries), torch.ones(3, call.allowed().shape[1], len(some[0, 0]), 7, dtype=torch.bool)
+        )
 
 
 def test_wrong_rows_have_a_large_product_error():

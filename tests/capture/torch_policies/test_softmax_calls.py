@@ -159,7 +159,7 @@ def test_rows_and_results(attend, data):
         )
         if wide or attend not in (masked_afterwards, altered_in_place, in_place):
             torch.testing.assert_close(rows.sum(-1), torch.ones(rows.shape[:-1]), rtol=0, atol=2e-6)
-        assert torch.equal(allowed, keep[:, 0])
+        assert torch.equal(allowed, keep.expand(allowed.shape))
         assert (rows[~keep.expand(rows.shape)] == 0).all()
 
 

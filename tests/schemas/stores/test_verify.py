@@ -399,7 +399,7 @@ def test_verify_for_programs(path, capsys):
     (report,) = json.loads(capsys.readouterr().out)
     assert (report["store"], report["version"], report["quick"], report["whole"]) == (
         str(path),
-        "version 1",
+        "version 2",
         False,
         False,
     )
