@@ -1,67 +1,114 @@
-"""Keys that come and go: the baseline is the mass that attention gives which is uniform over the keys of each query."""
+"""What uniform attention gives to every key: the table that Python and the viewer's page share, query by query."""
 
 from __future__ import annotations
+
+from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
 
-from vla_attention.schemas.groupings.key_counts import key_counts, num_valid_keys
-from vla_attention.schemas.layout import INVALID_ROLES, Role, SiteLayout, Span
-from vla_attention.testing import small_tokens
+from tests.kit.uniform_cases import LENGTHS, TABLE, attention, layout_of, tokens_of_case
+from vla_attention.schemas.groupings.key_counts import uniform_of_roles, uniform_of_version_1, uniform_rows
+from vla_attention.schemas.layout import INVALID_ROLES, Role
 
-IMAGE, ABSENT, PADDING, ACTION = (int(role) for role in (Role.IMAGE, Role.ABSENT, Role.PADDING, Role.ACTION))
+#: The table has 10 digits.
+CLOSE = 1e-9
+VERSION_1 = pytest.mark.parametrize("case", TABLE["version_1"], ids=lambda case: case["name"])
+STORED = pytest.mark.parametrize("case", TABLE["stored"], ids=lambda case: case["name"])
+#: The groups of `default`, as roles.
+GROUPS = {
+    "visual": (Role.IMAGE,),
+    "linguistic": (Role.BOS, Role.TEMPLATE, Role.INSTRUCTION, Role.TEXT),
+    "state": (Role.STATE, Role.PROPRIO),
+    "action": (Role.ACTION,),
+    "null": (Role.NULL,),
+    "padding": (Role.PADDING,),
+    "masked": (Role.MASKED_IMAGE,),
+}
 
 
-def layout(offset: int = 0) -> SiteLayout:
-    grown = Span("generated", "action", 5, 9, growing=True, growing_offset=offset)
-    return SiteLayout("joint", (Span("image", "image", 0, 3), Span("prompt", "text", 3, 5), grown))
-
-
-def uniform_mass(site: SiteLayout, roles: list[int], num_queries: int) -> np.ndarray:
-    """Mean mass (key,) under uniform attention, query by query."""
-    span = site.growing_span
-    queries = num_queries - sum(roles[key] == ABSENT for key in range(span.start, span.stop))
-    mass = np.zeros(len(roles))
+def of_version_1(case: dict[str, Any], roles: list[int]) -> list[float]:
+    """Mean share (key,) of each key at a replan, from its roles, query by query."""
+    growing = layout_of(case).growing_span
+    queries = case["num_queries"]
+    if growing is not None:
+        queries = max(1, queries - sum(roles[key] == Role.ABSENT for key in range(growing.start, growing.stop)))
+    shares = [0.0] * len(roles)
     for query in range(queries):
         seen = [
             key
             for key, role in enumerate(roles)
-            if role not in INVALID_ROLES and (key < span.start or key - span.start < query + span.growing_offset)
+            if role != Role.ABSENT
+            and not (growing and key in range(growing.start + query + growing.growing_offset, growing.stop))
         ]
-        mass[seen] += 1 / len(seen) / queries
-    return mass
+        valid = [key for key in seen if roles[key] not in INVALID_ROLES]
+        for key in seen if valid else ():
+            shares[key] += 1 / len(valid) / queries
+    return shares
 
 
-@pytest.mark.parametrize("offset", [0, 1, 2])
-@pytest.mark.parametrize(
-    "roles",
-    [
-        [IMAGE] * 5 + [ACTION] * 4,
-        [IMAGE] * 3 + [IMAGE, PADDING] + [ACTION] * 4,
-        [IMAGE] * 3 + [IMAGE, ABSENT] + [ACTION] * 2 + [ABSENT] * 2,
-    ],
-)
-def test_shares_of_keys_are_those_of_uniform_attention(roles, offset):
-    site = layout(offset)
-    key_role = np.array([roles], dtype=np.uint8)
-    valid = ~np.isin(key_role, INVALID_ROLES)
-    counts = key_counts(site, key_role, valid, num_queries=5)
-    expected = uniform_mass(site, roles, 5)
-    np.testing.assert_allclose((counts * valid)[0] / num_valid_keys(valid, counts)[0], expected, rtol=1e-12)
-    assert (counts[0, :3] == 1).all(), "a key that all queries see counts for one"
-    assert (counts[key_role == ABSENT] == 0).all()
+@VERSION_1
+def test_what_version_1_gives_is_uniform_at_every_query(case):
+    roles = np.array(case["key_role"], dtype=np.uint8)
+    given = uniform_of_version_1(layout_of(case), roles, ~np.isin(roles, INVALID_ROLES), case["num_queries"])
+    np.testing.assert_allclose(given, case["uniform"], rtol=CLOSE)
+    by_query = [of_version_1(case, of_replan) for of_replan in case["key_role"]]
+    np.testing.assert_allclose(case["uniform"], by_query, rtol=CLOSE)
 
 
-def test_usual_keys_count_for_one_each():
-    tokens = small_tokens(3, 0, [0])
-    assert tokens.key_counts is None
-    assert num_valid_keys(tokens.valid, None).dtype == np.int64
+def rows_of(case: dict[str, Any], replan: int, of: dict[str, int], weights: list[float]) -> list[list[float]]:
+    """Every query's attention in a selection: in proportion to the weights of the keys that it sees."""
+    axes = ("layer", "denoise", "head", "query")
+    chosen = [[of[axis]] if axis in of else range(length) for axis, length in zip(axes, LENGTHS, strict=True)]
+    rows = []
+    for cell in product([replan], *chosen):
+        seen = case["seen"]
+        for place in cell:
+            seen = seen[place] if len(seen) > 1 else seen[0]
+        parts = [weight * int(mark) for weight, mark in zip(weights, seen, strict=True)]
+        rows.append([part / sum(parts) for part in parts])
+    return rows
 
 
-def test_absent_keys_count_for_none():
-    site = SiteLayout("joint", (Span("prompt", "text", 0, 3),))
-    roles = np.array([[Role.TEXT, Role.TEXT, Role.TEXT], [Role.TEXT, Role.TEXT, Role.ABSENT]], dtype=np.uint8)
-    valid = ~np.isin(roles, INVALID_ROLES)
-    counts = key_counts(site, roles, valid, num_queries=4)
-    assert counts.tolist() == [[1, 1, 1], [1, 1, 0]]
-    assert num_valid_keys(valid, counts).tolist() == [3, 2]
+@STORED
+def test_what_is_stored_gives_the_means_and_lifts_of_the_table(case):
+    for expected in case["expected"]:
+        for replan, roles in enumerate(case["key_role"]):
+            uniform, row = (
+                [
+                    sum(column) / len(column)
+                    for column in zip(*rows_of(case, replan, expected["of"], weights), strict=True)
+                ]
+                for weights in ([1] * len(roles), case["weights"])
+            )
+            np.testing.assert_allclose(expected["uniform"][replan], uniform, rtol=CLOSE, err_msg=str(expected["of"]))
+            valid = [key for key, role in enumerate(roles) if role not in INVALID_ROLES]
+            of_valid = sum(row[key] for key in valid) / sum(uniform[key] for key in valid)
+            for group, lift in expected["lifts"][replan].items():
+                keys = [key for key, role in enumerate(roles) if role in GROUPS[group]]
+                given = sum(uniform[key] for key in keys)
+                if given:
+                    assert lift == pytest.approx(sum(row[key] for key in keys) / given / of_valid, rel=CLOSE), group
+                else:
+                    assert lift is None, group
+
+
+@STORED
+def test_rows_of_uniform_attention_are_those_of_the_masks(case):
+    seen = attention(case | {"queries": "all"}, [1.0] * 8) > 0
+    whole = case["expected"][0]
+    assert whole["of"] == {}
+    np.testing.assert_allclose(uniform_rows(seen).mean(axis=(1, 2, 3, 4)), whole["uniform"], rtol=CLOSE)
+
+
+def test_a_query_that_sees_no_key_gives_nothing():
+    assert uniform_rows(np.array([[True, False, True], [False, False, False]])).tolist() == [[0.5, 0, 0.5], [0, 0, 0]]
+
+
+def test_roles_say_what_a_policy_sees_in_which_all_queries_see_the_same():
+    (case,) = [case for case in TABLE["stored"] if case["name"] == "every query sees the same keys"]
+    roles = tokens_of_case(case).key_role
+    np.testing.assert_allclose(uniform_of_roles(roles), case["expected"][0]["uniform"], rtol=CLOSE)
+    roles = np.array([Role.IMAGE, Role.MASKED_IMAGE, Role.NULL, Role.TEXT, Role.ABSENT, Role.ACTION], dtype=np.uint8)
+    assert uniform_of_roles(roles).tolist() == [0.25, 0, 0.25, 0.25, 0, 0.25]
