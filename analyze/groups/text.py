@@ -5,6 +5,7 @@ from __future__ import annotations
 import polars as pl
 
 from vla_attention.analyze.groups.group_preview import UNTAKEN, GroupPreview
+from vla_attention.analyze.measures.baselines import baseline_notes
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.show.headings import wrap
 from vla_attention.analyze.show.numbers import format_number, of_tasks
@@ -31,6 +32,7 @@ def preview_text(question: Question, preview: GroupPreview) -> str:
     if grouping.ratio is not None and preview.uniform_ratio is not None:
         sides = " / ".join(" + ".join(side) for side in (grouping.ratio.numerator, grouping.ratio.denominator))
         lines.append(f"Ratio {sides}: uniform attention alone gives {_range(*preview.uniform_ratio)}.")
+        lines += baseline_notes(question.stores)
     return "\n".join(wrapped for line in lines for wrapped in _wrapped(line))
 
 

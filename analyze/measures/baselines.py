@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.stores.selection import Selection
+from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.key_counts import uniform_of_version_1
+from vla_attention.schemas.stores.reader import Store
+from vla_attention.schemas.stores.store_format import CALLERS_MODULES
 
 Array = NDArray[np.float64]
 
@@ -53,3 +58,22 @@ def uniform_masses(uniform: Array, weights: NDArray[np.float32]) -> Array:
     replans, *cells, keys = uniform.shape
     masses: Array = np.matmul(uniform.reshape(replans, -1, keys), weights.astype(np.float64))
     return masses.reshape(len(masses), *cells, weights.shape[2])
+
+
+def baseline_notes(stores: Sequence[Store]) -> tuple[str, ...]:
+    """The line about stores of version 1 whose baseline may be that of too many keys; empty where there are none.
+
+    In policies that `vla-capture` builds all queries of a replan see the same keys, but for a growing span, which is
+    counted; in other policies of torch nobody noted who sees what.
+    """
+    names = [
+        store.path.name
+        for store in stores
+        if store.attributes.store_version == 1 and store.attributes.policy.checkpoint_format == CALLERS_MODULES
+    ]
+    if not names:
+        return ()
+    return (
+        f"Baselines of {listing(names)} (version 1) are of the keys that any query of any layer sees; where queries or "
+        "layers see different keys, lifts are off. A new recording has baselines by query and layer.",
+    )

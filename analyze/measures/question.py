@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from vla_attention.analyze.measures.baselines import baseline_notes
 from vla_attention.analyze.measures.frames import layer_name
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
@@ -66,8 +67,8 @@ class Question:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """The lines that every result with numbers has: what was left out, and the notes."""
-        return (*self.skipped, *self.notes)
+        """The lines that every result with numbers has: what was left out, what the baselines are of, and the notes."""
+        return (*self.skipped, *baseline_notes(self.stores), *self.notes)
 
     @property
     def num_tasks(self) -> int:

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import polars as pl
 
+from vla_attention.analyze.measures.baselines import baseline_notes
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.sinks import SinkRule
 from vla_attention.analyze.ratios.analysis import Analysis, site_without_a_side
@@ -71,6 +72,7 @@ def caveats(analysis: Analysis, masses: Mapping[str, float], sinks: pl.DataFrame
         *_compute_type(question),
         *_rounding(question),
         *(Caveat("Left out", line, True) for line in question.skipped),
+        *(Caveat("Baseline of version 1", line, True) for line in baseline_notes(question.stores)),
         *(Caveat("Chosen part", line) for line in question.notes),
     ]
     return sorted(found, key=lambda caveat: not caveat.grave)
@@ -115,8 +117,8 @@ def _baseline(analysis: Analysis) -> list[Caveat]:
         for side in (grouping.ratio.numerator, grouping.ratio.denominator)
     )
     sentence = (
-        f"The numerator has {above} keys on average and the denominator {below}, so attention that treats all keys "
-        f"alike has the ratio {format_number(uniform)}. Read the lift: 1 is what uniform attention gives."
+        f"The numerator has {above} keys on average and the denominator {below}; attention that is uniform at each "
+        f"query has the ratio {format_number(uniform)}. Read the lift: 1 is what uniform attention gives."
     )
     return [Caveat("Uniform baseline", sentence)]
 
