@@ -29,6 +29,7 @@ from vla_attention.testing.stores import reseal
 
 ROWS = "Array joint/rows of episode task000_episode000 cannot be read: "
 ATOMS = "Array joint/atoms of episode task000_episode000 cannot be read: "
+UNIFORM = r"joint/uniform has the shape \(.*\); expected \(2, 2, 2, "
 STATE = "Array state of episode task000_episode000 cannot be read: "
 #: Zeros that take some kilobytes of a file.
 BOMB = 96_000_000
@@ -45,6 +46,11 @@ def _atoms(change: Callable[[dict[str, Any]], object], shape: Any = None) -> Cal
 def _state(change: Callable[[dict[str, Any]], object], shape: Any) -> Callable[[Path], None]:
     """Of the state an analysis knows the number of replans only."""
     return lambda store: edit_array(store, "state", change, shape)
+
+
+def _uniform(*shape: int) -> Callable[[Path], None]:
+    """What uniform attention gives, in another shape; the rows are (2, 2, 2, 2, 1, 39)."""
+    return lambda store: edit_array(store, "joint/uniform", lambda content: None, list(shape))
 
 
 def _codecs(codecs: list[Any]) -> Callable[[Path], None]:
@@ -239,6 +245,16 @@ ARRAY_CASES = [
         ),
         ROWS + "a chunk of it would take",
     ),
+    Case(
+        "uniform: not listed",
+        lambda store: edit_episode(store, lambda attributes: attributes["arrays"].pop("joint/uniform")),
+        "lacks the array joint/uniform",
+    ),
+    Case("uniform: 10^12 replans", _uniform(10**12, 1, 1, 1, 1, 39), UNIFORM + r"2, 1, 39\), or 1 in place of a leng"),
+    Case("uniform: more layers", _uniform(1, 3, 1, 1, 1, 39), UNIFORM + r"2, 1, 39\), or 1 in place of a length but"),
+    Case("uniform: fewer keys", _uniform(1, 1, 1, 1, 1, 20), UNIFORM + r"2, 1, 39\)"),
+    Case("uniform: an axis less", _uniform(1, 1, 1, 1, 39), UNIFORM + r"2, 1, 39\)"),
+    Case("uniform: a layer without a chunk", _uniform(1, 2, 1, 1, 1, 39), "Array joint/uniform of .* cannot be read"),
     Case("shard: an offset of 2^63", _offsets(_entry(2**63, 100)), ROWS + ".*overlap or lie outside"),
     Case("shard: an offset of 2^64 - 8", _offsets(_entry(2**64 - 8, 16)), ROWS + ".*overlap or lie outside"),
     Case("shard: a length of 2^63", _offsets(_entry(0, 2**63)), ROWS + ".*overlap or lie outside"),

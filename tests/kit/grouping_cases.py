@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.kit.grouping_episodes import NUM_EPISODES, made_up_episode
+from vla_attention.analyze.measures.baselines import uniform_masses
 from vla_attention.analyze.measures.episodes import replan_values
 from vla_attention.analyze.measures.masses import masses
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
@@ -31,6 +32,7 @@ from vla_attention.schemas.groupings.grouping import (
     parse_ratio_argument,
     with_groups,
 )
+from vla_attention.schemas.groupings.key_counts import uniform_of_version_1, uniform_rows
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vocabulary
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import Role
@@ -57,8 +59,11 @@ def _case(seed: int, number: int, episodes: Sequence[EpisodeTokens]) -> dict[str
     # Names may exist in another episode of the same layout only: then the group has no key here.
     others = [i for i, other in enumerate(episodes) if other.layout == tokens.layout] if number % 3 else [position]
     rows = _rows(generator, tokens)
-    case = {"episode": position, "vocabulary": others, **given, "rows": rows.ravel().tolist()}
-    return {**case, "expected": _expected(given, tokens, [episodes[i] for i in others], rows)}
+    uniform = _uniform(generator, tokens) if number % 4 else None
+    case = {"episode": position, "vocabulary": others, **given, "rows": rows.ravel().tolist(), "uniform": None}
+    if uniform is not None:
+        case["uniform"] = {"shape": list(uniform.shape), "values": uniform.ravel().tolist()}
+    return {**case, "expected": _expected(given, tokens, [episodes[i] for i in others], rows, uniform)}
 
 
 def _given(generator: np.random.Generator, number: int, tokens: EpisodeTokens) -> dict[str, Any]:
@@ -189,15 +194,35 @@ def _wrong_atom(generator: np.random.Generator, tokens: EpisodeTokens) -> str:
 
 
 def _rows(generator: np.random.Generator, tokens: EpisodeTokens) -> NDArray[np.float64]:
-    """Rows (replan, layer, denoise, head, key) that sum to 1; at times a group has no mass, or a row none at all."""
+    """Rows (replan, layer, denoise, head, key) that sum to 1.
+
+    At times a group has no mass, in all layers or in one, or a row has none at all.
+    """
     shape = (tokens.num_replans, *AXES, tokens.layout.num_keys)
     valid = np.broadcast_to(tokens.valid, (tokens.num_replans, tokens.layout.num_keys))[:, None, None, None]
     weights = np.exp(generator.normal(0, 3, shape)) * valid
     if generator.random() < 0.2:
         weights[..., : tokens.layout.spans[0].stop] = 0.0
+    if generator.random() < 0.4:
+        weights[:, 0, ..., : tokens.layout.spans[0].stop] = 0.0
     sums = weights.sum(axis=-1, keepdims=True)
     rows = np.divide(weights, sums, out=np.zeros_like(weights), where=sums > 0)
     return rows.astype(np.float32).astype(np.float64)
+
+
+def _uniform(generator: np.random.Generator, tokens: EpisodeTokens) -> NDArray[np.float32]:
+    """What uniform attention gives under random masks (replan, layer, denoise, head, query, key), as stores hold it.
+
+    Along a random choice of axes nothing changes; queries are kept apart or are the mean of some.
+    """
+    lengths = (tokens.num_replans, *AXES, 3)
+    shape = [length if generator.random() < 0.5 else 1 for length in lengths]
+    seen = generator.random((*shape, tokens.layout.num_keys)) < generator.choice([0.9, 0.5, 0.1])
+    seen[..., generator.integers(tokens.layout.num_keys)] |= ~seen.any(axis=-1)
+    uniform = uniform_rows(seen)
+    if generator.random() < 0.5:
+        uniform = uniform.mean(axis=4, keepdims=True)
+    return uniform.astype(np.float32)
 
 
 def chosen_grouping(given: dict[str, Any], vocabulary: Any) -> Grouping:
@@ -219,8 +244,13 @@ def chosen_grouping(given: dict[str, Any], vocabulary: Any) -> Grouping:
 
 
 def _expected(
-    given: dict[str, Any], tokens: EpisodeTokens, others: Sequence[EpisodeTokens], rows: NDArray[np.float64]
+    given: dict[str, Any],
+    tokens: EpisodeTokens,
+    others: Sequence[EpisodeTokens],
+    rows: NDArray[np.float64],
+    uniform: NDArray[np.float32] | None,
 ) -> dict[str, Any]:
+    """What Python makes of a case; `uniform`: what a store of version 2 holds, None for one of version 1."""
     item = SelectedEpisode(None, None, tokens)  # type: ignore[arg-type] - nothing of them is needed
     try:
         vocabulary = collect_vocabulary(others)
@@ -232,9 +262,16 @@ def _expected(
     mass = masses(rows, weights.astype(np.float64))  # type: ignore[arg-type] - in float64, as the page
     layers, denoise, heads = (tuple(range(length)) for length in AXES)
     selection = Selection(layers, layers, layers, denoise, denoise, heads, heads, per_head=False)
-    mean = mass.mean(axis=4 - 1, keepdims=True)
+    mean = mass.mean(axis=3, keepdims=True)
+    if uniform is None:
+        keys = uniform_of_version_1(tokens.layout, tokens.static_roles, item.valid, tokens.num_queries)
+        of_cells = keys[:, None, None, None]
+    else:
+        of_cells = uniform.mean(axis=(3, 4), dtype=np.float64)[:, :, :, None]
+    expected = uniform_masses(of_cells, weights)
+    counts = (resolved.num_keys, resolved.num_valid)
     measured = MeasuredEpisode(
-        item, selection, mean[..., :-1], mean[..., -1], mean[..., -1], resolved.num_keys, resolved.num_valid
+        item, selection, mean[..., :-1], mean[..., -1], mean[..., -1], *counts, expected[..., :-1], expected[..., -1]
     )
     values = replan_values(measured, grouping)
     shape = (tokens.num_replans, len(layers) + 1)

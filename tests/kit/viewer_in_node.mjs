@@ -57,6 +57,22 @@ function meanRows(values, keys, replans, [layers, denoise, heads]) {
   });
 }
 
+// Mean of what uniform attention gives, as stored (replan, layer, denoise, head, query, key), over a selection: (key) of
+// each replan or once.
+function meanUniform({ shape, values }, selection) {
+  const { layers, denoise, heads, query } = engine.storedPlaces(shape, selection);
+  const queries = query === "mean" ? [...Array(shape[4]).keys()] : [query];
+  const places = layers.flatMap((l) => denoise.flatMap((d) => heads.flatMap((h) => queries.map((q) => [l, d, h, q]))));
+  return Array.from({ length: shape[0] }, (_, replan) => {
+    const mean = new Float64Array(shape[5]);
+    for (const place of places) {
+      const first = [replan, ...place].reduce((at, position, axis) => at * shape[axis] + position, 0) * shape[5];
+      for (let key = 0; key < shape[5]; key++) mean[key] += values[first + key] / places.length;
+    }
+    return mean;
+  });
+}
+
 function measured(one) {
   const tokens = tokensOf(given.episodes[one.episode]);
   const others = one.vocabulary.map((number) => tokensOf(given.episodes[number]));
@@ -67,8 +83,16 @@ function measured(one) {
   const weights = engine.withValid(resolved, tokens);
   const rows = meanRows(one.rows, tokens.keys, replans, given.axes);
   const layers = rows.map((own) => engine.layerMasses(own, weights, tokens.keys));
+  const [numLayers, denoise, heads] = given.axes.map((length) => [...Array(length).keys()]);
+  const uniform = numLayers.map((layer) => {
+    const selection = { layers: [layer], denoise, heads, query: "mean" };
+    const keys = one.uniform ? meanUniform(one.uniform, selection) : tokens.uniformOfVersion1;
+    return engine.uniformMasses(keys, weights, tokens.keys);
+  });
   // A layer each, and their mean as the last, as in the tables.
-  const values = [...layers.map((layer) => [layer]), layers].map((own) => engine.replanValues(own, grouping, resolved));
+  const values = [...numLayers.map((layer) => [layer]), numLayers].map((own) =>
+    engine.replanValues(own.map((i) => layers[i]), own.map((i) => uniform[i]), grouping, resolved),
+  );
   const byReplan = Array.from({ length: replans }, (_, replan) => values.map((of) => of[replan]));
   const groups = (name) => flat(byReplan.flatMap((of) => of.map((value) => value.groups[name])));
   const cells = (get) => flat(byReplan.map((of) => of.map(get)));
@@ -118,8 +142,9 @@ const answers = {
   painted: ({ text, layout, camera, patches, erase }) => engine.paintedPatches(text, layout, camera, patches, erase),
   toggled: ({ text, atom }) => engine.toggledPart(text, atom),
   ranks: ({ row, valid }) => numbers(engine.keyRanks(Float64Array.from(row), Uint8Array.from(valid))),
-  lifts: ({ row, valid, counts }) =>
-    numbers(engine.keyLifts(Float64Array.from(row), Uint8Array.from(valid), counts && Float64Array.from(counts))),
+  lifts: ({ row, valid, uniform }) =>
+    numbers(engine.keyLifts(Float64Array.from(row), Uint8Array.from(valid), Float64Array.from(uniform))),
+  version_1: (episode) => tokensOf(episode).uniformOfVersion1.map(numbers),
   drafts: (text) => engine.textOfDraft(engine.draftOfText(text)),
   shell: (text) => engine.shellWord(text),
 };

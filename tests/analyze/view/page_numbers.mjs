@@ -25,14 +25,13 @@ function ofReplan(values, names) {
 }
 
 async function answerOf({ base, root, packed, episode, query }) {
-  const entry = { name: "store", root, episodes: [{ name: episode }], packed, summary: "" };
+  const entry = { name: root.replace(/\/$/, ""), root, episodes: [{ name: episode }], packed, summary: "" };
   const store = await libraryAt(base).openStore(entry);
   const opened = await store.openEpisode(episode);
   const state = { ...reading.stateOfLink(query), episode };
   const shown = await reading.loadShown(store, opened, state);
-  const { site, row, valid, tokens, replan, numbers, selection } = shown;
+  const { site, row, valid, uniform, replan, numbers, selection } = shown;
   const names = [...numbers.grouping.groups.keys()];
-  const counts = tokens.keyCounts?.[tokens.keyCounts.length === 1 ? 0 : replan] ?? null;
   const heads = await opened.headRows(site.layout.name, selection, replan);
   const cells = site.layers.map((_, layer) =>
     site.heads.map((_, head) => {
@@ -43,7 +42,7 @@ async function answerOf({ base, root, packed, episode, query }) {
   const cameras = [...shown.frames].map(([camera, frame]) => {
     const span = site.layout.spans.find((each) => each.camera === camera);
     const view = reading.viewOf(store.root.policy.cameras, camera);
-    const all = reading.shownValues(row, valid, counts, state.measure);
+    const all = reading.shownValues(row, valid, uniform, state.measure);
     const own = all.slice(span.start, span.stop);
     const scale = reading.scaleFor(own, state.measure, 1);
     const painting = { scale: { ...scale, high: 3 }, colours: reading.colourTable(state.colours), opacity: 0.8, smooth: state.smooth };
@@ -55,7 +54,9 @@ async function answerOf({ base, root, packed, episode, query }) {
     link: reading.linkOfState(state),
     site: site.layout.name,
     corrections: shown.corrections,
+    note: shown.baselineNote,
     row: plainList(row),
+    uniform: shown.allUniform.map(plainList),
     replans: numbers.replans.map((values) => ofReplan(values, names)),
     cells,
     cameras,

@@ -77,21 +77,22 @@ def test_lifts_and_ranks_of_single_keys(tmp_path):
     generator = np.random.default_rng(7)
     rows = np.round(generator.dirichlet(np.ones(12), 40), 2)  # with equal values
     valid = generator.random((40, 12)) < 0.8
-    counts = np.where(generator.random((40, 12)) < 0.3, 0.5, 1.0)
+    uniform = generator.choice([0.0, 0.05, 0.1], (40, 12), p=[0.1, 0.3, 0.6])
     given = [
-        {"row": row.tolist(), "valid": known.astype(int).tolist(), "counts": count.tolist() if i % 2 else None}
-        for i, (row, known, count) in enumerate(zip(rows, valid, counts, strict=True))
+        {"row": row.tolist(), "valid": known.astype(int).tolist(), "uniform": one.tolist()}
+        for row, known, one in zip(rows, valid, uniform, strict=True)
     ]
     found = run_in_node(tmp_path, {"ranks": given, "lifts": given})
-    for i, (row, known, count) in enumerate(zip(rows, valid, counts, strict=True)):
+    for i, (row, known, one) in enumerate(zip(rows, valid, uniform, strict=True)):
         own = row[known]
         below, same = (own[:, None] > own).sum(axis=1), (own[:, None] == own).sum(axis=1)
         ranks = (below + (same - 1) / 2) / (len(own) - 1)
         assert np.array(found["ranks"][i], dtype=float)[known] == pytest.approx(ranks)
-        number = count if i % 2 else np.ones(12)
-        lifts = own / number[known] / (own.sum() / number[known].sum())
-        assert np.array(found["lifts"][i], dtype=float)[known] == pytest.approx(lifts)
-        assert np.isnan(np.array(found["ranks"][i] + found["lifts"][i], dtype=float)).sum() == 2 * (~known).sum()
+        assert np.isnan(np.array(found["ranks"][i], dtype=float)).tolist() == (~known).tolist()
+        seen = known & (one > 0)
+        lifts = row[seen] / one[seen] / (own.sum() / one[known].sum())
+        assert np.array(found["lifts"][i], dtype=float)[seen] == pytest.approx(lifts)
+        assert np.isnan(np.array(found["lifts"][i], dtype=float)).tolist() == (~seen).tolist()
 
 
 @needs_node
@@ -131,5 +132,9 @@ def test_the_cases_are_of_all_kinds(cases):
     assert any(answer["on_segments"] is not None for answer in measured)
     ratios = [value for answer in measured for value in answer["cells"].get("ratio", [])]
     assert {"inf", "nan"} <= {value for value in ratios if isinstance(value, str)}
-    # Keys of generated tokens count in part.
-    assert any(value % 1.0 > 0.0 for answer in measured for value in answer["num_valid"])
+    shapes = [case["uniform"]["shape"] for case in given if case["uniform"]]
+    assert len(shapes) == NUM_CASES - NUM_CASES // 4
+    assert all({1} < {shape[axis] for shape in shapes} for axis in range(5))
+    lifts = [value for answer in measured for value in answer["groups"]["lift"]]
+    assert lifts.count("nan") > 100
+    assert sum(isinstance(value, float) and value > 0 for value in lifts) > 1000

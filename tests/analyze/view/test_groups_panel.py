@@ -20,6 +20,7 @@ import pytest
 
 import vla_attention as va
 from tests.kit.browser import needs_chromium, shown_page, wait_until_ready
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.testing import StoreSpec, write_site_store, write_store
 
 pytestmark = [pytest.mark.slow, needs_chromium]
@@ -230,8 +231,41 @@ def test_generated_tokens_and_sites_of_some_layers(tmp_path):
         measured(panel)
         groups = {**groups_of(panel), "rest": "*"}
         compare_with_command(page, panel, tmp_path, "layers_avg", groups=groups, ratio="seen/made")
-        keys = numbers_of(panel, "replan")["made"]["keys"]
-        assert not np.isclose(keys, round(keys))
+        now = numbers_of(panel, "replan")
+        assert now["made"]["keys"] == 6
+        # Only later queries see them, so that uniform attention gives them less than their number says.
+        assert number(panel, "uniform-ratio") > 1.1 * now["seen"]["keys"] / now["made"]["keys"]
+
+
+def masks(tokens: EpisodeTokens, cells: tuple[int, int, int, int]) -> np.ndarray:
+    """What uniform attention gives where each replan, layer, denoise step, head and query sees other keys."""
+    seen = np.random.default_rng(3).random((tokens.num_replans, *cells, tokens.layout.num_keys)) < 0.6
+    seen[..., [span.start for span in tokens.layout.spans]] = True
+    return seen / seen.sum(axis=-1, keepdims=True)
+
+
+def masked(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
+    rows = np.where(masks(tokens, rows.shape[1:5]) > 0, rows, 0.0)
+    return rows / rows.sum(axis=-1, keepdims=True)
+
+
+@pytest.mark.parametrize("cell", [{}, {"layer": 3, "head": 1, "denoise": 9}], ids=["means", "one head"])
+def test_queries_layers_and_heads_that_see_different_keys(tmp_path, cell):
+    spec = StoreSpec(
+        tasks=(1,), replans=4, layers=(0, 1, 3), queries="all", plant_uniform=masks, plant_rows=masked, mantissa_bits=23
+    )
+    path = write_store(tmp_path / "masked.zarr", spec=spec)
+    asked = {{"layer": "layers", "head": "heads"}.get(axis, axis): value for axis, value in cell.items()}
+    link = "&".join(f"{axis}={value}" for axis, value in cell.items())
+    # Whole segments, and groups that cut them.
+    for noun in ("role:instruction", "word:drawer"):
+        text = quote(f"@ratio seen/noun\nseen = camera:base_0_rgb\nnoun = {noun}")
+        with shown_page(path, query=f"?episode=task001_episode000&grouping={text}&{link}") as page:
+            panel = panel_of(page)
+            measured(panel)
+            groups = {**groups_of(panel), "rest": "*"}
+            layer = str(cell.get("layer", "layers_avg"))
+            compare_with_command(page, panel, tmp_path, layer, groups=groups, ratio="seen/noun", **asked)
 
 
 def test_the_panel_on_a_telephone(store):

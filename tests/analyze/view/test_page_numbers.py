@@ -19,6 +19,7 @@ import vla_attention as va
 from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answers
 from tests.kit.golden_stores import FOLDER, NAMES
 from tests.kit.http_ranges import serve
+from vla_attention.analyze.measures.baselines import baseline_notes
 from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.question_settings import settings_from_keywords
 from vla_attention.analyze.overlay.colours import Scale, overlay_image, scale_for
@@ -69,6 +70,11 @@ def settings_of(query: str, site: str) -> tuple[dict[str, Any], int]:
 
 CASES = [(name, query) for name in NAMES for query in QUERIES[name]]
 each_case = pytest.mark.parametrize(("name", "query"), CASES)
+
+
+@each_case
+def test_what_is_to_know_of_the_baseline_is_pythons_sentence(answers, name, query):
+    assert answers[name, query]["note"] == "".join(baseline_notes(va.open(FOLDER / f"{name}.zarr").stores))
 
 
 @each_case

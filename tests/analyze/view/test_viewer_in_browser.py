@@ -14,11 +14,14 @@ import pytest
 
 import vla_attention as va
 from tests.kit.browser import Watched, chromium, needs_chromium, watched_page
+from tests.kit.golden_stores import FOLDER
 from tests.kit.http_ranges import serve
 from tests.kit.viewer import served
 from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.measures.baselines import baseline_notes
 from vla_attention.analyze.view.server import ViewerServer
 from vla_attention.schemas.interventions import Interventions, PromptChange
+from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import StoreSpec, rerun_source, write_store
 
 pytestmark = [pytest.mark.slow, needs_chromium]
@@ -130,6 +133,18 @@ def test_a_patch_and_a_word_have_the_attention_of_their_keys(view, server, store
     words = va.open(store).words("episodes", tasks=0, layers=2, heads=1, denoise=9)
     words = words.filter(episode_index=0, kind="word").sort("place")
     assert [sum(masses) / 3 for masses in zip(*found, strict=True)] == pytest.approx(words["mass"].to_list(), rel=1e-5)
+
+
+def test_a_baseline_of_version_1_that_may_be_of_too_many_keys_is_noted(browser):
+    for name, count in (("library", 1), ("joint", 0)):
+        store = FOLDER / f"{name}.zarr"
+        with served(store) as running, watched_page(browser) as watched:
+            watched.open(running.link)
+            notes = watched.page.locator(f'{MAIN} [role="note"]:visible')
+            assert notes.count() == count
+            if count:
+                assert (notes.inner_text(),) == baseline_notes([open_store(store)])
+            assert watched.complaints == []
 
 
 def test_controls_change_the_link_and_the_link_shows_the_same(view, server):

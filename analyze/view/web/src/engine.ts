@@ -5,6 +5,7 @@
 export * from "./grouping/builtin_groupings";
 export * from "./grouping/grouping";
 export * from "./grouping/grouping_files";
+export * from "./grouping/key_counts";
 export * from "./grouping/resolve";
 export * from "./grouping/selector_parser";
 export * from "./grouping/text";

@@ -1,65 +1,73 @@
 /**
- * For how many keys each key counts: schemas/groupings/key_counts.py, which derives it. A key that every query sees
- * counts for 1, an absent one for 0, one of a growing span for a part of 1, because only the later queries see it.
+ * What uniform attention gives to every key: schemas/groupings/key_counts.py, which derives it. Both are held together
+ * by the cases of tests/schemas/groupings/uniform_cases.json.
+ *
+ * From version 2 on a store holds it, by replan, layer, denoise step, head, query and key; an axis along which nothing
+ * changes has length 1. Version 1 has roles alone.
  */
 import { ROLES } from "../store/documents";
 import type { SiteDocument, SpanDocument } from "../store/documents";
+import type { Selection } from "../store/episode_values";
 import type { KeyRole } from "./tokens";
 
-/** Of each replan, or once: (key). Null where every key counts for one. `valid`: (replan or 1, key). */
-export function keyCounts(
+/** What uniform attention gives every key, (key), of each replan or once. */
+export type UniformKeys = readonly Float64Array[];
+
+/** The places of the stored values (replan, layer, denoise, head, query, key) whose mean is that of a selection. */
+export function storedPlaces(shape: readonly number[], { layers, denoise, heads, query }: Selection): Selection {
+  const [, ofLayers, ofDenoise, ofHeads, ofQueries] = shape;
+  return {
+    layers: ofLayers === 1 ? [0] : layers,
+    denoise: ofDenoise === 1 ? [0] : denoise,
+    heads: ofHeads === 1 ? [0] : heads,
+    query: ofQueries === 1 ? "mean" : query,
+  };
+}
+
+/**
+ * What it gives in a store of version 1: 1 / N over the valid keys, and as much for every key that exists. Keys of a
+ * growing span get a part of that, because only the later queries see them.
+ *
+ * `valid`: (replan or 1, key). `numQueries`: action queries of a replan that generates all tokens of the growing span.
+ */
+export function uniformOfVersion1(
   layout: SiteDocument,
-  roles: KeyRole,
+  { replans, keys, codes }: KeyRole,
   valid: Uint8Array,
   numQueries: number,
-): Float64Array[] | null {
-  const { keys, codes } = roles;
+): Float64Array[] {
   const growing = layout.spans.find((span) => span.growing);
-  const replans = Math.max(roles.replans, valid.length / keys);
-  if (!growing) {
-    if (!codes.includes(ROLES.absent)) return null;
-    return Array.from({ length: roles.replans }, (_, replan) =>
-      Float64Array.from(codes.subarray(replan * keys, (replan + 1) * keys), (code) => (code === ROLES.absent ? 0 : 1)),
-    );
-  }
-  return Array.from({ length: replans }, (_, replan) => {
-    const own = (values: Uint8Array): Uint8Array => values.subarray(replan * keys).subarray(0, keys);
-    const absent = (roles.replans === 1 ? codes : own(codes)).slice(0, keys).map((code) => +(code === ROLES.absent));
-    return countsOfReplan(growing, absent, valid.length === keys ? valid : own(valid), numQueries);
+  const own = (values: Uint8Array, replan: number): Uint8Array =>
+    values.length === keys ? values : values.subarray(replan * keys, (replan + 1) * keys);
+  return Array.from({ length: Math.max(replans, valid.length / keys) }, (_, replan) => {
+    const exists = Float64Array.from(own(codes, replan), (code) => (code === ROLES.absent ? 0 : 1));
+    const known = own(valid, replan);
+    const counts = growing ? countsOfReplan(growing, exists, known, numQueries) : exists;
+    const number = counts.reduce((sum, count, key) => sum + (known[key] ? count : 0), 0);
+    return counts.map((count) => (number > 0 ? count / number : 0));
   });
 }
 
-/** The number of valid keys of each replan, or once. */
-export function numValidKeys(valid: Uint8Array, keys: number, counts: Float64Array[] | null): number[] {
-  const parts = counts?.some((one) => one.some((count) => count > 0 && count < 1)) ? counts : null;
-  return Array.from({ length: Math.max(valid.length / keys, parts?.length ?? 1) }, (_, replan) => {
-    let sum = 0;
-    const first = valid.length === keys ? 0 : replan * keys;
-    const count = parts && parts[parts.length === 1 ? 0 : replan];
-    for (let key = 0; key < keys; key++) if (valid[first + key]) sum += count ? count[key] : 1;
-    return sum;
-  });
-}
-
-function countsOfReplan(growing: SpanDocument, absent: Uint8Array, valid: Uint8Array, numQueries: number): Float64Array {
+/** For how much of a key that all queries see each key counts at one replan. */
+function countsOfReplan(growing: SpanDocument, exists: Float64Array, valid: Uint8Array, numQueries: number): Float64Array {
   const { start, stop, growing_offset: offset } = growing;
   let [gone, outside] = [0, 0];
   for (let key = 0; key < valid.length; key++) {
-    if (key >= start && key < stop) gone += absent[key];
-    else outside += valid[key];
+    if (key >= start && key < stop) gone += 1 - exists[key]!;
+    else outside += valid[key]!;
   }
   const queries = Math.max(1, numQueries - gone);
-  const sees = (query: number, key: number): boolean => key - start < query + offset && !absent[key];
-  const counts = Float64Array.from(absent, (missing) => (missing ? 0 : 1));
+  const sees = (query: number, key: number): boolean => key - start < query + offset && exists[key] === 1;
+  const counts = exists.slice();
   const shares = new Float64Array(stop - start);
   let all = 0;
   for (let query = 0; query < queries; query++) {
     let seen = outside;
-    for (let key = start; key < stop; key++) if (sees(query, key)) seen += valid[key];
+    for (let key = start; key < stop; key++) if (sees(query, key)) seen += valid[key]!;
     if (!seen) continue;
     all += 1 / seen;
-    for (let key = start; key < stop; key++) if (sees(query, key)) shares[key - start] += 1 / seen;
+    for (let key = start; key < stop; key++) if (sees(query, key)) shares[key - start]! += 1 / seen;
   }
-  if (all > 0) for (let key = start; key < stop; key++) counts[key] = shares[key - start] / all;
+  if (all > 0) for (let key = start; key < stop; key++) counts[key] = shares[key - start]! / all;
   return counts;
 }

@@ -1,4 +1,5 @@
 /** From a grouping and an episode's tokens to a weight per key and group, with all checks: schemas/groupings/resolve.py. */
+import { ROLES } from "../store/documents";
 import {
   cellCoverage,
   complement,
@@ -9,11 +10,10 @@ import {
   weightsOfCells,
 } from "./cells";
 import { type Grouping, isRest } from "./grouping";
-import { numValidKeys } from "./key_counts";
 import { type Atom, atomKey, atomsOf, EVERYTHING, folded, parseSelector, type Selector } from "./selector_parser";
 import { everyKey, keysOf, type Membership, noKeys, problemOf } from "./selectors";
 import { GroupingError, quoted, SelectorError, shortened } from "./text";
-import { type EpisodeTokens, pieceAt, type Vocabulary } from "./tokens";
+import { type EpisodeTokens, type KeyRole, pieceAt, type Vocabulary } from "./tokens";
 
 /** A grouping on one episode's keys. What is the same at all replans has one entry. */
 export interface ResolvedGrouping {
@@ -21,9 +21,9 @@ export interface ResolvedGrouping {
   readonly keys: number;
   /** Of each replan, or once: (group, key), 0..1. */
   readonly weights: readonly Float32Array[];
-  /** Of each replan, or once: (group), see `keyCounts`. */
+  /** Numbers of keys that exist, of each replan, or once: (group); fractional where objects cover parts of patches. */
   readonly numKeys: readonly Float64Array[];
-  /** Of each replan, or once. */
+  /** Number of keys that can hold information, of each replan, or once. */
   readonly numValid: readonly number[];
 }
 
@@ -76,13 +76,12 @@ export function resolve(grouping: Grouping, tokens: EpisodeTokens): ResolvedGrou
     });
     return stacked;
   });
-  const counts = tokens.keyCounts;
   return {
     names: [...grouping.groups.keys()],
     keys,
     weights,
-    numKeys: countedKeys(weights, keys, counts),
-    numValid: numValidKeys(tokens.valid, keys, counts),
+    numKeys: countedKeys(weights, tokens.keyRole),
+    numValid: countedValid(tokens),
   };
 }
 
@@ -93,18 +92,25 @@ export function selectorWeights(text: string, tokens: EpisodeTokens): Float32Arr
   return Array.from({ length: replans }, (_, replan) => values.slice(replan * tokens.keys, (replan + 1) * tokens.keys));
 }
 
-function countedKeys(weights: readonly Float32Array[], keys: number, counts: Float64Array[] | null): Float64Array[] {
-  return Array.from({ length: Math.max(weights.length, counts?.length ?? 1) }, (_, replan) => {
+function countedKeys(weights: readonly Float32Array[], { replans, keys, codes }: KeyRole): Float64Array[] {
+  const length = codes.includes(ROLES.absent) ? Math.max(weights.length, replans) : weights.length;
+  return Array.from({ length }, (_, replan) => {
     const own = ofReplan(weights, replan);
-    const count = counts && ofReplan(counts, replan);
+    const first = replans === 1 ? 0 : replan * keys;
     const sums = new Float64Array(own.length / keys);
     for (let group = 0; group < sums.length; group++) {
       let sum = 0;
-      for (let key = 0; key < keys; key++) sum += own[group * keys + key]! * (count ? count[key]! : 1);
+      for (let key = 0; key < keys; key++) if (codes[first + key] !== ROLES.absent) sum += own[group * keys + key]!;
       sums[group] = sum;
     }
     return sums;
   });
+}
+
+function countedValid({ keyRole: { replans, keys }, valid }: EpisodeTokens): number[] {
+  return Array.from({ length: replans }, (_, replan) =>
+    valid.subarray(replan * keys, (replan + 1) * keys).reduce((sum, known) => sum + known, 0),
+  );
 }
 
 /** Which (key, cell) pairs each group takes; whether groups are disjoint is checked here. */

@@ -1,7 +1,7 @@
 /** What selectors need of one episode's keys at one site, and the names in it: schemas/groupings/vocabulary.py. */
 import { INVALID_ROLES, ROLES } from "../store/documents";
 import type { PromptDocument, ObjectDocument, SiteDocument, SpanDocument } from "../store/documents";
-import { keyCounts } from "./key_counts";
+import { type UniformKeys, uniformOfVersion1 } from "./key_counts";
 import { BadArgument, casefold, characters, decimalDigits, listing, shortened, unknownName, visible } from "./text";
 import { wordsOf, type Word } from "./words";
 
@@ -31,7 +31,7 @@ export interface TokensOfEpisode {
   readonly objects: readonly ObjectDocument[];
   /** By camera of the site. */
   readonly coverage: ReadonlyMap<string, ObjectCoverage>;
-  /** Action queries of a replan; needed where the layout has a growing span. */
+  /** Action queries of a replan; needed for the baseline of version 1 where the layout has a growing span. */
   readonly numQueries: number;
 }
 
@@ -48,7 +48,7 @@ export class EpisodeTokens {
   readonly numQueries: number;
   /** Keys that can hold information, (replan or 1, key). */
   readonly valid: Uint8Array;
-  private countsOfKeys: Float64Array[] | null | undefined;
+  private uniform: UniformKeys | undefined;
   private wordsOfPrompts: Word[][] | undefined;
 
   constructor(tokens: TokensOfEpisode) {
@@ -64,10 +64,10 @@ export class EpisodeTokens {
     this.valid = this.keyRole.codes.map((code) => (INVALID_ROLES.includes(code) ? 0 : 1));
   }
 
-  /** For how many keys each key counts, of each replan or once; null where every key counts for one. */
-  get keyCounts(): Float64Array[] | null {
-    this.countsOfKeys ??= keyCounts(this.layout, this.keyRole, this.valid, this.numQueries);
-    return this.countsOfKeys;
+  /** What uniform attention gives every key in a store of version 1. */
+  get uniformOfVersion1(): UniformKeys {
+    this.uniform ??= uniformOfVersion1(this.layout, this.keyRole, this.valid, this.numQueries);
+    return this.uniform;
   }
 
   /** The instruction's words for each of `prompts`; throws `BadArgument` for words at keys that do not exist. */

@@ -1,19 +1,11 @@
 /** The masses of any grouping over an episode, from segment masses where it cuts no segment, else from rows. */
 import type { Grouping } from "../grouping/grouping";
 import type { ResolvedGrouping } from "../grouping/resolve";
-import type { EpisodeTokens } from "../grouping/tokens";
 import { layerMasses, type ReplanValues, replanValues } from "../measures/replans";
 import { weightsOnSegments, withValid } from "../measures/segments";
+import { type Place, uniformOfLayers } from "../page/baselines";
 import { meanAtoms } from "../page/episode_numbers";
-import type { Episode, Selection, SiteInfo } from "../store/episode";
-
-/** What masses are of: an episode's site and positions on its axes. Means are over all stored queries. */
-export interface Place {
-  readonly episode: Episode;
-  readonly site: SiteInfo;
-  readonly tokens: EpisodeTokens;
-  readonly selection: Selection;
-}
+import type { Selection } from "../store/episode";
 
 /** One text for each place and selection, equal where the rows are. */
 export function placeKey({ episode, site, selection }: Place): string {
@@ -32,7 +24,7 @@ export function cutsSegments(resolved: ResolvedGrouping, { tokens, site }: Place
   return weightsOnSegments(withValid(resolved, tokens), tokens, site.segments) === null;
 }
 
-/** The values of every replan: the rows of `replans` and `replans_groups` that `vla-analyze` writes. */
+/** The values of every replan, means over all stored queries: the rows of `replans` and `replans_groups` that `vla-analyze` writes. */
 export async function valuesOfEpisode(
   grouping: Grouping,
   resolved: ResolvedGrouping,
@@ -41,17 +33,19 @@ export async function valuesOfEpisode(
   const { episode, site, tokens } = place;
   const selection: Selection = { ...place.selection, query: "mean" };
   const weights = withValid(resolved, tokens);
+  const uniform = uniformOfLayers({ ...place, selection }, weights);
   const onSegments = weightsOnSegments(weights, tokens, site.segments);
   const name = site.layout.name;
   if (onSegments) {
-    const atoms = await episode.atoms(name);
+    const [atoms, given] = await Promise.all([episode.atoms(name), uniform]);
     const own = (layer: number): Float64Array => meanAtoms(atoms, layer, selection);
     const layers = selection.layers.map((layer) => layerMasses(own(layer), onSegments, atoms.segments));
-    return replanValues(layers, grouping, resolved);
+    return replanValues(layers, given, grouping, resolved);
   }
-  const rows = await Promise.all(
-    selection.layers.map((layer) => episode.meanRows(name, { ...selection, layers: [layer] })),
-  );
+  const [given, ...rows] = await Promise.all([
+    uniform,
+    ...selection.layers.map((layer) => episode.meanRows(name, { ...selection, layers: [layer] })),
+  ]);
   const layers = rows.map(({ values, keys }) => layerMasses(values, weights, keys));
-  return replanValues(layers, grouping, resolved);
+  return replanValues(layers, given, grouping, resolved);
 }

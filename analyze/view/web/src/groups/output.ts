@@ -3,7 +3,7 @@ import type { Grouping } from "../grouping/grouping";
 import { writeGroupingFile } from "../grouping/grouping_files";
 import { button, element } from "../page/dom";
 import { argumentsOfDraft, type Draft, shellWord } from "./draft";
-import type { Place } from "./episode_masses";
+import type { Place } from "../page/baselines";
 import { selectionArguments } from "./wording";
 
 const COPY = "Copy the command";

@@ -9,6 +9,7 @@ import { ofReplan } from "../grouping/resolve";
 import type { Atom } from "../grouping/selector_parser";
 import { attempt } from "../grouping/text";
 import type { EpisodeTokens } from "../grouping/tokens";
+import type { Place } from "../page/baselines";
 import { button, choice, element } from "../page/dom";
 import { type PageContext, type PanelInstance, registerPanel } from "../page/panels";
 import type { Shown } from "../page/shown";
@@ -25,7 +26,7 @@ import {
   type GroupLine,
   textOfDraft,
 } from "./draft";
-import { bytesOfRows, cutsSegments, type Place, placeKey, valuesOfEpisode } from "./episode_masses";
+import { bytesOfRows, cutsSegments, placeKey, valuesOfEpisode } from "./episode_masses";
 import { LinesEditor } from "./lines_editor";
 import { Output } from "./output";
 import { Results } from "./results";

@@ -100,8 +100,7 @@ export class Results {
             style: styles[group]!,
             values: replans.map((one) => one.groups[measure][group]!),
           }));
-    const uniforms = new Set(replans.map((one) => one.ratio?.uniform));
-    const uniform = measure === "lift" ? 1 : measure === "ratio" && uniforms.size === 1 ? [...uniforms][0]! : null;
+    const uniform = measure === "lift" ? 1 : measure === "ratio" ? sameUniform(replans) : null;
     const side = (part: readonly string[]): string => part.join(" + ");
     const title = measure === "ratio" ? `${side(grouping.ratio!.numerator)} / ${side(grouping.ratio!.denominator)}` : TITLES[measure];
     this.#chart.show({ title, uniform, lines });
@@ -158,6 +157,14 @@ export class Results {
       element("span", { class: "soft" }, "It says where attention went, not what the policy used."),
     );
   }
+}
+
+/** The uniform ratio of all replans; null where they have not one. */
+function sameUniform(replans: readonly ReplanValues[]): number | null {
+  const uniforms = replans.map((one) => one.ratio!.uniform);
+  const [first = NaN] = uniforms;
+  // Sums of what the keys get differ by rounding.
+  return uniforms.every((one) => Math.abs(one / first - 1) < 1e-6) ? first : null;
 }
 
 /** Groups that have a key at some replan. */

@@ -1,5 +1,5 @@
 /** Words for what a grouping's numbers are of: in the panel, and as options of `vla-analyze`. */
-import type { Place } from "./episode_masses";
+import type { Place } from "../page/baselines";
 
 /** A name for a new group that no other has, from a word or an object's name. */
 export function freeName(wanted: string, taken: readonly string[]): string {

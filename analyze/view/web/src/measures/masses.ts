@@ -1,5 +1,7 @@
 /** From rows and weights to masses and what follows from them: analyze/measures/masses.py. Pure arithmetic, float64. */
 import type { Grouping } from "../grouping/grouping";
+import type { UniformKeys } from "../grouping/key_counts";
+import { ofReplan } from "../grouping/resolve";
 
 /** Mass of each group, (row, group): sums over keys of rows (row, key) x weights (group, key). */
 export function masses(rows: Float32Array | Float64Array, keys: number, weights: Float32Array): Float64Array {
@@ -15,6 +17,13 @@ export function masses(rows: Float32Array | Float64Array, keys: number, weights:
   return sums;
 }
 
+/** What uniform attention gives groups, (group), of each replan or once; `weights`: (group, key) of each replan or once. */
+export function uniformMasses(uniform: UniformKeys, weights: readonly Float32Array[], keys: number): Float64Array[] {
+  return Array.from({ length: Math.max(uniform.length, weights.length) }, (_, replan) =>
+    masses(ofReplan(uniform, replan), keys, ofReplan(weights, replan)),
+  );
+}
+
 /** The measures of every group in one cell (replan, layer, denoise step, head), each (group). */
 export interface GroupMeasures {
   readonly mass: Float64Array;
@@ -23,24 +32,25 @@ export interface GroupMeasures {
   readonly keys: Float64Array;
   /** mass / number of keys; NaN for a group without keys */
   readonly density: Float64Array;
-  /** density / (mass of all valid keys / their number): 1 is what uniform attention gives */
+  /** (mass / what uniform attention gives) / (the same of all valid keys); NaN for a group of which no query sees a key */
   readonly lift: Float64Array;
 }
 
+/** `uniform`: what uniform attention gives the groups and, as the last, all valid keys, (group + 1). */
 export function groupMeasures(
   mass: Float64Array,
   validMass: number,
   numKeys: Float64Array,
-  numValid: number,
+  uniform: Float64Array,
 ): GroupMeasures {
   const total = mass.reduce((sum, value) => sum + value, 0);
-  const density = mass.map((value, group) => (numKeys[group]! > 0 ? value / numKeys[group]! : NaN));
+  const ofValid = validMass / uniform[mass.length]!;
   return {
     mass,
     fraction: mass.map((value) => value / total),
     keys: numKeys,
-    density,
-    lift: density.map((value) => value / (validMass / numValid)),
+    density: mass.map((value, group) => (numKeys[group]! > 0 ? value / numKeys[group]! : NaN)),
+    lift: mass.map((value, group) => (uniform[group]! > 0 ? value / uniform[group]! : NaN) / ofValid),
   };
 }
 

@@ -1,17 +1,23 @@
 /** Keys of one row on scales that can be compared between rows: lift and rank. */
 
-/**
- * Lift of every key: its probability / the mean probability of a valid key, as `vla-analyze overlay` shows it. NaN for
- * keys that are not valid. `counts`: for how many keys each key counts (see `keyCounts`).
- */
-export function keyLifts(row: Float64Array, valid: Uint8Array, counts: Float64Array | null): Float64Array {
-  let [mass, number] = [0, 0];
+/** The mass of the valid keys / what uniform attention gives them. */
+export function overUniform(row: Float64Array, valid: Uint8Array, uniform: Float64Array): number {
+  let [mass, given] = [0, 0];
   row.forEach((value, key) => {
     if (!valid[key]) return;
     mass += value;
-    number += counts ? counts[key]! : 1;
+    given += uniform[key]!;
   });
-  return row.map((value, key) => (valid[key] ? value / (counts ? counts[key]! : 1) / (mass / number) : NaN));
+  return mass / given;
+}
+
+/**
+ * Lift of every key, as `vla-analyze overlay` shows it: its probability / what uniform attention gives it, over the same
+ * of all valid keys. NaN for keys that are not valid or that no query sees. `uniform`: (key), see `key_counts.ts`.
+ */
+export function keyLifts(row: Float64Array, valid: Uint8Array, uniform: Float64Array): Float64Array {
+  const ofValid = overUniform(row, valid, uniform);
+  return row.map((value, key) => (valid[key] && uniform[key]! > 0 ? value / uniform[key]! / ofValid : NaN));
 }
 
 /**

@@ -23,7 +23,7 @@ export interface ReplanValues {
     readonly denominator: number;
     /** Of a mean over layers: the mean of the layers' finite ratios. */
     readonly value: number;
-    /** What uniform attention gives. */
+    /** What uniform attention gives; of a mean over layers the geometric mean of those layers whose ratio counts. */
     readonly uniform: number;
     /** The same, but of a mean over layers the geometric mean of the layers' ratios. */
     readonly geometric: number;
@@ -46,9 +46,13 @@ export function layerMasses(rows: Float32Array | Float64Array, weights: readonly
   return { values, groups: parts - 1 };
 }
 
-/** The values of every replan; `layers`: one layer's masses, or those of all layers that the mean is over. */
+/**
+ * The values of every replan. `layers`: one layer's masses, or those of all layers that the mean is over. `uniform`: what
+ * uniform attention gives in each of these layers, (group + 1) of each replan or once, the last to all valid keys.
+ */
 export function replanValues(
   layers: readonly LayerMasses[],
+  uniform: readonly (readonly Float64Array[])[],
   grouping: Grouping,
   resolved: ResolvedGrouping,
 ): ReplanValues[] {
@@ -60,23 +64,34 @@ export function replanValues(
     const mean = new Float64Array(groups + 1);
     for (const layer of layers) of(layer).forEach((value, i) => (mean[i]! += value / layers.length));
     const mass = mean.slice(0, groups);
-    const numKeys = ofReplan(resolved.numKeys, replan);
-    const numValid = ofReplan(resolved.numValid, replan);
-    const measures = groupMeasures(mass, mean[groups]!, numKeys, numValid);
-    const values = { groups: measures, validMass: mean[groups]!, numValid };
+    const given = uniform.map((layer) => ofReplan(layer, replan));
+    const meanGiven = new Float64Array(groups + 1);
+    for (const layer of given) layer.forEach((value, i) => (meanGiven[i]! += value / given.length));
+    const measures = groupMeasures(mass, mean[groups]!, ofReplan(resolved.numKeys, replan), meanGiven);
+    const values = { groups: measures, validMass: mean[groups]!, numValid: ofReplan(resolved.numValid, replan) };
     if (!grouping.ratio) return values;
     const [numerator, denominator] = sides(mass, grouping);
-    const [above, below] = sides(numKeys, grouping);
-    const uniform = above / below;
-    const ratios = layers.map((layer) => {
-      const [top, bottom] = sides(of(layer), grouping);
-      return top / bottom;
-    });
+    const quotient = (ofGroups: Float64Array): number => {
+      const [above, below] = sides(ofGroups, grouping);
+      return above / below;
+    };
+    const ratios = layers.map((layer) => quotient(of(layer)));
     const one = ratios.length === 1;
     const value = one ? ratios[0]! : finiteMean(ratios);
     const geometric = one ? ratios[0]! : finiteGeometricMean(ratios);
-    return { ...values, ratio: { numerator, denominator, value, uniform, geometric, lift: geometric / uniform } };
+    const expected = uniformOfLayers(given.map(quotient), ratios);
+    return { ...values, ratio: { numerator, denominator, value, uniform: expected, geometric, lift: geometric / expected } };
   });
+}
+
+/**
+ * The uniform ratio of a mean over layers: the geometric mean of the layers whose ratio has a logarithm, of all layers where
+ * none has; where all layers have the same, this one.
+ */
+function uniformOfLayers(uniforms: readonly number[], ratios: readonly number[]): number {
+  if (uniforms.every((value) => Object.is(value, uniforms[0]))) return uniforms[0]!;
+  const known = ratios.map((ratio) => ratio > 0 && Number.isFinite(ratio));
+  return finiteGeometricMean(known.includes(true) ? uniforms.filter((_, i) => known[i]) : uniforms);
 }
 
 /** What an episode's replans give together. */

@@ -10,8 +10,9 @@ import { type EpisodeTokens, vocabularyOf } from "../grouping/tokens";
 import { groupMeasures, type GroupMeasures } from "../measures/masses";
 import { layerMasses, type ReplanValues, replanValues } from "../measures/replans";
 import { weightsOnSegments, withValid } from "../measures/segments";
-import type { Atoms, Episode, Selection, SiteInfo } from "../store/episode";
+import type { Atoms, Selection, SiteInfo } from "../store/episode";
 import { StoreError } from "../store/errors";
+import { type Place, uniformOfGroups, uniformOfLayers } from "./baselines";
 
 export interface EpisodeNumbers {
   readonly grouping: Grouping;
@@ -26,6 +27,7 @@ export interface EpisodeNumbers {
 interface Known {
   grouping: Grouping;
   resolved: ResolvedGrouping;
+  weights: Float32Array[];
   onSegments: Float32Array[];
 }
 
@@ -36,9 +38,10 @@ function knownOf(tokens: EpisodeTokens, site: SiteInfo): Known {
   if (!found) {
     const grouping = findGrouping("default", vocabularyOf([tokens]));
     const resolved = resolve(grouping, tokens);
-    const onSegments = weightsOnSegments(withValid(resolved, tokens), tokens, site.segments);
+    const weights = withValid(resolved, tokens);
+    const onSegments = weightsOnSegments(weights, tokens, site.segments);
     if (!onSegments) throw new StoreError(`The segments of site ${site.layout.name} do not fit its roles: the store is damaged.`);
-    found = { grouping, resolved, onSegments };
+    found = { grouping, resolved, weights, onSegments };
     known.set(tokens, found);
   }
   return found;
@@ -61,21 +64,29 @@ export function meanAtoms(atoms: Atoms, layer: number, selection: Selection): Fl
 }
 
 /** The numbers of an episode for one selection. */
-export async function episodeNumbers(
-  episode: Episode,
-  site: SiteInfo,
-  tokens: EpisodeTokens,
-  selection: Selection,
-): Promise<EpisodeNumbers> {
-  const { grouping, resolved, onSegments } = knownOf(tokens, site);
-  const atoms = await episode.atoms(site.layout.name, selection.query);
+export async function episodeNumbers(place: Place): Promise<EpisodeNumbers> {
+  const { episode, site, tokens, selection } = place;
+  const { grouping, resolved, weights, onSegments } = knownOf(tokens, site);
+  const [atoms, uniform, uniformOfCells] = await Promise.all([
+    episode.atoms(site.layout.name, selection.query),
+    uniformOfLayers(place, weights),
+    Promise.all(
+      site.layers.map((_, layer) =>
+        Promise.all(
+          site.heads.map((__, head) =>
+            uniformOfGroups({ ...place, selection: { ...selection, layers: [layer], heads: [head] } }, weights),
+          ),
+        ),
+      ),
+    ),
+  ]);
   const { segments } = atoms;
   const layers = selection.layers.map((layer) => layerMasses(meanAtoms(atoms, layer, selection), onSegments, segments));
   const groups = resolved.names.length;
   return {
     grouping,
     present: resolved.names.filter((_, group) => resolved.numKeys.some((numbers) => numbers[group]! > 0)),
-    replans: replanValues(layers, grouping, resolved),
+    replans: replanValues(layers, uniform, grouping, resolved),
     cell(replan, layer, head) {
       const mean = new Float64Array(segments);
       for (const step of selection.denoise) {
@@ -83,8 +94,8 @@ export async function episodeNumbers(
         for (let i = 0; i < segments; i++) mean[i]! += atoms.values[at + i]! / selection.denoise.length;
       }
       const { values } = layerMasses(mean, [ofReplan(onSegments, replan)], segments);
-      const numbers = ofReplan(resolved.numKeys, replan);
-      return groupMeasures(values.slice(0, groups), values[groups]!, numbers, ofReplan(resolved.numValid, replan));
+      const own = ofReplan(uniformOfCells[layer]![head]!, replan);
+      return groupMeasures(values.slice(0, groups), values[groups]!, ofReplan(resolved.numKeys, replan), own);
     },
   };
 }

@@ -83,7 +83,7 @@ export class HeadGrid {
       }),
     );
     this.#note.textContent =
-      `Lift of ${chosen} at replan ${replan}: attention per key over the mean of the valid keys. White is uniform (×1), ` +
+      `Lift of ${chosen} at replan ${replan}: attention over what uniform attention gives it. White is uniform (×1), ` +
       `blue more, orange less; the colours end at ×${formatNumber(most)} and ×${formatNumber(1 / most)}.`;
   }
 

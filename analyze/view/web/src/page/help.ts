@@ -18,7 +18,7 @@ export const KEYS: readonly (readonly [string, string])[] = [
 ];
 
 const MEANING: readonly (readonly [string, string])[] = [
-  ["Share, lift, rank", "A share is the part of all attention that a key gets. Lift divides it by the mean of all valid keys: 1 is uniform attention. Rank orders the valid keys, 100% is the one with most."],
+  ["Share, lift, rank", "A share is the part of all attention that a key gets. Lift divides it by what uniform attention gives the key, where each query gives the same to every key that it sees: 1 is uniform. Rank orders the valid keys, 100% is the one with most."],
   ["Ratio", "Attention on picture keys divided by attention on words. With 512 patches and a dozen words, attention that ignores content has a ratio of about 43: compare with the uniform ratio, or read the lift."],
   ["What it can mean", "Where the action queries of these layers looked. A key without mass in any head of any layer adds nothing there."],
   ["What it cannot mean", "That the policy used what it looked at, or would act differently without it. In a deep layer a patch's key also carries words, and a word's key pictures. Only an intervention shows an effect."],

@@ -1,6 +1,8 @@
 /** What is below the pointer: a patch's share and objects, or a word and the heads that read it most. */
+import { ofReplan } from "../grouping/resolve";
 import type { HeadRows } from "../store/episode";
 import { sentenceOf } from "../store/errors";
+import { uniformKeys } from "./baselines";
 import { element } from "./dom";
 import { formatNumber, formatPercent } from "./number_text";
 import type { PictureBoard } from "./picture_board";
@@ -119,14 +121,25 @@ export class Inspector {
       const rows = await episode.headRows(site.layout.name, selection, replan);
       if (asked !== this.#asked) return;
       const best = headsThatRead(rows, word.keys, HEADS_OF_WORD);
+      const given = await Promise.all(
+        best.map(async ({ layer, head }) => {
+          const there = { ...selection, layers: [layer], heads: [head] };
+          return ofReplan(await uniformKeys({ ...shown, selection: there }), replan);
+        }),
+      );
+      if (asked !== this.#asked) return;
       const named = best.map(({ layer, head, mass: own }) => `layer ${site.layers[layer]} head ${site.heads[head]} (${formatPercent(own)})`);
-      const mean = new Float64Array(site.keys);
-      for (const { layer, head } of best) {
+      const row = new Float64Array(site.keys);
+      const uniform = new Float64Array(site.keys);
+      for (const [i, { layer, head }] of best.entries()) {
         const first = (rows.layers.indexOf(layer) * rows.heads + head) * rows.keys;
-        for (let key = 0; key < rows.keys; key++) mean[key]! += rows.values[first + key]! / best.length;
+        for (let key = 0; key < rows.keys; key++) {
+          row[key]! += rows.values[first + key]! / best.length;
+          uniform[key]! += given[i]![key]! / best.length;
+        }
       }
       this.host.textContent = `${start}. The heads that read it most: ${named.join(", ")}; the pictures show where they look.`;
-      this.pictures.preview(mean);
+      this.pictures.preview({ row, uniform });
     } catch (failure) {
       if (asked === this.#asked) this.host.textContent = sentenceOf(failure);
     }

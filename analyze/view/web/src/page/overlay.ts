@@ -23,9 +23,9 @@ export interface Scale {
 }
 
 /** What is shown of every key, (key): per cent of the attention, lift over uniform attention, or rank in per cent. */
-export function shownValues(row: Float64Array, valid: Uint8Array, counts: Float64Array | null, measure: Measure): Float64Array {
+export function shownValues(row: Float64Array, valid: Uint8Array, uniform: Float64Array, measure: Measure): Float64Array {
   if (measure === "raw") return row.map((value) => 100 * value);
-  if (measure === "lift") return keyLifts(row, valid, counts);
+  if (measure === "lift") return keyLifts(row, valid, uniform);
   return keyRanks(row, valid).map((rank) => 100 * rank);
 }
 
@@ -44,13 +44,13 @@ export function quantile(values: readonly number[] | Float64Array, part: number)
   return sorted[below]! + (place - below) * (sorted[above]! - sorted[below]!);
 }
 
-/** One scale for values that are compared. `uniform`: the mean value of a valid key, of the measure `raw`. */
+/** One scale for values that are compared. `uniform`: what uniform attention gives a patch, of the measure `raw`. */
 export function scaleFor(values: readonly number[] | Float64Array, measure: Measure, uniform: number): Scale {
   if (measure === "rank") return { high: 100, uniform: null, label: "rank among the valid keys", unit: "%" };
   const even = measure === "lift" ? 1 : uniform;
   const high = roundUp(Math.max(quantile(values, TOP_QUANTILE), LEAST_TOP * even, Number.MIN_VALUE));
   return measure === "lift"
-    ? { high, uniform: 1, label: "lift: attention on a patch / mean over the valid keys", unit: "" }
+    ? { high, uniform: 1, label: "lift: attention on a patch / what uniform attention gives it", unit: "" }
     : { high, uniform: even, label: "share of all attention on a patch", unit: "%" };
 }
 

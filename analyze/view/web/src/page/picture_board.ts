@@ -1,4 +1,7 @@
 /** The cameras' pictures with attention over them: one canvas a camera, with outlines, a brush and a cursor. */
+import { ofReplan } from "../grouping/resolve";
+import { finiteMean } from "../measures/masses";
+import { overUniform } from "../measures/ranks";
 import type { CameraDocument, SpanDocument } from "../store/documents";
 import { colourTable } from "./colour_maps";
 import { element } from "./dom";
@@ -17,6 +20,12 @@ interface Outline {
   name: string;
   colour: string;
   members: ReadonlyMap<string, Uint8Array>;
+}
+
+/** Another row and what uniform attention gives in its place, (key). */
+export interface Previewed {
+  row: Float64Array;
+  uniform: Float64Array;
 }
 
 interface Drawn {
@@ -43,7 +52,7 @@ export class PictureBoard {
   #brush: Brush | null = null;
   #painting: { camera: string; last: number; erase: boolean } | null = null;
   #shown: Shown | null = null;
-  #preview: Float64Array | null = null;
+  #preview: Previewed | null = null;
   #scale: Scale | null = null;
   #others: readonly PictureBoard[] = [];
 
@@ -68,10 +77,10 @@ export class PictureBoard {
     this.#paint();
   }
 
-  /** Lay another row over the pictures for a moment, (key); null: that of what is shown. */
-  preview(row: Float64Array | null): void {
-    if (this.#preview === row) return;
-    this.#preview = row;
+  /** Lay another row over the pictures for a moment; null: that of what is shown. */
+  preview(other: Previewed | null): void {
+    if (this.#preview === other) return;
+    this.#preview = other;
     this.#paint();
   }
 
@@ -217,39 +226,30 @@ export class PictureBoard {
     for (const listen of this.#hovered) listen(camera, patch < 0 ? null : patch);
   }
 
-  #valuesOf(row: Float64Array): Float64Array {
-    const { state, tokens, valid, replan } = this.#shown!;
-    const counts = tokens.keyCounts;
-    return shownValues(row, valid, counts ? counts[counts.length === 1 ? 0 : replan]! : null, state.measure);
-  }
-
   /** The values of all shown patches of all replans, where they are known: the scale does not change from one to the next. */
   #patchValues(): { values: number[]; uniform: number } {
     const shown = this.#shown!;
     const { site, state, tokens } = shown;
     const spans = [...this.#drawn.values()].map((drawn) => drawn.span);
     const values: number[] = [];
-    let uniform = 0;
+    const expected: number[] = [];
     const rows = this.#preview ? null : shown.allRows;
     const replans = rows ? shown.episode.numReplans : 1;
     for (let replan = 0; replan < replans; replan++) {
-      const row = rows ? Float64Array.from(rows.subarray(replan * site.keys, (replan + 1) * site.keys)) : (this.#preview ?? shown.row);
+      const row = rows ? rows.subarray(replan * site.keys, (replan + 1) * site.keys) : (this.#preview ?? shown).row;
+      const uniform = rows ? ofReplan(shown.allUniform, replan) : (this.#preview ?? shown).uniform;
       const first = rows && tokens.keyRole.replans > 1 ? replan * site.keys : 0;
       const valid = rows ? tokens.valid.subarray(first, first + site.keys) : shown.valid;
-      const counts = tokens.keyCounts;
-      const own = counts ? counts[counts.length === 1 ? 0 : rows ? replan : shown.replan]! : null;
-      const all = shownValues(row, valid, own, state.measure);
-      for (const span of spans) for (let key = span.start; key < span.stop; key++) values.push(all[key]!);
-      let mass = 0;
-      let number = 0;
-      row.forEach((value, key) => {
-        if (!valid[key]) return;
-        mass += value;
-        number += own ? own[key]! : 1;
-      });
-      uniform += (100 * mass) / number / replans;
+      const all = shownValues(row, valid, uniform, state.measure);
+      const ofValid = overUniform(row, valid, uniform);
+      for (const span of spans) {
+        for (let key = span.start; key < span.stop; key++) {
+          values.push(all[key]!);
+          expected.push(valid[key] && uniform[key]! > 0 ? 100 * uniform[key]! * ofValid : NaN);
+        }
+      }
     }
-    return { values, uniform };
+    return { values, uniform: finiteMean(expected) || 0 };
   }
 
   readonly #scales = new WeakMap<object, Map<string, Scale>>();
@@ -258,7 +258,7 @@ export class PictureBoard {
   ownScale(): Scale | null {
     const shown = this.#shown;
     if (!shown || !this.#drawn.size) return null;
-    const key = this.#preview ?? shown.allRows ?? shown.row;
+    const key = this.#preview?.row ?? shown.allRows ?? shown.row;
     let of = this.#scales.get(key);
     if (!of) this.#scales.set(key, (of = new Map()));
     let scale = of.get(shown.state.measure);
@@ -278,7 +278,8 @@ export class PictureBoard {
     this.onScale(this.#scale);
     if (!this.#scale) return;
     const { state } = shown;
-    const values = this.#valuesOf(this.#preview ?? shown.row);
+    const { row, uniform } = this.#preview ?? shown;
+    const values = shownValues(row, shown.valid, uniform, state.measure);
     const painting: Painting = { scale: this.#scale, colours: colourTable(state.colours), opacity: state.opacity, smooth: state.smooth };
     for (const [camera, drawn] of this.#drawn) {
       const { span, view, painted, canvas } = drawn;

@@ -1,10 +1,13 @@
 /** What is on the page at one moment: everything that its parts draw, read for one state. */
+import type { UniformKeys } from "../grouping/key_counts";
+import { ofReplan } from "../grouping/resolve";
 import { EpisodeTokens } from "../grouping/tokens";
 import type { Word } from "../grouping/words";
 import { wordsOf } from "../grouping/words";
 import type { PromptDocument } from "../store/documents";
 import type { Coverage, Episode, Picture, Selection, SiteInfo } from "../store/episode";
 import type { Store } from "../store/open";
+import { baselineNote, uniformKeys } from "./baselines";
 import { type EpisodeNumbers, episodeNumbers } from "./episode_numbers";
 import type { OneOrMean, ViewState } from "./state";
 
@@ -20,7 +23,10 @@ export interface Shown {
   /** Probability of every key, (key). */
   readonly row: Float64Array;
   /** The mean rows of all replans, (replan, key); null where an episode is too large to read for one picture. */
-  readonly allRows: Float32Array | null;
+  readonly allRows: Float64Array | null;
+  /** What uniform attention gives every key, mean as `row`: at this replan, (key), and at all replans. */
+  readonly uniform: Float64Array;
+  readonly allUniform: UniformKeys;
   readonly tokens: EpisodeTokens;
   /** Keys that can hold information at this replan, (key). */
   readonly valid: Uint8Array;
@@ -32,6 +38,8 @@ export interface Shown {
   readonly numbers: EpisodeNumbers;
   /** What of the state does not exist here, in a sentence; empty: nothing. */
   readonly corrections: string;
+  /** What to know of the lifts' baseline, in a sentence; empty: nothing. */
+  readonly baselineNote: string;
 }
 
 /** Decoded bytes up to which the rows of a whole episode are read for one selection. */
@@ -155,11 +163,13 @@ export async function loadShown(store: Store, episode: Episode, state: ViewState
     const all = (await episode.meanRows(name, selection)).values;
     return { all, own: all.subarray(replan * site.keys, (replan + 1) * site.keys) };
   });
-  const [tokens, { all, own }, taken, numbers] = await Promise.all([
+  const place = reading.then((known) => ({ episode, site, tokens: known, selection }));
+  const [tokens, { all, own }, taken, allUniform, numbers] = await Promise.all([
     reading,
     rows,
     pictures,
-    reading.then((known) => episodeNumbers(episode, site, known, selection)),
+    place.then(uniformKeys),
+    place.then(episodeNumbers),
   ]);
   const frames = new Map(seenCameras(tokens).map((camera) => [camera, taken.get(camera) ?? null]));
   const first = tokens.keyRole.replans === 1 ? 0 : replan * site.keys;
@@ -172,8 +182,10 @@ export async function loadShown(store: Store, episode: Episode, state: ViewState
     site,
     replan,
     selection,
-    row: Float64Array.from(own),
+    row: own,
     allRows: all,
+    uniform: ofReplan(allUniform, replan),
+    allUniform,
     tokens,
     valid: tokens.valid.subarray(first, first + site.keys),
     prompt,
@@ -182,5 +194,6 @@ export async function loadShown(store: Store, episode: Episode, state: ViewState
     coverage: tokens.coverage,
     numbers,
     corrections: missing.length ? `${missing.join("; ")}.` : "",
+    baselineNote: baselineNote(store.root, store.entry.name),
   };
 }

@@ -1,6 +1,7 @@
 /** The prompt as text: the instruction's words shaded by the attention on their keys, the rest as it stands. */
 import { characters } from "../grouping/text";
 import type { Word } from "../grouping/words";
+import { overUniform } from "../measures/ranks";
 import type { SpanDocument } from "../store/documents";
 import type { Episode } from "../store/episode";
 import { button, element } from "./dom";
@@ -11,28 +12,18 @@ export type WordListener = (place: number, word: Word) => void;
 
 export interface WordMeasures {
   mass: number;
-  /** Mass per key / mean mass of a valid key; NaN for a word without keys. */
+  /** Mass over what uniform attention gives; NaN for a word without keys that a query sees. */
   lift: number;
 }
 
 /** Mass and lift of keys in a row, as `vla-analyze words` has them. */
-export function measuresOfKeys(keys: readonly number[], shown: Pick<Shown, "row" | "valid" | "tokens" | "replan">): WordMeasures {
-  const counts = shown.tokens.keyCounts;
-  const own = counts ? counts[counts.length === 1 ? 0 : shown.replan]! : null;
-  let valid = 0;
-  let number = 0;
-  shown.row.forEach((value, key) => {
-    if (!shown.valid[key]) return;
-    valid += value;
-    number += own ? own[key]! : 1;
-  });
-  let mass = 0;
-  let pieces = 0;
+export function measuresOfKeys(keys: readonly number[], { row, valid, uniform }: Pick<Shown, "row" | "valid" | "uniform">): WordMeasures {
+  let [mass, given] = [0, 0];
   for (const key of keys) {
-    mass += shown.row[key]!;
-    pieces += own ? own[key]! : 1;
+    mass += row[key]!;
+    given += uniform[key]!;
   }
-  return { mass, lift: pieces > 0 ? mass / pieces / (valid / number) : NaN };
+  return { mass, lift: given > 0 ? mass / given / overUniform(row, valid, uniform) : NaN };
 }
 
 /** The sites whose keys have spans of a kind, to choose from: a sentence, empty where there is none. */

@@ -67,9 +67,11 @@ export interface CameraDocument {
 }
 
 export interface RootDocument {
+  store_version: 1 | 2;
   policy: {
     name: string;
     family: string;
+    checkpoint_format: string;
     untrained: boolean;
     num_layers: number;
     num_heads: number;
@@ -205,11 +207,12 @@ export function parseRoot(document: unknown): RootDocument {
   if (fields.format !== "vla-attention") {
     throw new StoreError("This is no store of vla-capture: the format in its zarr.json is another one.");
   }
-  if (fields.store_version !== 1) {
+  const version = fields.store_version;
+  if (version !== 1 && version !== 2) {
     throw new StoreError(
-      fields.store_version === undefined
-        ? "The store was written before version 1 of the format. This page reads version 1; vla-analyze reads the store."
-        : `The store has version ${String(fields.store_version).slice(0, 20)} of the format; this page reads version 1.`,
+      version === undefined
+        ? "The store is of a draft of the format, before version 1. This page reads versions 1 and 2; capture the episodes again."
+        : `The store has version ${JSON.stringify(version).slice(0, 20)} of the format; this page reads versions 1 and 2.`,
     );
   }
   const policy = object(fields.policy, "policy");
@@ -219,9 +222,11 @@ export function parseRoot(document: unknown): RootDocument {
   const sites = list(fields.sites, "sites", limits.SITES).map((each, i) => parseSite(each, `sites[${i}]`));
   if (!sites.length) throw new StoreError("The store cannot be shown: it has no sites.");
   return {
+    store_version: version,
     policy: {
       name: text(policy.name, "policy.name"),
       family: text(policy.family, "policy.family"),
+      checkpoint_format: text(policy.checkpoint_format, "policy.checkpoint_format"),
       untrained: flag(policy.untrained, "policy.untrained"),
       num_layers: whole(policy.num_layers, "policy.num_layers", limits.AXIS),
       num_heads: whole(policy.num_heads, "policy.num_heads", limits.AXIS),

@@ -1,5 +1,6 @@
 /** One episode: its attributes, and what is read of its arrays. Everything comes from the workers and is kept a while. */
 import type { ArrayName } from "./array_reader";
+import { type UniformKeys, storedPlaces } from "../grouping/key_counts";
 import { ByteCache } from "./cache";
 import type { AxesDocument, EpisodeDocument, PromptDocument, RootDocument, SiteDocument } from "./documents";
 import { numKeys, parseAxes } from "./documents";
@@ -71,7 +72,21 @@ export class Episode {
         `The rows of site ${layout.name} have the shape (${given.join(", ")}); the attributes say (${expected.join(", ")}).`,
       );
     }
-    return { layout, keys, layers: axes.layer, denoise: axes.denoise, heads: axes.head, numQueries, numActionQueries, segments };
+    const uniformShape = this.root.store_version === 1 ? null : this.#uniformShape(`${layout.name}/uniform`, expected);
+    const { layer: layers, denoise, head: heads } = axes;
+    return { layout, keys, layers, denoise, heads, numQueries, numActionQueries, segments, uniformShape };
+  }
+
+  #uniformShape(path: string, rows: readonly number[]): readonly number[] {
+    const given = this.document.arrays[path]?.shape;
+    if (!given) throw new StoreError(`Episode ${this.name} has no array ${path}, which stores of this version have.`);
+    const last = rows.length - 1;
+    if (given.length !== rows.length || given.some((extent, axis) => extent !== rows[axis] && (axis === last || extent !== 1))) {
+      throw new StoreError(
+        `The array ${path} has the shape (${given.join(", ")}); expected (${rows.join(", ")}), or 1 in place of a length but the last.`,
+      );
+    }
+    return given;
   }
 
   /** A site by its name. */
@@ -161,11 +176,12 @@ export class Episode {
     }
   }
 
-  #meansOf(site: SiteInfo, selection: Selection, first: number, count: number): Promise<Float32Array> {
+  /** The mean of values like rows over a selection, (count, key); computed once. */
+  #meansOf(array: ArrayName, selection: Selection, first: number, count: number): Promise<Float64Array> {
     const { layers, denoise, heads, query } = selection;
-    const key = ["mean", site.layout.name, layers, denoise, heads, query, first, count].join("|");
-    return this.#once(key, count * site.keys * 4, async () => {
-      const array = this.#rows(site);
+    const key = ["mean", array.path, layers, denoise, heads, query, first, count].join("|");
+    const size = count * array.shape[5]!;
+    return this.#once(key, size * 8, async () => {
       const asked = [];
       for (let which = 0; which < this.pool.size; which++) {
         const cells = layers
@@ -176,7 +192,7 @@ export class Episode {
         asked.push(this.pool.values(this.place, question, which));
       }
       const parts = await Promise.all(asked);
-      const mean = new Float32Array(count * site.keys);
+      const mean = new Float64Array(size);
       const number = layers.length * denoise.length * heads.length;
       for (let i = 0; i < mean.length; i++) {
         let sum = 0;
@@ -189,15 +205,25 @@ export class Episode {
   }
 
   /** The mean row (key) of a replan over a selection. Only its chunks are read. */
-  meanRow(site: string, selection: Selection, replan: number): Promise<Float32Array> {
-    return this.#meansOf(this.site(site), selection, replan, 1);
+  meanRow(site: string, selection: Selection, replan: number): Promise<Float64Array> {
+    return this.#meansOf(this.#rows(this.site(site)), selection, replan, 1);
   }
 
   /** The mean rows of the whole episode over a selection: `mean_rows` of analyze/measures/patch_maps.py. */
   async meanRows(site: string, selection: Selection): Promise<MeanRows> {
     const info = this.site(site);
-    const values = await this.#meansOf(info, selection, 0, this.numReplans);
+    const values = await this.#meansOf(this.#rows(info), selection, 0, this.numReplans);
     return { replans: this.numReplans, keys: info.keys, values };
+  }
+
+  /** The same of uniform attention, of each replan or once; null where the store does not hold it (version 1). */
+  async uniformKeys(site: string, selection: Selection): Promise<UniformKeys | null> {
+    const { keys, uniformShape } = this.site(site);
+    if (!uniformShape) return null;
+    const [replans] = uniformShape as [number];
+    const array = this.#array(`${site}/uniform`, "float32");
+    const values = await this.#meansOf(array, storedPlaces(uniformShape, selection), 0, replans);
+    return Array.from({ length: replans }, (_, replan) => values.subarray(replan * keys, (replan + 1) * keys));
   }
 
   /** The rows of every head at some layers, mean over denoise steps and the query, of one replan. */

@@ -13,6 +13,8 @@ export interface SiteInfo {
   /** Action queries of the policy at this site, for keys that not all of them see. */
   numActionQueries: number;
   segments: SegmentDocument[];
+  /** Lengths of the axes of what uniform attention gives, 1 where nothing changes along one; null: version 1 has none. */
+  uniformShape: readonly number[] | null;
 }
 
 /** Positions on the axes that means are over. */
@@ -53,7 +55,7 @@ export interface Atoms {
 export interface MeanRows {
   replans: number;
   keys: number;
-  values: Float32Array;
+  values: Float64Array;
 }
 
 /** Rows (layer, head, key) of one replan; `layers` are the positions that were asked for. */
