@@ -57,7 +57,7 @@ def build_parser() -> argparse.ArgumentParser:
     look = parser.add_argument_group("drawing")
     look.add_argument(
         "--measure", choices=("lift", "share"), default="lift",
-        help="lift: mass of a patch / mean mass of a valid key; share: per cent of all image attention (default: lift)",
+        help="lift: mass of a patch over uniform attention; share: per cent of all image attention (default: lift)",
     )  # fmt: skip
     look.add_argument("--smooth", action="store_true", help="bilinear between patches (default: patches as they are)")
     look.add_argument("--video", choices=("gif", "mp4"), help="also a video of the whole episode")

@@ -167,7 +167,10 @@ def _baseline_sentence(grouping: Grouping, uniform: float | None, level: Tables)
         f"{format_number(above)} keys on one side and {format_number(below)} on the other"
     )
     if abs(above - uniform * below) > _SAME_QUOTIENT * above:
-        baseline += " (a geometric mean over episodes and tasks, and not the quotient of these two means)"
+        baseline += (
+            " (a geometric mean over episodes and tasks, of what each query gives the keys that it sees, and not the "
+            "quotient of these two means)"
+        )
     if not grouping.compares_modalities:
         return f"{baseline}: read the ratio beside it, or read the lift."
     return (
@@ -230,8 +233,8 @@ def _groups_section(grouping: Grouping, tasks: Tables, kind: str) -> str:
         of_groups = "FRACTION of the summed masses of all groups" + (" (groups overlap)" if grouping.overlap else "")
         note = ""
     else:
-        of_groups = "LIFT  mass per key, against the mean over valid keys"
-        note = "\nMean over replans of mass per key / mass per valid key; 1 = what uniform attention gives."
+        of_groups = "LIFT  mass, against what uniform attention gives"
+        note = "\nMean over replans of mass / mass of attention that is uniform at each query, which has 1."
     return "\n".join([heading(of_groups), "\n\n".join(tables)]) + note
 
 

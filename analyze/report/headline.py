@@ -83,7 +83,7 @@ def _ratio_boxes(row: Mapping[str, Any], numerator: Sequence[str], denominator: 
     lift = f"{_interval(row, 'ratio_lift')}; ratio / uniform ratio"
     return [
         ratio,
-        Box("with uniform attention", uniform, "what the numbers of keys alone give"),
+        Box("with uniform attention", uniform, "what the keys that queries see alone give"),
         Box("lift", format_number(row["ratio_lift"]), lift),
     ]
 

@@ -111,8 +111,7 @@ def word_section(question: Question, folder: Path) -> Section:
         lambda where: plot_word_bars(study.summary, where, study.layer),
         folder,
         f"Bars of the words' lifts, highest first: {_named(of_words.head(5), 'lift') or 'none'}.",
-        f"Words by lift, site {study.question.site}: mass per piece against the mean over valid keys; 1 is uniform "
-        "attention.",
+        f"Words by lift, site {study.question.site}: mass over what uniform attention gives; 1 is uniform attention.",
     )
     rows = [
         [

@@ -157,8 +157,7 @@ def _layer_tables(analysis: Analysis) -> list[Table]:
         fractions = [percent_cell(of_group[layer, group]["fraction"]) for group in groups]
         shares.append([name, *fractions, *(number_cell(of_group[layer, group]["lift"]) for group in groups)])
     caption = (
-        "Groups per layer. Per cent: fraction of the groups' summed mass; lift: mass per key against the mean over "
-        "valid keys"
+        "Groups per layer. Per cent: fraction of the groups' summed mass; lift: mass over what uniform attention gives"
     )
     tables = [Table(caption, ["layer", *(f"{g} %" for g in groups), *(f"{g} lift" for g in groups)], shares)]
     if ratios:

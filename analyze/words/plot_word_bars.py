@@ -54,7 +54,7 @@ def plot_word_bars(
     bounds = shown.select("lift", "lift_low", "lift_high").to_numpy().astype(float).ravel()
     ratio_axis(axes.xaxis, np.append(bounds[bounds > 0], 1.0))
     _draw_bars(axes, shown, words.head(_MOST).height, dense)
-    axes.set_xlabel("lift: mass per piece / that of the average valid key (logarithmic)")
+    axes.set_xlabel("lift: mass / what uniform attention gives (logarithmic)")
     _legend(axes, shown)
     return save_figure(figure, folder, stem, summary)
 

@@ -14,7 +14,7 @@ from vla_attention.analyze.statistics.many_looks import NAMED_AT, fewest_tasks
 from vla_attention.analyze.words.word_study import WordStudy
 
 _NOTE = (
-    "lift: mean over replans of mass per piece / mass per valid key (1: uniform attention). share: of all linguistic "
+    "lift: mean over replans of mass / what uniform attention gives (1: uniform attention). share: of all linguistic "
     "mass (bos, template, instruction). q: p of lift 1, adjusted for the number of words (Benjamini-Hochberg)."
 )
 
