@@ -85,27 +85,41 @@ def open_run(path: Path, attributes: RootAttributes, mode: WriteMode, *, durable
         StoreExists: something is at `path` and the mode is `new`.
         RunMismatch: the mode is `resume` and the existing run differs; the first differing field is named.
     """
+    path = make_way(path, mode)
+    with _saying_where(path):
+        existing = read_existing_root(path) if path.exists() else create_root(path, attributes, durable)
+        check_same_run(path, existing, attributes)
+        remove_dead_partials(path)
+    return RunStore(path, existing, durable)
+
+
+def make_way(path: Path, mode: WriteMode) -> Path:
+    """Look at the place of a store before it is opened, and delete the one that is to be replaced; returns the place.
+
+    Raises:
+        StoreExists: something is at `path` and the mode is `new`.
+    """
     check_place(path, "write a store at")
     # Episodes are written beside the store itself; a link to it may be on another file system.
     path = path.resolve() if path.is_symlink() else path
-    try:
+    with _saying_where(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists():
-            if mode == "new":
-                refuse_existing(path)
-            existing = read_existing_root(path)
-            if mode == "overwrite":
-                delete_store(path)
-                existing = create_root(path, attributes, durable)
-        else:
-            existing = create_root(path, attributes, durable)
-        check_same_run(path, existing, attributes)
-        remove_dead_partials(path)
+        if path.exists() and mode == "new":
+            refuse_existing(path)
+        if path.exists() and mode == "overwrite":
+            read_existing_root(path)
+            delete_store(path)
+    return path
+
+
+@contextmanager
+def _saying_where(path: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
         if isinstance(error, UserError):
             raise
         raise BadArgument(f"Cannot write a store at {path}: {error.strerror or error}; give another --store.") from None
-    return RunStore(path, existing, durable)
 
 
 def refuse_existing(path: Path) -> NoReturn:

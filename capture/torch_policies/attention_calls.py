@@ -14,6 +14,8 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
+from vla_attention.capture.torch_policies.added_updates import OutputWay
+
 #: How a policy computes attention. `sdpa`: `scaled_dot_product_attention`. `softmax`: a softmax by hand whose result is
 #: multiplied with values. `multihead`: `multi_head_attention_forward`, which `nn.MultiheadAttention` calls. `flex`:
 #: `flex_attention`. transformers' attention interface calls one of these.
@@ -23,6 +25,9 @@ Positions = slice | Tensor | Sequence[int]
 #: Logits at or below this are of masked keys: masks are written as -inf, as the lowest number of a dtype, as -1e9, or
 #: as -1e4, the smallest in use.
 MASKED_BELOW = -5000.0
+#: Largest difference of numbers that are computed twice, relative to the largest of them, by the least precise dtype. A
+#: float32 kernel leaves 1e-6, one of bfloat16 a few of its roundings; rows with a wrong mask are off by far more.
+TOLERANCE = {"float32": 1e-3, "float64": 1e-3, "float16": 2e-2, "bfloat16": 6e-2}
 
 
 @dataclass(frozen=True)
@@ -102,12 +107,12 @@ class AttentionCall:
 
     def rows(self, queries: Positions = slice(None), batch: Positions = slice(None)) -> Tensor:
         """Return the probabilities of these queries, (batch, head, query, key) float32, exact zeros where masked."""
-        with _exact():
+        with exact():
             return self.tensors.rows(queries, batch)
 
     def allowed(self, queries: Positions = slice(None)) -> Tensor:
         """Return (batch, head or 1, query, key) bool: keys that the policy's own mask lets the query see."""
-        with _exact():
+        with exact():
             return self.tensors.allowed(queries)
 
     @property
@@ -125,7 +130,7 @@ class AttentionCall:
         rows: (batch, head, query, key) of the same queries and batch rows. Rows that are those of the kernel give
         rounding errors: some 1e-7 where it computes in float32, some 1e-3 to 1e-2 where in bfloat16.
         """
-        with _exact():
+        with exact():
             value = at_positions(self.value, 0, batch).float()
             size, heads, count, keys = rows.shape
             # Heads that share a value head become extra queries of that head, without copies of the values.
@@ -144,7 +149,8 @@ class Watcher(Protocol):
 
     It may have an attribute `changes`, False where it changes nothing: it is not asked then. It may have a method
     `passes(shape) -> bool` too, asked when the kernel has run: whether the call is not wanted.
-    It is not told of such a call again, and nothing is made of its tensors.
+    It is not told of such a call again, and nothing is made of its tensors. It may have
+    `output_modules`, the projections to which it wants outputs to be followed.
     """
 
     def change(self, shape: CallShape) -> Tensor | None:
@@ -154,12 +160,12 @@ class Watcher(Protocol):
         """
         ...
 
-    def saw(self, call: AttentionCall) -> None:
-        """Take what is wanted of a call, right after its kernel; in order."""
+    def saw(self, call: AttentionCall) -> OutputWay | None:
+        """Take what is wanted of a call, right after its kernel; in order. Return whether its output is followed."""
         ...
 
 
-def _exact() -> AbstractContextManager[object]:
+def exact() -> AbstractContextManager[object]:
     """Compute without gradients, and in the dtypes that are written, whatever autocast the policy runs under."""
     devices = [device for device in ("cpu", "cuda") if torch.is_autocast_enabled(device)]
     return _without_autocast(devices) if devices else torch.no_grad()

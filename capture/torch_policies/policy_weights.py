@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from vla_attention.capture.policies.weights import weights_digest
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
 from vla_attention.capture.torch_policies.policy_modules import modules_of
+from vla_attention.capture.torch_policies.tensor_functions import tensors_among
 from vla_attention.schemas.errors import BadArgument, did_you_mean, unknown_name
 
 
@@ -66,13 +67,46 @@ def device_and_dtype(policy: object) -> tuple[str, str]:
     return max(counts, key=lambda place: counts[place]) if counts else ("cpu", "float32")
 
 
+@dataclass(frozen=True)
+class OutputProjection:
+    """The output projection of a block, by its module and path."""
+
+    module: nn.Module
+    path: str
+
+    def __call__(self, mixed: Tensor) -> Tensor:
+        """Map mixed values (..., head · dim) float32 to (..., width), without a bias: no key gives it."""
+        if (linear := self._linear) is not None:
+            return nn.functional.linear(mixed, linear.weight.to(mixed.dtype))
+        flat = mixed.flatten(0, -2)
+        both = self._called(torch.cat([flat, torch.zeros_like(flat[:1])]))
+        return (both[:-1] - both[-1:]).view(*mixed.shape[:-1], -1)
+
+    def bias(self, mixed: Tensor) -> Tensor:
+        """Return what it gives for zeros, (width,) float32; mixed: values of the size that it takes."""
+        if (linear := self._linear) is not None:
+            zeros = linear.weight.new_zeros(len(linear.weight), dtype=torch.float32)
+            return zeros if linear.bias is None else linear.bias.float()
+        return self._called(torch.zeros_like(mixed.flatten(0, -2)[:1]))[0]
+
+    @property
+    def _linear(self) -> nn.Linear | None:
+        module = self.module
+        if isinstance(module, nn.Linear) and type(module).forward is nn.Linear.forward:
+            return module if module.weight.is_floating_point() else None
+        return None
+
+    def _called(self, mixed: Tensor) -> Tensor:
+        # Quantised weights, adapters: the module itself.
+        weights = (weight.dtype for weight in self.module.parameters() if weight.is_floating_point())
+        result = self.module(mixed.to(next(weights, mixed.dtype)))
+        return next(tensors_among((result,))).float()
+
+
 def projections_of(
     policy: object, layout: PolicyLayout, layers: tuple[int, ...]
-) -> dict[tuple[str, int], Callable[[Tensor], Tensor]]:
-    """Return (site, block) -> the function from (any, head · dim) to (any, width) of a block's output projection.
-
-    A bias is left out: no key gives it.
-    """
+) -> dict[tuple[str, int], OutputProjection]:
+    """Return (site, block) -> the output projection of a block, for the recorded layers."""
     modules = modules_of(policy)
     found = {}
     for site in layout.sites:
@@ -90,19 +124,5 @@ def projections_of(
                     f"The output projection '{path}' of site '{site.name}' is no module of the policy."
                     f"{did_you_mean(path, modules)} Change RecordedSite.projection, or record with contributions=False."
                 )
-            found[site.name, block] = _projection(modules[path])
+            found[site.name, block] = OutputProjection(modules[path], path)
     return found
-
-
-def _projection(module: nn.Module) -> Callable[[Tensor], Tensor]:
-    if isinstance(module, nn.Linear) and module.weight.is_floating_point():
-        weight = module.weight
-        return lambda mixed: nn.functional.linear(mixed, weight.to(mixed.dtype))
-
-    def project(mixed: Tensor) -> Tensor:
-        # Quantised weights, adapters: the module itself, without what it gives for zeros.
-        dtype = next((weight.dtype for weight in module.parameters() if weight.is_floating_point()), mixed.dtype)
-        both: Tensor = module(torch.cat([mixed.to(dtype), torch.zeros_like(mixed[:1], dtype=dtype)]))
-        return (both[:-1] - both[-1:]).float()
-
-    return project

@@ -159,6 +159,7 @@ def record(
         knockouts=SessionKnockouts(changes, allow_empty),
         tokenizer=None if tokenizer is None else TokenText(tokenizer),
         projections=projections,
+        undecided=contributions is None and recording.contributions,
         durable=durable,
     )
 

@@ -4,7 +4,8 @@ Most policies call them by names in torch (`torch.nn.functional.scaled_dot_produ
 During a block something else stands under these names; other functions cost nothing more. What is called otherwise,
 such as a function that was imported by name, is seen by a `TorchFunctionMode` only, through which every function of
 torch goes: a few microseconds each, more than many policies compute in it. The result of a softmax is followed by that
-mode, from the softmax to the next module that begins or ends after its product with the values.
+mode, from the softmax to the next module that begins or ends after its product with the values. So is the output of a
+call, to its addition to the residual stream, where the watcher wants it.
 """
 
 from __future__ import annotations
@@ -16,10 +17,12 @@ from functools import wraps
 from typing import Any
 
 import torch
-from torch import overrides
+from torch import nn, overrides
 from torch.overrides import TorchFunctionMode
 
 from vla_attention.capture.torch_policies import flex_calls, multihead_calls, sdpa_calls, softmax_calls
+from vla_attention.capture.torch_policies.followed_outputs import OutputFollower
+from vla_attention.capture.torch_policies.tensor_functions import tensors_among
 from vla_attention.capture.torch_policies.unseen_attention import ATTENTION_OPERATOR, LOAD_WITH_SDPA, UnseenAttention
 from vla_attention.capture.torch_policies.watched_block import WatchedBlock
 from vla_attention.schemas.errors import UserError
@@ -96,10 +99,31 @@ class SeenFunctions:
             own.stop_following()
 
     def at_module(self) -> None:
-        """Say that a module begins or ends: where no softmax is followed any more, the mode that follows ends."""
+        """Say that a module begins or ends: where nothing is followed any more, the mode that follows ends."""
         own = getattr(self._threads, "own", None)
-        if own is not None and own.following and not own.softmaxes.followed:
+        if own is not None and own.following and not own.follows:
             own.stop_following()
+
+    def around_projection(self, module: nn.Module, forward: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a forward that tells what follows an output what the projection was given and what it returned."""
+
+        def projected(*args: Any, **kwargs: Any) -> Any:
+            own = getattr(self._threads, "own", None)
+            if own is None or own.inside or not own.outputs.awaits(module):
+                return forward(*args, **kwargs)
+            given = next(tensors_among((*args, *kwargs.values())), None)
+            own.inside = True  # the module is one step
+            try:
+                result = forward(*args, **kwargs)
+            finally:
+                own.inside = False
+            returned = next(tensors_among((result,)), None)
+            if given is not None and returned is not None:
+                own.outputs.project(module, given, returned)
+                own.follow_what_is_left()
+            return result
+
+        return projected
 
     def _in_place_of(self, function: Any) -> Any:
         threads = self._threads
@@ -127,17 +151,19 @@ class _OfThread:
 
     Attributes:
         softmaxes: the followed results of softmaxes.
+        outputs: the followed outputs of attention calls.
         handlers: what is done instead of a function.
         inside: whether a handler runs; what it calls is no call of the policy's.
         taken: collects what `nn.MultiheadAttention` calls inside, None elsewhere.
         mode: sees every function of torch while it is entered.
-        following: whether it is entered for a softmax that is followed.
+        following: whether it is entered for what is followed.
     """
 
     def __init__(self, functions: SeenFunctions, block: WatchedBlock, stand_ins: Mapping[Any, Any]) -> None:
         self.block = block
         self.functions = functions
         self.softmaxes = softmax_calls.Softmaxes(block)
+        self.outputs = OutputFollower(block)
         self.inside = False
         self.taken: list[multihead_calls.InnerCall] | None = None
         self.following = False
@@ -152,15 +178,38 @@ class _OfThread:
         self.handlers |= {stand_ins[known]: self.handlers[known] for known in stand_ins if known in self.handlers}
         self.mode = _EveryFunction(self)
 
+    @property
+    def follows(self) -> bool:
+        """Whether anything is followed."""
+        return bool(self.softmaxes.followed) or bool(self.outputs.followed)
+
     def handle(self, handler: _Call, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
-        """Run a handler in place of a function."""
+        """Run a handler in place of a function, and follow the output of a call if the watcher wants it."""
         self.inside = True
         try:
-            return handler(function, args, kwargs)
+            result = handler(function, args, kwargs)
+            way = self.block.take_way()
+            if way is not None:
+                self.outputs.begin(way, next(tensors_among((result,))))
+            return result
         finally:
             self.inside = False
-            if self.softmaxes.followed and not self.following and not self.functions.every_function:
-                self._follow()
+            self.follow_what_is_left()
+
+    def follow_what_is_left(self) -> None:
+        """Enter the mode that sees every function, if something is followed."""
+        if self.follows and not self.following and not self.functions.every_function:
+            self._follow()
+
+    def follow(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
+        """Run a function that is no attention function, and follow what it makes of what is followed."""
+
+        def run() -> Any:
+            if self.softmaxes.followed:
+                return self.softmaxes.follow(function, args, kwargs)
+            return function(*args, **kwargs)
+
+        return self.outputs.follow(function, args, kwargs, run) if self.outputs.followed else run()
 
     def _attend(self, watch_call: Callable[..., Any]) -> _Call:
         def attend(function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
@@ -207,8 +256,8 @@ class _EveryFunction(TorchFunctionMode):
     def __init__(self, own: _OfThread) -> None:
         super().__init__()
         self._own = own
-        #: Every function of the policy comes by here: one look at a dictionary says whether a softmax is followed.
-        self._followed = own.softmaxes.followed
+        #: Every function of the policy comes by here: a look at each says whether anything is followed.
+        self._softmaxes, self._outputs = own.softmaxes.followed, own.outputs.followed
 
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
@@ -222,8 +271,8 @@ class _EveryFunction(TorchFunctionMode):
             return own.handle(handler, func, args, kwargs or {})
         if type(func) in _OPERATORS:
             self._refuse_unseen(func)
-        if self._followed and func not in _CALLS_SOFTMAX:
-            return own.handle(own.softmaxes.follow, func, args, kwargs or {})
+        if (self._softmaxes or self._outputs) and func not in _CALLS_SOFTMAX:
+            return own.handle(own.follow, func, args, kwargs or {})
         return func(*args, **kwargs) if kwargs else func(*args)
 
     def _refuse_unseen(self, operator: Any) -> None:

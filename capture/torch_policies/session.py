@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
@@ -13,12 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
-from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run
+from vla_attention.capture.store.store_root import read_existing_root
+from vla_attention.capture.store.store_writer import RunStore, WriteMode, make_way, open_run
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit, KnownCalls
 from vla_attention.capture.torch_policies.knockouts import SessionKnockouts
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
 from vla_attention.capture.torch_policies.policy_modules import find_policy
-from vla_attention.capture.torch_policies.policy_weights import find_module, policy_digest, weights_state
+from vla_attention.capture.torch_policies.policy_weights import (
+    OutputProjection,
+    find_module,
+    policy_digest,
+    weights_state,
+)
 from vla_attention.capture.torch_policies.prompts import TokenText
 from vla_attention.capture.torch_policies.replan_edits import ReplanEdits
 from vla_attention.capture.torch_policies.replan_inputs import (
@@ -32,8 +39,8 @@ from vla_attention.capture.torch_policies.replan_text import ReplanText, watched
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder, SiteRows, final_contribution
 from vla_attention.capture.torch_policies.unseen_attention import no_attention
 from vla_attention.capture.torch_policies.watch import watch_attention
-from vla_attention.schemas.errors import BadArgument, UserError
-from vla_attention.schemas.stores.store_format import RootAttributes, StoreExists, episode_name
+from vla_attention.schemas.errors import BadArgument, Note, UserError
+from vla_attention.schemas.stores.store_format import EPISODES_GROUP, RootAttributes, StoreExists, episode_name
 
 #: More replans than any episode has; the writer collects rows in blocks of two megabytes.
 _MANY_REPLANS = 1_000_000
@@ -55,6 +62,10 @@ class WeightsChanged(UserError, RuntimeError):
 
 class NothingRecorded(UserError, RuntimeError):
     """An episode in which no attention was seen."""
+
+
+class ContributionsUnknown(UserError, RuntimeError):
+    """Contributions of a policy of which it cannot be said what its keys add to its residual stream."""
 
 
 @dataclass
@@ -81,7 +92,6 @@ class Episode:
 
     run: RecordedRun
     facts: EpisodeFacts
-    writer: EpisodeWriter
     success: bool | None = None
     num_steps: int | None = None
     num_dropped: int = 0
@@ -89,6 +99,9 @@ class Episode:
     folder: Path | None = None
     _batch: EpisodeBatch | None = field(default=None, repr=False)
     _ended: bool = field(default=False, repr=False)
+    _stack: ExitStack = field(default_factory=ExitStack, repr=False)
+    #: None before the first policy call is recorded.
+    _writer: EpisodeWriter | None = field(default=None, repr=False)
 
     @property
     def name(self) -> str:
@@ -98,7 +111,12 @@ class Episode:
     @property
     def num_replans(self) -> int:
         """Number of recorded replans."""
-        return len(self.writer.records)
+        return 0 if self._writer is None else len(self._writer.records)
+
+    def _append(self, record: ReplanRecord) -> None:
+        if self._writer is None:
+            self._writer = self._stack.enter_context(self.run._writer_of(self.facts))
+        self._writer.append(record)
 
     @contextmanager
     def replan(self, *, env_step: int, **inputs: Any) -> Iterator[Replan]:
@@ -118,23 +136,24 @@ class Episode:
             yield replan
 
     def _commit(self) -> None:
-        if not self.writer.records:
+        writer = self._writer
+        if writer is None or not writer.records:
             raise NothingRecorded(
                 f"No attention was seen in the {self.num_dropped} replan blocks of {self.name}. "
                 f"{no_attention(self.run.policy)}"
             )
-        last = self.writer.records[-1].env_step + 1
+        last = writer.records[-1].env_step + 1
         facts = {
-            **self.writer.start.provenance,
+            **writer.start.provenance,
             "largest P·V error": f"{self.largest_error:.3g}",
             "replan blocks without attention": str(self.num_dropped),
         }
-        self.writer.start = replace(self.writer.start, provenance=facts)
+        writer.start = replace(writer.start, provenance=facts)
         self.run._check_weights()
         # Environments give numpy's bools and numbers.
         success = None if self.success is None else bool(self.success)
         num_steps = last if self.num_steps is None else whole_number("num_steps of an episode", self.num_steps)
-        self.folder = self.writer.commit(success, num_steps)
+        self.folder = writer.commit(success, num_steps)
         self.run.largest_error = max(self.run.largest_error, self.largest_error)
 
 
@@ -220,6 +239,10 @@ class RecordedRun:
             episodes.
         every_function: look at every function of torch at every policy call, which is slower. False: at an episode's
             first, and at all where attention functions are called otherwise than by their names in torch.
+
+    Args:
+        undecided: contributions are recorded if the first policy call shows what each part of the keys adds to the
+            residual stream. The store, which says whether it has any, is made after that call.
     """
 
     def __init__(
@@ -232,7 +255,8 @@ class RecordedRun:
         *,
         knockouts: SessionKnockouts,
         tokenizer: TokenText | None,
-        projections: Mapping[tuple[str, int], Callable[[Any], Any]],
+        projections: Mapping[tuple[str, int], OutputProjection],
+        undecided: bool = False,
         durable: bool = True,
     ) -> None:
         self.path = path
@@ -249,8 +273,10 @@ class RecordedRun:
         self._mode = mode
         self._tokenizer = tokenizer
         self._projections = projections
+        self._undecided = undecided
         self._durable = durable
         self._store: RunStore | None = None
+        self._entered = False
         self._in_block = False
         self.every_function = False
         #: Whether it is not known yet that names are enough.
@@ -258,18 +284,40 @@ class RecordedRun:
         self._sites = tuple(layout.site(site.name) for site in attributes.sites)
 
     def __enter__(self) -> RecordedRun:
-        self._store = open_run(self.path, self.attributes, self._mode, durable=self._durable)
-        self.path = self._store.path
+        self._entered = True
+        if self._undecided and self._mode == "resume" and self.path.exists():
+            # The policy calls that are stored there have shown it.
+            self._decide(contributions=read_existing_root(self.path).recording.contributions)
+        if self._undecided:
+            self.path = make_way(self.path, self._mode)
+            self._mode = "new" if self._mode == "new" else "resume"
+        else:
+            self._open()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._store = None
+        self._entered = False
+
+    def _open(self) -> None:
+        self._store = open_run(self.path, self.attributes, self._mode, durable=self._durable)
+        self.path = self._store.path
+
+    def _decide(self, *, contributions: bool, because: str = "") -> None:
+        """Note whether contributions are recorded; because: for the store."""
+        self._undecided = False
+        self.attributes = replace(
+            self.attributes,
+            recording=replace(self.attributes.recording, contributions=contributions),
+            provenance={**self.attributes.provenance, **({"contributions": because} if because else {})},
+        )
 
     def has(self, task_id: int, episode_index: int) -> bool:
         """Whether an episode is in the store already; a resumed loop skips it."""
-        return self._opened().has(task_id, episode_index)
+        self._check_entered()
+        return (self.path / EPISODES_GROUP / episode_name(task_id, episode_index)).is_dir()
 
     @contextmanager
     def episode(
@@ -336,20 +384,24 @@ class RecordedRun:
             )
         self._weights = state
 
-    def _opened(self) -> RunStore:
-        if self._store is None:
+    def _check_entered(self) -> None:
+        if not self._entered:
             raise RecordingStopped("This run is not open; use it as: with va.record(...) as run.")
-        return self._store
 
     def _begin(self, stack: ExitStack, facts: EpisodeFacts) -> Episode:
-        store = self._opened()
-        if store.has(facts.task_id, facts.episode_index):
+        if self.has(facts.task_id, facts.episode_index):
             name = episode_name(facts.task_id, facts.episode_index)
             raise StoreExists(
-                f"{name} is in {store.path} already; skip it with run.has(task_id, episode_index), or record into "
+                f"{name} is in {self.path} already; skip it with run.has(task_id, episode_index), or record into "
                 "another store."
             )
         self.knockouts.check_names(self.attributes.sites, facts.instruction, facts.objects)
+        self._names_unknown = True
+        return Episode(self, facts, _stack=stack)
+
+    def _writer_of(self, facts: EpisodeFacts) -> AbstractContextManager[EpisodeWriter]:
+        """Return the writer of an episode whose first policy call was recorded."""
+        assert self._store is not None
         start = EpisodeStart(
             task_id=facts.task_id,
             task_name=facts.task_name or f"task{facts.task_id}",
@@ -362,16 +414,14 @@ class RecordedRun:
         )
         steps = self.attributes.recording.denoise_steps
         times = self.layout.denoise_times or tuple(float(step) for step in range(self.layout.num_denoise_steps))
-        chosen = np.array([times[step] for step in steps])
-        self._names_unknown = True
-        return Episode(self, facts, stack.enter_context(store.episode(start, chosen, _MANY_REPLANS)))
+        return self._store.episode(start, np.array([times[step] for step in steps]), _MANY_REPLANS)
 
     @contextmanager
     def _replan(
         self, episodes: Sequence[Episode], given: Sequence[ReplanInputs], *, batch: int, rows: Sequence[int]
     ) -> Iterator[Replan]:
         """Record one policy call of some rows of a batch."""
-        self._opened()
+        self._check_entered()
         for episode in episodes:
             if episode._ended:
                 raise RecordingStopped(
@@ -428,6 +478,9 @@ class RecordedRun:
             for episode, inputs in list(zip(episodes, given, strict=True))[:2]
         )
         found = recorder.finish(where)
+        self._check_contributions(recorder)
+        if self._store is None:
+            self._open()
         if recorder.batch > 1:
             _check_length("actions", replan.actions, recorder.batch)
         replan.recorded = True
@@ -437,7 +490,32 @@ class RecordedRun:
             if actions is not None and recorder.batch > 1:
                 actions = actions[row]
             record = self._record(found[position], text, row, inputs, read_actions(actions))
-            episode.writer.append(record)
+            episode._append(record)
+
+    def _check_contributions(self, recorder: ReplanRecorder) -> None:
+        """Raise `ContributionsUnknown` if a call's contributions are not known; at the first one, decide about them."""
+        unknown = recorder.contributions_unknown()
+        if not self._undecided:
+            if unknown is not None:
+                raise ContributionsUnknown(
+                    "Contributions cannot be recorded, because it is not known what each part of the keys adds to the "
+                    f"residual stream: {unknown}. Name another projection in the layout, or record with "
+                    "contributions=False. Nothing of this episode was kept."
+                )
+            return
+        if unknown is None:
+            self._decide(
+                contributions=True, because=f"what is added to the residual stream ({recorder.contributions_of()})"
+            )
+            return
+        self._decide(contributions=False, because=f"none: {unknown}")
+        warnings.warn(
+            "The store has no contributions, because it is not known what each part of the keys adds to the residual "
+            f"stream: {unknown}. The rows are recorded. Name another projection in the layout if this is not the "
+            'output projection (docs/your-policy.md, "Contributions"), or record with contributions=False.',
+            Note,
+            stacklevel=2,
+        )
 
     def _record(
         self,

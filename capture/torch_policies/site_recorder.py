@@ -11,22 +11,22 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vla_attention.capture.recording.contributions import gram_matrix, keys_of_parts, part_contributions
+from vla_attention.capture.recording.contributions import gram_matrix, keys_of_parts, part_values
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.store.recorded_rows import RecordedRows
-from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
+from vla_attention.capture.torch_policies.added_updates import AddedUpdate, OutputWay, Scaling, after_steps
+from vla_attention.capture.torch_policies.attention_calls import TOLERANCE, AttentionCall, CallShape
 from vla_attention.capture.torch_policies.call_changes import ChangeRefused
 from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace, KnownCalls
+from vla_attention.capture.torch_policies.followed_outputs import difference
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
+from vla_attention.capture.torch_policies.policy_weights import OutputProjection
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.segments import Segment, segment_members, segments_of
 from vla_attention.schemas.stores.store_format import Recording
 
 #: Copies with more numbers than this move to the CPU immediately instead of waiting on the device.
 _LARGE_COPY = 2**20
-#: Largest difference of the rows' P·V from the kernel's output, relative to the largest output, by the call's dtype. A
-#: float32 kernel leaves 1e-6, one of bfloat16 a few of its roundings; rows with a wrong mask are off by far more.
-_TOLERANCE = {"float32": 1e-3, "float64": 1e-3, "float16": 2e-2, "bfloat16": 6e-2}
 #: Largest difference of a row's sum from 1, beside rounding.
 _SUM_TOLERANCE = 1e-3
 
@@ -70,6 +70,8 @@ class _Collected:
     grams: dict[tuple[int, int, int], list[Tensor]] = field(default_factory=dict)
     roles: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
     parts: dict[int, list[slice | Tensor]] = field(default_factory=dict)
+    #: What stands between the attention and the residual stream, beside the output projection.
+    between: set[str] = field(default_factory=set)
 
 
 class ReplanRecorder:
@@ -81,7 +83,7 @@ class ReplanRecorder:
         recording: what of them is recorded.
         batch: batch size that every call of the sites must have.
         rows: the rows of the batch that are recorded.
-        projections: (site, block) -> function from (any, head · dim) to (any, width), for contributions.
+        projections: (site, block) -> the block's output projection, for contributions.
         early_roles: the roles of keys before the masks are known, for contributions.
         bias: what knockouts add to the logits.
     """
@@ -93,7 +95,7 @@ class ReplanRecorder:
         recording: Recording,
         batch: int,
         rows: Sequence[int],
-        projections: Mapping[tuple[str, int], Callable[[Tensor], Tensor]],
+        projections: Mapping[tuple[str, int], OutputProjection],
         early_roles: EarlyRoles,
         bias: LogitBias | None = None,
     ) -> None:
@@ -103,11 +105,15 @@ class ReplanRecorder:
         self.rows = tuple(rows)
         self.order = CallOrder(known, policy)
         self.projections = projections
+        self.output_modules = tuple(projection.module for projection in projections.values())
         self.early_roles = early_roles
         self.bias = bias
         self.largest_error = 0.0
         self._changes: dict[tuple[int, ...], Tensor] = {}
         self._collected = {site.name: _Collected() for site in layout.sites}
+        #: Outputs that were not added to the residual stream yet, and of which call they are.
+        self._on_the_way: dict[OutputWay, CallPlace] = {}
+        self._unknown: list[str] = []
 
     @property
     def changes(self) -> bool:
@@ -155,31 +161,31 @@ class ReplanRecorder:
         step = 0 if self.layout.autoregressive else place.step
         return recording is not None and place.block in recording.layers and step in recording.denoise_steps
 
-    def saw(self, call: AttentionCall) -> None:
-        """Keep the rows of a call, if it is recorded."""
+    def saw(self, call: AttentionCall) -> OutputWay | None:
+        """Keep the rows of a call, if it is recorded; its output is followed for the contributions."""
         shape = call.shape
         place = self.order.place(shape)
         self.order.ran(shape, place)
         if place is None or place.site is None:
-            return
+            return None
         if self.bias is not None and call.asked is not None:
             self._check_changed(call.asked, shape, place)
         if not self._wanted(place):
-            return
+            return None
         site, recording = self.order.known.sites[place.site], self.recordings[place.site]
         if shape.batch != self.batch:
             self.order.problems[
                 f"a call of site '{site.name}' has a batch of {shape.batch}, and the replan one of {self.batch} "
                 "(several environments in one call: run.episodes)"
             ] = None
-            return
+            return None
         heads = site.keys.heads or self.layout.num_heads
         if shape.heads != heads:
             self.order.problems[f"a call of site '{site.name}' has {shape.heads} heads; the layout has {heads}"] = None
-            return
+            return None
         step = 0 if self.layout.autoregressive else place.step
         with torch.no_grad():
-            self._take(call, place, site, recording, (place.block, step))
+            return self._take(call, place, site, recording, (place.block, step))
 
     def _check_changed(self, asked: CallShape, shape: CallShape, place: CallPlace) -> None:
         """Raise `ChangeRefused` if a knockout of a call could not be made: the softmax showed other axes."""
@@ -193,7 +199,7 @@ class ReplanRecorder:
 
     def _take(
         self, call: AttentionCall, place: CallPlace, site: RecordedSite, recording: Recording, cell: tuple[int, int]
-    ) -> None:
+    ) -> OutputWay | None:
         collected, queries = self._collected[site.name], place.queries
         rows = call.rows(queries)
         error = call.product_error(rows, queries)
@@ -210,11 +216,11 @@ class ReplanRecorder:
         keys = None if place.keys is None else torch.from_numpy(place.keys).to(rows.device)
         if keys is not None:
             rows, uniform = _spread(rows, keys, site.keys.num_keys), _spread(uniform, keys, site.keys.num_keys)
-        if recording.contributions:
-            self._take_contributions(call, rows, keys, place, site, cell)
+        way = self._contributions_way(call, rows, keys, place, site, cell) if recording.contributions else None
         chosen = self._chosen(rows, recording)
         collected.rows.setdefault(cell, []).append(chosen.cpu() if chosen.numel() > _LARGE_COPY else chosen)
         collected.uniform.setdefault(cell, []).append(_kind_of(self._chosen(uniform, recording), collected.kinds))
+        return way
 
     def _chosen(self, values: Tensor, recording: Recording) -> Tensor:
         """What is recorded (row, head or 1, query, key) of values (batch, head or 1, query, key)."""
@@ -229,7 +235,7 @@ class ReplanRecorder:
 
     def _check_error(self, error: float, call: AttentionCall, rows: Tensor, place: CallPlace) -> None:
         shape, precision = call.shape, call.precision
-        allowed = _TOLERANCE.get(precision, 1e-3)
+        allowed = TOLERANCE.get(precision, TOLERANCE["float32"])
         if error > allowed:
             raise RowsDoNotMatch(
                 f"The rows of site '{place.site}', block {place.block}, step {place.step} give a P·V that differs from "
@@ -249,7 +255,7 @@ class ReplanRecorder:
                 "without a key do. Such rows cannot be stored."
             )
 
-    def _take_contributions(
+    def _contributions_way(
         self,
         call: AttentionCall,
         rows: Tensor,
@@ -257,19 +263,73 @@ class ReplanRecorder:
         place: CallPlace,
         site: RecordedSite,
         cell: tuple[int, int],
-    ) -> None:
+    ) -> OutputWay:
+        """Keep the mixed values of each part of the keys until the call's output is added to the residual stream."""
         collected, project = self._collected[site.name], self.projections[site.name, place.block]
         values = call.value if keys is None else _spread(call.value, keys, site.keys.num_keys, axis=2)
+        mixed = {}
         for row in self.rows:
             if row not in collected.roles:
                 collected.roles[row] = roles = self.early_roles(row, site, self.order.present[site.name])
                 members = segment_members(site.keys, roles[None], segments_of(site.keys, roles))[0]
                 collected.parts[row] = keys_of_parts(members, rows.device)
-            each = part_contributions(rows[row], values[row], collected.parts[row], project)
-            output = call.output[row, :, place.queries].float()
-            update = project(output.transpose(0, 1).reshape(output.shape[1], -1))
-            gram = gram_matrix(each, update)
+            mixed[row] = part_values(rows[row], values[row], collected.parts[row])
+
+        def take(update: AddedUpdate) -> None:
+            del self._on_the_way[way]
+            self._take_contributions(update, mixed, project, place, cell)
+
+        itself = call.shape.kind == "multihead"
+        way = OutputWay(project.module, project.path, call.output, place.queries, itself, take)
+        self._on_the_way[way] = place
+        return way
+
+    def _take_contributions(
+        self,
+        update: AddedUpdate,
+        mixed: Mapping[int, Tensor],
+        project: OutputProjection,
+        place: CallPlace,
+        cell: tuple[int, int],
+    ) -> None:
+        """Make the Gram matrices of what was added; mixed: row -> (query, part, head · dim)."""
+        collected, mismatches = self._collected[place.site or ""], [update.mismatch]
+        for row, of_parts in mixed.items():
+            # The last one is the whole output.
+            every = torch.cat([of_parts, update.mixed[row][:, None]], dim=1)
+            projected = project(after_steps(every, update.before, row))
+            mismatches.append(difference(projected[:, -1] + project.bias(every), update.projected[row]))
+            vectors = after_steps(projected, update.behind, row)
+            mismatches.append(difference(vectors[:, :-1].sum(dim=1), vectors[:, -1]))
+            gram = gram_matrix(vectors[:, :-1], vectors[:, -1])
             collected.grams.setdefault((*cell, row), []).append(gram)
+        for steps, where in ((update.before, "before"), (update.behind, "behind")):
+            collected.between |= {
+                f"{'factors' if isinstance(step, Scaling) else 'a mean taken away'} {where} the projection"
+                for step in steps
+            }
+        mismatch, most = float(torch.stack(mismatches).max()), TOLERANCE.get(update.precision, TOLERANCE["float32"])
+        if not mismatch <= most:
+            self._unknown.append(
+                f"{_where(place)} the parts of the keys add up to something that differs from what was added by "
+                f"{mismatch:.2g} of its largest number (allowed is {most:g} for {update.precision}): the output "
+                f"projection '{project.path}' computes something else than a linear map"
+            )
+
+    def contributions_unknown(self) -> str | None:
+        """Say why it is not known what the parts of the keys add to the residual stream; None if it is known."""
+        if self._unknown:
+            return self._unknown[0]
+        return next((f"{_where(place)} {way.describe_loss()}" for way, place in self._on_the_way.items()), None)
+
+    def contributions_of(self) -> str:
+        """Say what stands between the attention and the residual stream, beside the output projections."""
+        found = [
+            f"{name}: {', '.join(sorted(collected.between)) or 'nothing but the projection'}"
+            for name, collected in self._collected.items()
+            if collected.grams
+        ]
+        return "; ".join(found)
 
     def finish(self, where: str) -> list[dict[str, SiteRows]]:
         """Return for each recorded row of the batch what its sites gave.
@@ -281,6 +341,7 @@ class ReplanRecorder:
             NumbersNotFinite: rows hold NaN or infinity.
         """
         self.order.check(where)
+        unknown = self.contributions_unknown() is not None
         found: list[dict[str, SiteRows]] = [{} for _ in self.rows]
         for name, recording in self.recordings.items():
             site, collected = self.layout.site(name), self._collected[name]
@@ -292,7 +353,7 @@ class ReplanRecorder:
                 rows = rows.reshape(len(recording.layers), len(recording.denoise_steps), *rows.shape[1:])
                 self._check_finite(rows, recording, site.name, where)
                 contribution = None
-                if recording.contributions:
+                if recording.contributions and not unknown:
                     grams = [torch.stack(collected.grams[*cell, row]).mean(dim=0) for cell in cells]
                     gram = torch.stack(grams).cpu().numpy()
                     contribution = gram.reshape(*rows.shape[:2], *gram.shape[1:])
@@ -421,6 +482,10 @@ def _kind_of(uniform: Tensor, kinds: list[Tensor]) -> Tensor:
     if len(kinds) < _MOST_KINDS:
         kinds.append(uniform)
     return uniform
+
+
+def _where(place: CallPlace) -> str:
+    return f"in block {place.block} of site '{place.site}' (step {place.step}),"
 
 
 def _spread(values: Tensor, keys: Tensor, count: int, axis: int = -1) -> Tensor:

@@ -117,18 +117,18 @@ class Product:
     def rows_of(self, probabilities: Tensor) -> Tensor:
         """Return the probabilities of the product as (*batch, *heads, query, key)."""
         order = (*self.batch, *self.heads, self.query, self.axes.key)
-        return _in_order(probabilities, self.axes.parts, order, self.axes.sizes)
+        return in_order(probabilities, self.axes.parts, order, self.axes.sizes)
 
     def values_of(self, values: Tensor) -> Tensor:
         """Return (batch, kv_head, key, dim)."""
         heads = self.heads[: self.shared]
-        found = _in_order(values, self.values, (*self.batch, *heads, self.axes.key, _DIM), self.axes.sizes)
+        found = in_order(values, self.values, (*self.batch, *heads, self.axes.key, _DIM), self.axes.sizes)
         found = found.expand(*(self.axes.sizes[axis] for axis in (*self.batch, *heads)), *found.shape[-2:])
         return found.reshape(self.size(self.batch), self.size(heads), *found.shape[-2:])
 
     def output_of(self, output: Tensor) -> Tensor:
         """Return (batch, head, query, dim)."""
-        found = _in_order(output, self.output, (*self.batch, *self.heads, self.query, _DIM), self.axes.sizes)
+        found = in_order(output, self.output, (*self.batch, *self.heads, self.query, _DIM), self.axes.sizes)
         return found.reshape(self.size(self.batch), self.size(self.heads), *found.shape[-2:])
 
 
@@ -194,7 +194,7 @@ def _batch_and_heads(lead: Sequence[int], free: Sequence[int]) -> tuple[tuple[in
     return tuple(lead[:-1]), (lead[-1],)
 
 
-def _in_order(tensor: Tensor, parts: Sequence[Sequence[int]], order: Sequence[int], sizes: Sequence[int]) -> Tensor:
+def in_order(tensor: Tensor, parts: Sequence[Sequence[int]], order: Sequence[int], sizes: Sequence[int]) -> Tensor:
     """Take folded axes apart and bring the softmax's axes into an order; axes that the tensor lacks have size 1."""
     found: list[int] = []
     shape: list[int] = []

@@ -25,6 +25,12 @@ from vla_attention.capture.torch_policies.attention_calls import (
 from vla_attention.capture.torch_policies.call_changes import ChangeRefused, check_keys_left, fitted_change
 from vla_attention.capture.torch_policies.call_tensors import batch_and_heads, normalised, part
 from vla_attention.capture.torch_policies.softmax_axes import Axes, Product, find_product
+from vla_attention.capture.torch_policies.tensor_functions import (
+    CHANGES,
+    SAME_NUMBERS,
+    axes_after,
+    no_dropout,
+)
 from vla_attention.capture.torch_policies.watched_block import WatchedBlock, Where
 
 #: `torch.nn.functional.softmax` calls the tensor's.
@@ -35,30 +41,6 @@ SOFTMAXES: tuple[Callable[..., Any], ...] = (
 _MATMULS = {
     torch.matmul, torch.bmm, Tensor.matmul, Tensor.bmm, Tensor.__matmul__, Tensor.__rmatmul__, torch.linalg.matmul,
     torch.ops.aten.matmul, torch.ops.aten.matmul.default, torch.ops.aten.bmm, torch.ops.aten.bmm.default,
-}  # fmt: skip
-#: Functions whose result has the same axes and the same numbers, up to rounding.
-_COPIES = {
-    Tensor.to, Tensor.type, Tensor.type_as, Tensor.float, Tensor.half, Tensor.bfloat16, Tensor.double,
-    Tensor.contiguous, Tensor.clone, torch.clone, Tensor.detach, torch.detach, Tensor.cpu, Tensor.cuda,
-    Tensor.requires_grad_,
-}  # fmt: skip
-#: Functions whose result has the same axes, and numbers that can differ.
-_CHANGES = {
-    torch.nn.functional.dropout, torch.dropout, torch.dropout_, torch.nan_to_num, Tensor.nan_to_num, Tensor.nan_to_num_,
-    torch.mul, Tensor.mul, Tensor.mul_, Tensor.__mul__, Tensor.__rmul__, Tensor.__imul__, torch.div, Tensor.div,
-    Tensor.div_, Tensor.__truediv__, Tensor.__itruediv__, Tensor.masked_fill, Tensor.masked_fill_, torch.masked_fill,
-    torch.add, Tensor.add, Tensor.add_, Tensor.__add__, Tensor.__radd__, Tensor.__iadd__,
-    torch.where, Tensor.where, torch.clamp, Tensor.clamp, Tensor.clamp_,
-}  # fmt: skip
-_DROPOUTS = {torch.nn.functional.dropout, torch.dropout, torch.dropout_}
-_SWAPS = {
-    torch.transpose, Tensor.transpose, torch.swapaxes, Tensor.swapaxes, torch.swapdims, Tensor.swapdims,
-}  # fmt: skip
-_PERMUTES = {torch.permute, Tensor.permute}
-_MATRIX_TRANSPOSES = {Tensor.mT.__get__, Tensor.mH.__get__}  # type: ignore[attr-defined]
-_FOLDS = {
-    Tensor.view, Tensor.reshape, torch.reshape, Tensor.flatten, torch.flatten, Tensor.unflatten, torch.unflatten,
-    Tensor.squeeze, torch.squeeze, Tensor.unsqueeze, torch.unsqueeze, Tensor.view_as, Tensor.reshape_as,
 }  # fmt: skip
 
 
@@ -229,7 +211,7 @@ class Softmaxes:
         elif isinstance(result, Tensor) and result.ndim:
             axes = _axes_after(function, args, kwargs, given, result)
             if axes is not None:
-                altered = given.altered or (function not in _SAME_NUMBERS and not _no_dropout(function, args, kwargs))
+                altered = given.altered or (function not in SAME_NUMBERS and not no_dropout(function, args, kwargs))
                 self._follow(result, given.softmax, axes, altered=altered)
         return result
 
@@ -305,11 +287,10 @@ class Softmaxes:
         self._block.saw(AttentionCall(shape, tensors, None if shape == replace(before, kv_heads=kv_heads) else before))
 
 
-#: Methods that write to their tensor otherwise than those of `_CHANGES`.
+#: Methods that write to their tensor otherwise than those of `CHANGES`.
 _WRITES = {"__setitem__", "copy_", "index_fill_", "index_copy_", "scatter_", "masked_scatter_", "zero_", "fill_"}
 #: Largest difference of a sum of probabilities from 1 that rounding to bfloat16 leaves, with room.
 _ROUNDING = 1e-2
-_SAME_NUMBERS = {*_COPIES, *_SWAPS, *_PERMUTES, *_MATRIX_TRANSPOSES, *_FOLDS}
 
 
 def _axes_after(
@@ -318,22 +299,10 @@ def _axes_after(
     """Return the axes of what a function made of a followed tensor, None if it cannot be followed."""
     before, axes = given.tensor(), given.axes
     assert before is not None
-    if function in _COPIES or function in _CHANGES:
+    if function in CHANGES:
         return axes if result.shape == before.shape else None
-    if function in _MATRIX_TRANSPOSES:
-        order = list(range(before.ndim))
-        order[-2:] = reversed(order[-2:])
-        return axes.permuted(order)
-    if function in _SWAPS:
-        first, second = [place for place in (*args[1:], *kwargs.values()) if not isinstance(place, Tensor)][:2]
-        order = list(range(before.ndim))
-        order[first], order[second] = order[second], order[first]
-        return axes.permuted(order)
-    if function in _PERMUTES:
-        positions = args[1:] or tuple(place for place in kwargs.values() if not isinstance(place, Tensor))
-        return axes.permuted(positions if isinstance(positions[0], int) else positions[0])
-    if function in _FOLDS:
-        return axes.refolded(result.shape)
+    if function in SAME_NUMBERS:
+        return axes_after(function, args, kwargs, axes, result)
     if result is before:  # changed in place
         return axes
     if function is Tensor.__getitem__ and result.ndim == before.ndim:
@@ -347,15 +316,6 @@ def _axes_after(
 def _times_written(tensor: Tensor) -> int:
     """Return how often torch wrote to a tensor; tensors of inference mode do not count it."""
     return 0 if tensor.is_inference() else tensor._version
-
-
-def _no_dropout(function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> bool:
-    if function not in _DROPOUTS:
-        return False
-    rate, training = dict(enumerate(args)).get(1, kwargs.get("p", 0.5)), dict(enumerate(args)).get(2)
-    if training is None:
-        training = kwargs.get("training", kwargs.get("train", True))
-    return not training or rate == 0
 
 
 @lru_cache(maxsize=1024)

@@ -58,7 +58,7 @@ def watch_attention(policy: object, watcher: Watcher, *, every_function: bool = 
             with (
                 seen_by_python(),
                 functions.names_replaced(),
-                block.following_modules(functions.in_this_thread, functions.at_module),
+                block.following_modules(functions.in_this_thread, functions.at_module, functions.around_projection),
                 functions.in_this_thread(),
             ):
                 yield functions

@@ -15,7 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape, Kind, Watcher
+from vla_attention.capture.torch_policies.added_updates import OutputWay
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape, Kind, Watcher, exact
 from vla_attention.capture.torch_policies.call_changes import ChangeRefused
 from vla_attention.capture.torch_policies.policy_modules import FoundPolicy
 from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
@@ -43,11 +44,15 @@ class Where:
 
 
 class _ThreadState(threading.local):
-    """What belongs to one thread: the modules whose forward is running, and whether its calls are seen."""
+    """What belongs to one thread: the modules whose forward is running, whether its calls are seen, and an output.
+
+    way: of the call that the watcher saw last, if it wants its output to be followed.
+    """
 
     def __init__(self) -> None:
         self.running: list[nn.Module] = []
         self.seen = False
+        self.way: OutputWay | None = None
 
 
 class WatchedBlock:
@@ -100,6 +105,12 @@ class WatchedBlock:
                 "outside the block, or give the object that holds both."
             )
         )
+
+    @property
+    def running_module(self) -> str:
+        """The innermost module whose forward is running in this thread, in words."""
+        running = self._thread.running
+        return f"module '{self.paths[id(running[-1])]}'" if running else "the policy"
 
     def new_shape(
         self, where: Where, kind: Kind, sizes: tuple[int, int, int, int, int], dtype: torch.dtype
@@ -161,13 +172,24 @@ class WatchedBlock:
 
     def saw(self, call: AttentionCall) -> None:
         """Tell the watcher about a call, and count it."""
-        with self._lock, torch.no_grad(), self._failing(), _without_modes():
+        with self.computing():
             if self._closed:  # a thread that still runs; the block has ended with an error
                 return
             if call.shape.number != self._number:  # another call came in between, in this thread or in another
                 call = replace(call, shape=replace(call.shape, number=self._number))
             self._number += 1
-            self.watcher.saw(call)
+            self._thread.way = self.watcher.saw(call)
+
+    def take_way(self) -> OutputWay | None:
+        """Return how the output of the call that was just seen is followed, once."""
+        way, self._thread.way = self._thread.way, None
+        return way
+
+    @contextmanager
+    def computing(self) -> Iterator[None]:
+        """Compute for the watcher beside the policy: without gradients, autocast and function modes."""
+        with self._lock, exact(), self._failing(), _without_modes():
+            yield
 
     def refuse_nested(self, *tensors: Tensor) -> None:
         """Raise `UnseenAttention` for nested tensors, whose sequences have lengths of their own, and inside of vmap."""
@@ -238,22 +260,30 @@ class WatchedBlock:
 
     @contextmanager
     def following_modules(
-        self, seeing: Callable[[], AbstractContextManager[object]], at_module: Callable[[], None]
+        self,
+        seeing: Callable[[], AbstractContextManager[object]],
+        at_module: Callable[[], None],
+        around_projection: Callable[[nn.Module, Callable[..., Any]], Callable[..., Any]],
     ) -> Iterator[None]:
         """Keep track of which modules run, and see the calls of every thread that runs one of them.
 
         Calls are seen by threads. A module that is called in a thread where none are enters `seeing` for its forward.
-        `at_module` is called where a module begins or ends. Hooks would not do: `module.forward(...)` skips them, and
-        so do some fast paths.
+        `at_module` is called where a module begins or ends, `around_projection` returns what stands in place of the
+        forward of a module to which outputs are followed. Hooks would not do: `module.forward(...)` skips them, and so
+        do some fast paths.
         """
-        attending, simple = self._found.attending, self._found.simple
+        wanted = {id(module) for module in getattr(self.watcher, "output_modules", ())}
         replaced: list[_Forward] = []
         self._thread.seen = True
+
+        def replace_forward(module: nn.Module, call: Callable[..., Any]) -> None:
+            replaced.append(_Forward(module, around_projection(module, call) if id(module) in wanted else call))
+
         try:
-            replaced.extend(
-                _Forward(module, self._followed(module, module.forward, seeing, at_module)) for module in attending
-            )
-            replaced.extend(_Forward(module, self._noticed(module.forward, at_module)) for module in simple)
+            for module in self._found.attending:
+                replace_forward(module, self._followed(module, module.forward, seeing, at_module))
+            for module in self._found.simple:
+                replace_forward(module, self._noticed(module.forward, at_module))
             yield
         finally:
             self._thread.seen = False

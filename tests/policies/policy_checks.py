@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from tests.kit.uniform_attention import check_uniform, zeroed_queries
 from tests.policies.word_tokenizer import INSTRUCTION, WordTokenizer
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
+from vla_attention.capture.torch_policies.policy_modules import modules_of
 from vla_attention.capture.torch_policies.watch import seen_by_python, watch_attention
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import open_store
@@ -67,6 +68,7 @@ def record(case: PolicyCase, path: Path, replans: int = 2, **settings: Any) -> A
     assert verify_store(store) == []
     if "knockout" not in settings:
         assert run.largest_error < PRODUCT_TOLERANCE
+    assert store.attributes.recording.contributions == settings.get("contributions", True)
     return store
 
 
@@ -162,6 +164,48 @@ def kept_outputs(modules: Sequence[Any], pick: Callable[[Any, tuple[Any, ...], A
     finally:
         for handle in handles:
             handle.remove()
+
+
+#: A module, and whether the residual stream is what it is given or what it returns.
+Stream = tuple[Any, Literal["given", "returned"]]
+
+
+def check_contributions(
+    case: PolicyCase, store: Any, site: str, stream: Callable[[int], tuple[Stream, Stream]]
+) -> None:
+    """Compare what is stored of each block of a site with what it adds to the residual stream in the policy's own call.
+
+    stream: block -> where the residual stream is seen before the attention and behind it. The bias of the output
+    projection, which no key gives, is taken away.
+    """
+    recorded, modules = case.layout.site(site), modules_of(case.policy)
+    blocks = recorded.keys.layers or tuple(range(case.layout.num_layers))
+    places = [place for block in blocks for place in stream(block)]
+    number = {"given": 0, "returned": 1}
+
+    def numbers(_module: Any, inputs: tuple[Any, ...], output: Any) -> list[Tensor]:
+        first = output[0] if isinstance(output, tuple) else output
+        return [value.detach().clone() for value in (inputs[0], first)]
+
+    with kept_outputs([module for module, _ in places], numbers) as kept:
+        case.call(case.observation)
+    seen = [[call[number[which]] for call in calls] for calls, (_, which) in zip(kept, places, strict=True)]
+    expected = []
+    for block, before, after in zip(blocks, seen[::2], seen[1::2], strict=True):
+        projection = modules[str(recorded.projection).replace("{block}", str(block))]
+        norms = []
+        for first, second in zip(before, after, strict=True):
+            added = (second - first)[:, 0] if case.layout.name == "act" else (second - first)[0]
+            added = added[slice(*recorded.queries(len(added)))]
+            added = added if projection.bias is None else added - projection.bias.detach()
+            norms.append(float(added.square().sum(dim=-1).mean()))
+        expected.append([np.mean(norms)] if case.layout.autoregressive else norms)
+    grams = np.asarray(store.episodes[0].read(f"{site}/contribution"))
+    least = 1e-6 * np.max(expected)
+    assert least > 0
+    for gram in grams:
+        np.testing.assert_allclose(gram[..., -1, -1], expected, rtol=1e-3, atol=least)
+        np.testing.assert_allclose(gram[..., :-1, :-1].sum(axis=(-1, -2)), expected, rtol=1e-3, atol=least)
 
 
 def softmax_rows(query: Tensor, key: Tensor, scale: float, mask: Tensor | None = None) -> np.ndarray:

@@ -13,6 +13,7 @@ from tests.policies import lerobot_models as models
 from tests.policies.policy_checks import (
     PolicyCase,
     check_analysis,
+    check_contributions,
     check_rows,
     check_uniform_attention,
     record,
@@ -74,6 +75,18 @@ def test_the_feature_map_s_order_is_row_by_row(case):
     moved = (inputs[0] != inputs[1]).any(dim=-1)[:, 0].nonzero().flatten().tolist()
     span = case.layout.site("cross").keys.camera_span("wrist")
     assert moved == [span.start + 1 * COLUMNS + 1]
+
+
+@pytest.mark.parametrize("site", ["self", "cross"])
+def test_contributions_are_what_the_layers_add(case, tmp_path, site):
+    layers = case.policy.model.decoder.layers
+
+    def stream(block):
+        layer = layers[block]
+        before = (layer, "given") if site == "self" else (layer.norm1, "returned")
+        return before, (layer.norm1 if site == "self" else layer.norm2, "given")
+
+    check_contributions(case, record(case, tmp_path, tokenizer=None), site, stream)
 
 
 def test_a_knockout_takes_the_keys_mass_away(case, tmp_path):

@@ -13,6 +13,7 @@ from tests.policies import lerobot_models as models
 from tests.policies.policy_checks import (
     PolicyCase,
     check_analysis,
+    check_contributions,
     check_rows,
     check_uniform_attention,
     record,
@@ -83,6 +84,16 @@ def test_keys_have_the_roles_of_the_chat_template(case, tmp_path):
     assert roles_of(store, "self") == ["state", "learned", "learned", *["action"] * CHUNK]
     pieces = store.episodes[0].attributes.prompts[0].pieces
     assert [piece.text.strip() for piece in pieces[-WORDS:]] == INSTRUCTION.split()
+
+
+@pytest.mark.parametrize("site", ["cross", "self"])
+def test_contributions_are_what_the_blocks_add(case, tmp_path, site):
+    blocks = case.policy._groot_model.action_head.model.transformer_blocks
+
+    def stream(block):
+        return (blocks[block].norm1, "given"), (blocks[block].norm3, "given")
+
+    check_contributions(case, record(case, tmp_path), site, stream)
 
 
 def test_a_knockout_takes_the_keys_mass_away(case, tmp_path):

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 import vla_attention as va
 from tests.policies.policy_checks import (
     PolicyCase,
+    check_contributions,
     check_rows,
     check_uniform_attention,
     kept_outputs,
@@ -141,6 +142,14 @@ def test_rows_are_those_of_the_blocks_own_queries_and_keys(case, tmp_path):
             for block in site.layers
         ]
         check_rows(store, site.name, np.array(rows))
+
+
+@pytest.mark.parametrize("site", ["cross_text", "cross_image", "self"])
+def test_contributions_are_what_the_blocks_add(case, tmp_path, site):
+    blocks = case.policy.action_head.model.transformer_blocks
+    check_contributions(
+        case, record(case, tmp_path), site, lambda block: ((blocks[block], "given"), (blocks[block], "returned"))
+    )
 
 
 def test_a_knockout_of_words_leaves_the_picture_only_blocks_alone(case, tmp_path):

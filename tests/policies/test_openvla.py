@@ -14,6 +14,7 @@ from tests.policies.policy_checks import (
     PolicyCase,
     changed_spans,
     check_analysis,
+    check_contributions,
     check_rows,
     check_uniform_attention,
     kept_outputs,
@@ -114,6 +115,17 @@ def test_a_camera_s_picture_reaches_its_patches_and_no_others(chunked, camera):
 def test_the_state_reaches_its_key(chunked):
     other = {**chunked.observation, "state": torch.zeros(1, 5)}
     assert changed_spans(chunked, "joint", other) == ["state"]
+
+
+@pytest.mark.parametrize("kind", ["one", "chunked"])
+def test_contributions_are_what_the_layers_add(request, tmp_path, kind):
+    case = request.getfixturevalue(kind)
+    layers = case.policy.language_model.model.layers
+
+    def stream(block):
+        return (layers[block].input_layernorm, "given"), (layers[block].post_attention_layernorm, "given")
+
+    check_contributions(case, record(case, tmp_path), "joint", stream)
 
 
 @pytest.mark.parametrize("name", ["one", "chunked"])

@@ -18,6 +18,7 @@ from tests.policies.policy_checks import (
     PolicyCase,
     changed_spans,
     check_analysis,
+    check_contributions,
     check_rows,
     check_uniform_attention,
     kept_outputs,
@@ -90,6 +91,15 @@ def test_tokens_see_those_written_before_them_only(case, tmp_path):
 def test_a_camera_s_picture_reaches_its_patches_and_no_others(case, camera):
     name = f"observation.images.{camera}"
     assert changed_spans(case, "joint", {**case.observation, name: 1 - case.observation[name]}) == [camera]
+
+
+def test_contributions_are_what_the_layers_add(case, tmp_path):
+    layers = case.policy.model.paligemma_with_expert.paligemma.model.language_model.layers
+
+    def stream(block):
+        return (layers[block].input_layernorm, "given"), (layers[block].post_attention_layernorm, "given")
+
+    check_contributions(case, record(case, tmp_path), "joint", stream)
 
 
 def test_a_knockout_takes_the_keys_mass_away(case, tmp_path):

@@ -21,6 +21,7 @@ from tests.policies.policy_checks import (
     PolicyCase,
     changed_spans,
     check_analysis,
+    check_contributions,
     check_rows,
     check_uniform_attention,
     kept_outputs,
@@ -62,6 +63,15 @@ def test_a_camera_s_picture_reaches_its_patches_and_no_others(case, camera):
 
 def test_the_state_reaches_its_key(case):
     assert changed_spans(case, "joint", {**case.observation, "observation.state": torch.zeros(1, 6)}) == ["state"]
+
+
+def test_contributions_are_what_the_expert_s_layers_add(case, tmp_path):
+    layers = case.policy.model.paligemma_with_expert.gemma_expert.model.layers
+
+    def stream(block):
+        return (layers[block].input_layernorm, "given"), (layers[block].post_attention_layernorm, "given")
+
+    check_contributions(case, record(case, tmp_path), "joint", stream)
 
 
 def test_a_knockout_takes_the_keys_mass_away(case, tmp_path):

@@ -15,6 +15,7 @@ from tests.policies.policy_checks import (
     PolicyCase,
     changed_spans,
     check_analysis,
+    check_contributions,
     check_rows,
     check_uniform_attention,
     kept_outputs,
@@ -73,6 +74,15 @@ def test_a_camera_s_picture_reaches_its_keys_and_no_others(case, number):
 def test_the_state_and_the_noise_reach_their_keys(case):
     assert changed_spans(case, "joint", {**case.observation, "state": torch.zeros(1, 5)}) == ["state"]
     assert changed_spans(case, "joint", {**case.observation, "noise": torch.zeros(1, CHUNK, 4)}) == ["actions"]
+
+
+def test_contributions_are_what_the_layers_add(case, tmp_path):
+    layers = case.policy.model.dit.layers
+
+    def stream(block):
+        return (layers[block].input_layernorm, "given"), (layers[block].post_attention_layernorm, "given")
+
+    check_contributions(case, record(case, tmp_path), "joint", stream)
 
 
 def test_a_knockout_takes_the_keys_mass_away_and_changes_actions(case, tmp_path):

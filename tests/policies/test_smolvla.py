@@ -16,6 +16,7 @@ from tests.policies.policy_checks import (
     PolicyCase,
     changed_spans,
     check_analysis,
+    check_contributions,
     check_rows,
     check_uniform_attention,
     record,
@@ -140,6 +141,16 @@ def test_select_action_answers_from_its_queue_in_between(policy, tmp_path):
                 policy.select_action(dict(case.observation))
     assert (episode.num_replans, episode.num_dropped) == (2, 2 * CHUNK - 2)
     assert list(open_store(tmp_path / "run.zarr").episodes[0].read("env_step")) == [0, CHUNK]
+
+
+@pytest.mark.parametrize("site", ["self", "cross"])
+def test_contributions_are_what_the_expert_s_layers_add(case, tmp_path, site):
+    layers = case.policy.model.vlm_with_expert.lm_expert.layers
+
+    def stream(block):
+        return (layers[block].input_layernorm, "given"), (layers[block].post_attention_layernorm, "given")
+
+    check_contributions(case, record(case, tmp_path), site, stream)
 
 
 @pytest.mark.parametrize("what", ["word:bowl", "camera:wrist"])

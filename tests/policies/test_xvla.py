@@ -14,6 +14,7 @@ from tests.policies.policy_checks import (
     PolicyCase,
     changed_spans,
     check_analysis,
+    check_contributions,
     check_rows,
     check_uniform_attention,
     kept_outputs,
@@ -66,6 +67,15 @@ def test_further_views_and_the_state_reach_their_keys(case):
     # Florence 2's encoder mixes the first view and the words.
     top = {**case.observation, "observation.images.top": 1 - case.observation["observation.images.top"]}
     assert changed_spans(case, "joint", top) == ["top_mean", "top", "prompt"]
+
+
+def test_contributions_are_what_the_blocks_add(case, tmp_path):
+    blocks = case.policy.model.transformer.blocks
+
+    def stream(block):
+        return (blocks[block].norm1, "given"), (blocks[block].norm2, "given")
+
+    check_contributions(case, record(case, tmp_path), "joint", stream)
 
 
 def test_a_knockout_takes_the_keys_mass_away(case, tmp_path):

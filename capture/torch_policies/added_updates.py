@@ -1,0 +1,128 @@
+"""What a policy adds to its residual stream of the output of one attention call, and what each part of it becomes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Numbers times a factor of the call, (batch, query, number): a gate, a weight, one over a norm."""
+
+    factor: Tensor
+
+    @classmethod
+    def between(cls, before: Tensor, after: Tensor) -> Scaling:
+        """Return what was made of numbers (batch, query, number) float32; a number that was 0 stays 0."""
+        return cls(torch.where(before == 0, 0.0, after / before))
+
+    def of(self, values: Tensor, row: int) -> Tensor:
+        """Return values (query, part, number) of a row of the batch, scaled."""
+        return values * self.factor[row][:, None]
+
+
+@dataclass(frozen=True)
+class Centring:
+    """Numbers less their mean over the last axis, as in a LayerNorm."""
+
+    def of(self, values: Tensor, row: int) -> Tensor:
+        """Return values (query, part, number) of a row of the batch, centred."""
+        return values - values.mean(dim=-1, keepdim=True)
+
+
+#: With the factors of the call, each is linear.
+Steps = tuple[Scaling | Centring, ...]
+
+
+def after_steps(values: Tensor, steps: Steps, row: int) -> Tensor:
+    """Return values (query, part, number) of a row of the batch after the steps."""
+    for step in steps:
+        values = step.of(values, row)
+    return values
+
+
+@dataclass(frozen=True)
+class AddedUpdate:
+    """What was added to the residual stream.
+
+    Attributes:
+        mixed: the mixed values of the action queries, (batch, query, head · dim) float32.
+        before: what was done to them before the projection.
+        projected: what the projection returned for them, (batch, query, width) float32.
+        behind: what was done to that before it was added.
+        mismatch: how far numbers on the way are from what the steps make of them, relative to the largest; a tensor
+            without axes.
+        precision: the least precise dtype on the way, such as `bfloat16`.
+    """
+
+    mixed: Tensor
+    before: Steps
+    projected: Tensor
+    behind: Steps
+    mismatch: Tensor
+    precision: str
+
+
+@dataclass(eq=False)
+class OutputWay:
+    """The output of one attention call, to be followed to the residual stream.
+
+    Attributes:
+        projection: the module that projects it to the width of the stream.
+        path: of that module.
+        output: what the kernel computed, (batch, head, query, dim).
+        queries: the action queries.
+        projects: whether the call projects its output itself, as `nn.MultiheadAttention` does.
+        take: called when it was added to the stream.
+        computed: what was computed of it last that is none of the steps: "module 'x' computes tanh of".
+        misfit: what is wrong with what the projection was given or returned, as a sentence without its subject.
+    """
+
+    projection: nn.Module
+    path: str
+    output: Tensor
+    queries: slice
+    projects: bool
+    take: Callable[[AddedUpdate], None]
+    computed: str = field(default="", init=False)
+    misfit: str = field(default="", init=False)
+    #: The mixed values of the action queries, (batch, query, head · dim) float32.
+    mixed: Tensor = field(init=False)
+    before: Steps = field(default=(), init=False)
+    #: What the projection returned for them, (batch, query, width) float32; None before it has run.
+    projected: Tensor | None = field(default=None, init=False)
+    done: bool = field(default=False, init=False)
+    #: When it began, on the clock of what follows it.
+    began: int = field(default=0, init=False)
+    mismatches: list[Tensor] = field(default_factory=list, init=False)
+    dtypes: set[torch.dtype] = field(default_factory=set, init=False)
+
+    def __post_init__(self) -> None:
+        # A copy: the policy may write over its output.
+        of_actions = self.output[:, :, self.queries].transpose(1, 2).flatten(2)
+        self.mixed = of_actions.to(torch.float32, copy=True)
+        self.dtypes.add(self.output.dtype)
+
+    @property
+    def precision(self) -> str:
+        """The least precise dtype so far, such as `bfloat16`."""
+        return str(max(self.dtypes, key=lambda dtype: torch.finfo(dtype).eps)).removeprefix("torch.")
+
+    def describe_loss(self) -> str:
+        """Say why it was not followed to the residual stream."""
+        if self.projected is None:
+            if self.computed:
+                return f"{self.computed} what the attention gave, before the output projection '{self.path}'"
+            return f"the output projection '{self.path}' {self.misfit or 'was not given what the attention gave'}"
+        given = f"what the output projection '{self.path}' returned"
+        return f"{self.computed} {given}" if self.computed else f"{given} is added to no tensor that was there before"
+
+    def added(self, behind: Steps) -> AddedUpdate:
+        """Return what was added, after these steps behind the projection."""
+        assert self.projected is not None
+        mismatch = torch.stack([*self.mismatches, self.mixed.new_zeros(())]).amax()
+        return AddedUpdate(self.mixed, self.before, self.projected, behind, mismatch, self.precision)

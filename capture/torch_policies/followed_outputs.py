@@ -1,0 +1,406 @@
+"""Following the output of an attention call from function to function, until a policy adds it to its residual stream.
+
+The way leads to the output projection that the layout names, and from what this returns to an addition. On it the
+output may be copied, cast, folded and transposed, multiplied and divided, and normalised. With the factors of the call
+all of that is linear: parts of the output take the same way, and add up to what was added. Where something else is done
+to it, it is not followed any further.
+
+It is added to the residual stream where the other summand is older than the attention call, or made of older tensors by
+copies, factors and sums. The sum with a younger tensor, that of a parallel feed-forward layer, is followed too, but may
+only be added to the stream as it is.
+"""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Generic, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from vla_attention.capture.torch_policies.added_updates import AddedUpdate, Centring, OutputWay, Scaling, Steps
+from vla_attention.capture.torch_policies.attention_calls import TOLERANCE
+from vla_attention.capture.torch_policies.softmax_axes import Axes, in_order
+from vla_attention.capture.torch_policies.tensor_functions import (
+    PRODUCTS,
+    QUOTIENTS,
+    SAME_NUMBERS,
+    SUMS,
+    axes_after,
+    no_dropout,
+    tensors_among,
+)
+from vla_attention.capture.torch_policies.watched_block import WatchedBlock
+
+_RMS_NORMS = {torch.nn.functional.rms_norm, torch.rms_norm}
+_LAYER_NORMS = {torch.nn.functional.layer_norm, torch.layer_norm}
+_SUMS_OF_PRODUCTS = {torch.addcmul, Tensor.addcmul, Tensor.addcmul_}
+#: Functions that often change no number.
+_OFTEN_NOTHING = {
+    torch.nan_to_num, Tensor.nan_to_num, Tensor.nan_to_num_, torch.clamp, Tensor.clamp, Tensor.clamp_,
+    torch.where, Tensor.where, torch.masked_fill, Tensor.masked_fill, Tensor.masked_fill_,
+}  # fmt: skip
+#: Functions whose result is as old as what they are given.
+_AGELESS = {
+    *SAME_NUMBERS, *PRODUCTS, *QUOTIENTS, *SUMS, Tensor.__getitem__, Tensor.expand, Tensor.chunk, torch.chunk,
+    Tensor.split, torch.split, Tensor.narrow, torch.narrow, Tensor.unbind, torch.unbind,
+}  # fmt: skip
+_Known = TypeVar("_Known")
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a tensor is on its way.
+
+    Attributes:
+        way: whose.
+        sizes: of the output (batch, head, query, dim), or of what the projection returned, (batch, token, width).
+        axes: how its axes are made of these, which may be divided; None: unknown.
+        tokens: the action queries on the axis of queries or tokens.
+        start: the numbers of the action queries after `steps`, (batch, query, number) float32.
+        steps: those until `start`, from the output or from the projection.
+        scaled: whether it was multiplied since.
+        joined: what was added, where it is the sum with a younger tensor.
+    """
+
+    way: OutputWay
+    sizes: tuple[int, ...]
+    axes: Axes | None
+    tokens: slice
+    start: Tensor
+    steps: Steps = ()
+    scaled: bool = False
+    joined: AddedUpdate | None = None
+
+    @property
+    def behind(self) -> bool:
+        """Whether it is behind the projection."""
+        return len(self.sizes) == 3
+
+    def numbers(self, tensor: Tensor) -> Tensor | None:
+        """Return the numbers of the action queries in the tensor, (batch, query, number) float32; None: unknown."""
+        if self.axes is None:
+            return None
+        found = in_order(tensor.detach(), self.axes.parts, range(len(self.axes.sizes)), self.axes.sizes)
+        found = found.reshape(self.sizes)
+        found = found if self.behind else found.transpose(1, 2).flatten(2)
+        return found[:, self.tokens].to(torch.float32, copy=True)
+
+
+class _TensorTable(Generic[_Known]):
+    """What is known of some tensors, as long as they live."""
+
+    def __init__(self) -> None:
+        self._entries: dict[int, tuple[weakref.ref[Tensor], _Known]] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._entries)
+
+    def get(self, tensor: Tensor) -> _Known | None:
+        """Return what is known of a tensor."""
+        entry = self._entries.get(id(tensor))
+        return None if entry is None or entry[0]() is not tensor else entry[1]
+
+    def put(self, tensor: Tensor, known: _Known) -> None:
+        """Note what is known of a tensor."""
+        number, entries = id(tensor), self._entries
+
+        def forget(gone: weakref.ref[Tensor]) -> None:
+            entry = entries.get(number)
+            if entry is not None and entry[0] is gone:
+                del entries[number]
+
+        entries[number] = weakref.ref(tensor, forget), known
+
+    def drop(self, tensor: Tensor) -> None:
+        """Forget a tensor."""
+        self._entries.pop(id(tensor), None)
+
+    def keep(self, wanted: Callable[[_Known], bool]) -> None:
+        """Forget the tensors of which something else is known."""
+        for number in [number for number, (_, known) in self._entries.items() if not wanted(known)]:
+            del self._entries[number]
+
+
+class OutputFollower:
+    """Follows the outputs of attention calls in one thread.
+
+    Attributes:
+        followed: the tensors that are followed.
+    """
+
+    def __init__(self, block: WatchedBlock) -> None:
+        self.followed: _TensorTable[_Place] = _TensorTable()
+        self._block = block
+        #: The outputs that were not added yet.
+        self._ways: list[OutputWay] = []
+        #: When tensors were made, of those that were since outputs are followed.
+        self._made: _TensorTable[int] = _TensorTable()
+        self._clock = 0
+
+    def begin(self, way: OutputWay, result: Tensor) -> None:
+        """Follow the output of a call that has just run; result: what the policy got of it."""
+        self._clock += 1
+        way.began = self._clock
+        self._ways.append(way)
+        with self._block.computing():
+            if way.projects:
+                self._enter(way, result, (1, 0), way.queries)
+            else:
+                axes = _axes_of_output(result, way.output)
+                self._put(result, _Place(way, tuple(way.output.shape), axes, way.queries, way.mixed))
+
+    def awaits(self, module: nn.Module) -> bool:
+        """Return whether an output is on its way to a projection."""
+        return any(way.projection is module and way.projected is None for way in self._ways)
+
+    def project(self, module: nn.Module, given: Tensor, result: Tensor) -> None:
+        """Note what a projection was given and what it returned."""
+        found = self.followed.get(given)
+        with self._block.computing():
+            for way in self._ways:
+                if way.projection is module and way.projected is None:
+                    place = found if found is not None and found.way is way else None
+                    self._project(way, place, given, result)
+
+    def _project(self, way: OutputWay, place: _Place | None, given: Tensor, result: Tensor) -> None:
+        way.dtypes.add(given.dtype)
+        if place is None or not place.scaled:
+            # Whatever was done to it, these may be its numbers: other code than torch's may have moved them.
+            way.before, start = ((), way.mixed) if place is None else (place.steps, place.start)
+            found = _token_order(given, start, way)
+            if found is None:
+                way.misfit = "gets other numbers than the attention gave, or in another order"
+                return
+            self._enter(way, result, *found)
+            return
+        numbers = place.numbers(given)
+        if numbers is None or place.axes is None:
+            way.misfit = "gets what the attention gave scaled, and in an order of axes that is not known"
+            return
+        way.before = (*place.steps, Scaling.between(place.start, numbers))
+        # Which axis is the outer one; another order of them shows in what the projection returns.
+        outer = next((axis for part in place.axes.parts for axis in part if place.axes.sizes[axis] != 1), 0)
+        self._enter(way, result, (0, 1) if outer == 0 or place.sizes[0] == 1 else (1, 0), way.queries)
+
+    def _enter(self, way: OutputWay, result: Tensor, order: tuple[int, int], tokens: slice) -> None:
+        """Follow what a projection returned; order: of its axes for batch (0) and token (1), before the width."""
+        batch, width = way.output.shape[0], result.shape[-1]
+        sizes = batch, result.numel() // max(1, batch * width), width
+        place = _Place(way, sizes, Axes(sizes, (order, (2,))).refolded(result.shape), tokens, way.mixed)
+        numbers = place.numbers(result)
+        if numbers is None:
+            way.misfit = f"returns the shape {tuple(result.shape)}, in which the action queries are not known"
+            return
+        way.dtypes.add(result.dtype)
+        way.projected = numbers
+        self._put(result, replace(place, start=numbers))
+
+    def follow(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], run: Callable[[], Any]) -> Any:
+        """Run a function, and follow what it makes of the tensors that are followed."""
+        # Of functions such as type_as and view_as, the other tensors do not count.
+        operands = (*args, *kwargs.values())
+        given = list(tensors_among(operands[:1] if function in SAME_NUMBERS else operands))
+        found = [(tensor, place) for tensor in given if (place := self.followed.get(tensor)) is not None]
+        if len(found) != 1:
+            result = run()
+            self._left(function, given, [place for _, place in found], result)
+            return result
+        tensor, place = found[0]
+        with self._block.computing():  # before the tensor is written over
+            addition = self._addition(function, args, kwargs, tensor, place)
+        result = run()
+        if addition is None:
+            with self._block.computing():
+                followed = self._moved(function, args, kwargs, tensor, place, result)
+            if not followed:
+                self._left(function, given, [place], result)
+        elif addition.to_stream:
+            self._finish(place.way, addition.added)
+        else:
+            self._put(result, replace(place, joined=addition.added))
+        return result
+
+    def _moved(
+        self,
+        function: Any,
+        args: tuple[Any, ...],
+        kwargs: Mapping[str, Any],
+        tensor: Tensor,
+        place: _Place,
+        result: Any,
+    ) -> bool:
+        """Follow what a function made of a followed tensor; returns whether it can be followed."""
+        first = args[0] if args else kwargs.get("input", kwargs.get("self"))
+        if not isinstance(result, Tensor) or result.numel() != tensor.numel():
+            return False
+        if function in PRODUCTS or (function in QUOTIENTS and first is tensor and not kwargs.get("rounding_mode")):
+            if result.shape != tensor.shape or place.joined is not None:
+                return False
+            self._put(result, replace(place, scaled=True))
+        elif first is not tensor:
+            return False
+        elif function in SAME_NUMBERS:
+            axes = None if place.axes is None else axes_after(function, args, kwargs, place.axes, result)
+            self._put(result, replace(place, axes=axes))
+        elif no_dropout(function, args, kwargs):
+            self._put(result, place)
+        elif function is Tensor.__getitem__ and result.data_ptr() == tensor.data_ptr():  # axes of size 1
+            axes = None if place.axes is None else place.axes.refolded(result.shape)
+            self._put(result, replace(place, axes=axes))
+        elif function in _OFTEN_NOTHING and result.shape == tensor.shape and torch.equal(result, tensor):
+            self._put(result, place)
+        elif function in _RMS_NORMS and place.joined is None:
+            self._put(result, replace(place, scaled=True))
+        elif function in _LAYER_NORMS and place.joined is None:
+            return self._layer_norm(args, kwargs, tensor, place, result)
+        else:
+            return False
+        return True
+
+    def _layer_norm(
+        self, args: tuple[Any, ...], kwargs: Mapping[str, Any], tensor: Tensor, place: _Place, result: Tensor
+    ) -> bool:
+        names = ("input", "normalized_shape", "weight", "bias", "eps")
+        given = {"weight": None, "bias": None, "eps": 1e-5} | dict(zip(names, args, strict=False)) | dict(kwargs)
+        before, after = place.numbers(tensor), place.numbers(result)
+        if before is None or after is None or tuple(given["normalized_shape"]) != before.shape[-1:]:
+            return False
+        factor = (before.var(dim=-1, keepdim=True, unbiased=False) + given["eps"]).rsqrt()
+        if given["weight"] is not None:
+            factor = factor * given["weight"].float()
+        expected = (before - before.mean(dim=-1, keepdim=True)) * factor
+        expected = expected if given["bias"] is None else expected + given["bias"].float()
+        place.way.mismatches.append(difference(expected, after))
+        scaled: Steps = (Scaling.between(place.start, before),) if place.scaled else ()
+        steps = (*place.steps, *scaled, Centring(), Scaling(factor.expand_as(before)))
+        self._put(result, replace(place, steps=steps, start=after, scaled=False))
+        return True
+
+    def _addition(
+        self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], tensor: Tensor, place: _Place
+    ) -> _Addition | None:
+        """Return what a sum adds of a followed tensor to another one as large; None for other functions and sums."""
+        operands = [*args, *(kwargs[name] for name in ("input", "other", "tensor1", "tensor2") if name in kwargs)]
+        first, *others = operands or [None]
+        summed = tensor
+        if function in SUMS and len(others) == 1:
+            other = others[0] if first is tensor else first
+            factor = 1 if first is tensor else kwargs.get("alpha", 1)
+        elif function in _SUMS_OF_PRODUCTS and len(others) == 2 and first is not tensor:
+            other, factor = first, kwargs.get("value", 1)
+            summed = others[0] * others[1]
+        else:
+            return None
+        if not place.behind or not isinstance(other, Tensor) or isinstance(other, nn.Parameter):
+            return None
+        if other.numel() != tensor.numel() or summed.shape != tensor.shape:
+            return None
+        scaled = place.scaled or summed is not tensor or factor != 1
+        to_stream = (self._made.get(other) or 0) <= place.way.began
+        if place.joined is not None:
+            return None if summed is not tensor or factor != 1 else _Addition(place.joined, to_stream)
+        numbers, way = place.numbers(summed), place.way
+        if scaled and numbers is None:
+            return None
+        way.dtypes.add(tensor.dtype)
+        steps = place.steps
+        if scaled and numbers is not None:
+            steps = (*steps, Scaling.between(place.start, numbers * factor))
+        elif numbers is not None:
+            way.mismatches.append(difference(numbers, place.start))
+        return _Addition(way.added(steps), to_stream)
+
+    def _finish(self, way: OutputWay, added: AddedUpdate) -> None:
+        """End a way: its output was added to the residual stream."""
+        way.done = True
+        self._ways.remove(way)
+        self.followed.keep(lambda place: place.way is not way)
+        if not self._ways:
+            self._made.keep(lambda age: False)
+        with self._block.computing():
+            way.take(added)
+
+    def _put(self, tensor: Tensor, place: _Place) -> None:
+        place.way.computed = ""
+        self.followed.put(tensor, place)
+
+    def _left(self, function: Any, given: Sequence[Tensor], places: Sequence[_Place], result: Any) -> None:
+        """Note that what a function made is not followed; given: its tensors, places: of those that are followed."""
+        made = list(tensors_among((result,)))
+        written = made
+        if getattr(function, "__name__", "") == "__setitem__":
+            written = list(given[:1])
+        for tensor in written:
+            self.followed.drop(tensor)
+        for place in places:
+            if any(tensor.numel() >= place.start.numel() for tensor in written):
+                of_what = "of" if place.joined is None else "of a sum with"
+                place.way.computed = f"{self._block.running_module} computes {_name(function)} {of_what}"
+        if function in _AGELESS and not places:
+            age = max((self._made.get(tensor) or 0 for tensor in given), default=0)
+        else:
+            self._clock += 1
+            age = self._clock
+        if age and self._ways:
+            for tensor in made:
+                self._made.put(tensor, age)
+
+
+@dataclass(frozen=True)
+class _Addition:
+    """A sum with a followed tensor: what it adds, and whether to the residual stream."""
+
+    added: AddedUpdate
+    to_stream: bool
+
+
+def _name(function: Any) -> str:
+    return str(getattr(function, "__name__", function))
+
+
+def difference(one: Tensor, other: Tensor) -> Tensor:
+    """Return the largest difference of two tensors, relative to the largest number; a tensor without axes."""
+    if not one.numel():
+        return one.new_zeros(())
+    largest = torch.maximum(one.abs().amax(), other.abs().amax())
+    return (one - other).abs().amax() / torch.where(largest == 0, 1.0, largest)
+
+
+def _axes_of_output(result: Tensor, output: Tensor) -> Axes | None:
+    """Return the axes of what a policy got as the output (batch, head, query, dim) of a call; None: unknown."""
+    sizes = tuple(output.shape)
+    for parts in (((0,), (1,), (2,), (3,)), ((0,), (2,), (1,), (3,)), ((0, 1), (2,), (3,))):
+        if tuple(result.shape) == tuple(math.prod(sizes[axis] for axis in part) for part in parts):
+            found = in_order(result.detach(), parts, (0, 1, 2, 3), sizes)
+            if (found.data_ptr(), found.stride()) == (output.data_ptr(), output.stride()) or torch.equal(found, output):
+                return Axes(sizes, parts)
+    return None
+
+
+def _token_order(given: Tensor, numbers: Tensor, way: OutputWay) -> tuple[tuple[int, int], slice] | None:
+    """Return in which order what a projection is given has the axes of batch (0) and token (1), and its action queries.
+
+    numbers: those of the action queries, (batch, query, number). None: the projection is given others.
+    """
+    batch, _, queries, _ = way.output.shape
+    size = numbers.shape[-1]
+    count, rest = divmod(given.numel(), max(1, batch * size))
+    if rest or not count:
+        return None
+    start, stop, _ = way.queries.indices(queries)
+    flat = given.detach().reshape(-1, size)
+    most = TOLERANCE.get(way.precision, TOLERANCE["float32"])
+    for order in ((0, 1), (1, 0)):
+        tokens = flat.view(batch, count, size) if order == (0, 1) else flat.view(count, batch, size).transpose(0, 1)
+        # The projection may be given the tokens of one expert only, the first or the last ones.
+        for left_out in dict.fromkeys((0, queries - count, start)):
+            if not 0 <= left_out <= start or stop - left_out > count:
+                continue
+            chosen = slice(start - left_out, stop - left_out)
+            if float(difference(tokens[:, chosen].float(), numbers)) <= most:
+                return order, chosen
+    return None

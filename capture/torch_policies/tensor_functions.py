@@ -1,0 +1,82 @@
+"""Functions of torch by what they do to a tensor, for following tensors from function to function."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vla_attention.capture.torch_policies.softmax_axes import Axes
+
+#: Functions whose result has the same axes and the same numbers, up to rounding.
+COPIES = {
+    Tensor.to, Tensor.type, Tensor.type_as, Tensor.float, Tensor.half, Tensor.bfloat16, Tensor.double,
+    Tensor.contiguous, Tensor.clone, torch.clone, Tensor.detach, torch.detach, Tensor.cpu, Tensor.cuda,
+    Tensor.requires_grad_,
+}  # fmt: skip
+DROPOUTS = {torch.nn.functional.dropout, torch.dropout, torch.dropout_}
+PRODUCTS = {torch.mul, Tensor.mul, Tensor.mul_, Tensor.__mul__, Tensor.__rmul__, Tensor.__imul__}
+QUOTIENTS = {torch.div, Tensor.div, Tensor.div_, Tensor.__truediv__, Tensor.__itruediv__}
+SUMS = {torch.add, Tensor.add, Tensor.add_, Tensor.__add__, Tensor.__radd__, Tensor.__iadd__}
+#: Functions whose result has the same axes, and numbers that can differ.
+CHANGES = {
+    *DROPOUTS, *PRODUCTS, *QUOTIENTS, *SUMS, torch.nan_to_num, Tensor.nan_to_num, Tensor.nan_to_num_,
+    Tensor.masked_fill, Tensor.masked_fill_, torch.masked_fill,
+    torch.where, Tensor.where, torch.clamp, Tensor.clamp, Tensor.clamp_,
+}  # fmt: skip
+SWAPS = {
+    torch.transpose, Tensor.transpose, torch.swapaxes, Tensor.swapaxes, torch.swapdims, Tensor.swapdims,
+}  # fmt: skip
+PERMUTES = {torch.permute, Tensor.permute}
+MATRIX_TRANSPOSES = {Tensor.mT.__get__, Tensor.mH.__get__}  # type: ignore[attr-defined]
+FOLDS = {
+    Tensor.view, Tensor.reshape, torch.reshape, Tensor.flatten, torch.flatten, Tensor.unflatten, torch.unflatten,
+    Tensor.squeeze, torch.squeeze, Tensor.unsqueeze, torch.unsqueeze, Tensor.view_as, Tensor.reshape_as,
+}  # fmt: skip
+#: Functions whose result has the same numbers, in another order of axes.
+SAME_NUMBERS = {*COPIES, *SWAPS, *PERMUTES, *MATRIX_TRANSPOSES, *FOLDS}
+
+
+def no_dropout(function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> bool:
+    """Return whether a call is a dropout that takes nothing away."""
+    if function not in DROPOUTS:
+        return False
+    rate, training = dict(enumerate(args)).get(1, kwargs.get("p", 0.5)), dict(enumerate(args)).get(2)
+    if training is None:
+        training = kwargs.get("training", kwargs.get("train", True))
+    return not training or rate == 0
+
+
+def axes_after(
+    function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], axes: Axes, result: Tensor
+) -> Axes | None:
+    """Return the axes of what one of `SAME_NUMBERS` made of a tensor, None if they cannot be told.
+
+    axes: of the tensor, the function's first argument.
+    """
+    count = len(axes.parts)
+    if function in COPIES:
+        return axes if result.ndim == count else None
+    if function in FOLDS:
+        return axes.refolded(result.shape)
+    if function in PERMUTES:
+        positions = args[1:] or tuple(place for place in kwargs.values() if not isinstance(place, Tensor))
+        return axes.permuted(positions if isinstance(positions[0], int) else positions[0])
+    order = list(range(count))
+    if function in MATRIX_TRANSPOSES:
+        first, second = -2, -1
+    else:
+        first, second = [place for place in (*args[1:], *kwargs.values()) if not isinstance(place, Tensor)][:2]
+    order[first], order[second] = order[second], order[first]
+    return axes.permuted(order)
+
+
+def tensors_among(values: Iterable[Any]) -> Iterator[Tensor]:
+    """Yield the tensors among values, those in lists and tuples too."""
+    for value in values:
+        if isinstance(value, Tensor):
+            yield value
+        elif isinstance(value, list | tuple):
+            yield from tensors_among(value)

@@ -1,0 +1,361 @@
+"""Contributions are what a policy's blocks add to their residual stream, with gates and norms, or there are none."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+import vla_attention as va
+from tests.kit.residual_policies import (
+    ACTIONS,
+    BLOCKS,
+    DIM,
+    HEADS,
+    PARTS,
+    STEPS,
+    UNKNOWN,
+    WAYS,
+    WIDTH,
+    ResidualPolicy,
+    Way,
+    projected,
+    residual_layout,
+)
+from vla_attention.capture.torch_policies.policy_layout import CallRule
+from vla_attention.capture.torch_policies.session import ContributionsUnknown
+from vla_attention.schemas.errors import Note
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.verify import verify_store
+
+
+def fill(run, policy, number=0, replans=2):
+    with run.episode(task_id=0, episode_index=number, instruction="") as episode:
+        for step in range(replans):
+            with episode.replan(env_step=step) as replan:
+                replan.actions = policy.act()[0]
+
+
+def fill_two(run, policy):
+    for number in range(2):
+        fill(run, policy, number=number)
+
+
+def recorded(path, policy, replans=2, **settings):
+    """The store of one episode; nothing is said."""
+    settings = {"layout": residual_layout(), "denoise_steps": "all", "durable": False} | settings
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with va.record(path / "a.zarr", policy, **settings) as run:
+            fill(run, policy, replans=replans)
+    return stored(path)
+
+
+def stored(path):
+    store = open_store(path / "a.zarr")
+    assert verify_store(store) == []
+    return store
+
+
+def gram_of(vectors: Tensor) -> np.ndarray:
+    """Gram matrices of vectors (query, part, width) and their sum, mean over the queries."""
+    vectors = torch.cat([vectors, vectors.sum(dim=1, keepdim=True)], dim=1)
+    return (vectors @ vectors.transpose(1, 2)).mean(dim=0).detach().numpy()
+
+
+def expected(policy, way, row=0, batch=1) -> np.ndarray:
+    """Gram matrices (block, denoise step, part, part) of a row of the batch, by hand."""
+    result = []
+    for block, calls in zip(policy.blocks, policy.calls(batch), strict=True):
+        for call in calls:
+            parts = [way.part(block, call, call.share(keys)) for keys in PARTS.values()]
+            result.append(gram_of(torch.stack(parts, dim=2)[row].float()))
+    return np.reshape(result, (BLOCKS, STEPS, 4, 4))
+
+
+def close(given: np.ndarray, wanted: np.ndarray, most: float = 1e-5) -> None:
+    """Compare Gram matrices relative to the largest number of each."""
+    scale = np.abs(wanted).max(axis=(-1, -2), keepdims=True)
+    np.testing.assert_allclose(given / scale, wanted / scale, atol=most, rtol=0)
+
+
+@pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+def test_parts_are_what_the_policy_adds_of_them(tmp_path, way):
+    policy = ResidualPolicy(way.add)
+    actions = policy.act()
+    store = recorded(tmp_path, policy)
+    episode, wanted = store.episodes[0], expected(policy, way)
+    # Every function is looked at in the first policy call, and in the second only what follows the attention.
+    for gram in episode.read("joint/contribution"):
+        close(gram, wanted)
+    np.testing.assert_array_equal(episode.read("actions")[1], actions[0].double().numpy())
+
+
+def test_a_gate_changes_the_ratio_that_is_stored(tmp_path):
+    policy, way = ResidualPolicy(WAYS["adaLN"].add), WAYS["adaLN"]
+    store = recorded(tmp_path, policy)
+
+    def ratio(gram):
+        return np.sqrt(gram[..., 0, 0] / gram[..., 1, 1])
+
+    gram = store.episodes[0].read("joint/contribution")[0]
+    without = expected(policy, Way(way.add, lambda block, call, share: projected(block, share)))
+    np.testing.assert_allclose(ratio(gram), ratio(expected(policy, way)), rtol=1e-4)
+    assert (np.abs(np.log(ratio(gram) / ratio(without))) > 0.02).all()
+    assert store.attributes.provenance["contributions"].endswith("(joint: factors behind the projection)")
+
+
+@pytest.mark.parametrize("name", ["plain", "adaLN", "gate before the projection", "Gemma", "LayerNorm and gate"])
+def test_policies_in_bfloat16(tmp_path, name):
+    policy, way = ResidualPolicy(WAYS[name].add).to(torch.bfloat16), WAYS[name]
+    gram = recorded(tmp_path, policy).episodes[0].read("joint/contribution")[0]
+    close(gram, expected(policy, way), most=3e-2)
+
+
+@pytest.mark.parametrize("name", ["adaLN", "gate before the projection", "LayerNorm", "turned around", "flat"])
+def test_rows_of_a_batch_have_gates_of_their_own(tmp_path, name):
+    policy, way = ResidualPolicy(WAYS[name].add), WAYS[name]
+    facts = [{"task_id": 0, "episode_index": row, "instruction": ""} for row in range(3)]
+    with (
+        va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), denoise_steps="all", durable=False) as run,
+        run.episodes(facts) as episodes,
+    ):
+        for step in range(2):
+            with episodes.replan(env_step=step, active=[True, False, True]):
+                policy.act(batch=3)
+        episodes._episodes.pop(1)  # nothing was recorded of it
+    for episode, row in zip(stored(tmp_path).episodes, (0, 2), strict=True):
+        for gram in episode.read("joint/contribution"):
+            close(gram, expected(policy, way, row, batch=3))
+
+
+@pytest.mark.parametrize(("add", "word"), UNKNOWN.values(), ids=UNKNOWN)
+def test_where_it_cannot_be_said_there_are_none_and_a_sentence_says_why(tmp_path, add, word):
+    policy = ResidualPolicy(add)
+    run = va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), durable=False)
+    with run, pytest.warns(Note, match="The store has no contributions") as notes:
+        fill_two(run, policy)
+    assert len(notes) == 1
+    sentence = str(notes[0].message)
+    assert "block 0 of site 'joint'" in sentence
+    assert "blocks.0.out" in sentence
+    assert word in sentence
+    store = stored(tmp_path)
+    assert not store.attributes.recording.contributions
+    assert store.attributes.provenance["contributions"].removeprefix("none: ") in sentence
+    assert [episode.has("joint/contribution") for episode in store.episodes] == [False, False]
+    assert va.open(tmp_path / "a.zarr").masses().height > 0
+
+
+def test_contributions_that_were_asked_for_and_are_unknown_are_an_error(tmp_path):
+    policy = ResidualPolicy(UNKNOWN["tanh"][0])
+    run = va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), contributions=True, durable=False)
+    with run, pytest.raises(ContributionsUnknown, match=r"computes tanh .* record with contributions=False"):
+        fill(run, policy)
+    assert not list((tmp_path / "a.zarr" / "episodes").glob("task*"))
+    recorded(tmp_path / "without", policy, contributions=False)
+
+
+def test_a_policy_that_begins_to_do_otherwise_is_an_error(tmp_path):
+    policy = ResidualPolicy(WAYS["plain"].add)
+    with va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), durable=False) as run:
+        fill(run, policy)
+        for block in policy.blocks:
+            block.add = UNKNOWN["tanh"][0]
+        with pytest.raises(ContributionsUnknown, match=r"computes tanh .* Nothing of this episode was kept"):
+            fill(run, policy, number=1)
+    assert [episode.name for episode in stored(tmp_path).episodes] == ["task000_episode000"]
+
+
+@pytest.mark.parametrize("name", ["plain", "tanh"])
+def test_a_store_that_is_continued_keeps_what_it_has(tmp_path, name):
+    policy = ResidualPolicy(WAYS[name].add if name in WAYS else UNKNOWN[name][0])
+    notes = 0
+    for number in range(2):
+        with (
+            warnings.catch_warnings(record=True) as caught,
+            va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), resume=True, durable=False) as run,
+        ):
+            warnings.simplefilter("always")
+            assert run.has(0, 0) == bool(number)
+            fill(run, policy, number=number)
+        notes += len(caught)
+    assert notes == (name == "tanh")
+    store = stored(tmp_path)
+    assert [episode.has("joint/contribution") for episode in store.episodes] == [name == "plain"] * 2
+    # Another policy, whose gates are not known, may not be mixed in.
+    if name == "plain":
+        for block in policy.blocks:
+            block.add = UNKNOWN["tanh"][0]
+        with (
+            va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), resume=True, durable=False) as run,
+            pytest.raises(ContributionsUnknown),
+        ):
+            fill(run, policy, number=2)
+
+
+def test_the_store_is_made_with_the_first_policy_call(tmp_path):
+    policy, path = ResidualPolicy(WAYS["plain"].add), tmp_path / "a.zarr"
+    with va.record(path, policy, layout=residual_layout(), durable=False) as run:
+        assert not path.exists()
+        assert not run.has(0, 0)
+        fill(run, policy)
+        assert run.has(0, 0)
+    with va.record(path, policy, layout=residual_layout(), overwrite=True, durable=False) as run:
+        assert not path.exists()
+        fill(run, policy, number=1)
+    assert [episode.name for episode in stored(tmp_path).episodes] == ["task000_episode001"]
+
+
+class Multihead(nn.Module):
+    """A block with torch's own attention, which projects inside, and a gate behind it."""
+
+    def __init__(self, batch_first: bool) -> None:
+        super().__init__()
+        self.attention = nn.MultiheadAttention(WIDTH, HEADS, batch_first=batch_first)
+        self.gate = nn.Parameter(torch.randn(WIDTH))
+        self.dropout = nn.Dropout(0.1)
+
+    def forward(self, tokens: Tensor, memory: Tensor) -> Tensor:
+        update = self.attention(tokens, memory, memory, need_weights=False)[0]
+        return tokens + self.dropout(update) * self.gate
+
+
+@pytest.mark.parametrize("batch_first", [True, False])
+def test_attention_that_projects_its_output_itself(tmp_path, batch_first):
+    torch.manual_seed(0)
+    policy = nn.Module()
+    policy.block = Multihead(batch_first)
+    policy.eval()
+    tokens, memory = torch.randn(2, ACTIONS, WIDTH), torch.randn(2, 10, WIDTH)
+
+    def act():
+        given = (tokens, memory) if batch_first else (tokens.transpose(0, 1), memory.transpose(0, 1))
+        with torch.no_grad():
+            return policy.block(*given)
+
+    site = residual_layout().sites[0]
+    layout = residual_layout(
+        sites=(type(site)(site.keys, site.action_queries, site.role_of_span, "block.attention.out_proj"),),
+        rules=(CallRule(r"block\.attention", None, sequence=(("joint", 0),)),),
+        num_layers=1,
+        num_denoise_steps=1,
+    )
+    facts = [{"task_id": 0, "episode_index": row, "instruction": ""} for row in range(2)]
+    with (
+        va.record(tmp_path / "a.zarr", policy, layout=layout, durable=False) as run,
+        run.episodes(facts) as episodes,
+        episodes.replan(env_step=0),
+    ):
+        act()
+    attention, dim = policy.block.attention, WIDTH // HEADS
+    weights, biases = attention.in_proj_weight.chunk(3), attention.in_proj_bias.chunk(3)
+    query, key, value = (
+        nn.functional.linear(given, weight, bias).unflatten(-1, (HEADS, dim)).transpose(1, 2)
+        for given, weight, bias in zip((tokens, memory, memory), weights, biases, strict=True)
+    )
+    rows = (query @ key.transpose(2, 3) / dim**0.5).softmax(-1)
+    parts = [
+        (rows[..., keys] @ value[:, :, keys]).transpose(1, 2).flatten(2)
+        @ attention.out_proj.weight.T
+        * policy.block.gate
+        for keys in PARTS.values()
+    ]
+    for row, episode in enumerate(stored(tmp_path).episodes):
+        close(episode.read("joint/contribution")[0, 0, 0], gram_of(torch.stack(parts, dim=2)[row]))
+
+
+class Experts(nn.Module):
+    """Two experts that share an attention: each projects its own tokens, as in pi0's training pass."""
+
+    def __init__(self, gated: bool) -> None:
+        super().__init__()
+        self.first, self.second = nn.Linear(WIDTH, WIDTH), nn.Linear(WIDTH, WIDTH, bias=False)
+        self.gate = nn.Parameter(torch.randn(WIDTH)) if gated else None
+
+    def forward(self, context: Tensor, tokens: Tensor) -> tuple[Tensor, Tensor]:
+        both = torch.cat([context, tokens], dim=1)
+        q = both.unflatten(-1, (HEADS, WIDTH // HEADS)).transpose(1, 2)
+        rows = torch.softmax(q @ q.transpose(2, 3), dim=-1)
+        mixed = torch.einsum("bhqk,bhkd->bqhd", rows, q).flatten(2)
+        count = context.shape[1]
+        update = self.second(mixed[:, count:])
+        if self.gate is not None:
+            update = update * self.gate
+        return context + self.first(mixed[:, :count]), tokens + update
+
+
+@pytest.mark.parametrize("gated", [False, True])
+def test_experts_that_share_an_attention(tmp_path, gated):
+    torch.manual_seed(0)
+    policy = nn.Module()
+    policy.block = Experts(gated)
+    context, tokens = torch.randn(1, 6, WIDTH), torch.randn(1, ACTIONS, WIDTH)
+    site = residual_layout().sites[0]
+    layout = residual_layout(
+        sites=(type(site)(site.keys, (-ACTIONS, None), site.role_of_span, "block.second"),),
+        rules=(CallRule("block", None, sequence=(("joint", 0),)),),
+        num_layers=1,
+        num_denoise_steps=1,
+    )
+    with (
+        va.record(tmp_path / "a.zarr", policy, layout=layout, durable=False) as run,
+        run.episode(task_id=0, episode_index=0, instruction="") as episode,
+        episode.replan(env_step=0),
+        torch.no_grad(),
+    ):
+        policy.block(context, tokens)
+    q = torch.cat([context, tokens], dim=1).unflatten(-1, (HEADS, WIDTH // HEADS)).transpose(1, 2)
+    rows = (q @ q.transpose(2, 3)).softmax(-1)[:, :, -ACTIONS:]
+    parts = [
+        policy.block.second((rows[..., keys] @ q[:, :, keys]).transpose(1, 2).flatten(2))
+        * (policy.block.gate if gated else 1)
+        for keys in PARTS.values()
+    ]
+    close(stored(tmp_path).episodes[0].read("joint/contribution")[0, 0, 0], gram_of(torch.stack(parts, dim=2)[0]))
+
+
+class Halves(nn.Module):
+    """A projection that is no nn.Linear: its weights are kept as a sum, as adapters keep theirs."""
+
+    def __init__(self, plain: nn.Linear) -> None:
+        super().__init__()
+        self.base, self.down, self.up = plain, nn.Linear(HEADS * DIM, 2, bias=False), nn.Linear(2, WIDTH, bias=False)
+
+    def forward(self, mixed: Tensor) -> Tensor:
+        return self.base(mixed) + 0.5 * self.up(self.down(mixed))
+
+
+class Rectified(nn.Linear):
+    """A projection that is not linear."""
+
+    def forward(self, mixed: Tensor) -> Tensor:
+        return super().forward(mixed).relu()
+
+
+def test_a_projection_with_an_adapter(tmp_path):
+    policy = ResidualPolicy(WAYS["adaLN"].add)
+    for block in policy.blocks:
+        block.out = Halves(block.out)
+
+    def part(block, call, share):
+        adapted = block.out.base.weight + 0.5 * block.out.up.weight @ block.out.down.weight
+        return share @ adapted.T * block.modulation(call.condition)[:, None].chunk(3, dim=-1)[2]
+
+    gram = recorded(tmp_path, policy).episodes[0].read("joint/contribution")[0]
+    close(gram, expected(policy, Way(WAYS["adaLN"].add, part)))
+
+
+def test_a_projection_that_is_not_linear_has_no_parts(tmp_path):
+    policy = ResidualPolicy(WAYS["plain"].add)
+    for block in policy.blocks:
+        block.out = Rectified(HEADS * DIM, WIDTH)
+    with (
+        pytest.warns(Note, match=r"add up to something that differs .* 'blocks\.0\.out'"),
+        va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), durable=False) as run,
+    ):
+        fill(run, policy)
+    assert not stored(tmp_path).attributes.recording.contributions

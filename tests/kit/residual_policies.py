@@ -1,0 +1,296 @@
+"""A small policy whose blocks add what their attention gives to the residual stream in many ways.
+
+A way is a pair of functions: `add`, the policy's own code, and `part`, by hand: what some keys' share of the mixed
+values adds with the factors of that call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from vla_attention.capture.torch_policies.policy_layout import CallRule, PolicyLayout, RecordedSite
+from vla_attention.schemas.layout import PatchGrid, SiteLayout, Span
+
+WIDTH, HEADS, DIM, PREFIX, TEXT, ACTIONS, BLOCKS, STEPS = 12, 3, 5, 6, 2, 4, 2, 2
+KEYS = PREFIX + ACTIONS
+PARTS = {"image": slice(0, PREFIX - TEXT), "text": slice(PREFIX - TEXT, PREFIX), "actions": slice(PREFIX, KEYS)}
+
+
+@dataclass
+class Call:
+    """What a block computed in one call.
+
+    stream, normed: (batch, query, width). mixed: (batch, query, head · dim). rows: (batch, head, query, key). value:
+    (batch, head, key, dim). condition: (batch, width).
+    """
+
+    stream: Tensor
+    normed: Tensor
+    mixed: Tensor
+    rows: Tensor
+    value: Tensor
+    condition: Tensor
+
+    def share(self, keys: slice) -> Tensor:
+        """The mixed values (batch, query, head · dim) of some keys."""
+        shares = self.rows[..., keys] @ self.value[:, :, keys].float()
+        return shares.transpose(1, 2).flatten(2).to(self.mixed.dtype)
+
+
+class GemmaNorm(nn.Module):
+    """As in transformers: the norm by hand, in float32, with an offset from 1 as its weight."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.randn(width) / 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        output = x.float() * torch.rsqrt(x.float().pow(2).mean(-1, keepdim=True) + 1e-6)
+        return (output * (1.0 + self.weight.float())).type_as(x)
+
+
+class LayerScale(nn.Module):
+    """As in timm; `inplace` writes over what it is given."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.gamma, self.inplace = nn.Parameter(torch.randn(width)), False
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x.mul_(self.gamma) if self.inplace else x * self.gamma
+
+
+Add = Callable[["Block", Call], Tensor]
+Part = Callable[["Block", Call, Tensor], Tensor]
+
+
+class Block(nn.Module):
+    """Norm, attention, what `add` does with it, and a feed-forward layer."""
+
+    def __init__(self, add: Add) -> None:
+        super().__init__()
+        self.add = add
+        inner = HEADS * DIM
+        self.norm = nn.LayerNorm(WIDTH)
+        self.query, self.key, self.value = (nn.Linear(WIDTH, inner) for _ in range(3))
+        self.gate_proj = nn.Linear(WIDTH, inner)
+        self.out = nn.Linear(inner, WIDTH)
+        self.modulation = nn.Sequential(nn.SiLU(), nn.Linear(WIDTH, 3 * WIDTH))
+        self.post_norm, self.rms_norm, self.layer_norm = GemmaNorm(WIDTH), nn.RMSNorm(WIDTH), nn.LayerNorm(WIDTH)
+        for norm in (self.rms_norm, self.layer_norm):
+            nn.init.normal_(norm.weight)
+        nn.init.normal_(self.layer_norm.bias)
+        self.scale, self.dropout = LayerScale(WIDTH), nn.Dropout(0.3)
+        self.alpha = nn.Parameter(torch.tensor(0.4))
+        self.second = nn.Linear(WIDTH, WIDTH)
+        self.mlp = nn.Sequential(nn.Linear(WIDTH, 2 * WIDTH), nn.GELU(), nn.Linear(2 * WIDTH, WIDTH))
+        self.kept: list[Call] | None = None
+
+    def forward(self, tokens: Tensor, prefix: Tensor, condition: Tensor) -> Tensor:
+        normed = self.norm(tokens)
+        both = torch.cat([prefix, normed], dim=1)
+        q, k, v = (
+            linear(given).view(len(given), -1, HEADS, DIM).transpose(1, 2)
+            for linear, given in ((self.query, normed), (self.key, both), (self.value, both))
+        )
+        mixed = functional.scaled_dot_product_attention(q, k, v)
+        folded = mixed.transpose(1, 2).flatten(2)
+        rows = None
+        if self.kept is not None:
+            rows = ((q.float() @ k.float().transpose(2, 3)) / DIM**0.5).softmax(-1)
+            # Some ways write over what they are given.
+            self.kept.append(Call(tokens.clone(), normed, folded.clone(), rows, v, condition))
+        tokens = self.add(self, Call(tokens, normed, folded, q, v, condition))
+        return tokens + self.mlp(tokens)
+
+
+class ResidualPolicy(nn.Module):
+    """`act(batch)`: STEPS denoise steps, each with another condition."""
+
+    def __init__(self, add: Add, seed: int = 0) -> None:
+        super().__init__()
+        torch.manual_seed(seed)
+        self.blocks = nn.ModuleList(Block(add) for _ in range(BLOCKS))
+        self.eval()
+
+    @torch.no_grad()
+    def act(self, batch: int = 1) -> Tensor:
+        numbers = torch.Generator().manual_seed(1)
+        dtype = self.blocks[0].norm.weight.dtype
+        prefix, tokens, condition = (
+            torch.randn(batch, *size, generator=numbers).to(dtype)
+            for size in ((PREFIX, WIDTH), (ACTIONS, WIDTH), (WIDTH,))
+        )
+        for step in range(STEPS):
+            hidden = tokens
+            for block in self.blocks:
+                hidden = block(hidden, prefix, condition + step)
+            tokens = tokens - hidden / STEPS
+        return tokens
+
+    def calls(self, batch: int = 1) -> list[list[Call]]:
+        """What each block computes at each denoise step."""
+        for block in self.blocks:
+            block.kept = []
+        self.act(batch)
+        found = [block.kept for block in self.blocks]
+        for block in self.blocks:
+            block.kept = None
+        return found
+
+
+def residual_layout(**changes: Any) -> PolicyLayout:
+    """The layout of `ResidualPolicy`."""
+    spans = (
+        Span("image_front", "image", 0, PREFIX - TEXT, "front", PatchGrid(2, 2, 8, 8)),
+        Span("prompt", "text", PREFIX - TEXT, PREFIX),
+        Span("actions", "action", PREFIX, KEYS),
+    )
+    roles = {"image_front": "image", "prompt": "instruction", "actions": "action"}
+    site = RecordedSite(SiteLayout("joint", spans), (0, ACTIONS), roles, "blocks.{block}.out")
+    fields: dict[str, Any] = {
+        "name": "residual",
+        "family": "residual",
+        "sites": (site,),
+        "rules": (CallRule(r"blocks\.(?P<block>\d+)", "joint"),),
+        "num_layers": BLOCKS,
+        "num_heads": HEADS,
+        "num_denoise_steps": STEPS,
+    }
+    return PolicyLayout(**{**fields, **changes})
+
+
+def projected(block: Block, share: Tensor) -> Tensor:
+    """Return the share of the mixed values behind the output projection, without its bias."""
+    return share @ block.out.weight.T
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way from the attention to the residual stream, in the policy's own code and by hand."""
+
+    add: Add
+    part: Part
+    #: What stands in the store's provenance: gates and norms before and behind the projection.
+    between: str = field(default="")
+
+
+def chunk(block: Block, call: Call, number: int) -> Tensor:
+    """A third of the modulation (batch, 1, width)."""
+    return block.modulation(call.condition)[:, None].chunk(3, dim=-1)[number]
+
+
+def rms(x: Tensor, eps: float = 1e-6) -> Tensor:
+    return (x.square().mean(-1, keepdim=True) + eps).rsqrt()
+
+
+def gated_residual(x: Tensor, y: Tensor, gate: Tensor | None) -> Tensor:
+    """As in openpi's transformers."""
+    return x + y if gate is None else x + y * gate
+
+
+def with_gemma_norm(block: Block, call: Call) -> Tensor:
+    update = block.out(call.mixed)
+    return call.stream + block.post_norm(update)
+
+
+def in_place(block: Block, call: Call) -> Tensor:
+    block.scale.inplace = True
+    update = block.scale(block.out(call.mixed))
+    update += call.stream
+    return update
+
+
+def gemma_part(block: Block, call: Call, share: Tensor) -> Tensor:
+    return projected(block, share) * rms(block.out(call.mixed)) * (1 + block.post_norm.weight)
+
+
+def layer_norm_part(block: Block, call: Call, share: Tensor) -> Tensor:
+    update, each = block.out(call.mixed), projected(block, share)
+    scale = (update.var(-1, keepdim=True, unbiased=False) + block.layer_norm.eps).rsqrt()
+    return (each - each.mean(-1, keepdim=True)) * scale * block.layer_norm.weight
+
+
+def before(block: Block, call: Call) -> Tensor:
+    return torch.sigmoid(block.gate_proj(call.normed))
+
+
+#: Ways that are seen.
+WAYS: dict[str, Way] = {
+    "plain": Way(lambda b, c: c.stream + b.out(c.mixed), lambda b, c, s: projected(b, s)),
+    "dropout": Way(lambda b, c: b.dropout(b.out(c.mixed)) + c.stream, lambda b, c, s: projected(b, s)),
+    "adaLN": Way(
+        lambda b, c: c.stream + chunk(b, c, 2) * b.out(c.mixed), lambda b, c, s: projected(b, s) * chunk(b, c, 2)
+    ),
+    "adaLN in one function": Way(
+        lambda b, c: torch.addcmul(c.stream, b.out(c.mixed), chunk(b, c, 2)),
+        lambda b, c, s: projected(b, s) * chunk(b, c, 2),
+    ),
+    "gate before the projection": Way(
+        lambda b, c: c.stream + b.out(c.mixed * before(b, c)), lambda b, c, s: projected(b, s * before(b, c))
+    ),
+    "gate before in place": Way(
+        lambda b, c: c.stream + b.out(c.mixed.mul_(before(b, c))), lambda b, c, s: projected(b, s * before(b, c))
+    ),
+    "both gates": Way(
+        lambda b, c: c.stream + chunk(b, c, 1) * b.out(c.mixed * before(b, c)),
+        lambda b, c, s: projected(b, s * before(b, c)) * chunk(b, c, 1),
+    ),
+    "norm before the projection": Way(
+        lambda b, c: c.stream + b.out(functional.rms_norm(c.mixed, c.mixed.shape[-1:], eps=1e-6)),
+        lambda b, c, s: projected(b, s * rms(c.mixed)),
+    ),
+    "Gemma": Way(with_gemma_norm, gemma_part),
+    "RMSNorm": Way(
+        lambda b, c: c.stream + b.rms_norm(b.out(c.mixed)),
+        lambda b, c, s: projected(b, s) * rms(b.out(c.mixed), 1.2e-7) * b.rms_norm.weight,
+    ),
+    "LayerNorm": Way(lambda b, c: c.stream + b.layer_norm(b.out(c.mixed)), layer_norm_part),
+    "LayerNorm and gate": Way(
+        lambda b, c: c.stream + chunk(b, c, 0) * b.layer_norm(b.out(c.mixed)),
+        lambda b, c, s: layer_norm_part(b, c, s) * chunk(b, c, 0),
+    ),
+    "LayerScale": Way(lambda b, c: c.stream + b.scale(b.out(c.mixed)), lambda b, c, s: projected(b, s) * b.scale.gamma),
+    "LayerScale in place": Way(in_place, lambda b, c, s: projected(b, s) * b.scale.gamma),
+    "gated residual": Way(
+        lambda b, c: gated_residual(c.stream, b.out(c.mixed), chunk(b, c, 2)),
+        lambda b, c, s: projected(b, s) * chunk(b, c, 2),
+    ),
+    "alpha": Way(lambda b, c: torch.add(c.stream, b.out(c.mixed), alpha=0.3), lambda b, c, s: 0.3 * projected(b, s)),
+    "ReZero": Way(lambda b, c: c.stream + b.alpha * b.out(c.mixed), lambda b, c, s: b.alpha * projected(b, s)),
+    "float32 stream": Way(
+        lambda b, c: (c.stream.float() + b.out(c.mixed) * chunk(b, c, 1)).type_as(c.stream),
+        lambda b, c, s: projected(b, s) * chunk(b, c, 1),
+    ),
+    "scaled stream": Way(lambda b, c: 1.5 * c.stream + b.out(c.mixed), lambda b, c, s: projected(b, s)),
+    "parallel feed-forward": Way(
+        lambda b, c: b.out(c.mixed) + b.mlp(c.normed) + c.stream, lambda b, c, s: projected(b, s)
+    ),
+    "turned around": Way(
+        lambda b, c: c.stream + (b.out(c.mixed).transpose(0, 1) * chunk(b, c, 2).transpose(0, 1)).transpose(0, 1),
+        lambda b, c, s: projected(b, s) * chunk(b, c, 2),
+    ),
+    "flat": Way(
+        lambda b, c: c.stream + b.out(c.mixed.reshape(-1, HEADS * DIM)).view(c.stream.shape),
+        lambda b, c, s: projected(b, s),
+    ),
+}
+
+#: Ways of which it cannot be said what each part adds, and a word of the sentence that says why.
+UNKNOWN: dict[str, tuple[Add, str]] = {
+    "tanh": (lambda b, c: c.stream + torch.tanh(b.out(c.mixed)), "tanh"),
+    "second linear layer": (lambda b, c: c.stream + b.second(b.out(c.mixed)), "linear"),
+    "gate of a sum": (lambda b, c: c.stream + chunk(b, c, 2) * (b.out(c.mixed) + b.mlp(c.normed)), "mul"),
+    "other tokens": (lambda b, c: c.stream + b.out(c.mixed).flip(1), "flip"),
+    "squared": (lambda b, c: c.stream + b.out(c.mixed) ** 2, "pow"),
+    "no residual stream": (lambda b, c: b.out(c.mixed), "layer_norm"),
+    "mixed heads": (lambda b, c: c.stream + b.out(c.mixed.unflatten(-1, (HEADS, DIM)).mT.flatten(-2)), "out"),
+    "value residual": (lambda b, c: c.stream + b.out(c.mixed + b.gate_proj(c.normed)), "add"),
+    "added constant": (lambda b, c: c.stream + chunk(b, c, 2) * (b.out(c.mixed) + b.second.bias), "add"),
+}
