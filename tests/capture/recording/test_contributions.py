@@ -180,6 +180,40 @@ def test_contributions_of_all_steps_at_once_are_those_of_each_call(pi05, state_d
     assert (got.contribution[..., nothing_read, :] == 0).all()
 
 
+@pytest.mark.parametrize("pi05", [True, False])
+def test_updates_of_pi_are_what_the_expert_adds_to_its_residual_stream(pi05):
+    from tests.kit.policy_inputs import make_observation
+    from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, build_random_model, dummy_policy
+    from vla_attention.capture.policies.pi.policy import PiPolicy
+
+    tiny = dummy_policy()
+    policy = PiPolicy(
+        build_random_model(dataclasses.replace(DUMMY_CONFIG, pi05=pi05), 3),
+        tiny.tokenizer,
+        tiny.processing,
+        tiny.source,
+    )
+    given = policy.prepare(make_observation(1), "put the red cube on the plate")
+    recording = Recording((0, 1, 2), (0, 1, 2), (0, 1, 2), tuple(range(8)), "mean", 4, 10, contributions=True)
+    recorder = make_recorders(recording, policy.sites, given.key_role)["joint"]
+    actions = slice(policy.model.config.first_action_query, None)
+    kept: dict[tuple[int, str], list[torch.Tensor]] = {}
+    for number, block in enumerate(policy.model.paligemma_with_expert.gemma_expert.model.layers):
+        for name in ("input_layernorm", "post_attention_layernorm"):
+            streams = kept.setdefault((number, name), [])
+            getattr(block, name).register_forward_hook(
+                lambda _module, inputs, _output, streams=streams: streams.append(inputs[0][0, actions].clone())
+            )
+    policy.act(given, 7, {"joint": recorder})
+    gram = recorder.finish().contribution
+    assert gram is not None
+    for layer in range(3):
+        before, after = (torch.stack(kept[layer, name]) for name in ("input_layernorm", "post_attention_layernorm"))
+        expected = (after - before).square().sum(dim=-1).mean(dim=-1).numpy()  # (denoise step,)
+        np.testing.assert_allclose(gram[layer, :, -1, -1], expected, rtol=1e-4)
+        np.testing.assert_allclose(gram[layer, :, :-1, :-1].sum(axis=(-1, -2)), expected, rtol=1e-3)
+
+
 def test_contributions_that_wait_on_a_gpu_are_those_of_each_call(monkeypatch):
     """The way of a GPU, made on the processor: rows, values and updates are kept until the steps are done."""
     from tests.kit.policy_inputs import make_observation

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from tests.kit.cosmos_helpers import GOLDEN, recorders_of
+from vla_attention.capture.policies.cosmos import dit
 from vla_attention.capture.policies.cosmos.case import read_case
 from vla_attention.capture.policies.cosmos.observer import CallObserver
 from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
@@ -30,6 +31,26 @@ def test_parts_add_up_to_the_gated_update_of_each_site(dummy, prepared):
         np.testing.assert_allclose(norm(gram, range(whole)), norm(gram, [whole]), rtol=1e-4, err_msg=site)
 
 
+def test_updates_are_what_the_blocks_add_to_the_residual_stream(dummy, prepared, monkeypatch):
+    streams: list[torch.Tensor] = []
+    own = dit.modulate
+
+    def kept(x, shift, scale):
+        streams.append(x[0, dummy.config.frames.index(dummy.query_frame)].clone())
+        return own(x, shift, scale)
+
+    monkeypatch.setattr(dit, "modulate", kept)
+    grams = grams_of(dummy, prepared)
+    layers, steps = dummy.num_layers, dummy.num_denoise_steps
+    # Each block reads the stream before self-attention, cross-attention and feed-forward, and the final layer once.
+    before = torch.stack(streams).unflatten(0, (steps, 3 * layers + 1))[:, :-1].unflatten(1, (layers, 3))
+    added = before.diff(dim=2).square().sum(dim=-1).mean(dim=-1)  # (denoise step, layer, site)
+    for number, site in enumerate(("self", "cross")):
+        expected = added[..., number].T.double().numpy()
+        np.testing.assert_allclose(grams[site][..., -1, -1], expected, rtol=1e-4)
+        np.testing.assert_allclose(norm(grams[site], range(grams[site].shape[-1] - 1)) ** 2, expected, rtol=1e-4)
+
+
 def test_parts_are_the_latent_frames_and_the_kinds_of_text(dummy, prepared):
     found = {site.name: segments_of(site, prepared.key_role[site.name]) for site in dummy.sites}
     assert [segment.span for segment in found["self"]] == [span.name for span in dummy.sites[0].spans]
@@ -49,7 +70,7 @@ def test_padded_text_contributes_exactly_nothing(dummy, prepared):
 def test_norms_of_frames_are_those_of_the_reference():
     """Root mean squares over a frame's queries, from the Gram matrix, against the reference's norm of each query."""
     case = read_case(GOLDEN / "dit_batch2_T5_rect")
-    dit, tokens, frames = case.build_dit("cpu"), 15, 5
+    model, tokens, frames = case.build_dit("cpu"), 15, 5
     parts = np.repeat(np.eye(frames, dtype=bool), tokens, axis=0)
     names = ("latents", "timesteps", "condition_mask", "padding_mask", "text_embeddings")
     for entry, frame in [(0, 2), (1, 4)]:
@@ -57,7 +78,7 @@ def test_norms_of_frames_are_those_of_the_reference():
         recorder = AttentionRecorder(plan, frames * tokens, parts)
         observer = CallObserver(0, frame, tokens, {"self": recorder})
         with torch.no_grad():
-            dit(*(torch.from_numpy(case.inputs[name][entry : entry + 1]) for name in names), observer)
+            model(*(torch.from_numpy(case.inputs[name][entry : entry + 1]) for name in names), observer)
         grams = recorder.finish().contribution[:, 0].astype(np.float64)
         for layer, gram in enumerate(grams):
             norms = case.expected[f"frame_contrib_norms_{layer:02d}"][entry, frame * tokens : (frame + 1) * tokens]
