@@ -348,3 +348,106 @@ def small_pi0_lerobot(**changes: Any) -> Any:
     own = policy.model.denoise_step
     policy.model.denoise_step = lambda past_key_values, **given: own(past_key_values=deepcopy(past_key_values), **given)
     return policy.eval()
+
+
+class AdaptiveNorm(torch.nn.Module):
+    """The norm of openpi's transformers: scale, shift and a gate from the condition."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.dense = torch.nn.Linear(width, 3 * width)
+
+    def forward(self, x: torch.Tensor, condition: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the normed x (batch, token, width) and the gate (batch, 1, width)."""
+        normed = x * torch.rsqrt(x.square().mean(-1, keepdim=True) + 1e-6)
+        scale, shift, gate = self.dense(condition)[:, None].chunk(3, dim=-1)
+        return normed * (1 + scale) + shift, gate
+
+
+class FinalNorm(AdaptiveNorm):
+    """The same after the last layer, which leaves the condition here."""
+
+    condition: torch.Tensor
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
+        """Return the normed x."""
+        return super().forward(x, self.condition)[0]
+
+
+def small_pi05_lerobot(config: Any, state: Mapping[str, torch.Tensor]) -> Any:
+    """LeRobot's PI05Pytorch with the sizes and weights of a `PiModel`; cameras: those of `config`.
+
+    Its transformers has other Gemma layers: adaptive norms, `_gated_residual`, no factor before the first layer. They
+    are put in here, written after openpi's transformers_replace/models/gemma/modeling_gemma.py.
+    """
+    from copy import deepcopy
+
+    from lerobot.policies.pi05 import modeling_pi05 as module
+    from lerobot.policies.pi05.configuration_pi05 import PI05Config
+    from transformers import GemmaConfig, PaliGemmaConfig
+    from transformers.models.gemma.modeling_gemma import GemmaDecoderLayer
+
+    class Layer(GemmaDecoderLayer):
+        def forward(self, hidden_states: Any, *, adarms_cond: Any, **given: Any) -> Any:
+            residual = hidden_states
+            hidden_states, gate = self.input_layernorm(hidden_states, adarms_cond)
+            hidden_states, _ = self.self_attn(hidden_states=hidden_states, **given)
+            residual = hidden_states = residual + hidden_states * gate
+            hidden_states, gate = self.post_attention_layernorm(hidden_states, adarms_cond)
+            final.condition = adarms_cond
+            return residual + self.mlp(hidden_states) * gate
+
+    vision, width = config.siglip, config.action_expert.width
+
+    def configuration() -> Any:
+        sizes = {
+            **{"model_type": "siglip_vision_model", "hidden_size": vision.width, "intermediate_size": vision.mlp_dim},
+            **{"num_hidden_layers": vision.depth, "num_attention_heads": vision.num_heads, "vision_use_head": False},
+            **{"image_size": vision.image_size, "patch_size": vision.patch_size},
+        }
+        text = {"model_type": "gemma"}
+        return PaliGemmaConfig(vision_config=sizes, text_config=text, projection_dim=config.paligemma.width)
+
+    def sizes_of(part: Any) -> Any:
+        return module.GemmaConfig(
+            part.width, part.depth, part.mlp_dim, part.num_heads, part.num_kv_heads, part.head_dim
+        )
+
+    check = ModuleType("transformers.models.siglip.check")
+    check.check_whether_transformers_replace_is_installed_correctly = lambda: True  # type: ignore[attr-defined]
+    settings = PI05Config(
+        **features(vision.image_size, vision.image_size, config.cameras),
+        n_action_steps=config.action_horizon,
+        chunk_size=config.action_horizon,
+        num_inference_steps=config.num_denoise_steps,
+        tokenizer_max_length=config.max_token_len,
+        image_resolution=(vision.image_size, vision.image_size),
+        max_action_dim=config.action_dim,
+    )
+    with (
+        mock.patch.dict(sys.modules, {"transformers.models.siglip.check": check}),
+        mock.patch("transformers.models.siglip.check", check, create=True),
+        mock.patch.object(module, "CONFIG_MAPPING", {"paligemma": configuration, "gemma": GemmaConfig}),
+        mock.patch.object(
+            module, "get_gemma_config", side_effect=[sizes_of(config.paligemma), sizes_of(config.action_expert)]
+        ),
+    ):
+        policy = module.PI05Pytorch(settings)
+    networks = policy.paligemma_with_expert
+    inner, expert = networks.paligemma.model, networks.gemma_expert.model
+    inner.multi_modal_projector.linear = torch.nn.Linear(vision.width, config.paligemma.width)
+    final = expert.norm = FinalNorm(width)
+    for layer in expert.layers:
+        layer.__class__ = Layer
+        layer.input_layernorm, layer.post_attention_layernorm = AdaptiveNorm(width), AdaptiveNorm(width)
+    # The factors on embeddings and picture features, which openpi's transformers leaves out.
+    for part in (inner.language_model.config, inner.config.text_config, expert.config):
+        part.hidden_size = 1
+    own = policy.denoise_step
+    policy.denoise_step = lambda past_key_values, **given: own(past_key_values=deepcopy(past_key_values), **given)
+    names = dict(policy.named_parameters())
+    for name, values in state.items():
+        names[name].data = values.clone()
+    left = set(names) - set(state)
+    assert all("lm_head" in name for name in left), left
+    return policy.eval()
