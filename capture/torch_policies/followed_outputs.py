@@ -48,6 +48,8 @@ _AGELESS = {
     *SAME_NUMBERS, *PRODUCTS, *QUOTIENTS, *SUMS, Tensor.__getitem__, Tensor.expand, Tensor.chunk, torch.chunk,
     Tensor.split, torch.split, Tensor.narrow, torch.narrow, Tensor.unbind, torch.unbind,
 }  # fmt: skip
+#: Numbers that are all smaller are taken for zeros.
+_TINY = 1e-30
 _Known = TypeVar("_Known")
 
 
@@ -210,13 +212,13 @@ class OutputFollower:
             self._left(function, given, [place for _, place in found], result)
             return result
         tensor, place = found[0]
-        with self._block.computing():  # before the tensor is written over
-            addition = self._addition(function, args, kwargs, tensor, place)
+        addition = None
+        if place.behind and (function in SUMS or function in _SUMS_OF_PRODUCTS):
+            with self._block.computing():  # before the tensor is written over
+                addition = self._addition(function, args, kwargs, tensor, place)
         result = run()
         if addition is None:
-            with self._block.computing():
-                followed = self._moved(function, args, kwargs, tensor, place, result)
-            if not followed:
+            if not self._moved(function, args, kwargs, tensor, place, result):
                 self._left(function, given, [place], result)
         elif addition.to_stream:
             self._finish(place.way, addition.added)
@@ -240,7 +242,8 @@ class OutputFollower:
         if function in PRODUCTS or (function in QUOTIENTS and first is tensor and not kwargs.get("rounding_mode")):
             if result.shape != tensor.shape or place.joined is not None:
                 return False
-            self._put(result, replace(place, scaled=True))
+            by_one = any(isinstance(given, int | float) and given == 1 for given in args[1:2])
+            self._put(result, replace(place, scaled=place.scaled or not by_one))
         elif first is not tensor:
             return False
         elif function in SAME_NUMBERS:
@@ -251,12 +254,17 @@ class OutputFollower:
         elif function is Tensor.__getitem__ and result.data_ptr() == tensor.data_ptr():  # axes of size 1
             axes = None if place.axes is None else place.axes.refolded(result.shape)
             self._put(result, replace(place, axes=axes))
-        elif function in _OFTEN_NOTHING and result.shape == tensor.shape and torch.equal(result, tensor):
-            self._put(result, place)
         elif function in _RMS_NORMS and place.joined is None:
             self._put(result, replace(place, scaled=True))
         elif function in _LAYER_NORMS and place.joined is None:
-            return self._layer_norm(args, kwargs, tensor, place, result)
+            with self._block.computing():
+                return self._layer_norm(args, kwargs, tensor, place, result)
+        elif function in _OFTEN_NOTHING and result.shape == tensor.shape:
+            with self._block.computing():
+                same = torch.equal(result, tensor)
+            if not same:
+                return False
+            self._put(result, place)
         else:
             return False
         return True
@@ -295,7 +303,7 @@ class OutputFollower:
             summed = others[0] * others[1]
         else:
             return None
-        if not place.behind or not isinstance(other, Tensor) or isinstance(other, nn.Parameter):
+        if not isinstance(other, Tensor) or isinstance(other, nn.Parameter):
             return None
         if other.numel() != tensor.numel() or summed.shape != tensor.shape:
             return None
@@ -363,11 +371,10 @@ def _name(function: Any) -> str:
 
 
 def difference(one: Tensor, other: Tensor) -> Tensor:
-    """Return the largest difference of two tensors, relative to the largest number; a tensor without axes."""
+    """Return the largest difference from another tensor, relative to its largest number; a tensor without axes."""
     if not one.numel():
         return one.new_zeros(())
-    largest = torch.maximum(one.abs().amax(), other.abs().amax())
-    return (one - other).abs().amax() / torch.where(largest == 0, 1.0, largest)
+    return (one - other).abs().amax() / other.abs().amax().clamp(min=_TINY)
 
 
 def _axes_of_output(result: Tensor, output: Tensor) -> Axes | None:
@@ -401,6 +408,7 @@ def _token_order(given: Tensor, numbers: Tensor, way: OutputWay) -> tuple[tuple[
             if not 0 <= left_out <= start or stop - left_out > count:
                 continue
             chosen = slice(start - left_out, stop - left_out)
-            if float(difference(tokens[:, chosen].float(), numbers)) <= most:
+            found = tokens[:, chosen].float()
+            if torch.equal(found, numbers) or float(difference(found, numbers)) <= most:
                 return order, chosen
     return None

@@ -95,7 +95,7 @@ class RecordedSite:
             finer roles where token ids are known; keys that no action query may see become `masked_image` in image
             spans, `padding` in text, and `absent` in others.
         projection: path of the output projection with ``{block}`` for the block's number, for contributions; None where
-            there is none.
+            there is none. What the policy does before and behind it (gates, norms) is seen as it runs.
         variable_span: the span that may have fewer keys in a call than in `keys` (a prompt without padding). Its keys
             come first in the span, the rest is absent at this replan.
     """

@@ -128,6 +128,7 @@ class Episode:
         Raises:
             CallsDoNotFit: the attention calls are not those of the layout.
             RowsDoNotMatch: the rows do not reproduce what the policy's kernel gave.
+            ContributionsUnknown: contributions are recorded, and it is not known what the parts of the keys add.
         """
         if self._batch is not None:
             raise RecordingStopped("This episode is one of several; use the replan of run.episodes(...).")

@@ -313,7 +313,7 @@ class ReplanRecorder:
             self._unknown.append(
                 f"{_where(place)} the parts of the keys add up to something that differs from what was added by "
                 f"{mismatch:.2g} of its largest number (allowed is {most:g} for {update.precision}): the output "
-                f"projection '{project.path}' computes something else than a linear map"
+                f"projection '{project.path}' is not linear, or something changes numbers that is no function of torch"
             )
 
     def contributions_unknown(self) -> str | None:

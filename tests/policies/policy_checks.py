@@ -171,12 +171,16 @@ Stream = tuple[Any, Literal["given", "returned"]]
 
 
 def check_contributions(
-    case: PolicyCase, store: Any, site: str, stream: Callable[[int], tuple[Stream, Stream]]
+    case: PolicyCase,
+    store: Any,
+    site: str,
+    stream: Callable[[int], tuple[Stream, Stream]],
+    between: str = "nothing but the projection",
 ) -> None:
     """Compare what is stored of each block of a site with what it adds to the residual stream in the policy's own call.
 
     stream: block -> where the residual stream is seen before the attention and behind it. The bias of the output
-    projection, which no key gives, is taken away.
+    projection, which no key gives, is taken away. between: what the store says stands between.
     """
     recorded, modules = case.layout.site(site), modules_of(case.policy)
     blocks = recorded.keys.layers or tuple(range(case.layout.num_layers))
@@ -200,6 +204,7 @@ def check_contributions(
             added = added if projection.bias is None else added - projection.bias.detach()
             norms.append(float(added.square().sum(dim=-1).mean()))
         expected.append([np.mean(norms)] if case.layout.autoregressive else norms)
+    assert f"{site}: {between}" in store.attributes.provenance["contributions"]
     grams = np.asarray(store.episodes[0].read(f"{site}/contribution"))
     least = 1e-6 * np.max(expected)
     assert least > 0

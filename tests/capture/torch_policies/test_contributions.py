@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode, _get_current_function_mode_stack
 
 import vla_attention as va
 from tests.kit.residual_policies import (
@@ -22,6 +25,7 @@ from tests.kit.residual_policies import (
     WIDTH,
     ResidualPolicy,
     Way,
+    chunk,
     projected,
     residual_layout,
 )
@@ -359,3 +363,81 @@ def test_a_projection_that_is_not_linear_has_no_parts(tmp_path):
     ):
         fill(run, policy)
     assert not stored(tmp_path).attributes.recording.contributions
+
+
+class Own(TorchFunctionMode):
+    """A mode of the policy's own."""
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        return func(*args, **(kwargs or {}))
+
+
+def gated_in_modes(place):
+    def add(block, call):
+        with Own() if place == "around both" else nullcontext():
+            with Own() if place == "around the projection" else nullcontext(), torch.device("cpu"):
+                update = block.out(call.mixed)
+            with Own() if place == "around the addition" else nullcontext():
+                return call.stream + chunk(block, call, 2) * update
+
+    return add
+
+
+@pytest.mark.parametrize("place", ["around the projection", "around the addition", "around both"])
+def test_modes_of_the_policy_are_entered_and_left_while_an_output_is_followed(tmp_path, place):
+    policy = ResidualPolicy(gated_in_modes(place))
+    gram = recorded(tmp_path, policy).episodes[0].read("joint/contribution")
+    for replan in gram:
+        close(replan, expected(policy, WAYS["adaLN"]))
+    assert not _get_current_function_mode_stack()
+
+
+def test_an_error_between_attention_and_residual_stream_leaves_nothing_behind(tmp_path):
+    def fails(block, call):
+        block.out(call.mixed)
+        raise TypeError("no pixels")
+
+    policy = ResidualPolicy(WAYS["plain"].add)
+    with va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), durable=False) as run:
+        for number in range(2):
+            fill(run, policy, number=number)
+            policy.blocks[1].add = fails
+            with pytest.raises(TypeError, match="no pixels"):
+                fill(run, policy, number=5)
+            policy.blocks[1].add = WAYS["plain"].add
+            assert not _get_current_function_mode_stack()
+            assert "forward" not in policy.blocks[0].out.__dict__
+    assert len(stored(tmp_path).episodes) == 2
+
+
+def test_a_policy_in_another_thread(tmp_path):
+    policy = ResidualPolicy(WAYS["adaLN"].add)
+    with (
+        ThreadPoolExecutor(1) as pool,
+        va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), denoise_steps="all", durable=False) as run,
+        run.episode(task_id=0, episode_index=0, instruction="") as episode,
+    ):
+        for step in range(2):
+            with episode.replan(env_step=step):
+                pool.submit(policy.act).result()
+    for gram in stored(tmp_path).episodes[0].read("joint/contribution"):
+        close(gram, expected(policy, WAYS["adaLN"]))
+
+
+def test_what_is_done_to_the_output_by_code_that_is_not_seen_is_noticed(tmp_path):
+    """Numbers are compared on the way, so that what passes by torch's functions is no silent factor."""
+
+    def through_numpy(block, call):
+        update = block.out(call.mixed)
+        update.numpy()[...] *= 2
+        return call.stream + update
+
+    def before(block, call):
+        call.mixed.numpy()[...] *= 2
+        return call.stream + block.out(call.mixed)
+
+    for number, add in enumerate((through_numpy, before)):
+        policy = ResidualPolicy(add)
+        run = va.record(tmp_path / f"{number}.zarr", policy, layout=residual_layout(), durable=False)
+        with run, pytest.warns(Note, match="The store has no contributions"):
+            fill(run, policy)
