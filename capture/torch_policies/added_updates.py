@@ -77,7 +77,7 @@ class OutputWay:
         output: what the kernel computed, (batch, head, query, dim).
         queries: the action queries.
         projects: whether the call projects its output itself, as `nn.MultiheadAttention` does.
-        take: called when it was added to the stream.
+        take: called with what was added to the stream; again with None if that was not the stream.
         computed: what was computed of it last that is none of the steps: "module 'x' computes tanh of".
         misfit: what is wrong with what the projection was given or returned, as a sentence without its subject.
     """
@@ -87,7 +87,7 @@ class OutputWay:
     output: Tensor
     queries: slice
     projects: bool
-    take: Callable[[AddedUpdate], None]
+    take: Callable[[AddedUpdate | None], None]
     computed: str = field(default="", init=False)
     misfit: str = field(default="", init=False)
     #: The mixed values of the action queries, (batch, query, head · dim) float32.
@@ -95,7 +95,6 @@ class OutputWay:
     before: Steps = field(default=(), init=False)
     #: What the projection returned for them, (batch, query, width) float32; None before it has run.
     projected: Tensor | None = field(default=None, init=False)
-    done: bool = field(default=False, init=False)
     #: When it began, on the clock of what follows it.
     began: int = field(default=0, init=False)
     mismatches: list[Tensor] = field(default_factory=list, init=False)

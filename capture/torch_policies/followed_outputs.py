@@ -7,7 +7,8 @@ to it, it is not followed any further.
 
 It is added to the residual stream where the other summand is older than the attention call, or made of older tensors by
 copies, factors and sums. The sum with a younger tensor, that of a parallel feed-forward layer, is followed too, but may
-only be added to the stream as it is.
+only be added to the stream as it is. What is multiplied with a gate and then added to another older tensor was not the
+stream, but the sum of two branches.
 """
 
 from __future__ import annotations
@@ -127,24 +128,35 @@ class _TensorTable(Generic[_Known]):
             del self._entries[number]
 
 
-class OutputFollower:
-    """Follows the outputs of attention calls in one thread.
+@dataclass(frozen=True)
+class _Stream:
+    """A tensor that is taken for the residual stream after the output of `way` was added; scaled: it was multiplied."""
 
-    Attributes:
-        followed: the tensors that are followed.
-    """
+    way: OutputWay
+    scaled: bool = False
+
+
+class OutputFollower:
+    """Follows the outputs of attention calls in one thread; true while it follows any."""
 
     def __init__(self, block: WatchedBlock) -> None:
-        self.followed: _TensorTable[_Place] = _TensorTable()
         self._block = block
+        self._places: _TensorTable[_Place] = _TensorTable()
+        self._streams: _TensorTable[_Stream] = _TensorTable()
         #: The outputs that were not added yet.
         self._ways: list[OutputWay] = []
         #: When tensors were made, of those that were since outputs are followed.
         self._made: _TensorTable[int] = _TensorTable()
         self._clock = 0
 
+    def __bool__(self) -> bool:
+        return bool(self._places) or bool(self._streams)
+
     def begin(self, way: OutputWay, result: Tensor) -> None:
         """Follow the output of a call that has just run; result: what the policy got of it."""
+        self._streams.keep(lambda stream: False)
+        if not self._ways:
+            self._made.keep(lambda age: False)
         self._clock += 1
         way.began = self._clock
         self._ways.append(way)
@@ -161,7 +173,7 @@ class OutputFollower:
 
     def project(self, module: nn.Module, given: Tensor, result: Tensor) -> None:
         """Note what a projection was given and what it returned."""
-        found = self.followed.get(given)
+        found = self._places.get(given)
         with self._block.computing():
             for way in self._ways:
                 if way.projection is module and way.projected is None:
@@ -206,7 +218,9 @@ class OutputFollower:
         # Of functions such as type_as and view_as, the other tensors do not count.
         operands = (*args, *kwargs.values())
         given = list(tensors_among(operands[:1] if function in SAME_NUMBERS else operands))
-        found = [(tensor, place) for tensor in given if (place := self.followed.get(tensor)) is not None]
+        found = [(tensor, place) for tensor in given if (place := self._places.get(tensor)) is not None]
+        if not found and self._streams:
+            return self._follow_stream(function, given, run)
         if len(found) != 1:
             result = run()
             self._left(function, given, [place for _, place in found], result)
@@ -221,7 +235,7 @@ class OutputFollower:
             if not self._moved(function, args, kwargs, tensor, place, result):
                 self._left(function, given, [place], result)
         elif addition.to_stream:
-            self._finish(place.way, addition.added)
+            self._finish(place.way, addition.added, result)
         else:
             self._put(result, replace(place, joined=addition.added))
         return result
@@ -308,7 +322,7 @@ class OutputFollower:
         if other.numel() != tensor.numel() or summed.shape != tensor.shape:
             return None
         scaled = place.scaled or summed is not tensor or factor != 1
-        to_stream = (self._made.get(other) or 0) <= place.way.began
+        to_stream = self._may_be_stream(other, tensor, place.way)
         if place.joined is not None:
             return None if summed is not tensor or factor != 1 else _Addition(place.joined, to_stream)
         numbers, way = place.numbers(summed), place.way
@@ -322,19 +336,52 @@ class OutputFollower:
             way.mismatches.append(difference(numbers, place.start))
         return _Addition(way.added(steps), to_stream)
 
-    def _finish(self, way: OutputWay, added: AddedUpdate) -> None:
+    def _finish(self, way: OutputWay, added: AddedUpdate, stream: Tensor) -> None:
         """End a way: its output was added to the residual stream."""
-        way.done = True
         self._ways.remove(way)
-        self.followed.keep(lambda place: place.way is not way)
-        if not self._ways:
-            self._made.keep(lambda age: False)
+        self._places.keep(lambda place: place.way is not way)
+        self._streams.put(stream, _Stream(way))
         with self._block.computing():
             way.take(added)
 
+    def _follow_stream(self, function: Any, given: Sequence[Tensor], run: Callable[[], Any]) -> Any:
+        """Run a function, and see whether what was taken for the residual stream becomes a branch of another sum."""
+        found = [(tensor, stream) for tensor in given if (stream := self._streams.get(tensor)) is not None]
+        result = run()
+        self._left(function, given, [], result)
+        for tensor, stream in found:
+            if not isinstance(result, Tensor) or result.numel() != tensor.numel():
+                continue
+            if function in SAME_NUMBERS:
+                self._streams.put(result, stream)
+            elif function in PRODUCTS or function in QUOTIENTS:
+                self._streams.put(result, replace(stream, scaled=stream.scaled or len(given) > 1))
+            elif function in SUMS:
+                self._end_stream(stream, any(self._may_be_stream(other, tensor, stream.way) for other in given))
+        return result
+
+    def _end_stream(self, stream: _Stream, with_older: bool) -> None:
+        """End what is known of a stream where it is added to another tensor, older than the attention call or not."""
+        way = stream.way
+        self._streams.keep(lambda other: other.way is not way)
+        if stream.scaled and with_older:
+            way.computed = f"{self._block.running_module} adds a multiple of a sum with"
+            with self._block.computing():
+                way.take(None)
+
+    def _may_be_stream(self, other: object, tensor: Tensor, way: OutputWay) -> bool:
+        """Return whether a summand is as large as a followed tensor, and older than the attention call."""
+        return (
+            isinstance(other, Tensor)
+            and other is not tensor
+            and not isinstance(other, nn.Parameter)
+            and other.numel() == tensor.numel()
+            and (self._made.get(other) or 0) <= way.began
+        )
+
     def _put(self, tensor: Tensor, place: _Place) -> None:
         place.way.computed = ""
-        self.followed.put(tensor, place)
+        self._places.put(tensor, place)
 
     def _left(self, function: Any, given: Sequence[Tensor], places: Sequence[_Place], result: Any) -> None:
         """Note that what a function made is not followed; given: its tensors, places: of those that are followed."""
@@ -343,7 +390,7 @@ class OutputFollower:
         if getattr(function, "__name__", "") == "__setitem__":
             written = list(given[:1])
         for tensor in written:
-            self.followed.drop(tensor)
+            self._places.drop(tensor)
         for place in places:
             if any(tensor.numel() >= place.start.numel() for tensor in written):
                 of_what = "of" if place.joined is None else "of a sum with"
@@ -353,7 +400,7 @@ class OutputFollower:
         else:
             self._clock += 1
             age = self._clock
-        if age and self._ways:
+        if age:
             for tensor in made:
                 self._made.put(tensor, age)
 

@@ -96,8 +96,9 @@ def record(
         layers, denoise_steps, heads: what is recorded; None is everything. `first`, `last` and `all` are denoise steps.
         queries: `mean` over the action queries, or `all` of them.
         bits: precision of the stored rows in mantissa bits; 23 is exact.
-        contributions: also what each part of the keys adds to the residual stream, gates and norms included; None: where
-            the layout names projections and the first policy call shows it (docs/your-policy.md, "Contributions").
+        contributions: also what each part of the keys adds to the residual stream, gates and norms included; None:
+            where the layout names projections and the first policy call shows it (docs/your-policy.md,
+            "Contributions").
         frames: store the pictures that replans are given.
         knockout, keep: keys that the action queries do not read, or that alone they read, in the grouping language; or
             `Interventions`.

@@ -181,7 +181,7 @@ class _OfThread:
     @property
     def follows(self) -> bool:
         """Whether anything is followed."""
-        return bool(self.softmaxes.followed) or bool(self.outputs.followed)
+        return bool(self.softmaxes.followed) or bool(self.outputs)
 
     def handle(self, handler: _Call, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
         """Run a handler in place of a function, and follow the output of a call if the watcher wants it."""
@@ -209,7 +209,7 @@ class _OfThread:
                 return self.softmaxes.follow(function, args, kwargs)
             return function(*args, **kwargs)
 
-        return self.outputs.follow(function, args, kwargs, run) if self.outputs.followed else run()
+        return self.outputs.follow(function, args, kwargs, run) if self.outputs else run()
 
     def _attend(self, watch_call: Callable[..., Any]) -> _Call:
         def attend(function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
@@ -257,7 +257,7 @@ class _EveryFunction(TorchFunctionMode):
         super().__init__()
         self._own = own
         #: Every function of the policy comes by here: a look at each says whether anything is followed.
-        self._softmaxes, self._outputs = own.softmaxes.followed, own.outputs.followed
+        self._softmaxes, self._outputs = own.softmaxes.followed, own.outputs
 
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None

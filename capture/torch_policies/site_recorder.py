@@ -275,7 +275,10 @@ class ReplanRecorder:
                 collected.parts[row] = keys_of_parts(members, rows.device)
             mixed[row] = part_values(rows[row], values[row], collected.parts[row])
 
-        def take(update: AddedUpdate) -> None:
+        def take(update: AddedUpdate | None) -> None:
+            if update is None:
+                self._unknown.append(f"{_where(place)} {way.describe_loss()}")
+                return
             del self._on_the_way[way]
             self._take_contributions(update, mixed, project, place, cell)
 

@@ -27,7 +27,7 @@ class Call:
     """What a block computed in one call.
 
     stream, normed: (batch, query, width). mixed: (batch, query, head · dim). rows: (batch, head, query, key). value:
-    (batch, head, key, dim). condition: (batch, width).
+    (batch, head, key, dim). condition: (batch, width). branch: of a feed-forward layer before the attention.
     """
 
     stream: Tensor
@@ -36,6 +36,7 @@ class Call:
     rows: Tensor
     value: Tensor
     condition: Tensor
+    branch: Tensor
 
     def share(self, keys: slice) -> Tensor:
         """The mixed values (batch, query, head · dim) of some keys."""
@@ -94,6 +95,7 @@ class Block(nn.Module):
 
     def forward(self, tokens: Tensor, prefix: Tensor, condition: Tensor) -> Tensor:
         normed = self.norm(tokens)
+        branch = self.mlp(normed)
         both = torch.cat([prefix, normed], dim=1)
         q, k, v = (
             linear(given).view(len(given), -1, HEADS, DIM).transpose(1, 2)
@@ -105,8 +107,8 @@ class Block(nn.Module):
         if self.kept is not None:
             rows = ((q.float() @ k.float().transpose(2, 3)) / DIM**0.5).softmax(-1)
             # Some ways write over what they are given.
-            self.kept.append(Call(tokens.clone(), normed, folded.clone(), rows, v, condition))
-        tokens = self.add(self, Call(tokens, normed, folded, q, v, condition))
+            self.kept.append(Call(tokens.clone(), normed, folded.clone(), rows, v, condition, branch))
+        tokens = self.add(self, Call(tokens, normed, folded, q, v, condition, branch))
         return tokens + self.mlp(tokens)
 
 
@@ -272,6 +274,7 @@ WAYS: dict[str, Way] = {
     "parallel feed-forward": Way(
         lambda b, c: b.out(c.mixed) + b.mlp(c.normed) + c.stream, lambda b, c, s: projected(b, s)
     ),
+    "feed-forward before": Way(lambda b, c: c.branch + b.out(c.mixed) + c.stream, lambda b, c, s: projected(b, s)),
     "turned around": Way(
         lambda b, c: c.stream + (b.out(c.mixed).transpose(0, 1) * chunk(b, c, 2).transpose(0, 1)).transpose(0, 1),
         lambda b, c, s: projected(b, s) * chunk(b, c, 2),
@@ -287,6 +290,10 @@ UNKNOWN: dict[str, tuple[Add, str]] = {
     "tanh": (lambda b, c: c.stream + torch.tanh(b.out(c.mixed)), "tanh"),
     "second linear layer": (lambda b, c: c.stream + b.second(b.out(c.mixed)), "linear"),
     "gate of a sum": (lambda b, c: c.stream + chunk(b, c, 2) * (b.out(c.mixed) + b.mlp(c.normed)), "mul"),
+    "gate of a sum with an older branch": (
+        lambda b, c: c.stream + chunk(b, c, 2) * (c.branch + b.out(c.mixed)),
+        "adds a multiple of a sum with",
+    ),
     "other tokens": (lambda b, c: c.stream + b.out(c.mixed).flip(1), "flip"),
     "squared": (lambda b, c: c.stream + b.out(c.mixed) ** 2, "pow"),
     "no residual stream": (lambda b, c: b.out(c.mixed), "layer_norm"),
