@@ -74,7 +74,7 @@ class OutputWay:
     Attributes:
         projection: the module that projects it to the width of the stream.
         path: of that module.
-        output: what the kernel computed, (batch, head, query, dim).
+        output: what the kernel computed, (batch, head, query, dim); None since it is followed.
         queries: the action queries.
         projects: whether the call projects its output itself, as `nn.MultiheadAttention` does.
         take: called with what was added to the stream; again with None if that was not the stream.
@@ -84,12 +84,14 @@ class OutputWay:
 
     projection: nn.Module
     path: str
-    output: Tensor
+    output: Tensor | None
     queries: slice
     projects: bool
     take: Callable[[AddedUpdate | None], None]
     computed: str = field(default="", init=False)
     misfit: str = field(default="", init=False)
+    #: Of the output.
+    sizes: tuple[int, ...] = field(init=False)
     #: The mixed values of the action queries, (batch, query, head · dim) float32.
     mixed: Tensor = field(init=False)
     before: Steps = field(default=(), init=False)
@@ -101,9 +103,10 @@ class OutputWay:
     dtypes: set[torch.dtype] = field(default_factory=set, init=False)
 
     def __post_init__(self) -> None:
+        assert self.output is not None
         # A copy: the policy may write over its output.
-        of_actions = self.output[:, :, self.queries].transpose(1, 2).flatten(2)
-        self.mixed = of_actions.to(torch.float32, copy=True)
+        self.mixed = self.output[:, :, self.queries].transpose(1, 2).flatten(2).to(torch.float32, copy=True)
+        self.sizes = tuple(self.output.shape)
         self.dtypes.add(self.output.dtype)
 
     @property

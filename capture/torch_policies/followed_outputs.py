@@ -5,10 +5,10 @@ output may be copied, cast, folded and transposed, multiplied and divided, and n
 all of that is linear: parts of the output take the same way, and add up to what was added. Where something else is done
 to it, it is not followed any further.
 
-It is added to the residual stream where the other summand is older than the attention call, or made of older tensors by
-copies, factors and sums. The sum with a younger tensor, that of a parallel feed-forward layer, is followed too, but may
-only be added to the stream as it is. What is multiplied with a gate and then added to another older tensor was not the
-stream, but the sum of two branches.
+It is added to the residual stream where the other summand is older than the attention call, or made of an older tensor
+by copies, factors and sums. The sum with a younger tensor, that of a parallel feed-forward layer, is followed too, but
+may only be added to the stream as it is. What is multiplied with a gate and then added to another older tensor was not
+the stream, but the sum of two branches.
 """
 
 from __future__ import annotations
@@ -164,8 +164,9 @@ class OutputFollower:
             if way.projects:
                 self._enter(way, result, (1, 0), way.queries)
             else:
-                axes = _axes_of_output(result, way.output)
-                self._put(result, _Place(way, tuple(way.output.shape), axes, way.queries, way.mixed))
+                axes = None if way.output is None else _axes_of_output(result, way.output)
+                self._put(result, _Place(way, way.sizes, axes, way.queries, way.mixed))
+            way.output = None
 
     def awaits(self, module: nn.Module) -> bool:
         """Return whether an output is on its way to a projection."""
@@ -202,7 +203,7 @@ class OutputFollower:
 
     def _enter(self, way: OutputWay, result: Tensor, order: tuple[int, int], tokens: slice) -> None:
         """Follow what a projection returned; order: of its axes for batch (0) and token (1), before the width."""
-        batch, width = way.output.shape[0], result.shape[-1]
+        batch, width = way.sizes[0], result.shape[-1]
         sizes = batch, result.numel() // max(1, batch * width), width
         place = _Place(way, sizes, Axes(sizes, (order, (2,))).refolded(result.shape), tokens, way.mixed)
         numbers = place.numbers(result)
@@ -317,9 +318,7 @@ class OutputFollower:
             summed = others[0] * others[1]
         else:
             return None
-        if not isinstance(other, Tensor) or isinstance(other, nn.Parameter):
-            return None
-        if other.numel() != tensor.numel() or summed.shape != tensor.shape:
+        if not isinstance(other, Tensor) or other.numel() != tensor.numel() or summed.shape != tensor.shape:
             return None
         scaled = place.scaled or summed is not tensor or factor != 1
         to_stream = self._may_be_stream(other, tensor, place.way)
@@ -374,7 +373,6 @@ class OutputFollower:
         return (
             isinstance(other, Tensor)
             and other is not tensor
-            and not isinstance(other, nn.Parameter)
             and other.numel() == tensor.numel()
             and (self._made.get(other) or 0) <= way.began
         )
@@ -395,8 +393,12 @@ class OutputFollower:
             if any(tensor.numel() >= place.start.numel() for tensor in written):
                 of_what = "of" if place.joined is None else "of a sum with"
                 place.way.computed = f"{self._block.running_module} computes {_name(function)} {of_what}"
+        ages = [self._made.get(tensor) or 0 for tensor in given]
+        if function in SUMS and not places and made:
+            whole = [age for age, tensor in zip(ages, given, strict=True) if tensor.numel() == made[0].numel()]
+            ages = [min(whole, default=0)]
         if function in _AGELESS and not places:
-            age = max((self._made.get(tensor) or 0 for tensor in given), default=0)
+            age = max(ages, default=0)
         else:
             self._clock += 1
             age = self._clock
@@ -440,7 +442,7 @@ def _token_order(given: Tensor, numbers: Tensor, way: OutputWay) -> tuple[tuple[
 
     numbers: those of the action queries, (batch, query, number). None: the projection is given others.
     """
-    batch, _, queries, _ = way.output.shape
+    batch, _, queries, _ = way.sizes
     size = numbers.shape[-1]
     count, rest = divmod(given.numel(), max(1, batch * size))
     if rest or not count:

@@ -275,6 +275,10 @@ WAYS: dict[str, Way] = {
         lambda b, c: b.out(c.mixed) + b.mlp(c.normed) + c.stream, lambda b, c, s: projected(b, s)
     ),
     "feed-forward before": Way(lambda b, c: c.branch + b.out(c.mixed) + c.stream, lambda b, c, s: projected(b, s)),
+    "feed-forward in between": Way(
+        lambda b, c: (c.stream + b.mlp(c.normed)) + chunk(b, c, 1) * b.out(c.mixed),
+        lambda b, c, s: projected(b, s) * chunk(b, c, 1),
+    ),
     "turned around": Way(
         lambda b, c: c.stream + (b.out(c.mixed).transpose(0, 1) * chunk(b, c, 2).transpose(0, 1)).transpose(0, 1),
         lambda b, c, s: projected(b, s) * chunk(b, c, 2),
