@@ -14,10 +14,9 @@ the stream, but the sum of two branches.
 from __future__ import annotations
 
 import math
-import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -34,6 +33,7 @@ from vla_attention.capture.torch_policies.tensor_functions import (
     no_dropout,
     tensors_among,
 )
+from vla_attention.capture.torch_policies.tensor_table import TensorTable
 from vla_attention.capture.torch_policies.watched_block import WatchedBlock
 
 _RMS_NORMS = {torch.nn.functional.rms_norm, torch.rms_norm}
@@ -51,7 +51,6 @@ _AGELESS = {
 }  # fmt: skip
 #: Numbers that are all smaller are taken for zeros.
 _TINY = 1e-30
-_Known = TypeVar("_Known")
 
 
 @dataclass(frozen=True)
@@ -93,41 +92,6 @@ class _Place:
         return found[:, self.tokens].to(torch.float32, copy=True)
 
 
-class _TensorTable(Generic[_Known]):
-    """What is known of some tensors, as long as they live."""
-
-    def __init__(self) -> None:
-        self._entries: dict[int, tuple[weakref.ref[Tensor], _Known]] = {}
-
-    def __bool__(self) -> bool:
-        return bool(self._entries)
-
-    def get(self, tensor: Tensor) -> _Known | None:
-        """Return what is known of a tensor."""
-        entry = self._entries.get(id(tensor))
-        return None if entry is None or entry[0]() is not tensor else entry[1]
-
-    def put(self, tensor: Tensor, known: _Known) -> None:
-        """Note what is known of a tensor."""
-        number, entries = id(tensor), self._entries
-
-        def forget(gone: weakref.ref[Tensor]) -> None:
-            entry = entries.get(number)
-            if entry is not None and entry[0] is gone:
-                del entries[number]
-
-        entries[number] = weakref.ref(tensor, forget), known
-
-    def drop(self, tensor: Tensor) -> None:
-        """Forget a tensor."""
-        self._entries.pop(id(tensor), None)
-
-    def keep(self, wanted: Callable[[_Known], bool]) -> None:
-        """Forget the tensors of which something else is known."""
-        for number in [number for number, (_, known) in self._entries.items() if not wanted(known)]:
-            del self._entries[number]
-
-
 @dataclass(frozen=True)
 class _Stream:
     """A tensor that is taken for the residual stream after the output of `way` was added; scaled: it was multiplied."""
@@ -141,12 +105,12 @@ class OutputFollower:
 
     def __init__(self, block: WatchedBlock) -> None:
         self._block = block
-        self._places: _TensorTable[_Place] = _TensorTable()
-        self._streams: _TensorTable[_Stream] = _TensorTable()
+        self._places: TensorTable[_Place] = TensorTable()
+        self._streams: TensorTable[_Stream] = TensorTable()
         #: The outputs that were not added yet.
         self._ways: list[OutputWay] = []
         #: When tensors were made, of those that were since outputs are followed.
-        self._made: _TensorTable[int] = _TensorTable()
+        self._made: TensorTable[int] = TensorTable()
         self._clock = 0
 
     def __bool__(self) -> bool:
