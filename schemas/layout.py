@@ -63,6 +63,23 @@ class Role(IntEnum):
 #: Roles of keys that can never hold information: exact zeros of a mask, an inert null sink, or a key that does not
 #: exist at this replan (a shorter prompt, fewer generated tokens).
 INVALID_ROLES = (Role.MASKED_IMAGE, Role.PADDING, Role.NULL, Role.ABSENT)
+#: Roles that a key of a span can have, by the span's kind; any key can be absent.
+ROLES_OF_KIND: dict[SpanKind, tuple[Role, ...]] = {
+    "image": (Role.IMAGE, Role.MASKED_IMAGE, Role.BLANK, Role.ABSENT),
+    "text": (Role.BOS, Role.TEMPLATE, Role.INSTRUCTION, Role.STATE, Role.PADDING, Role.TEXT, Role.NULL, Role.ABSENT),
+    "state": (Role.STATE, Role.LEARNED, Role.ABSENT),
+    "action": (Role.ACTION, Role.ABSENT),
+    "latent": (
+        Role.IMAGE,
+        Role.MASKED_IMAGE,
+        Role.ACTION,
+        Role.PROPRIO,
+        Role.BLANK,
+        Role.FUTURE,
+        Role.VALUE,
+        Role.ABSENT,
+    ),
+}
 
 
 def check_site_name(name: str) -> None:

@@ -52,19 +52,19 @@ class KnownCalls:
         self.blocks = {site.name: site.keys.layers or tuple(range(layout.num_layers)) for site in layout.sites}
         #: (site, number of keys, token) -> (the site's keys of such a call, the length of its variable span).
         self.keys: dict[tuple[str, int, int], tuple[NDArray[np.int64], int]] = {}
-        self._rules: dict[tuple[str, str, int, int], tuple[int, int]] = {}
+        self._rules: dict[tuple[str, str, int, int], tuple[int, int | None]] = {}
         self._queries: dict[tuple[str, int], slice] = {}
 
-    def rule(self, shape: CallShape) -> tuple[int, int]:
-        """Return the number of a call's rule, and of the block in its module's path; -1 where there is none."""
+    def rule(self, shape: CallShape) -> tuple[int, int | None]:
+        """Return the number of a call's rule, -1 for none, and of the block in its module's path, if that names one."""
         call = shape.module, shape.kind, shape.queries, shape.keys
         found = self._rules.get(call)
         if found is None:
-            found = -1, -1
+            found = -1, None
             for number, rule in enumerate(self.layout.rules):
                 match = rule.fits(*call)
                 if match is not None:
-                    found = number, int(match["block"]) if rule.site is not None else -1
+                    found = number, rule.block(match) if rule.site is not None else None
                     break
             self._rules[call] = found
         return found
@@ -110,6 +110,12 @@ class CallOrder:
             return CallPlace(number)
         else:
             name = rule.site
+        if block is None:
+            self._problem(
+                f"the group (?P<block>...) of the rule '{rule.modules}' is no number in the path of module "
+                f"'{shape.module}'; let it match the block's digits only"
+            )
+            return CallPlace(number)
         site = self.known.sites[name]
         if block not in self.known.blocks[name]:
             self._problem(f"module '{shape.module}' is block {block}, which site '{name}' does not have")

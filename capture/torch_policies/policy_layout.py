@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import Literal
 
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
-from vla_attention.schemas.layout import Role, SiteLayout, Span, find_role
+from vla_attention.schemas.layout import ROLES_OF_KIND, Role, SiteLayout, Span, find_role
 from vla_attention.schemas.safe_text import check_name, check_text
 
 #: How a picture becomes the model's input image: its sides stretched; padded on two sides; padded left and on top only.
@@ -75,6 +75,11 @@ class CallRule:
             return None
         return _compiled(self.modules).fullmatch(module)
 
+    def block(self, match: re.Match[str]) -> int | None:
+        """Return the number of the block in a module's path, None where the group is no number or did not match."""
+        found = match["block"]
+        return int(found) if found is not None and found.isdecimal() else None
+
     def describe(self) -> str:
         """The rule on one line."""
         named = (("kind", self.kind), ("queries", self.queries), ("keys", self.keys))
@@ -91,9 +96,9 @@ class RecordedSite:
         keys: the spans, with grids; also the blocks (`layers`) that have the site, when others do not.
         action_queries: (start, stop) on the query axis of a call. Numbers below 0 count from the end, a stop of None
             is the end: (-50, None) are the last 50 queries.
-        role_of_span: span -> role of its keys ("image", "instruction", "state", "action" ...). Keys of the prompt get
-            finer roles where token ids are known; keys that no action query may see become `masked_image` in image
-            spans, `padding` in text, and `absent` in others.
+        role_of_span: span -> role of its keys ("image", "instruction", "state", "action" ...), one that keys of its
+            kind can have. Keys of the prompt get finer roles where token ids are known; keys that no action query may
+            see become `masked_image` in image spans, `padding` in text, and `absent` in others.
         projection: path of the output projection with ``{block}`` for the block's number, for contributions; None where
             there is none. What the policy does before and behind it (gates, norms) is seen as it runs.
         variable_span: the span that may have fewer keys in a call than in `keys` (a prompt without padding). Its keys
@@ -115,11 +120,22 @@ class RecordedSite:
         missing = [name for name in names if name not in self.role_of_span]
         if missing:
             raise BadArgument(f"Site '{self.name}' says no role for the spans {listing(missing)}.")
-        for role in self.role_of_span.values():
-            find_role(role)
+        for span in self.keys.spans:
+            self._check_role(span)
         start, stop = self.action_queries
         if stop is not None and (start < 0) == (stop < 0) and stop <= start:
             raise BadArgument(f"Site '{self.name}' has the action queries {start}..{stop}, which are none.")
+
+    def _check_role(self, span: Span) -> None:
+        """Raise an error unless keys of the span's kind can have the role that is given for them."""
+        if span.kind not in ROLES_OF_KIND:
+            raise unknown_name("kind of span", span.kind, ROLES_OF_KIND)
+        allowed = ROLES_OF_KIND[span.kind]
+        if self.role_of(span) not in allowed:
+            raise BadArgument(
+                f"Site '{self.name}' gives the span '{span.name}' of kind '{span.kind}' the role "
+                f"'{self.role_of_span[span.name]}'; its keys can be {listing(role.label for role in allowed)}."
+            )
 
     @property
     def name(self) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.schemas.errors import listing
-from vla_attention.schemas.layout import INVALID_ROLES, Piece, Prompt, Role, SiteLayout, Span, SpanKind
+from vla_attention.schemas.layout import INVALID_ROLES, ROLES_OF_KIND, Piece, Prompt, Role, SiteLayout, Span
 from vla_attention.schemas.precision import mass_error_bound
 from vla_attention.schemas.stores.store_format import Recording
 
@@ -27,22 +27,6 @@ _SUMMATION_TOLERANCE = 1e-5
 _COVERAGE_TOLERANCE = 1e-3
 #: Asymmetry and negative eigenvalues that float32 products leave in a Gram matrix, as a share of its trace.
 _GRAM_TOLERANCE = 1e-4
-
-_ROLES_OF_KIND: dict[SpanKind, tuple[Role, ...]] = {
-    "image": (Role.IMAGE, Role.MASKED_IMAGE, Role.BLANK),
-    "text": (Role.BOS, Role.TEMPLATE, Role.INSTRUCTION, Role.STATE, Role.PADDING, Role.TEXT, Role.NULL),
-    "state": (Role.STATE, Role.LEARNED),
-    "action": (Role.ACTION,),
-    "latent": (
-        Role.IMAGE,
-        Role.MASKED_IMAGE,
-        Role.ACTION,
-        Role.PROPRIO,
-        Role.BLANK,
-        Role.FUTURE,
-        Role.VALUE,
-    ),
-}
 
 
 def row_problems(
@@ -210,7 +194,7 @@ def _where(mask: NDArray[np.bool_], recording: Recording, first_replan: int) -> 
 def role_problems(layout: SiteLayout, key_role: NDArray[np.integer], first_replan: int = 0) -> Iterator[str]:
     """Role codes (replan, key): each key has a role that a key of its span can have."""
     for span in layout.spans:
-        allowed = (*_ROLES_OF_KIND[span.kind], Role.ABSENT)
+        allowed = ROLES_OF_KIND[span.kind]
         wrong = ~np.isin(key_role[:, span.start : span.stop], [int(role) for role in allowed])
         if wrong.any():
             replan, key = np.argwhere(wrong)[0]

@@ -70,6 +70,14 @@ def test_rules_fit_whole_paths_and_their_conditions():
     assert rule.fits("blocks.1.attention", "sdpa", 4, 13) is None
 
 
+@pytest.mark.parametrize(("path", "block"), [("blocks.12.a", 12), ("blocks.left.a", None), ("blocks.a", None)])
+def test_the_block_is_a_number_or_none(path, block):
+    rule = CallRule(r"blocks(?:\.(?P<block>\w+))?\.a", "joint")
+    match = rule.fits(path, "sdpa", 3, 13)
+    assert match is not None
+    assert rule.block(match) == block
+
+
 def test_roles_of_masked_keys_follow_the_spans():
     assert [SITE.masked_role(span) for span in KEYS.spans] == [Role.MASKED_IMAGE, Role.PADDING, Role.ABSENT]
     assert SITE.role_of(KEYS.spans[1]) is Role.INSTRUCTION
@@ -107,6 +115,12 @@ def test_rules_and_sites_check_themselves():
         RecordedSite(KEYS, (0, 1), {"image_front": "image", "prompt": "text"})
     with pytest.raises(UnknownName, match="Unknown role 'imag'"):
         RecordedSite(KEYS, (0, 1), {**ROLES, "image_front": "imag"})
+    wrong = "gives the span 'image_front' of kind 'image' the role 'instruction'; its keys can be image, masked_image"
+    with pytest.raises(BadArgument, match=wrong):
+        RecordedSite(KEYS, (0, 1), {**ROLES, "image_front": "instruction"})
+    picture = SiteLayout("joint", (Span("front", "picture", 0, 4),))  # type: ignore[arg-type]
+    with pytest.raises(UnknownName, match=r"Unknown kind of span 'picture'\..* Existing: image, text, state"):
+        RecordedSite(picture, (0, 1), {"front": "image"})
     with pytest.raises(BadArgument, match="which are none"):
         RecordedSite(KEYS, (3, 3), ROLES)
 

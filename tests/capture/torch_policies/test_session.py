@@ -237,6 +237,13 @@ def without_rule(layout, number):
         ),
         (small_layout(rules=(CallRule(r"blocks\.(?P<block>\d+)\.attention", "joint"),)), "has 11 keys"),
         (small_layout(num_heads=3), "has 2 heads"),
+        (
+            small_layout(
+                rules=(CallRule(r"blocks\.\d+\.(?P<block>\w+)", "joint", queries=HORIZON), CallRule(".*", None))
+            ),
+            r"the group (?P<block>...) of the rule 'blocks\.\d+\.(?P<block>\w+)' is no number in the path of module "
+            "'blocks.0.attention'",
+        ),
     ],
 )
 def test_calls_that_do_not_fit_are_shown(tmp_path, policy, layout, sentence):
