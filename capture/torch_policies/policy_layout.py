@@ -198,6 +198,7 @@ class PromptText:
     Attributes:
         spans: the spans that hold the prompt's tokens, in the order of the tokens.
         embedding: path of the module whose first argument is the token ids; its longest call in a replan is the prompt.
+            Where a tokenizer is given, it is an error if it is not called.
         skip_ids: ids that are no text (placeholders for patches): they have no key in `spans`.
         skip_first: number of ids before the first that has a key (placeholders that the policy replaced by another id).
         site: the site whose spans these are; None for every site that has them, at the same keys.

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor, nn
 
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
+from vla_attention.capture.torch_policies.prompt_ids import PromptIds
 from vla_attention.capture.torch_policies.prompts import (
     TokenText,
     prompt_from_ids,
@@ -27,31 +25,25 @@ from vla_attention.schemas.layout import Prompt
 class ReplanText:
     """The text of one policy call, by row of the batch.
 
-    inputs: row -> what the caller gave.
+    seen: the token ids of the call. inputs: row -> what the caller gave.
     """
 
     def __init__(
-        self, layout: PolicyLayout, tokenizer: TokenText | None, batch: int, inputs: Mapping[int, ReplanInputs]
+        self, layout: PolicyLayout, tokenizer: TokenText | None, seen: PromptIds, inputs: Mapping[int, ReplanInputs]
     ) -> None:
         self.layout = layout
         self.tokenizer = tokenizer
-        self.batch = batch
+        self.seen = seen
         self.inputs = inputs
-        #: (row of the batch, token) ids of the longest call of the embedding.
-        self.ids: NDArray[np.int64] | None = None
         #: Site -> (key,) bool, the keys that its calls had so far.
         self.present: Mapping[str, NDArray[np.bool_]] = {}
 
-    def saw_ids(self, ids: Tensor) -> None:
-        """Keep the ids of a call of the embedding, (batch, token) or (token,), if it is the longest so far."""
-        if ids.is_floating_point() or ids.ndim not in (1, 2):
-            return
-        rows = ids if ids.ndim == 2 else ids[None]
-        if len(rows) == self.batch and (self.ids is None or rows.shape[1] > self.ids.shape[1]):
-            self.ids = rows.detach().cpu().numpy().astype(np.int64)
-
     def prompt(self, row: int, found: Mapping[str, SiteRows] | None) -> Prompt:
-        """Return the prompt of a row; `found`: what the call's sites gave, None before the call has ended."""
+        """Return the prompt of a row; `found`: what the call's sites gave, None before the call has ended.
+
+        Raises:
+            PromptDoesNotFit: the ids of its words are wanted and were not seen, or do not fit; see `prompt_from_ids`.
+        """
         given = self.inputs[row]
         if isinstance(given.prompt, Prompt):
             return given.prompt
@@ -62,8 +54,10 @@ class ReplanText:
         keys = text_keys(sites[0], self.layout.text.spans, present)
         if given.prompt is not None:
             return prompt_from_pieces(given.prompt, keys, given.instruction)
-        if self.ids is None or self.tokenizer is None:
+        if self.tokenizer is None:
             return prompt_without_pieces(given.instruction)
+        if self.seen.ids is None:
+            raise self.seen.missing()
         valid = None
         if found is not None and any(site.name in found for site in sites):
             # The prompt has the same keys at every site; what else the sites hold differs.
@@ -83,7 +77,7 @@ class ReplanText:
     ) -> NDArray[np.uint8]:
         """Return the role codes of a site's keys, (key,), see `roles_of_keys`."""
         bos = None
-        if self.layout.text is not None and self.ids is not None and self.tokenizer is not None:
+        if self.layout.text is not None and self.seen.ids is not None and self.tokenizer is not None:
             ids, first = self._text_ids(row), text_keys(site, self.layout.text.spans, None) if self._has(site) else []
             if ids and first and ids[0] == self.tokenizer.bos:
                 bos = first[0]
@@ -102,27 +96,7 @@ class ReplanText:
         return self.present.get(site.name)
 
     def _text_ids(self, row: int) -> list[int]:
-        assert self.ids is not None
+        assert self.seen.ids is not None
         assert self.layout.text is not None
         skipped = set(self.layout.text.skip_ids)
-        return [token for token in self.ids[row, self.layout.text.skip_first :].tolist() if token not in skipped]
-
-
-@contextmanager
-def watched_ids(embedding: nn.Module | None, text: ReplanText) -> Iterator[None]:
-    """Within the block, the policy's text embedding, if there is one, tells `text` the ids that it is given."""
-    if embedding is None:
-        yield
-        return
-
-    def look(_module: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
-        for value in (*arguments, *named.values()):
-            if isinstance(value, Tensor):
-                text.saw_ids(value)
-                return
-
-    handle = embedding.register_forward_pre_hook(look, with_kwargs=True)
-    try:
-        yield
-    finally:
-        handle.remove()
+        return [token for token in self.seen.ids[row, self.layout.text.skip_first :].tolist() if token not in skipped]

@@ -20,12 +20,8 @@ from vla_attention.capture.torch_policies.call_order import CallsDoNotFit, Known
 from vla_attention.capture.torch_policies.knockouts import SessionKnockouts
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
 from vla_attention.capture.torch_policies.policy_modules import find_policy
-from vla_attention.capture.torch_policies.policy_weights import (
-    OutputProjection,
-    find_module,
-    policy_digest,
-    weights_state,
-)
+from vla_attention.capture.torch_policies.policy_weights import OutputProjection, policy_digest, weights_state
+from vla_attention.capture.torch_policies.prompt_ids import PromptIds, embeddings_of
 from vla_attention.capture.torch_policies.prompts import TokenText
 from vla_attention.capture.torch_policies.replan_edits import ReplanEdits
 from vla_attention.capture.torch_policies.replan_inputs import (
@@ -35,7 +31,7 @@ from vla_attention.capture.torch_policies.replan_inputs import (
     read_inputs,
     whole_number,
 )
-from vla_attention.capture.torch_policies.replan_text import ReplanText, watched_ids
+from vla_attention.capture.torch_policies.replan_text import ReplanText
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder, SiteRows, final_contribution
 from vla_attention.capture.torch_policies.unseen_attention import no_attention
 from vla_attention.capture.torch_policies.watch import watch_attention
@@ -264,7 +260,7 @@ class RecordedRun:
         self.policy = policy
         self._found = find_policy(policy)
         self._weights = weights_state(policy)
-        self._embedding = None if layout.text is None else find_module(policy, layout.text.embedding, "token ids")
+        self._embeddings = embeddings_of(policy, layout)
         self.layout = layout
         self._known = KnownCalls(layout)
         self.attributes = attributes
@@ -430,7 +426,8 @@ class RecordedRun:
                 )
         if self._in_block:
             raise RecordingStopped("A replan block stands inside of another; record one policy call after the other.")
-        text = ReplanText(self.layout, self._tokenizer, batch, dict(zip(rows, given, strict=True)))
+        ids = PromptIds(self._embeddings, batch)
+        text = ReplanText(self.layout, self._tokenizer, ids, dict(zip(rows, given, strict=True)))
         edits = ReplanEdits(self, dict(zip(rows, zip(episodes, given, strict=True), strict=True)), text)
         recorder = ReplanRecorder(
             self._known,
@@ -449,7 +446,7 @@ class RecordedRun:
         try:
             every_function = self.every_function or self._names_unknown
             seen = watch_attention(self._found, recorder, every_function=every_function)
-            with watched_ids(self._embedding, text), seen as functions:
+            with ids.watched(), seen as functions:
                 yield replan
         finally:
             self._in_block = False

@@ -12,7 +12,17 @@ import torch
 from torch import nn
 
 import vla_attention as va
-from tests.kit.small_torch_policy import BLOCKS, HEADS, HORIZON, PROMPT, STEPS, SmallPolicy, given, small_layout
+from tests.kit.small_torch_policy import (
+    BLOCKS,
+    HEADS,
+    HORIZON,
+    PROMPT,
+    STEPS,
+    WIDTH,
+    SmallPolicy,
+    given,
+    small_layout,
+)
 from vla_attention.capture.torch_policies import record as record_module
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
@@ -376,6 +386,70 @@ def test_wrong_inputs_are_sentences(tmp_path, policy, inputs, error, sentence):
     with start(tmp_path, policy) as run, pytest.raises(error) as caught:
         one_call(run, policy, **inputs)
     assert sentence in str(caught.value)
+
+
+class TextEncoder(nn.Module):
+    """As a T5 encoder with tied weights: `shared` is a module of its own, and the encoder calls another one."""
+
+    def __init__(self, embedding, embed=lambda self, ids: self.embed_tokens(ids)):
+        super().__init__()
+        self.embed_tokens, self.shared = embedding, nn.Embedding.from_pretrained(embedding.weight)
+        self.places, self.embed = nn.Embedding(32, WIDTH), embed
+
+    def forward(self, ids):
+        self.places(torch.arange(12))
+        return self.embed(self, ids)
+
+
+def with_encoder(*embed):
+    policy = SmallPolicy()
+    policy.words = TextEncoder(policy.words, *embed)
+    return policy
+
+
+def encoded(embedding):
+    return small_layout(text=PromptText(("prompt",), embedding))
+
+
+@pytest.mark.parametrize("changes", [{}, {"contributions": False}, {"knockout": "role:state"}])
+def test_an_embedding_that_is_not_called_is_refused_by_name(tmp_path, changes):
+    policy = with_encoder()
+    with start(tmp_path, policy, layout=encoded("words.shared"), **changes) as run:
+        sentence = (
+            r"The module 'words\.shared', .*, was not called .*whole numbers: 'words\.embed_tokens' \(1, 6\) with the "
+            r"same weights, 'words\.places' \(12,\)\. Name the one .* in PromptText\.embedding"
+        )
+        with pytest.raises(PromptDoesNotFit, match=sentence):
+            one_call(run, policy)
+        # Where the caller gives the pieces, nobody needs the ids.
+        one_call(run, policy, prompt=[None, "pick", " the", " bowl", None, None])
+    with start(tmp_path / "right", policy, layout=encoded("words.embed_tokens"), **changes) as run:
+        one_call(run, policy)
+    for path in (tmp_path, tmp_path / "right"):
+        labels = [Role(code).label for code in stored(path).episodes[0].read("joint/key_role")[0][5:10]]
+        assert labels == ["instruction"] * 3 + ["template", "padding"]
+
+
+@pytest.mark.parametrize(
+    ("embed", "sentence"),
+    [
+        (
+            lambda self, ids: self.embed_tokens(torch.cat([ids, ids]))[:1],
+            r"the shape \(2, 6\), and the policy call has a batch of 1: expected token ids \(batch, token\)",
+        ),
+        (
+            lambda self, ids: nn.functional.embedding(ids, self.embed_tokens.weight),
+            r"was not called .*'words\.places' \(12,\)\. .* give its pieces with replan\(prompt=\.\.\.\)",
+        ),
+    ],
+)
+def test_ids_of_another_batch_and_no_ids_at_all_are_refused(tmp_path, embed, sentence):
+    policy = with_encoder(embed)
+    with (
+        start(tmp_path, policy, layout=encoded("words.embed_tokens")) as run,
+        pytest.raises(PromptDoesNotFit, match=sentence),
+    ):
+        one_call(run, policy)
 
 
 def test_other_pictures_are_made_as_large_as_the_models(tmp_path, policy):
