@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from vla_attention.capture.torch_policies.added_updates import OutputWay
+from vla_attention.schemas.errors import BadArgument
 
 #: How a policy computes attention. `sdpa`: `scaled_dot_product_attention`. `softmax`: a softmax by hand whose result is
 #: multiplied with values. `multihead`: `multi_head_attention_forward`, which `nn.MultiheadAttention` calls. `flex`:
@@ -28,6 +29,10 @@ MASKED_BELOW = -5000.0
 #: Largest difference of numbers that are computed twice, relative to the largest of them, by the least precise dtype. A
 #: float32 kernel leaves 1e-6, one of bfloat16 a few of its roundings; rows with a wrong mask are off by far more.
 TOLERANCE = {"float32": 1e-3, "float64": 1e-3, "float16": 2e-2, "bfloat16": 6e-2}
+
+
+class RowsRefused(BadArgument):
+    """Rows were wanted of an attention call whose keys or heads are not those that a layout can name."""
 
 
 @dataclass(frozen=True)
@@ -89,15 +94,18 @@ class AttentionCall:
         shape: module, kind and sizes.
         tensors: where the tensors come from.
         asked: the shape that the watcher was asked about before a softmax by hand, if its product has another one.
+        refused: why rows and values of this call cannot be recorded, in a sentence; "" where they can.
     """
 
     shape: CallShape
     tensors: CallTensors
     asked: CallShape | None = None
+    refused: str = ""
 
     @property
     def value(self) -> Tensor:
-        """The values (batch, kv_head, key, dim)."""
+        """The values (batch, kv_head, key, dim); errors as `rows`."""
+        self._check_refused()
         return self.tensors.value()
 
     @property
@@ -106,9 +114,18 @@ class AttentionCall:
         return self.tensors.output()
 
     def rows(self, queries: Positions = slice(None), batch: Positions = slice(None)) -> Tensor:
-        """Return the probabilities of these queries, (batch, head, query, key) float32, exact zeros where masked."""
+        """Return the probabilities of these queries, (batch, head, query, key) float32, exact zeros where masked.
+
+        Raises:
+            RowsRefused: the call's keys or heads are in an order that nothing tells.
+        """
+        self._check_refused()
         with exact():
             return self.tensors.rows(queries, batch)
+
+    def _check_refused(self) -> None:
+        if self.refused:
+            raise RowsRefused(self.refused)
 
     def allowed(self, queries: Positions = slice(None)) -> Tensor:
         """Return (batch, head or 1, query, key) bool: keys that the policy's own mask lets the query see."""

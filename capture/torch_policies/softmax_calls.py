@@ -44,6 +44,13 @@ _MATMULS = {
 }  # fmt: skip
 
 
+#: Functions whose result has some of the numbers, in an order of its own.
+_PICKS = {
+    torch.index_select, Tensor.index_select, torch.gather, Tensor.gather, torch.take_along_dim, Tensor.take_along_dim,
+    torch.flip, Tensor.flip, torch.roll, Tensor.roll,
+}  # fmt: skip
+
+
 @dataclass
 class _Softmax:
     """A softmax whose result has not met values yet.
@@ -69,12 +76,17 @@ class _Softmax:
 
 @dataclass(frozen=True)
 class _Followed:
-    """A tensor that comes from a softmax."""
+    """A tensor that comes from a softmax.
+
+    altered: its numbers are others than the softmax's. picked: they were picked by an index, so that which key, head
+    and row of the batch is where is not known.
+    """
 
     tensor: weakref.ref[Tensor]
     softmax: _Softmax
     axes: Axes
     altered: bool
+    picked: bool = False
 
 
 @dataclass(frozen=True)
@@ -212,7 +224,8 @@ class Softmaxes:
             axes = _axes_after(function, args, kwargs, given, result)
             if axes is not None:
                 altered = given.altered or (function not in SAME_NUMBERS and not no_dropout(function, args, kwargs))
-                self._follow(result, given.softmax, axes, altered=altered)
+                picked = given.picked or _picks(function, args)
+                self._follow(result, given.softmax, axes, altered=altered, picked=picked)
         return result
 
     def _may_attend(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> bool:
@@ -226,10 +239,10 @@ class Softmaxes:
         followed = self.followed.get(id(given))
         return followed if followed is not None and followed.tensor() is given else None
 
-    def _follow(self, tensor: Tensor, softmax: _Softmax, axes: Axes, *, altered: bool) -> None:
+    def _follow(self, tensor: Tensor, softmax: _Softmax, axes: Axes, *, altered: bool, picked: bool = False) -> None:
         number, all_followed = id(tensor), self.followed
         reference = weakref.ref(tensor, lambda gone: _forget(all_followed, number, gone))
-        all_followed[number] = _Followed(reference, softmax, axes, altered)
+        all_followed[number] = _Followed(reference, softmax, axes, altered, picked)
 
     def _product(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], result: Any) -> None:
         if function is torch.einsum:
@@ -284,7 +297,8 @@ class Softmaxes:
         if not self._block.changes and self._block.passes(shape):
             return
         tensors = SoftmaxTensors(softmax, product, probabilities, altered, values, result)
-        self._block.saw(AttentionCall(shape, tensors, None if shape == replace(before, kv_heads=kv_heads) else before))
+        asked = None if shape == replace(before, kv_heads=kv_heads) else before
+        self._block.saw(AttentionCall(shape, tensors, asked, _order_unknown(shape) if followed.picked else ""))
 
 
 #: Methods that write to their tensor otherwise than those of `CHANGES`.
@@ -305,12 +319,28 @@ def _axes_after(
         return axes_after(function, args, kwargs, axes, result)
     if result is before:  # changed in place
         return axes
-    if function is Tensor.__getitem__ and result.ndim == before.ndim:
+    if (function is Tensor.__getitem__ or function in _PICKS) and result.ndim == before.ndim:
         # Keys may be cut off, as those of attention sinks are.
         key = axes.key_position()
         same = all(result.shape[axis] == before.shape[axis] for axis in range(before.ndim) if axis != key)
         return axes.with_keys(result.shape[key]) if key is not None and same else None
     return None
+
+
+def _picks(function: Any, args: tuple[Any, ...]) -> bool:
+    """Whether a function's result may have the numbers in another order: slices keep it, other indices may not."""
+    if function is not Tensor.__getitem__:
+        return function in _PICKS
+    index = args[1] if isinstance(args[1], tuple) else (args[1],)
+    return not all(part is Ellipsis or isinstance(part, slice) for part in index)
+
+
+def _order_unknown(shape: CallShape) -> str:
+    return (
+        f"The attention call {shape} picks its probabilities by an index (as rows[..., order]) before it multiplies "
+        "them with the values: which key, head and row of the batch is where is not known. Slices are followed, and an "
+        "order that is made after the product; else give the call a rule without a site."
+    )
 
 
 def _times_written(tensor: Tensor) -> int:

@@ -7,6 +7,7 @@ import math
 import pickle
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from torch import Tensor, nn
 
 from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
+from vla_attention.capture.torch_policies.attention_calls import RowsRefused
 from vla_attention.capture.torch_policies.call_changes import ChangeRefused
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.capture.torch_policies.policy_layout import CallRule, PolicyLayout, RecordedSite
@@ -361,6 +363,50 @@ def test_keys_of_the_state_that_no_query_may_see_are_absent(tmp_path):
     np.testing.assert_allclose(rows, expected(policy, [4]), atol=2e-6)
     roles = open_store(tmp_path / "a.zarr").episodes[0].read("joint/key_role")[0]
     assert [Role(code).label for code in roles[4:6]] == ["absent", "state"]
+
+
+KEY_ORDER, HEAD_ORDER = torch.tensor([8, 0, 7, 1, 6, 2, 5, 3, 4]), torch.tensor([1, 0])
+PICKS = {
+    "keys": lambda p, v: p[..., KEY_ORDER] @ v[:, :, KEY_ORDER],
+    "a list of keys": lambda p, v: p[:, :, :, KEY_ORDER.tolist()] @ v[:, :, KEY_ORDER],
+    "chosen keys": lambda p, v: p[..., torch.ones(KEYS).bool()] @ v[:, :, torch.ones(KEYS).bool()],
+    "heads": lambda p, v: (p[:, HEAD_ORDER] @ v[:, HEAD_ORDER])[:, HEAD_ORDER],
+    "rows of the batch": lambda p, v: p[torch.zeros(len(p), dtype=torch.int64)] @ v,
+    "index_select": lambda p, v: torch.index_select(p, -1, KEY_ORDER) @ v.index_select(2, KEY_ORDER),
+    "flip": lambda p, v: p.flip(-1) @ v.flip(2),
+    "roll": lambda p, v: p.roll(1, -1) @ v.roll(1, 2),
+    "gather": lambda p, v: p.gather(-1, KEY_ORDER.expand(p.shape)) @ v[:, :, KEY_ORDER],
+    "an order, then a cast": lambda p, v: p[..., KEY_ORDER].double().float().contiguous() @ v[:, :, KEY_ORDER],
+}
+
+
+@pytest.mark.parametrize("multiply", PICKS.values(), ids=PICKS)
+def test_an_index_that_may_permute_is_refused(tmp_path, multiply):
+    policy = OddPolicy(lambda block, q, k, v: multiply(torch.softmax(logits(q, k), dim=-1), v))
+    with pytest.raises(RowsRefused, match=r"blocks\.0: softmax, 3 x 9, .* picks its probabilities by an index"):
+        rows_of(tmp_path / "refused", policy)
+    # Where its rows are not wanted, such a call is one like others.
+    rules = (CallRule(r"blocks\.0", None), *layout().rules)
+    sites = tuple(replace(site, keys=replace(site.keys, layers=(1,))) for site in layout().sites)
+    policy.blocks[1].attend = by_hand
+    rows, result = rows_of(tmp_path, policy, shape=layout(rules=rules, sites=sites))
+    assert torch.equal(result, policy.act())
+    np.testing.assert_allclose(rows, expected(policy)[1:], atol=2e-6)
+
+
+@pytest.mark.parametrize("cut", [lambda p: p[..., :], lambda p: p[:, :, :], lambda p: p[..., 0:KEYS:1]])
+def test_slices_are_followed(tmp_path, cut):
+    policy = OddPolicy(lambda block, q, k, v: cut(torch.softmax(logits(q, k), dim=-1)) @ v)
+    np.testing.assert_allclose(rows_of(tmp_path, policy)[0], expected(policy), atol=2e-6)
+
+
+def test_keys_that_a_slice_cuts_off_in_front(tmp_path):
+    def attend(block, q, k, v):
+        extra = torch.cat([torch.full((len(q), HEADS, ACTIONS, 1), -math.inf), logits(q, k)], dim=-1)
+        return torch.softmax(extra, dim=-1)[..., 1:] @ v
+
+    policy = OddPolicy(attend)
+    np.testing.assert_allclose(rows_of(tmp_path, policy)[0], expected(policy), atol=2e-6)
 
 
 def test_weights_that_change_during_a_run_are_refused(tmp_path):
