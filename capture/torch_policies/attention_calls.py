@@ -29,6 +29,8 @@ MASKED_BELOW = -5000.0
 #: Largest difference of numbers that are computed twice, relative to the largest of them, by the least precise dtype. A
 #: float32 kernel leaves 1e-6, one of bfloat16 a few of its roundings; rows with a wrong mask are off by far more.
 TOLERANCE = {"float32": 1e-3, "float64": 1e-3, "float16": 2e-2, "bfloat16": 6e-2}
+#: Largest difference of a row's sum from 1, beside rounding.
+_SUM_TOLERANCE = 1e-3
 
 
 class RowsRefused(BadArgument):
@@ -94,7 +96,7 @@ class AttentionCall:
         shape: module, kind and sizes.
         tensors: where the tensors come from.
         asked: the shape that the watcher was asked about before a softmax by hand, if its product has another one.
-        refused: why rows and values of this call cannot be recorded, in a sentence; "" where they can.
+        refused: why rows and values of this call cannot be recorded, in words that follow "it"; "" where they can.
     """
 
     shape: CallShape
@@ -125,7 +127,7 @@ class AttentionCall:
 
     def _check_refused(self) -> None:
         if self.refused:
-            raise RowsRefused(self.refused)
+            raise RowsRefused(f"The attention call {self.shape} cannot be recorded: it {self.refused}.")
 
     def allowed(self, queries: Positions = slice(None)) -> Tensor:
         """Return (batch, head or 1, query, key) bool: keys that the policy's own mask lets the query see."""
@@ -159,6 +161,30 @@ class AttentionCall:
                 return 0.0
             largest, scale = float(difference.max()), float(output.abs().max())
             return largest / scale if scale > 0 else (0.0 if largest == 0 else float("inf"))
+
+    def unfit(self, rows: Tensor, error: float) -> str:
+        """Return why rows cannot be stored, in words that follow "its rows"; "" where they can.
+
+        rows: (batch, head, query, key). error: their `product_error`.
+        """
+        allowed = TOLERANCE.get(self.precision, TOLERANCE["float32"])
+        if error > allowed:
+            return (
+                f"give a P·V that differs from the kernel's output by {error:.2g} of its largest number; allowed is "
+                f"{allowed:g} for {self.precision}. The call ({self.shape.kind}) does something else than "
+                "softmax(q kᵀ + mask) v. If the policy is in training mode, its dropout does: call policy.eval(). "
+                "Otherwise report it with the library's version"
+            )
+        sums = rows.sum(dim=-1)
+        # A query without any key has a row of zeros.
+        wrong = ((sums - 1).abs() > max(allowed, _SUM_TOLERANCE)) & (sums != 0)
+        if bool(wrong.any()):
+            return (
+                f"sum to {float(sums[wrong][0]):.4g} and not to 1 when they are multiplied with the values: the module "
+                "changes them after the softmax, as dropout (call policy.eval()), factors and sinks without a key do "
+                "(load the model without them). Such rows cannot be stored; a rule without a site leaves them out"
+            )
+        return ""
 
 
 class Watcher(Protocol):

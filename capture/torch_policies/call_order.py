@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.torch_policies.attention_calls import CallShape
 from vla_attention.capture.torch_policies.inspect_calls import CallTable, folded_paths
+from vla_attention.capture.torch_policies.key_caches import LOAD_WITH_DYNAMIC_CACHE
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
 from vla_attention.schemas.errors import BadArgument, UserError, listing
 
@@ -148,6 +149,10 @@ class CallOrder:
         if found is None or (site.variable_span is not None and self._variable.get(site.name) != found[1]):
             fitted = self._keys(site, count, token)
             if fitted is None:
+                if self.layout.autoregressive:
+                    self._problem(
+                        f"static and sliding caches have keys that a layout cannot name: {LOAD_WITH_DYNAMIC_CACHE}"
+                    )
                 return None
             found = self.known.keys[call] = fitted, self._variable.get(site.name, 0)
         if call not in self._noted:
@@ -223,9 +228,14 @@ class CallOrder:
             wrong = {block: count for block, count in times.items() if count != expected}
             if wrong:
                 given = listing(f"block {block}: {count}" for block, count in wrong.items())
+                several = len(wrong) == len(times) and all(count % expected == 0 for count in times.values())
+                more = (
+                    "; a replan block holds one policy call, and blocks that run several times in a denoise step are "
+                    "named by a rule with a sequence" * several
+                )
                 yield (
                     f"the blocks of site '{site.name}' must compute {expected} times a policy call, once in each "
-                    f"denoise step, but did otherwise ({given})"
+                    f"denoise step, but did otherwise ({given}){more}"
                 )
 
     def _missing_tokens(self, site: RecordedSite, times: dict[int, int]) -> Iterator[str]:

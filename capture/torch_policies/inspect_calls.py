@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ from typing import Any
 from torch import Tensor
 
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
+from vla_attention.capture.torch_policies.key_caches import KeyCaches
 from vla_attention.capture.torch_policies.unseen_attention import no_attention
 from vla_attention.capture.torch_policies.watch import watch_attention
 from vla_attention.schemas.errors import BadArgument
@@ -21,6 +23,15 @@ _CHECKED_QUERIES = 64
 _SCREEN = 40
 #: From this many numbers of keys on, those of one module are written as a range.
 _RANGE = 4
+
+
+#: Below a table all of whose calls have several rows of a batch.
+_BATCH = (
+    "Calls with a batch are recorded with run.episodes([...]), an episode for each row; where some rows are none, as "
+    "those that guidance computes without the instruction, with rows=... and batch=..."
+)
+#: The error of rows times values, and why recording refuses the call.
+_Check = tuple[float, str]
 
 
 class NoAttention(BadArgument):
@@ -37,6 +48,7 @@ class CallRow:
         keys: the smallest and the largest number of keys.
         times: how often each module made such a call, the least and the most.
         product_error: the largest error of rows times values, relative to the kernel's output.
+        refused: why recording refuses these calls at a site, in words; "" where it does not.
     """
 
     modules: tuple[str, ...]
@@ -49,6 +61,7 @@ class CallRow:
     dtype: str
     times: tuple[int, int]
     product_error: float
+    refused: str = ""
 
     @property
     def pattern(self) -> str:
@@ -64,16 +77,20 @@ class CallTable:
         policy: name of its class.
         calls: the shapes, in order.
         errors: of rows times values, one for every call; empty where they were not looked at, and then not shown.
+        refused: for every call why recording refuses it, see `CallRow`; empty where it was not looked at.
     """
 
     policy: str
     calls: tuple[CallShape, ...]
     errors: tuple[float, ...] = ()
+    refused: tuple[str, ...] = ()
 
     @property
     def rows(self) -> tuple[CallRow, ...]:
         """The calls, those of the same shape in modules of one pattern folded into one row."""
-        return tuple(_rows(self.calls, self.errors or (float("nan"),) * len(self.calls)))
+        count = len(self.calls)
+        checks = zip(self.errors or (float("nan"),) * count, self.refused or ("",) * count, strict=True)
+        return tuple(_rows(self.calls, list(checks)))
 
     def __str__(self) -> str:
         rows = self.rows
@@ -86,7 +103,10 @@ class CallTable:
         ]
         if len(rows) > _SCREEN:
             lines.append(f"... and {len(rows) - _SCREEN} further rows: see `.rows`")
+        lines += [_refusal(row) for row in rows if row.refused]
         batch = sorted({call.batch for call in self.calls})
+        if batch and batch[0] > 1 and self.errors:
+            lines.append(_BATCH)
         total = f"{len(self.calls)} attention calls of {self.policy}, batch {_listed(batch)}"
         return "\n".join([total, *lines])
 
@@ -95,10 +115,12 @@ class CallTable:
 
 @dataclass
 class _Shapes:
-    """A watcher that keeps shapes and errors."""
+    """A watcher that keeps shapes and errors, and why calls would be refused."""
 
     calls: list[CallShape] = field(default_factory=list)
     errors: list[float] = field(default_factory=list)
+    refused: list[str] = field(default_factory=list)
+    caches: KeyCaches = field(default_factory=KeyCaches)
 
     def change(self, shape: CallShape) -> Tensor | None:
         return None
@@ -107,7 +129,16 @@ class _Shapes:
         step = max(1, -(-call.shape.queries // _CHECKED_QUERIES))
         queries = slice(None, None, step)
         self.calls.append(call.shape)
-        self.errors.append(call.product_error(call.rows(queries), queries))
+        if call.refused:
+            self.errors.append(float("nan"))
+            self.refused.append(f"it {call.refused}")
+            return
+        rows = call.rows(queries)
+        error = call.product_error(rows, queries)
+        self.errors.append(error)
+        unfit = call.unfit(rows, error) if math.isfinite(error) else "or its output hold NaN or infinite numbers"
+        cache = self.caches.problem(call)
+        self.refused.append(f"its rows {unfit}" if unfit else cache)
 
 
 def inspect(policy: object, call: Callable[[], object]) -> CallTable:
@@ -116,7 +147,8 @@ def inspect(policy: object, call: Callable[[], object]) -> CallTable:
     policy: an `nn.Module`, or an object that holds modules. call: runs it once, as
     `lambda: policy.select_action(batch)`.
     The P·V error is the largest difference of rows times values from what the policy's own kernel computed, relative to
-    its largest output: rounding errors say that the rows are those of the kernel.
+    its largest output: rounding errors say that the rows are those of the kernel. `refused` stands there for calls that
+    recording refuses, and the reason below the table.
 
     Raises:
         NoAttention: no attention was seen.
@@ -127,14 +159,14 @@ def inspect(policy: object, call: Callable[[], object]) -> CallTable:
         call()
     if not shapes.calls:
         raise NoAttention(no_attention(policy))
-    return CallTable(type(policy).__name__, tuple(shapes.calls), tuple(shapes.errors))
+    return CallTable(type(policy).__name__, tuple(shapes.calls), tuple(shapes.errors), tuple(shapes.refused))
 
 
-def _rows(calls: Sequence[CallShape], errors: Sequence[float]) -> Iterator[CallRow]:
-    # Of each module and shape: how often, and the largest error.
-    counts: dict[tuple[Any, ...], list[float]] = {}
-    for call, error in zip(calls, errors, strict=True):
-        counts.setdefault((call.module, *_shape(call), (call.keys, call.keys)), []).append(error)
+def _rows(calls: Sequence[CallShape], checks: Sequence[_Check]) -> Iterator[CallRow]:
+    # Of each module and shape the check of each call.
+    counts: dict[tuple[Any, ...], list[_Check]] = {}
+    for call, check in zip(calls, checks, strict=True):
+        counts.setdefault((call.module, *_shape(call), (call.keys, call.keys)), []).append(check)
     # A module with many numbers of keys, such as a decoder with a cache, gets one row.
     ranges: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
     for entry in counts:
@@ -142,19 +174,20 @@ def _rows(calls: Sequence[CallShape], errors: Sequence[float]) -> Iterator[CallR
     for shape, entries in ranges.items():
         if len(entries) >= _RANGE:
             numbers = [entry[-1][0] for entry in entries]
-            merged = [error for entry in entries for error in counts.pop(entry)]
+            merged = [check for entry in entries for check in counts.pop(entry)]
             counts[(*shape, (min(numbers), max(numbers)))] = merged
     first = {(call.module, *_shape(call)): number for number, call in reversed(list(enumerate(calls)))}
-    folded: dict[tuple[Any, ...], list[tuple[str, list[float]]]] = {}
+    folded: dict[tuple[Any, ...], list[tuple[str, list[_Check]]]] = {}
     for entry in sorted(counts, key=lambda entry: first[entry[:-1]]):
-        module = str(entry[0])
-        folded.setdefault((re.sub(r"\d+", "{}", module), *entry[1:]), []).append((module, counts[entry]))
-    for (_, kind, batch, heads, kv_heads, queries, dtype, keys), modules in folded.items():
+        module, refused = str(entry[0]), any(why for _, why in counts[entry])
+        folded.setdefault((re.sub(r"\d+", "{}", module), *entry[1:], refused), []).append((module, counts[entry]))
+    for (_, kind, batch, heads, kv_heads, queries, dtype, keys, _), modules in folded.items():
         times = [len(found) for _, found in modules]
         yield CallRow(
             modules=tuple(module for module, _ in modules), kind=kind, batch=batch, heads=heads, kv_heads=kv_heads,
             queries=queries, keys=keys, dtype=dtype, times=(min(times), max(times)),
-            product_error=max(error for _, found in modules for error in found),
+            product_error=max(error for _, found in modules for error, _ in found),
+            refused=next((why for _, found in modules for _, why in found if why), ""),
         )  # fmt: skip
 
 
@@ -168,7 +201,13 @@ def _cells(row: CallRow) -> tuple[str, ...]:
     times = str(row.times[0]) if row.times[0] == row.times[1] else f"{row.times[0]}..{row.times[1]}"
     calls = f"{len(row.modules)} x {times}" if len(row.modules) > 1 else times
     pattern = row.pattern or "(policy)"
-    return pattern, row.kind, f"{row.queries} x {keys}", heads, row.dtype, calls, f"{row.product_error:.0e}"
+    error = "refused" if row.refused else f"{row.product_error:.0e}"
+    return pattern, row.kind, f"{row.queries} x {keys}", heads, row.dtype, calls, error
+
+
+def _refusal(row: CallRow) -> str:
+    pattern, _, sizes, *_ = _cells(row)
+    return f"Recording refuses {pattern}, {sizes}: {row.refused}."
 
 
 def folded_paths(paths: Sequence[str]) -> str:

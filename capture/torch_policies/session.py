@@ -35,7 +35,7 @@ from vla_attention.capture.torch_policies.replan_text import ReplanText
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder, SiteRows, final_contribution
 from vla_attention.capture.torch_policies.unseen_attention import no_attention
 from vla_attention.capture.torch_policies.watch import watch_attention
-from vla_attention.schemas.errors import BadArgument, Note, UserError
+from vla_attention.schemas.errors import BadArgument, Note, UserError, listing
 from vla_attention.schemas.stores.store_format import EPISODES_GROUP, RootAttributes, StoreExists, episode_name
 
 #: More replans than any episode has; the writer collects rows in blocks of two megabytes.
@@ -155,9 +155,16 @@ class Episode:
 
 
 class EpisodeBatch(Sequence[Episode]):
-    """Several episodes whose policy calls are made together: row i of the batch is episode i."""
+    """Several episodes whose policy calls are made together.
 
-    def __init__(self, run: RecordedRun, stack: ExitStack) -> None:
+    Attributes:
+        rows: the row of the policy call's batch of each episode.
+        batch: number of rows of a policy call.
+    """
+
+    def __init__(self, run: RecordedRun, stack: ExitStack, rows: Sequence[int], batch: int) -> None:
+        self.rows = tuple(rows)
+        self.batch = batch
         self._run = run
         self._stack = stack
         self._episodes: list[Episode] = []
@@ -176,27 +183,30 @@ class EpisodeBatch(Sequence[Episode]):
 
         Args:
             env_step: environment step of all episodes, or of each.
-            active: which rows are recorded; None: all of them. A row whose episode has ended is left out.
-            inputs: as in `ReplanInputs`, each a sequence with one entry per row.
+            active: which episodes are recorded; None: all of them. One that has ended is left out.
+            inputs: as in `ReplanInputs`, each a sequence with one entry for each episode.
         """
         count = len(self)
         _check_length("active", active, count)
-        chosen = [row for row in range(count) if active is None or active[row]]
+        chosen = [number for number in range(count) if active is None or active[number]]
         steps: list[Any] = list(np.asarray(env_step)) if np.ndim(env_step) else [env_step] * count
         for name, values in (("env_step", steps), *(inputs.items())):
             _check_length(name, values, count)
         given = [
             read_inputs(
                 self._run.layout,
-                self[row].facts,
-                steps[row],
-                {name: None if values is None else values[row] for name, values in inputs.items()},
+                self[number].facts,
+                steps[number],
+                {name: None if values is None else values[number] for name, values in inputs.items()},
             )
-            for row in chosen
+            for number in chosen
         ]
         if not chosen:
             raise BadArgument("No row of the batch is active.")
-        with self._run._replan([self[row] for row in chosen], given, batch=count, rows=chosen) as replan:
+        rows = [self.rows[number] for number in chosen]
+        with self._run._replan(
+            [self[number] for number in chosen], given, batch=self.batch, rows=rows, places=chosen, count=count
+        ) as replan:
             yield replan
 
     def next_episode(self, row: int, **facts: Any) -> Episode:
@@ -209,6 +219,18 @@ class EpisodeBatch(Sequence[Episode]):
         episode = self._run._begin(self._stack, EpisodeFacts(**facts))
         episode._batch = self
         return episode
+
+
+def _rows_of_batch(count: int, rows: Sequence[int] | None, batch: int | None) -> tuple[list[int], int]:
+    """Return the row of each of `count` episodes, and the number of rows of a policy call, checked."""
+    chosen = [whole_number("row of an episode", row) for row in (range(count) if rows is None else rows)]
+    size = count if batch is None else whole_number("batch of run.episodes", batch)
+    if len(chosen) != count or len(set(chosen)) != count or not all(0 <= row < size for row in chosen):
+        raise BadArgument(
+            f"run.episodes has {count} episodes at the rows {listing(chosen)} of a batch of {size}; expected a row of "
+            "its own for each of them, counted from 0."
+        )
+    return chosen, size
 
 
 def _check_length(name: str, values: Any, count: int) -> None:
@@ -351,22 +373,31 @@ class RecordedRun:
             episode._commit()
 
     @contextmanager
-    def episodes(self, episodes: Sequence[Mapping[str, Any]]) -> Iterator[EpisodeBatch]:
+    def episodes(
+        self, episodes: Sequence[Mapping[str, Any]], *, rows: Sequence[int] | None = None, batch: int | None = None
+    ) -> Iterator[EpisodeBatch]:
         """Record several episodes whose policy calls are one call with a batch; leaving the block stores them all.
 
         Args:
-            episodes: for each row of the batch the arguments of `episode`.
+            episodes: for each of them the arguments of `episode`.
+            rows: the row of the batch of each episode; None: 0, 1, 2 and so on.
+            batch: number of rows of a policy call; None: as many as episodes. The other rows are not recorded, and
+                knockouts leave them as they are: guidance computes a second row without the instruction.
+
+        Raises:
+            BadArgument: rows that the batch does not have, or that two episodes share.
         """
+        chosen, size = _rows_of_batch(len(episodes), rows, batch)
         with ExitStack() as stack:
-            batch = EpisodeBatch(self, stack)
+            joined = EpisodeBatch(self, stack, chosen, size)
             for facts in episodes:
-                batch._episodes.append(batch._begin(facts))
+                joined._episodes.append(joined._begin(facts))
             try:
-                yield batch
+                yield joined
             finally:
-                for episode in batch:
+                for episode in joined:
                     episode._ended = True
-            for episode in batch:
+            for episode in joined:
                 episode._commit()
 
     def _check_weights(self) -> None:
@@ -415,9 +446,19 @@ class RecordedRun:
 
     @contextmanager
     def _replan(
-        self, episodes: Sequence[Episode], given: Sequence[ReplanInputs], *, batch: int, rows: Sequence[int]
+        self,
+        episodes: Sequence[Episode],
+        given: Sequence[ReplanInputs],
+        *,
+        batch: int,
+        rows: Sequence[int],
+        places: Sequence[int] = (0,),
+        count: int = 1,
     ) -> Iterator[Replan]:
-        """Record one policy call of some rows of a batch."""
+        """Record one policy call of some rows of a batch.
+
+        places: where the actions of each episode are among those of all `count` episodes.
+        """
         self._check_entered()
         for episode in episodes:
             if episode._ended:
@@ -453,7 +494,7 @@ class RecordedRun:
         if recorder.saw_attention:
             self._names_unknown = not functions.by_names
         try:
-            self._store_replan(replan, recorder, text, episodes, given, rows)
+            self._store_replan(replan, recorder, text, episodes, given, rows, places, count)
         except CallsDoNotFit as error:
             raise error if every_function else CallsDoNotFit(f"{error}\n{_BY_NAMES}") from None
 
@@ -465,6 +506,8 @@ class RecordedRun:
         episodes: Sequence[Episode],
         given: Sequence[ReplanInputs],
         rows: Sequence[int],
+        places: Sequence[int],
+        count: int,
     ) -> None:
         if not recorder.saw_attention:
             self.num_dropped += 1
@@ -479,14 +522,14 @@ class RecordedRun:
         self._check_contributions(recorder)
         if self._store is None:
             self._open()
-        if recorder.batch > 1:
-            _check_length("actions", replan.actions, recorder.batch)
+        if count > 1:
+            _check_length("actions", replan.actions, count)
         replan.recorded = True
         for position, (row, episode, inputs) in enumerate(zip(rows, episodes, given, strict=True)):
             episode.largest_error = max(episode.largest_error, recorder.largest_error)
             actions = replan.actions
-            if actions is not None and recorder.batch > 1:
-                actions = actions[row]
+            if actions is not None and count > 1:
+                actions = actions[places[position]]
             record = self._record(found[position], text, row, inputs, read_actions(actions))
             episode._append(record)
 

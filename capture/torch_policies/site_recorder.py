@@ -19,6 +19,7 @@ from vla_attention.capture.torch_policies.attention_calls import TOLERANCE, Atte
 from vla_attention.capture.torch_policies.call_changes import ChangeRefused
 from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.followed_outputs import difference
+from vla_attention.capture.torch_policies.key_caches import LOAD_WITH_DYNAMIC_CACHE, first_values, slid
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
 from vla_attention.capture.torch_policies.policy_weights import OutputProjection
 from vla_attention.schemas.errors import BadArgument, UserError
@@ -27,8 +28,6 @@ from vla_attention.schemas.stores.store_format import Recording
 
 #: Copies with more numbers than this move to the CPU immediately instead of waiting on the device.
 _LARGE_COPY = 2**20
-#: Largest difference of a row's sum from 1, beside rounding.
-_SUM_TOLERANCE = 1e-3
 
 #: What a row of the batch adds to the logits of a call (head or 1, query, key); None for nothing. The arrays live as
 #: long as the recorder, and are the same for calls to which the same is added.
@@ -68,6 +67,8 @@ class _Collected:
     uniform: dict[tuple[int, int], list[Tensor]] = field(default_factory=dict)
     kinds: list[Tensor] = field(default_factory=list)
     grams: dict[tuple[int, int, int], list[Tensor]] = field(default_factory=dict)
+    #: By block: the first values of the last generated token's call, see `key_caches`.
+    first_values: dict[int, Tensor] = field(default_factory=dict)
     roles: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
     parts: dict[int, list[slice | Tensor]] = field(default_factory=dict)
     #: What stands between the attention and the residual stream, beside the output projection.
@@ -176,7 +177,7 @@ class ReplanRecorder:
         if shape.batch != self.batch:
             self.order.problems[
                 f"a call of site '{site.name}' has a batch of {shape.batch}, and the replan one of {self.batch} "
-                "(several environments in one call: run.episodes)"
+                "(several environments in one call, and guidance with and without the instruction: run.episodes)"
             ] = None
             return None
         heads = site.keys.heads or self.layout.num_heads
@@ -211,6 +212,8 @@ class ReplanRecorder:
             )
         self.largest_error = max(self.largest_error, error)
         self._check_error(error, call, rows, place)
+        if self.layout.autoregressive and call.shape.queries == 1:
+            self._check_cache(call, place)
         seen = call.allowed(queries)
         uniform = seen / seen.sum(dim=-1, keepdim=True).clamp(min=1)
         keys = None if place.keys is None else torch.from_numpy(place.keys).to(rows.device)
@@ -233,26 +236,22 @@ class ReplanRecorder:
             values = values.mean(dim=2, keepdim=True)
         return values
 
+    def _check_cache(self, call: AttentionCall, place: CallPlace) -> None:
+        """Note a cache whose first key has left since the token before: its keys are not those of the layout."""
+        of_block = self._collected[place.site or ""].first_values
+        before, of_block[place.block] = of_block.get(place.block), first_values(call)
+        if before is not None and slid(before, of_block[place.block]):
+            self.order.problems[
+                f"the caches of site '{place.site}' lose their first key from token to token (a sliding window), so "
+                f"that no key has a place of its own: {LOAD_WITH_DYNAMIC_CACHE}"
+            ] = None
+
     def _check_error(self, error: float, call: AttentionCall, rows: Tensor, place: CallPlace) -> None:
-        shape, precision = call.shape, call.precision
-        allowed = TOLERANCE.get(precision, TOLERANCE["float32"])
-        if error > allowed:
+        problem = call.unfit(rows, error)
+        if problem:
             raise RowsDoNotMatch(
-                f"The rows of site '{place.site}', block {place.block}, step {place.step} give a P·V that differs from "
-                f"the kernel's output by {error:.2g} of its largest number; allowed is {allowed:g} for {precision}. "
-                f"The call of module '{shape.module}' ({shape.kind}) does something else than softmax(q kᵀ + mask) v. "
-                "If the policy is in training mode, its dropout does: call policy.eval(). Otherwise report it with the "
-                "library's version."
-            )
-        sums = rows.sum(dim=-1)
-        # A query without any key has a row of zeros.
-        wrong = ((sums - 1).abs() > max(allowed, _SUM_TOLERANCE)) & (sums != 0)
-        if bool(wrong.any()):
-            raise RowsDoNotMatch(
-                f"The rows of site '{place.site}', block {place.block}, step {place.step} sum to "
-                f"{float(sums[wrong][0]):.4g} and not to 1 when they are multiplied with the values: module "
-                f"'{shape.module}' changes them after the softmax, as dropout (call policy.eval()), factors and sinks "
-                "without a key do. Such rows cannot be stored."
+                f"The rows of site '{place.site}', block {place.block}, step {place.step} (module "
+                f"'{call.shape.module}') {problem}."
             )
 
     def _contributions_way(

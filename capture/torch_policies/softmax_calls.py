@@ -44,6 +44,11 @@ _MATMULS = {
 }  # fmt: skip
 
 
+_ORDER_UNKNOWN = (
+    "picks its probabilities by an index (as rows[..., order]) before it multiplies them with the values, so that "
+    "nothing tells which key, head and row of the batch is where. Slices are followed, and an order that is made after "
+    "the product; else give the call a rule without a site"
+)
 #: Functions whose result has some of the numbers, in an order of its own.
 _PICKS = {
     torch.index_select, Tensor.index_select, torch.gather, Tensor.gather, torch.take_along_dim, Tensor.take_along_dim,
@@ -298,7 +303,7 @@ class Softmaxes:
             return
         tensors = SoftmaxTensors(softmax, product, probabilities, altered, values, result)
         asked = None if shape == replace(before, kv_heads=kv_heads) else before
-        self._block.saw(AttentionCall(shape, tensors, asked, _order_unknown(shape) if followed.picked else ""))
+        self._block.saw(AttentionCall(shape, tensors, asked, _ORDER_UNKNOWN if followed.picked else ""))
 
 
 #: Methods that write to their tensor otherwise than those of `CHANGES`.
@@ -333,14 +338,6 @@ def _picks(function: Any, args: tuple[Any, ...]) -> bool:
         return function in _PICKS
     index = args[1] if isinstance(args[1], tuple) else (args[1],)
     return not all(part is Ellipsis or isinstance(part, slice) for part in index)
-
-
-def _order_unknown(shape: CallShape) -> str:
-    return (
-        f"The attention call {shape} picks its probabilities by an index (as rows[..., order]) before it multiplies "
-        "them with the values: which key, head and row of the batch is where is not known. Slices are followed, and an "
-        "order that is made after the product; else give the call a rule without a site."
-    )
 
 
 def _times_written(tensor: Tensor) -> int:

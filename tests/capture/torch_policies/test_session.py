@@ -571,7 +571,7 @@ def test_rows_that_do_not_reproduce_the_kernel_are_refused(tmp_path, policy, mon
     monkeypatch.setattr(AttentionCall, "rows", lambda self, *where: exact(self, *where).roll(1, dims=-1))
     with (
         start(tmp_path, policy) as run,
-        pytest.raises(RowsDoNotMatch, match=r"block 0, step 0 give a P·V that differs"),
+        pytest.raises(RowsDoNotMatch, match=r"block 0, step 0 .* give a P·V that differs"),
     ):
         one_call(run, policy)
     assert not run.num_dropped

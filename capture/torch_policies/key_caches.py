@@ -1,0 +1,73 @@
+"""Caches whose keys have no place of their own: sliding ones, whose first keys leave, and static ones that fill up.
+
+A layout names keys by their position, which is the same in every call of a replan. Both kinds are told by what the
+calls of one module are given, one after another, and not by a cache's class.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall
+
+LOAD_WITH_DYNAMIC_CACHE = (
+    "load the policy with a dynamic cache, which keeps all keys and has no empty ones (in transformers: "
+    "cache_implementation=None, and no sliding_window)"
+)
+
+
+def first_values(call: AttentionCall) -> Tensor:
+    """Return a copy of the values of a call's first two keys, (batch, kv_head, key, dim)."""
+    return call.value[:, :, :2].detach().clone()
+
+
+def slid(before: Tensor, now: Tensor) -> bool:
+    """Whether a cache has lost its first key between two calls of one query; both: `first_values`."""
+    if before.shape != now.shape or before.shape[2] < 2:
+        return False
+    return torch.equal(now[:, :, 0], before[:, :, 1]) and not torch.equal(now[:, :, 0], before[:, :, 0])
+
+
+@dataclass
+class _Calls:
+    """Of the calls of one module: their numbers of keys, and the last one's first values and keys that it may see."""
+
+    keys: list[int] = field(default_factory=list)
+    first: Tensor | None = None
+    seen: Tensor | None = None
+
+
+class KeyCaches:
+    """Follows the keys of each module from call to call."""
+
+    def __init__(self) -> None:
+        self._modules: dict[str, _Calls] = {}
+
+    def problem(self, call: AttentionCall) -> str:
+        """Return why no layout can name the keys of the next call of a module, in words; "" where one can."""
+        shape = call.shape
+        calls = self._modules.setdefault(shape.module, _Calls())
+        calls.keys.append(shape.keys)
+        if shape.queries > 1:
+            calls.first = calls.seen = None
+            return ""
+        before, calls.first = calls.first, first_values(call)
+        seen_before, calls.seen = calls.seen, call.allowed()[:, 0]
+        if before is None or seen_before is None or shape.keys != calls.keys[-2]:
+            return ""
+        if slid(before, calls.first):
+            return (
+                f"its cache of {shape.keys} keys loses its first key at each call (a sliding window), so that no key "
+                f"has a place of its own: {LOAD_WITH_DYNAMIC_CACHE}"
+            )
+        others = [keys for keys in calls.keys if keys != shape.keys]
+        more = bool((calls.seen & ~seen_before).any()) and not bool((seen_before & ~calls.seen).any())
+        if others and more:
+            return (
+                f"its static cache fills up: the calls have {shape.keys} keys, some of them empty, and an earlier one "
+                f"had {others[0]} without the empty ones: {LOAD_WITH_DYNAMIC_CACHE}"
+            )
+        return ""

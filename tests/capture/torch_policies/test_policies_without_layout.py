@@ -1,0 +1,219 @@
+"""Valid policies that no layout can say, or only just: refused with the way out by `va.inspect`, or recorded."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import vla_attention as va
+from tests.capture.torch_policies.test_odd_policies import HEAD_ORDER, HEADS, OddPolicy, by_hand, logits
+from tests.kit.cached_torch_policies import (
+    LoopedPolicy,
+    SlidingAttention,
+    StaticAttention,
+    cached_policy,
+    fixed_layout,
+    looped_layout,
+)
+from tests.kit.small_torch_policy import HORIZON, WIDTH, SmallPolicy, given, small_layout
+from tests.kit.small_torch_variants import CausalAttention, token_layout
+from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
+from vla_attention.capture.torch_policies.record import record
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.verify import verify_store
+
+PICTURE = torch.rand(3, 8, 8, generator=torch.Generator().manual_seed(0))
+
+
+def record_call(path, policy, layout, call, **changes):
+    changes = {"bits": 23, "queries": "all", "denoise_steps": "all", "durable": False, "contributions": False} | changes
+    with (
+        record(path / "a.zarr", policy, layout=layout, **changes) as run,
+        run.episode(task_id=0, episode_index=0, instruction="") as episode,
+        episode.replan(env_step=0),
+    ):
+        call()
+    store = open_store(path / "a.zarr")
+    assert verify_store(store) == []
+    return store.episodes[0].read("joint/rows")[0]
+
+
+@pytest.mark.parametrize(
+    ("attention", "layout", "text", "shown", "sentence"),
+    [
+        (
+            StaticAttention,
+            token_layout(),
+            "pick the bowl",
+            "1 x 15: its static cache fills up: the calls have 15 keys, .* an earlier one had 9 without",
+            "static and sliding caches have keys that a layout cannot name",
+        ),
+        (
+            SlidingAttention,
+            token_layout(),
+            "the",
+            "1 x 7: its cache of 7 keys loses its first key at each call",
+            "static and sliding caches have keys that a layout cannot name",
+        ),
+        # The numbers of keys fit; what the keys are changes from token to token.
+        (
+            SlidingAttention,
+            fixed_layout(),
+            "the",
+            "1 x 7: its cache of 7 keys loses its first key at each call",
+            "the caches of site 'joint' lose their first key from token to token",
+        ),
+    ],
+)
+def test_caches_whose_keys_have_no_places(tmp_path, attention, layout, text, shown, sentence):
+    policy = cached_policy(attention)
+    table = str(va.inspect(policy, lambda: policy.act(PICTURE, text)))
+    refused = [line for line in table.splitlines() if "refused" in line]
+    assert len(refused) == 1
+    assert " 1 x " in refused[0]
+    way_out = r".*: load the policy with a dynamic cache.* cache_implementation=None"
+    assert re.search(f"Recording refuses {re.escape('layers.{0,1}')}, {shown}{way_out}", table)
+    with pytest.raises(CallsDoNotFit, match=sentence + way_out):
+        record_call(tmp_path, policy, layout, lambda: policy.act(PICTURE, text))
+
+
+def test_a_cache_that_grows_is_not_refused():
+    policy = cached_policy(CausalAttention)
+    assert "refuse" not in str(va.inspect(policy, lambda: policy.act(PICTURE, "pick the bowl")))
+
+
+def sinks(block, q, k, v):
+    extra = torch.cat([logits(q, k), torch.ones(len(q), HEADS, q.shape[2], 1)], dim=-1)
+    return torch.softmax(extra, dim=-1)[..., :-1] @ v
+
+
+def picked(block, q, k, v):
+    return (torch.softmax(logits(q, k), dim=-1)[:, HEAD_ORDER] @ v[:, HEAD_ORDER])[:, HEAD_ORDER]
+
+
+def scaled(block, q, k, v):
+    return (torch.softmax(logits(q, k), dim=-1) * 0.5) @ v
+
+
+def dropped(block, q, k, v):
+    return nn.functional.dropout(torch.softmax(logits(q, k), dim=-1), 0.5, training=True) @ v
+
+
+def not_finite(block, q, k, v):
+    return torch.softmax(logits(q * math.nan, k), dim=-1) @ v
+
+
+@pytest.mark.parametrize(
+    ("attend", "reason"),
+    [
+        (
+            sinks,
+            r"its rows sum to 0\.\d+ and not to 1 .* sinks without a key do .* a rule without a site leaves them out",
+        ),
+        (scaled, r"its rows sum to 0\.5 and not to 1"),
+        (dropped, r"its rows sum to .* and not to 1 .* policy\.eval\(\)"),
+        (picked, r"it picks its probabilities by an index"),
+        (not_finite, r"its rows or its output hold NaN or infinite numbers"),
+    ],
+)
+def test_inspect_shows_what_recording_refuses(attend, reason):
+    policy = OddPolicy(attend)
+    policy.blocks[1].attend = by_hand
+    table = va.inspect(policy, policy.act)
+    refused, *others = str(table).splitlines()[2:-1]
+    assert refused.startswith("blocks.{0,1}" if attend is not_finite else "blocks.0")
+    assert refused.endswith("refused")
+    assert [line.split()[0] for line in others] == ([] if attend is not_finite else ["blocks.1"])
+    assert all(line.endswith("e+00") or "e-0" in line for line in others)
+    assert re.search(rf"Recording refuses blocks\..*, 3 x 9: {reason}", str(table).splitlines()[-1])
+
+
+def test_blocks_that_run_several_times_are_named_by_a_sequence(tmp_path):
+    policy = LoopedPolicy()
+    prefix, noise = torch.randn(1, 5, WIDTH), torch.randn(1, 3, WIDTH)
+    sentence = r"must compute 2 times .* \(block 0: 4, block 1: 4\); .* are named by a rule with a sequence"
+    with pytest.raises(CallsDoNotFit, match=sentence):
+        record_call(tmp_path / "plain", policy, looped_layout(sequence=False), lambda: policy.act(prefix, noise))
+    for block in policy.blocks:
+        block.kept = []
+    rows = record_call(tmp_path, policy, looped_layout(), lambda: policy.act(prefix, noise))
+    for layer in range(4):
+        for step in range(2):
+            kept = policy.blocks[layer % 2].kept[2 * step + layer // 2]
+            np.testing.assert_allclose(rows[layer, step], kept.numpy(), atol=2e-6)
+
+
+class GuidedPolicy:
+    """Guidance: the second row of each call has the instruction, the first has none."""
+
+    def __init__(self):
+        self.network = SmallPolicy()
+
+    def act(self, pictures, texts, states, noise):
+        both = {"pictures": pictures, "states": states, "noise": noise}
+        both = {name: torch.cat([value, value]) for name, value in both.items()}
+        without, with_text = self.network.act(**both, texts=["" for _ in texts] + texts).chunk(2)
+        return without + 3 * (with_text - without)
+
+
+def guided_layout():
+    layout = small_layout()
+    site = replace(layout.sites[0], projection="network.blocks.{block}.attention.out")
+    rules = tuple(replace(rule, modules=rf"network\.{rule.modules}") for rule in layout.rules)
+    return replace(layout, sites=(site,), rules=rules, text=replace(layout.text, embedding="network.words"))
+
+
+@pytest.mark.parametrize("knockout", [None, "word:bowl"])
+def test_guidance_as_a_batch_of_two(tmp_path, knockout):
+    policy, inputs = GuidedPolicy(), given()
+    own = policy.act(**inputs)
+    table = str(va.inspect(policy, lambda: policy.act(**inputs)))
+    assert table.splitlines()[-1].startswith("Calls with a batch are recorded with run.episodes([...])")
+    settings = {"tokenizer": policy.network.tokenizer, "durable": False, "bits": 23, "knockout": knockout}
+    facts = {"task_id": 0, "episode_index": 0, "instruction": "pick the bowl"}
+    with record(tmp_path / "a.zarr", policy, layout=guided_layout(), **settings) as run:
+        with (
+            pytest.raises(CallsDoNotFit, match=r"batch of 2, and the replan one of 1 .*guidance.*run\.episodes"),
+            run.episode(**facts) as episode,
+            episode.replan(env_step=0),
+        ):
+            policy.act(**inputs)
+        with (
+            run.episodes([facts], rows=[1], batch=2) as episodes,
+            episodes.replan(env_step=0, state=inputs["states"], frames=[{"front": inputs["pictures"]}]) as replan,
+        ):
+            replan.actions = policy.act(**inputs)
+            assert torch.equal(replan.actions, own) == (knockout is None)
+    with (
+        record(tmp_path / "b.zarr", policy.network, layout=small_layout(), **settings) as run,
+        run.episode(**facts) as episode,
+        episode.replan(env_step=0) as replan,
+    ):
+        replan.actions = policy.network.act(**inputs)
+    guided, plain = (open_store(tmp_path / name).episodes[0] for name in ("a.zarr", "b.zarr"))
+    assert verify_store(open_store(tmp_path / "a.zarr")) == []
+    assert guided.attributes.prompts == plain.attributes.prompts
+    assert guided.read("actions").shape == (1, HORIZON, 2)
+    for array in ("joint/rows", "joint/contribution", "joint/key_role"):
+        np.testing.assert_allclose(guided.read(array), plain.read(array), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "given", [{"rows": [2], "batch": 2}, {"rows": [0, 1], "batch": 2}, {"rows": [-1]}, {"batch": 0}]
+)
+def test_rows_that_a_batch_does_not_have(tmp_path, given):
+    policy = SmallPolicy()
+    facts = {"task_id": 0, "episode_index": 0, "instruction": ""}
+    with (
+        record(tmp_path / "a.zarr", policy, layout=small_layout(), durable=False) as run,
+        pytest.raises(BadArgument, match=r"1 episodes at the rows .* expected a row of its own for each"),
+        run.episodes([facts], **given),
+    ):
+        pass
