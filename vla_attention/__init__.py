@@ -85,10 +85,13 @@ def workers(where: int | str) -> AbstractContextManager[None]:
     return workers_there(where)
 
 
-def inspect(policy: object, call: Callable[[], object]) -> CallTable:
+def inspect(policy: object, call: Callable[[], object], *, first_row: Callable[[], object] | None = None) -> CallTable:
     """Return a table of every attention call that `call()` makes in a torch policy; printed, it fits a screen.
 
         va.inspect(policy, lambda: policy.select_action(batch))
+
+    Calls that recording refuses are marked, with the reason. `first_row`: where `call` has a batch, the same call with
+    the first row alone; calls whose first row is another one then (heads folded outside of the batch) are marked, too.
 
     Raises:
         NoAttention: no attention was seen.
@@ -96,7 +99,7 @@ def inspect(policy: object, call: Callable[[], object]) -> CallTable:
     """
     # Imported here: `import vla_attention` loads no torch.
     inspect_calls = _module_of_the_recorder("capture.torch_policies.inspect_calls").inspect
-    table: CallTable = inspect_calls(policy, call)
+    table: CallTable = inspect_calls(policy, call, first_row=first_row)
     return table
 
 

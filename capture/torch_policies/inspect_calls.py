@@ -11,14 +11,17 @@ from typing import Any
 
 from torch import Tensor
 
-from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
+from vla_attention.capture.torch_policies.attention_calls import TOLERANCE, AttentionCall, CallShape
 from vla_attention.capture.torch_policies.key_caches import KeyCaches
+from vla_attention.capture.torch_policies.random_numbers import RandomNumbers
 from vla_attention.capture.torch_policies.unseen_attention import no_attention
 from vla_attention.capture.torch_policies.watch import watch_attention
 from vla_attention.schemas.errors import BadArgument
 
 #: How many queries of a call the product of rows and values is checked for.
 _CHECKED_QUERIES = 64
+#: About how many queries of a call the first row of a batch is compared for: they are kept from all calls.
+_COMPARED_QUERIES = 4
 #: Rows of a table on a screen.
 _SCREEN = 40
 #: From this many numbers of keys on, those of one module are written as a range.
@@ -36,6 +39,10 @@ _Check = tuple[float, str]
 
 class NoAttention(BadArgument):
     """A policy whose call computed no attention that can be seen."""
+
+
+class OtherCalls(BadArgument):
+    """Two policy calls that were to be compared, and made other attention calls."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +128,8 @@ class _Shapes:
     errors: list[float] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
     caches: KeyCaches = field(default_factory=KeyCaches)
+    #: Of every call the rows of the first row of its batch, (head, query, key), where they are wanted.
+    first_rows: list[Tensor | None] | None = None
 
     def change(self, shape: CallShape) -> Tensor | None:
         return None
@@ -129,6 +138,8 @@ class _Shapes:
         step = max(1, -(-call.shape.queries // _CHECKED_QUERIES))
         queries = slice(None, None, step)
         self.calls.append(call.shape)
+        if self.first_rows is not None:
+            self.first_rows.append(None if call.refused else _first_row(call))
         if call.refused:
             self.errors.append(float("nan"))
             self.refused.append(f"it {call.refused}")
@@ -141,7 +152,7 @@ class _Shapes:
         self.refused.append(f"its rows {unfit}" if unfit else cache)
 
 
-def inspect(policy: object, call: Callable[[], object]) -> CallTable:
+def inspect(policy: object, call: Callable[[], object], *, first_row: Callable[[], object] | None = None) -> CallTable:
     """Return a table of every attention call that `call()` makes in `policy`; printed, it fits a screen.
 
     policy: an `nn.Module`, or an object that holds modules. call: runs it once, as
@@ -150,16 +161,58 @@ def inspect(policy: object, call: Callable[[], object]) -> CallTable:
     its largest output: rounding errors say that the rows are those of the kernel. `refused` stands there for calls that
     recording refuses, and the reason below the table.
 
+    first_row: where `call` has a batch, the same call with the first row of its inputs alone, noise included. Calls
+    whose first row is not what this call gives, as where heads are folded outside of the batch, are refused.
+
     Raises:
         NoAttention: no attention was seen.
+        OtherCalls: `first_row` makes other attention calls.
         UserError: see `watch_attention`.
     """
-    shapes = _Shapes()
+    shapes = _Shapes(first_rows=None if first_row is None else [])
+    random = RandomNumbers()
     with watch_attention(policy, shapes):
         call()
     if not shapes.calls:
         raise NoAttention(no_attention(policy))
+    if first_row is not None:
+        alone = _Shapes(first_rows=[])
+        random.again()
+        with watch_attention(policy, alone):
+            first_row()
+        _compare_first_rows(shapes, alone)
     return CallTable(type(policy).__name__, tuple(shapes.calls), tuple(shapes.errors), tuple(shapes.refused))
+
+
+def _first_row(call: AttentionCall) -> Tensor:
+    step = max(1, call.shape.queries // _COMPARED_QUERIES)
+    return call.rows(slice(None, None, step), slice(0, 1))[0].cpu()
+
+
+def _compare_first_rows(shapes: _Shapes, alone: _Shapes) -> None:
+    """Refuse calls whose first row is another one without the other rows of the batch."""
+    modules = [call.module for call in shapes.calls]
+    if modules != [call.module for call in alone.calls]:
+        raise OtherCalls(
+            f"The call given as first_row made {len(alone.calls)} attention calls, and that of all rows {len(modules)} "
+            "or others: both must be the same policy call."
+        )
+    pairs = zip(shapes.first_rows or (), alone.first_rows or (), alone.calls, strict=True)
+    for number, (rows, expected, shape) in enumerate(pairs):
+        if rows is None or expected is None or shapes.refused[number]:
+            continue
+        if rows.shape != expected.shape:
+            shapes.refused[number] = (
+                f"the first row of its batch has the shape {tuple(rows.shape)} (head, query, key), and in the call of "
+                f"one row {tuple(expected.shape)}: nothing tells batch from heads. Record one environment at a time"
+            )
+            continue
+        difference = float((rows - expected).abs().max()) if rows.numel() else 0.0
+        if not difference <= TOLERANCE.get(shape.dtype, TOLERANCE["float32"]):
+            shapes.refused[number] = (
+                f"the first row of its batch differs by {difference:.2g} from that of the call of one row: the heads "
+                "are folded outside of the batch, or the two calls had other inputs. Record one environment at a time"
+            )
 
 
 def _rows(calls: Sequence[CallShape], checks: Sequence[_Check]) -> Iterator[CallRow]:

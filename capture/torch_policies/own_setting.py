@@ -13,8 +13,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
+from vla_attention.capture.torch_policies.random_numbers import RandomNumbers
 from vla_attention.capture.torch_policies.watch import watch_attention
 from vla_attention.schemas.errors import BadArgument
 
@@ -57,16 +59,14 @@ def difference_to_own_setting(policy: object, call: Callable[[], Any]) -> OwnSet
     Raises:
         CannotCompare: the call returns no numbers, another number of them the second time, or makes no attention call.
     """
-    devices = list(range(torch.cuda.device_count())) if torch.cuda.is_available() else []
-    with torch.random.fork_rng(devices):
-        state = torch.random.get_rng_state(), [torch.cuda.get_rng_state(device) for device in devices]
-        own = list(_numbers(call()))
-        torch.random.set_rng_state(state[0])
-        for device, kept in zip(devices, state[1], strict=True):
-            torch.cuda.set_rng_state(kept, device)
-        watcher = _Silent()
+    random, watcher = RandomNumbers(), _Silent()
+    try:
+        own = numbers_of(call())
+        random.again()
         with watch_attention(policy, watcher):
-            recorded = list(_numbers(call()))
+            recorded = numbers_of(call())
+    finally:
+        random.again()
     if not watcher.count:
         raise CannotCompare(
             "The call given as own_setting made no attention call when it was repeated: a policy that answers from a "
@@ -84,8 +84,12 @@ def difference_to_own_setting(policy: object, call: Callable[[], Any]) -> OwnSet
     return OwnSettingDifference(float(max(differences)), float(max(np.abs(values).max(initial=0) for values in own)))
 
 
-def _numbers(result: Any) -> Iterator[np.ndarray]:
-    """The arrays of a result, as float64."""
+def numbers_of(result: Any) -> list[NDArray[np.float64]]:
+    """Return the arrays of a policy call's result, as float64, in their order."""
+    return list(_numbers(result))
+
+
+def _numbers(result: Any) -> Iterator[NDArray[np.float64]]:
     if isinstance(result, torch.Tensor):
         yield result.detach().double().cpu().numpy()
     elif isinstance(result, np.ndarray):

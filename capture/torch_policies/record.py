@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from vla_attention.capture.provenance import describe_machine
+from vla_attention.capture.torch_policies.batch_rows import rows_apart
 from vla_attention.capture.torch_policies.knockouts import SessionKnockouts, interventions_of, with_name
-from vla_attention.capture.torch_policies.own_setting import difference_to_own_setting
+from vla_attention.capture.torch_policies.own_setting import difference_to_own_setting, numbers_of
 from vla_attention.capture.torch_policies.policy_layout import (
     LayoutForAnotherVersion,
     PolicyLayout,
@@ -106,7 +107,8 @@ def record(
         condition: a short name for a run with a knockout.
         allow_empty: leave a replan unchanged where the knocked-out group has no key.
         own_setting: a policy call that can be repeated, `lambda: policy.select_action(batch)`: it is made once as you
-            make it and once as it is recorded, and the difference goes into the store.
+            make it and once as it is recorded, and the difference goes into the store. Two further calls check that the
+            rows of its batch are apart.
         resume, overwrite: continue a store, or delete it first.
         any_version: accept other versions of libraries than those that the layout was written for.
         provenance: further facts for the store.
@@ -116,6 +118,7 @@ def record(
         StoreExists: a store is there, and neither `resume` nor `overwrite` is given.
         RunMismatch: `resume` with other settings than those of the store.
         LayoutForAnotherVersion: the layout was written for other libraries than those that are installed.
+        BatchRowsMixed: a change of one row of the batch of `own_setting` changes the actions of another.
         BadArgument: a number of a layer, head or denoise step does not exist; a projection is no module.
     """
     if resume and overwrite:
@@ -138,7 +141,7 @@ def record(
     facts = describe_machine(device)
     facts |= {library: version for library, version in installed.items() if version is not None}
     facts |= {"layout for another version": other} if other is not None else {}
-    facts["difference to own setting"] = _difference(policy, own_setting)
+    facts |= _own_setting(policy, layout, own_setting)
     facts |= dict(provenance or {})
     attributes = RootAttributes(
         format=FORMAT_NAME,
@@ -267,8 +270,14 @@ def _identity(policy: object, layout: PolicyLayout, checkpoint: str, dtype: str,
     )
 
 
-def _difference(policy: object, own_setting: Callable[[], Any] | None) -> str:
-    return "not measured" if own_setting is None else str(difference_to_own_setting(policy, own_setting))
+def _own_setting(policy: object, layout: PolicyLayout, own_setting: Callable[[], Any] | None) -> dict[str, str]:
+    """What is measured with a policy call that can be repeated, for the store."""
+    if own_setting is None:
+        return {"difference to own setting": "not measured"}
+    return {
+        "difference to own setting": str(difference_to_own_setting(policy, own_setting)),
+        "rows of the batch of own setting": rows_apart(policy, layout, own_setting, numbers_of),
+    }
 
 
 def installed_version(library: str) -> str | None:
