@@ -15,10 +15,9 @@ from torch import Tensor
 import vla_attention as va
 from tests.kit.uniform_attention import check_uniform, zeroed_queries
 from tests.policies.word_tokenizer import INSTRUCTION, WordTokenizer
-from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
 from vla_attention.capture.torch_policies.policy_modules import modules_of
-from vla_attention.capture.torch_policies.watch import seen_by_python, watch_attention
+from vla_attention.capture.torch_policies.watch import seen_by_python
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
@@ -87,67 +86,17 @@ def check_rows(store: Any, site: str, expected: np.ndarray) -> None:
     np.testing.assert_allclose(rows_of(store, site)[0], expected, atol=ROW_TOLERANCE, rtol=0)
 
 
-class _Values:
-    """Keeps the values of the first call of one block that a rule gives to the site."""
-
-    def __init__(self, case: PolicyCase, site: str, block: int) -> None:
-        self.layout, self.site, self.block = case.layout, site, block
-        self.values: Tensor | None = None
-
-    def change(self, shape: CallShape) -> None:
-        """Change nothing."""
-
-    def saw(self, call: AttentionCall) -> None:
-        """Keep the values, if this is the call."""
-        shape = call.shape
-        for rule in self.layout.rules:
-            match = rule.fits(shape.module, shape.kind, shape.queries, shape.keys)
-            if match is not None:
-                # The first call of a sequence is that of its first block.
-                place = rule.sequence[0] if rule.sequence else rule.site and (rule.site, int(match["block"]))
-                if place == (self.site, self.block) and self.values is None:
-                    self.values = call.value.detach().clone()
-                return
-
-    def keys(self) -> list[int]:
-        """The site's keys of this call: generated tokens do not exist yet, and the prompt may be shorter."""
-        assert self.values is not None
-        site = self.layout.site(self.site)
-        missing = site.keys.num_keys - self.values.shape[2]
-        missing -= sum(span.num_keys for span in site.keys.spans if span.growing)
-        keys = []
-        for span in site.keys.spans:
-            left_out = missing if span.name == site.variable_span else span.num_keys if span.growing else 0
-            keys += range(span.start, span.stop - left_out)
-        return keys
-
-
-def values_of(case: PolicyCase, site: str, block: int, observation: Any) -> np.ndarray:
-    """Return the values (key of the site, number) of a block's first call; NaN for keys that the call does not have."""
-    watcher = _Values(case, site, block)
-    with watch_attention(case.policy, watcher):
-        case.call(observation)
-    assert watcher.values is not None
-    numbers = watcher.values[0].transpose(0, 1).flatten(1).float().numpy()
-    values = np.full((case.layout.site(site).keys.num_keys, numbers.shape[1]), np.nan, dtype=np.float32)
-    values[watcher.keys()] = numbers
-    return values
-
-
-def changed_spans(case: PolicyCase, site: str, observation: Any, block: int = 0) -> list[str]:
-    """Return the spans whose keys change with the observation, at a block whose keys are not mixed yet.
-
-    Fails unless all keys of a span change or none does.
-    """
-    before, after = (values_of(case, site, block, given) for given in (case.observation, observation))
-    moved = ~np.isclose(before, after, atol=1e-7, rtol=1e-5, equal_nan=True).all(axis=1)
-    names = []
-    for span in case.layout.site(site).keys.spans:
-        part = moved[span.start : span.stop]
-        if part.any():
-            assert part.all(), f"{span.name}: keys {np.flatnonzero(~part).tolist()} do not change"
-            names.append(span.name)
-    return names
+def check_change(case: PolicyCase, keys: str, observation: Any, **settings: Any) -> None:
+    """Check that another observation moves exactly these keys (grouping language), before any block has mixed them."""
+    settings = {"tokenizer": WordTokenizer(), "instruction": case.instruction} | settings
+    found = va.check_layout(
+        case.policy,
+        lambda: case.call(case.observation),
+        case.layout,
+        {keys: lambda: case.call(observation)},
+        **settings,
+    )
+    assert found.fits, found
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from tests.policies import lerobot_models as models
 from tests.policies.policy_checks import (
     PolicyCase,
     check_analysis,
+    check_change,
     check_contributions,
     check_rows,
     check_uniform_attention,
@@ -94,6 +95,11 @@ def test_contributions_are_what_the_blocks_add(case, tmp_path, site):
         return (blocks[block].norm1, "given"), (blocks[block].norm3, "given")
 
     check_contributions(case, record(case, tmp_path), site, stream)
+
+
+def test_the_state_reaches_its_key(case):
+    # Cross-attention mixes no action tokens with one another: those of the first self-attention are still their own.
+    check_change(case, "span:state", {**case.observation, "state": case.observation["state"] + 1}, site="self")
 
 
 def test_a_knockout_takes_the_keys_mass_away(case, tmp_path):

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 import vla_attention as va
 from tests.policies.policy_checks import (
     PolicyCase,
+    check_change,
     check_contributions,
     check_rows,
     check_uniform_attention,
@@ -150,6 +151,12 @@ def test_contributions_are_what_the_blocks_add(case, tmp_path, site):
     check_contributions(
         case, record(case, tmp_path), site, lambda block: ((blocks[block], "given"), (blocks[block], "returned"))
     )
+
+
+@pytest.mark.parametrize("site", ["cross_text", "cross_image"])
+def test_a_word_reaches_its_key_and_no_others(case, site):
+    bowl, plate = WordTokenizer().encode("bowl plate")
+    check_change(case, "word:bowl", torch.where(case.observation == bowl, plate, case.observation), site=site)
 
 
 def test_a_knockout_of_words_leaves_the_picture_only_blocks_alone(case, tmp_path):

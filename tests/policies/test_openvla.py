@@ -12,8 +12,8 @@ import vla_attention as va
 from tests.policies.openvla_stand_in import HEADS, LAYERS, PATCH, SIDE, OpenVLAForActionPrediction
 from tests.policies.policy_checks import (
     PolicyCase,
-    changed_spans,
     check_analysis,
+    check_change,
     check_contributions,
     check_rows,
     check_uniform_attention,
@@ -109,12 +109,19 @@ def test_a_camera_s_picture_reaches_its_patches_and_no_others(chunked, camera):
     pictures = chunked.observation["pictures"].clone()
     pictures[:, camera] = 1 - pictures[:, camera]
     names = ["image", "wrist_image"]
-    assert changed_spans(chunked, "joint", {**chunked.observation, "pictures": pictures}) == [names[camera]]
+    check_change(chunked, f"camera:{names[camera]}", {**chunked.observation, "pictures": pictures})
 
 
 def test_the_state_reaches_its_key(chunked):
-    other = {**chunked.observation, "state": torch.zeros(1, 5)}
-    assert changed_spans(chunked, "joint", other) == ["state"]
+    check_change(chunked, "span:state", {**chunked.observation, "state": torch.zeros(1, 5)})
+
+
+@pytest.mark.parametrize("name", ["one", "chunked"])
+def test_a_word_reaches_its_key_and_no_others(name, request):
+    case = request.getfixturevalue(name)
+    exchanged = case.observation["ids"].clone()
+    exchanged[exchanged == WordTokenizer().encode("bowl")[0]] = WordTokenizer().encode("plate")[0]
+    check_change(case, "word:bowl", {**case.observation, "ids": exchanged})
 
 
 @pytest.mark.parametrize("kind", ["one", "chunked"])

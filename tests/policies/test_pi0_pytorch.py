@@ -19,8 +19,8 @@ import vla_attention as va
 from tests.policies import lerobot_models as models
 from tests.policies.policy_checks import (
     PolicyCase,
-    changed_spans,
     check_analysis,
+    check_change,
     check_contributions,
     check_rows,
     check_uniform_attention,
@@ -58,11 +58,11 @@ def test_rows_are_the_weights_that_the_expert_s_layers_return(case, tmp_path):
 @pytest.mark.parametrize("camera", models.CAMERAS)
 def test_a_camera_s_picture_reaches_its_patches_and_no_others(case, camera):
     name = f"observation.images.{camera}"
-    assert changed_spans(case, "joint", {**case.observation, name: 1 - case.observation[name]}) == [camera]
+    check_change(case, f"camera:{camera}", {**case.observation, name: 1 - case.observation[name]})
 
 
 def test_the_state_reaches_its_key(case):
-    assert changed_spans(case, "joint", {**case.observation, "observation.state": torch.zeros(1, 6)}) == ["state"]
+    check_change(case, "span:state", {**case.observation, "observation.state": torch.zeros(1, 6)})
 
 
 def test_contributions_are_what_the_expert_s_layers_add(case, tmp_path):

@@ -13,8 +13,8 @@ import vla_attention as va
 from tests.policies.pi0_model import CAMERAS, CHUNK, LONGEST, PATCHES, inputs, small_pi0
 from tests.policies.policy_checks import (
     PolicyCase,
-    changed_spans,
     check_analysis,
+    check_change,
     check_contributions,
     check_rows,
     check_uniform_attention,
@@ -68,12 +68,16 @@ def test_a_shorter_prompt_leaves_absent_keys(case, tmp_path):
 def test_a_camera_s_picture_reaches_its_keys_and_no_others(case, number):
     pictures = case.observation["pixel_values"].clone()
     pictures[:, number] = torch.rand(pictures[:, number].shape, generator=torch.Generator().manual_seed(9))
-    assert changed_spans(case, "joint", {**case.observation, "pixel_values": pictures}) == [CAMERAS[number]]
+    check_change(case, f"camera:{CAMERAS[number]}", {**case.observation, "pixel_values": pictures})
 
 
 def test_the_state_and_the_noise_reach_their_keys(case):
-    assert changed_spans(case, "joint", {**case.observation, "state": torch.zeros(1, 5)}) == ["state"]
-    assert changed_spans(case, "joint", {**case.observation, "noise": torch.zeros(1, CHUNK, 4)}) == ["actions"]
+    check_change(case, "span:state", {**case.observation, "state": torch.zeros(1, 5)})
+    check_change(case, "span:actions", {**case.observation, "noise": torch.zeros(1, CHUNK, 4)})
+
+
+def test_a_word_reaches_its_key_and_no_others(case):
+    check_change(case, "word:bowl", inputs(instruction=INSTRUCTION.replace("bowl", "plate")))
 
 
 def test_contributions_are_what_the_layers_add(case, tmp_path):

@@ -14,8 +14,8 @@ import vla_attention as va
 from tests.policies import lerobot_models as models
 from tests.policies.policy_checks import (
     PolicyCase,
-    changed_spans,
     check_analysis,
+    check_change,
     check_contributions,
     check_rows,
     check_uniform_attention,
@@ -107,26 +107,22 @@ def test_an_action_token_of_self_sees_those_before_it_only(case, tmp_path):
 @pytest.mark.parametrize("camera", models.CAMERAS)
 def test_a_camera_s_picture_reaches_its_patches_and_no_others(case, camera):
     name = f"observation.images.{camera}"
-    other = {**case.observation, name: 1 - case.observation[name]}
-    assert changed_spans(case, "self", other) == [camera]
+    check_change(case, f"camera:{camera}", {**case.observation, name: 1 - case.observation[name]})
 
 
 def test_the_words_the_state_and_the_noise_reach_their_keys(case):
-    words = case.observation["observation.language.tokens"].clone()
-    words[:] = 20 + torch.arange(words.shape[1])
-    assert changed_spans(
-        PolicyCase(case.policy, case.layout, case.call, {**case.observation}),
-        "self",
-        {**case.observation, "observation.state": torch.zeros(1, 6)},
-    ) == ["state"]
+    tokens = case.observation["observation.language.tokens"].clone()
+    tokens[:, INSTRUCTION.split().index("bowl")] += 20
+    check_change(case, "word:bowl", {**case.observation, "observation.language.tokens": tokens})
+    check_change(case, "span:state", {**case.observation, "observation.state": torch.zeros(1, 6)})
     short = case_of(case.policy, padding=6)
     ids = short.observation["observation.language.tokens"] + 20
-    assert changed_spans(short, "self", {**short.observation, "observation.language.tokens": ids}) == ["prompt"]
+    check_change(short, "span:prompt", {**short.observation, "observation.language.tokens": ids})
     noise = models.chunk_of(case.policy, seed=5)
     chosen = PolicyCase(
         case.policy, case.layout, lambda batch: (noise if "noise" in batch else case.call)(batch), case.observation
     )
-    assert changed_spans(chosen, "self", {**case.observation, "noise": torch.zeros(1)}) == ["actions"]
+    check_change(chosen, "span:actions", {**case.observation, "noise": torch.zeros(1)})
 
 
 def test_select_action_answers_from_its_queue_in_between(policy, tmp_path):

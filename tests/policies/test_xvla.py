@@ -12,8 +12,8 @@ import vla_attention as va
 from tests.policies import lerobot_models as models
 from tests.policies.policy_checks import (
     PolicyCase,
-    changed_spans,
     check_analysis,
+    check_change,
     check_contributions,
     check_rows,
     check_uniform_attention,
@@ -60,13 +60,12 @@ def test_keys_have_the_roles_of_actions_views_words_and_soft_prompts(case, tmp_p
 
 def test_further_views_and_the_state_reach_their_keys(case):
     wrist = {**case.observation, "observation.images.wrist": 1 - case.observation["observation.images.wrist"]}
-    assert changed_spans(case, "joint", wrist) == ["wrist_mean", "wrist"]
+    check_change(case, "span:wrist_mean | camera:wrist", wrist)
     # The state is part of every action token.
-    still = {**case.observation, "observation.state": torch.zeros(1, 6)}
-    assert changed_spans(case, "joint", still) == ["actions"]
+    check_change(case, "span:actions", {**case.observation, "observation.state": torch.zeros(1, 6)})
     # Florence 2's encoder mixes the first view and the words.
     top = {**case.observation, "observation.images.top": 1 - case.observation["observation.images.top"]}
-    assert changed_spans(case, "joint", top) == ["top_mean", "top", "prompt"]
+    check_change(case, "span:top_mean | camera:top | span:prompt", top)
 
 
 def test_contributions_are_what_the_blocks_add(case, tmp_path):

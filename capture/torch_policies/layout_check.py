@@ -1,0 +1,334 @@
+"""`va.check_layout`: whether what a user changes in a policy call reaches the keys that the layout names for it.
+
+The keys are looked at where the attention calls of the first block get them, before any block has mixed them. Values
+are compared, which hold what a token is; keys may have its position in them, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.capture.interventions.resolution import run_vocabularies, site_tokens
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
+from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace, KnownCalls
+from vla_attention.capture.torch_policies.inspect_calls import NoAttention
+from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
+from vla_attention.capture.torch_policies.policy_modules import FoundPolicy, find_policy
+from vla_attention.capture.torch_policies.prompt_ids import PromptIds, embeddings_of
+from vla_attention.capture.torch_policies.prompts import TokenText
+from vla_attention.capture.torch_policies.random_numbers import RandomNumbers
+from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs
+from vla_attention.capture.torch_policies.replan_text import ReplanText
+from vla_attention.capture.torch_policies.unseen_attention import no_attention
+from vla_attention.capture.torch_policies.watch import watch_attention
+from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
+from vla_attention.schemas.groupings.selector_weights import selector_weights
+from vla_attention.schemas.layout import Span
+
+#: Largest difference of a key's values, relative to the largest of them, that rounding leaves, by dtype: a prompt of
+#: another length makes other kernels run.
+_ROUNDING = {"float32": 1e-5, "float64": 1e-5, "float16": 5e-3, "bfloat16": 2e-2}
+#: Selectors that need the prompt's text.
+_OF_WORDS = ("word", "words")
+
+
+class NotRepeatable(BadArgument):
+    """A policy call that gives its attention other keys when it is made again."""
+
+
+@dataclass(frozen=True)
+class KeysMoved:
+    """Which keys of one site moved when one thing was changed.
+
+    Attributes:
+        selector: the keys that should move, in the grouping language.
+        site, block: where they were looked at.
+        expected, moved: (key,) numbers of the site's keys, ascending.
+        present: (key,) numbers of the keys that the calls have.
+        spans: the site's.
+    """
+
+    selector: str
+    site: str
+    block: int
+    expected: tuple[int, ...]
+    moved: tuple[int, ...]
+    present: tuple[int, ...]
+    spans: tuple[Span, ...]
+
+    @property
+    def fits(self) -> bool:
+        """Whether exactly the expected keys moved."""
+        return self.expected == self.moved
+
+    def named(self, keys: Sequence[int]) -> str:
+        """Return keys in words: spans by name, and parts of spans with the numbers of their keys."""
+        words = []
+        for span in self.spans:
+            own = [key for key in keys if span.start <= key < span.stop]
+            if own:
+                whole = len(own) == sum(span.start <= key < span.stop for key in self.present)
+                words.append(span.name if whole else f"{span.name} ({_ranges(own)})")
+        return ", ".join(words) or "nothing"
+
+    @property
+    def verdict(self) -> str:
+        """What is wrong, in words, or "yes"."""
+        missing = self.named(sorted(set(self.expected) - set(self.moved)))
+        beside = self.named(sorted(set(self.moved) - set(self.expected)))
+        wrong = [f"{missing} did not move"] * (missing != "nothing") + [f"{beside} moved"] * (beside != "nothing")
+        return f"no: {'; '.join(wrong)}" if wrong else "yes"
+
+
+@dataclass(frozen=True)
+class LayoutCheck:
+    """What moved and what should have, for every change; printed, it is a table.
+
+    Attributes:
+        layout: the layout's name.
+        changes: one for every change and site.
+        left_out: the sites that were not looked at, because earlier blocks have mixed their keys.
+    """
+
+    layout: str
+    changes: tuple[KeysMoved, ...]
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def fits(self) -> bool:
+        """Whether every change moved exactly the keys that the layout names for it."""
+        return all(change.fits for change in self.changes)
+
+    def __str__(self) -> str:
+        lines = [("changed", "site", "should move", "moved", "fits")]
+        lines += [
+            (moved.selector, moved.site, moved.named(moved.expected), moved.named(moved.moved), moved.verdict)
+            for moved in self.changes
+        ]
+        widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
+        text = [
+            "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
+        ]
+        wrong = sum(not change.fits for change in self.changes)
+        found = (
+            "every change moves its keys and no others" if not wrong else f"{wrong} of {len(self.changes)} do not fit"
+        )
+        blocks = dict.fromkeys(f"'{moved.site}' at block {moved.block}" for moved in self.changes)
+        text.insert(0, f"Layout '{self.layout}', keys of {' and '.join(blocks)}: {found}")
+        if self.left_out:
+            text.append(
+                f"Not looked at: {listing(self.left_out)}, whose first block comes after others that mix the keys "
+                "(site=... does)."
+            )
+        return "\n".join(text)
+
+    __repr__ = __str__
+
+
+def check_layout(
+    policy: object,
+    call: Callable[[], object],
+    layout: PolicyLayout,
+    perturb: Mapping[str, Callable[[], object]],
+    *,
+    tokenizer: Any = None,
+    instruction: str = "",
+    site: str | None = None,
+) -> LayoutCheck:
+    """Return whether a change of a policy's input moves exactly the keys that the layout names for it.
+
+    >>> import vla_attention as va
+    >>> check = va.check_layout(policy, lambda: policy.act(**batch), layout, {
+    ...     "camera:front": lambda: policy.act(**{**batch, "pictures": 1 - batch["pictures"]}),
+    ...     "span:state": lambda: policy.act(**{**batch, "states": batch["states"] + 1}),
+    ... })
+    >>> check.fits
+    True
+
+    The keys are looked at in the first block of a policy call, at the first denoise step, before anything but the
+    policy's own encoders has mixed them: what a text encoder mixes moves together, and is named together, as
+    `"camera:front | span:prompt"`.
+
+    Args:
+        policy, layout: as in `va.record`.
+        call: makes the policy call, for one environment; it can be repeated, and is made with the same random numbers.
+        perturb: keys in the grouping language (`camera:front`, `span:state`, `word:bowl`, `role:instruction`,
+            `patch:front[0:1,0:1]`) -> the same policy call with that alone changed which they hold. A picture must
+            change in every patch that is named, and a word be exchanged by one of as many tokens.
+        tokenizer, instruction: for words; the policy's own tokenizer, and the task as the policy reads it.
+        site: look at this site, at its first block; None: at every site that the policy's first block has.
+
+    Raises:
+        CallsDoNotFit: the attention calls are not those of the layout.
+        NotRepeatable: keys move although nothing was changed.
+        SelectorError: a name that the layout does not have.
+        BadArgument: keys of the layout that the call does not have, or words without a tokenizer.
+    """
+    if not perturb:
+        raise BadArgument("va.check_layout got no changes; expected a dictionary from keys to policy calls.")
+    for selector in perturb:
+        if tokenizer is None and any(atom.kind in _OF_WORDS for atom in atoms_of(parse_selector(selector))):
+            raise BadArgument(f"'{selector}' needs tokenizer= and instruction=, which say where the words are.")
+    blocks = _first_blocks(layout, site)
+    found, random = find_policy(policy), RandomNumbers()
+    text = None if tokenizer is None else TokenText(tokenizer)
+    try:
+        keys = _keys_of(found, layout, blocks, call, "the unchanged call")
+        expected = keys.expected(layout, perturb, text, instruction)
+        random.again()
+        again = _keys_of(found, layout, blocks, call, "the unchanged call, made again")
+        _check_repeats(keys, again, layout)
+        changes = []
+        for selector, changed_call in perturb.items():
+            random.again()
+            changed = _keys_of(found, layout, blocks, changed_call, f"the call for '{selector}'")
+            for name, block in blocks.items():
+                present = keys.there(name) | changed.there(name)
+                wanted, moved = _numbers(expected[selector][name]), _numbers(keys.moved(changed, name))
+                if wanted or moved:
+                    spans = layout.site(name).keys.spans
+                    changes.append(KeysMoved(selector, name, block, wanted, moved, _numbers(present), spans))
+    finally:
+        random.again()
+    left_out = tuple(other.name for other in layout.sites if other.name not in blocks) if site is None else ()
+    return LayoutCheck(layout.name, tuple(changes), left_out)
+
+
+def _first_blocks(layout: PolicyLayout, site: str | None) -> dict[str, int]:
+    """The sites to look at, and the block of each."""
+    if site is not None:
+        return {site: min(layout.site(site).keys.layers, default=0)}
+    firsts = {known.name: min(known.keys.layers, default=0) for known in layout.sites}
+    return {name: block for name, block in firsts.items() if block == min(firsts.values())}
+
+
+@dataclass
+class _Keys:
+    """A watcher that keeps the values of the first call of some sites' first blocks, and what tells their words.
+
+    values: site -> (key, number), NaN for keys that the call does not have. valid: site -> (key,) bool, keys that some
+    action query may see. rounding: site -> see `_ROUNDING`.
+    """
+
+    order: CallOrder
+    blocks: Mapping[str, int]
+    ids: PromptIds
+    values: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    valid: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    rounding: dict[str, float] = field(default_factory=dict)
+
+    changes = False
+
+    def change(self, shape: CallShape) -> None:
+        return None
+
+    def saw(self, call: AttentionCall) -> None:
+        place = self.order.place(call.shape)
+        self.order.ran(call.shape, place)
+        name = None if place is None else place.site
+        if place is None or name is None or name in self.values or self.blocks.get(name) != place.block:
+            return
+        if call.shape.batch != 1:
+            raise BadArgument(
+                f"A call of site '{name}' has a batch of {call.shape.batch}; give va.check_layout policy calls for one "
+                "environment."
+            )
+        self._keep(call, place, self.order.known.sites[name])
+
+    def _keep(self, call: AttentionCall, place: CallPlace, site: RecordedSite) -> None:
+        count = site.keys.num_keys
+        own = np.arange(count) if place.keys is None else place.keys
+        numbers = call.value[0].detach().transpose(0, 1).flatten(1).float().cpu().numpy()
+        self.values[site.name] = values = np.full((count, numbers.shape[1]), np.nan, dtype=np.float32)
+        values[own] = numbers
+        self.valid[site.name] = valid = np.zeros(count, dtype=bool)
+        valid[own] = call.allowed(place.queries)[0].any(dim=0).cpu().numpy()
+        self.rounding[site.name] = _ROUNDING.get(call.precision, _ROUNDING["float32"])
+
+    def there(self, site: str) -> NDArray[np.bool_]:
+        """(key,) bool, the keys that the call has."""
+        there: NDArray[np.bool_] = np.logical_not(np.isnan(self.values[site]).all(axis=1))
+        return there
+
+    def moved(self, other: _Keys, site: str) -> NDArray[np.bool_]:
+        """(key,) bool, the keys of a site that another call has otherwise, or that one of the calls lacks."""
+        before, after = np.nan_to_num(self.values[site]), np.nan_to_num(other.values[site])
+        scale = np.maximum(np.abs(before).max(axis=1), np.abs(after).max(axis=1))
+        moved: NDArray[np.bool_] = np.greater(np.abs(before - after).max(axis=1), self.rounding[site] * scale)
+        moved |= self.there(site) != other.there(site)
+        return moved
+
+    def expected(
+        self, layout: PolicyLayout, selectors: Mapping[str, object], tokenizer: TokenText | None, instruction: str
+    ) -> dict[str, dict[str, NDArray[np.bool_]]]:
+        """Return selector -> site -> (key,) bool, the keys that it takes of those that the call has."""
+        text = ReplanText(layout, tokenizer, self.ids, {0: ReplanInputs(env_step=0, instruction=instruction)})
+        text.present = self.order.present
+        prompt = text.prompt(0, None)
+        sites = [layout.site(name) for name in self.values]
+        roles = {
+            site.name: text.roles(0, site, prompt, self.order.present[site.name], self.valid[site.name])
+            for site in sites
+        }
+        layouts = [site.keys for site in sites]
+        tokens = site_tokens(layouts, roles, prompt, (), {})
+        vocabularies = run_vocabularies(layouts, [prompt.instruction_text], ())
+        chosen = {}
+        for selector in selectors:
+            weights = selector_weights(selector, tokens, vocabularies)
+            chosen[selector] = {name: (weights[name][0] > 0) & self.there(name) for name in self.values}
+            if not any(keys.any() for keys in chosen[selector].values()):
+                raise BadArgument(
+                    f"'{selector}' takes no key that the policy call has at {listing(self.values)}; the spans there "
+                    f"are {listing(span.name for site in sites for span in site.keys.spans)}."
+                )
+        return chosen
+
+
+def _keys_of(
+    policy: FoundPolicy, layout: PolicyLayout, blocks: Mapping[str, int], call: Callable[[], object], what: str
+) -> _Keys:
+    ids = PromptIds(embeddings_of(policy.policy, layout), batch=1)
+    name = type(policy.policy).__name__
+    keys = _Keys(CallOrder(KnownCalls(layout), name), blocks, ids)
+    with ids.watched(), watch_attention(policy, keys):
+        call()
+    if not keys.order.seen:
+        raise NoAttention(f"In {what}: {no_attention(policy.policy)}")
+    keys.order.check(what)
+    return keys
+
+
+def _check_repeats(keys: _Keys, again: _Keys, layout: PolicyLayout) -> None:
+    """Raise `NotRepeatable` if keys move between two calls in which nothing was changed."""
+    for name in keys.values:
+        moved = keys.moved(again, name)
+        if moved.any():
+            spans = [span.name for span in layout.site(name).keys.spans if moved[span.start : span.stop].any()]
+            raise NotRepeatable(
+                f"The keys of the spans {listing(spans)} at site '{name}' are others when the unchanged call is made "
+                "again, with the same random numbers of torch. Give the policy its noise, or reset it in each call, as "
+                "lambda: (policy.reset(), policy.select_action(batch))[1]."
+            )
+
+
+def _numbers(chosen: NDArray[np.bool_]) -> tuple[int, ...]:
+    return tuple(int(key) for key in np.flatnonzero(chosen))
+
+
+def _ranges(keys: Sequence[int]) -> str:
+    """Return ascending numbers as text: `key 7`, `keys 4..6` or `keys 4..6, 9`."""
+    parts: list[list[int]] = []
+    for key in keys:
+        if parts and parts[-1][-1] == key - 1:
+            parts[-1].append(key)
+        else:
+            parts.append([key])
+    what = "key" if len(keys) == 1 else "keys"
+    return f"{what} {listing(str(part[0]) if len(part) == 1 else f'{part[0]}..{part[-1]}' for part in parts)}"
