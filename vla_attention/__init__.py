@@ -24,8 +24,23 @@ from typing import TYPE_CHECKING, Any
 from vla_attention.schemas.errors import UserError
 
 if TYPE_CHECKING:
-    from vla_attention.analyze.api import OpenStores
+    # What `__getattr__` gives, for type checkers and editors.
+    from vla_attention import datasets as datasets
+    from vla_attention.analyze.api import OpenStores as OpenStores
+    from vla_attention.capture.torch_policies import layouts as layouts
     from vla_attention.capture.torch_policies.inspect_calls import CallTable
+    from vla_attention.capture.torch_policies.layout_check import check_layout as check_layout
+    from vla_attention.capture.torch_policies.policy_layout import CallRule as CallRule
+    from vla_attention.capture.torch_policies.policy_layout import CameraPicture as CameraPicture
+    from vla_attention.capture.torch_policies.policy_layout import PolicyLayout as PolicyLayout
+    from vla_attention.capture.torch_policies.policy_layout import PromptText as PromptText
+    from vla_attention.capture.torch_policies.policy_layout import RecordedSite as RecordedSite
+    from vla_attention.capture.torch_policies.record import record as record
+    from vla_attention.schemas.layout import PatchGrid as PatchGrid
+    from vla_attention.schemas.layout import SiteLayout as SiteLayout
+    from vla_attention.schemas.layout import Span as Span
+
+    __version__: str
 
 #: Public names of the recorder by module. They are imported when they are used: the recorder needs torch.
 _RECORDER = {
@@ -104,25 +119,27 @@ def inspect(policy: object, call: Callable[[], object], *, first_row: Callable[[
     return table
 
 
-def __getattr__(name: str) -> Any:
-    if name == "OpenStores":
-        from vla_attention.analyze.api import OpenStores
+if not TYPE_CHECKING:  # else every misspelt name would be of type Any
 
-        return OpenStores
-    if name == "__version__":
-        from importlib.metadata import version
+    def __getattr__(name: str) -> Any:
+        if name == "OpenStores":
+            from vla_attention.analyze.api import OpenStores
 
-        return version("vla-attention")
-    if name == "datasets":
-        from importlib import import_module
+            return OpenStores
+        if name == "__version__":
+            from importlib.metadata import version
 
-        return import_module("vla_attention.datasets")
-    if name == "layouts":
-        return _module_of_the_recorder("capture.torch_policies.layouts")
-    for module, names in _RECORDER.items():
-        if name in names:
-            return getattr(_module_of_the_recorder(module), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+            return version("vla-attention")
+        if name == "datasets":
+            from importlib import import_module
+
+            return import_module("vla_attention.datasets")
+        if name == "layouts":
+            return _module_of_the_recorder("capture.torch_policies.layouts")
+        for module, names in _RECORDER.items():
+            if name in names:
+                return getattr(_module_of_the_recorder(module), name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def _module_of_the_recorder(name: str) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, SupportsIndex
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,23 +43,9 @@ class EpisodeFacts:
 
 @dataclass(frozen=True)
 class ReplanInputs:
-    """What the caller gives to `replan(...)` beside the environment step. All of it is optional.
+    """What the caller gives to `replan(...)`, checked and in the store's form; `Episode.replan` describes each.
 
-    Attributes:
-        env_step: the environment step of the call.
-        frames: camera of the layout -> picture as the policy gets it, (height, width, 3) uint8 or (3, height, width)
-            with numbers from 0 to 1; stored in the model's input size.
-        state: (state_dim,) numbers.
-        instruction: the instruction of this call, where it is not that of the episode.
-        prompt: the prompt's pieces, one text for each key of the prompt (None for keys without text), or a `Prompt`;
-            None: from the token ids that the policy embeds.
-        roles: site -> role codes (key,), where the layout's are not those of this call.
-        noise_seed: the seed of this call's noise; None: that of the episode.
-        masks: camera -> (height, width) whole numbers: the number of each pixel's object, counted in the episode's
-            `objects`.
-        coverage: camera -> (patch, object), the share of each patch that each object covers; instead of masks.
-        dataset_actions: (step, action_dim), the actions that a data set has from this call on; no more of them are
-            stored than the policy gives actions.
+    coverage: also what masks gave.
     """
 
     env_step: int
@@ -101,7 +87,9 @@ def _numbers(what: str, given: Any) -> NDArray[np.float64]:
 _NAMES = tuple(part.name for part in fields(ReplanInputs) if part.name != "env_step")
 
 
-def read_inputs(layout: PolicyLayout, facts: EpisodeFacts, env_step: int, given: Mapping[str, Any]) -> ReplanInputs:
+def read_inputs(
+    layout: PolicyLayout, facts: EpisodeFacts, env_step: SupportsIndex, given: Mapping[str, Any]
+) -> ReplanInputs:
     """Return what a caller gave for one replan, checked and in the store's form.
 
     Raises:

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Never, SupportsIndex, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,7 @@ from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder, S
 from vla_attention.capture.torch_policies.unseen_attention import no_attention
 from vla_attention.capture.torch_policies.watch import watch_attention
 from vla_attention.schemas.errors import BadArgument, Note, UserError, listing
+from vla_attention.schemas.layout import Prompt
 from vla_attention.schemas.stores.store_format import EPISODES_GROUP, RootAttributes, StoreExists, episode_name
 
 #: More replans than any episode has; the writer collects rows in blocks of two megabytes.
@@ -115,19 +116,52 @@ class Episode:
         self._writer.append(record)
 
     @contextmanager
-    def replan(self, *, env_step: int, **inputs: Any) -> Iterator[Replan]:
-        """Record the policy call in the block; `ReplanInputs` has the other arguments.
+    def replan(
+        self,
+        *,
+        env_step: SupportsIndex,
+        frames: Mapping[str, Any] | None = None,
+        state: Any = None,
+        instruction: str | None = None,
+        prompt: Prompt | Sequence[str | None] | None = None,
+        roles: Mapping[str, Any] | None = None,
+        noise_seed: SupportsIndex | None = None,
+        masks: Mapping[str, Any] | None = None,
+        coverage: Mapping[str, Any] | None = None,
+        dataset_actions: Any = None,
+        # No type fits: for a type checker these are errors, and for `read_inputs` names that do not exist.
+        **unknown: Never,
+    ) -> Iterator[Replan]:
+        """Record the policy call in the block. What is None is not known, or that of the episode.
 
         Args:
             env_step: the environment step at which the call is made; it increases from call to call.
+            frames: camera of the layout -> picture as the policy gets it, (height, width, 3) uint8 or (3, height,
+                width) with numbers from 0 to 1; stored in the model's input size.
+            state: (state_dim,) numbers.
+            instruction: the instruction of this call, where it is not that of the episode.
+            prompt: the prompt's pieces, one text for each key of the prompt (None for keys without text), or a
+                `Prompt`; None: from the token ids that the policy embeds.
+            roles: site -> role codes (key,), where the layout's are not those of this call.
+            noise_seed: the seed of this call's noise.
+            masks: camera -> (height, width) whole numbers: the number of each pixel's object, counted in the episode's
+                `objects`.
+            coverage: camera -> (patch, object), the share of each patch that each object covers; instead of masks.
+            dataset_actions: (step, action_dim), the actions that a data set has from this call on; no more of them are
+                stored than the policy gives actions.
 
         Raises:
+            BadArgument: an argument or a camera does not exist, or a value has another shape or type.
             CallsDoNotFit: the attention calls are not those of the layout.
             RowsDoNotMatch: the rows do not reproduce what the policy's kernel gave.
             ContributionsUnknown: contributions are recorded, and it is not known what the parts of the keys add.
         """
         if self._batch is not None:
             raise RecordingStopped("This episode is one of several; use the replan of run.episodes(...).")
+        inputs = dict(
+            frames=frames, state=state, instruction=instruction, prompt=prompt, roles=roles, noise_seed=noise_seed,
+            masks=masks, coverage=coverage, dataset_actions=dataset_actions, **unknown,
+        )  # fmt: skip
         given = read_inputs(self.run.layout, self.facts, env_step, inputs)
         with self.run._replan([self], [given], batch=1, rows=[0]) as replan:
             yield replan
@@ -172,24 +206,49 @@ class EpisodeBatch(Sequence[Episode]):
     def __len__(self) -> int:
         return len(self._episodes)
 
-    def __getitem__(self, row: Any) -> Any:
-        return self._episodes[row]
+    @overload
+    def __getitem__(self, number: int) -> Episode: ...
+
+    @overload
+    def __getitem__(self, number: slice) -> list[Episode]: ...
+
+    def __getitem__(self, number: int | slice) -> Episode | list[Episode]:
+        return self._episodes[number]
 
     @contextmanager
     def replan(
-        self, *, env_step: int | Sequence[int], active: Sequence[bool] | None = None, **inputs: Any
+        self,
+        *,
+        env_step: SupportsIndex | Sequence[SupportsIndex],
+        active: Sequence[bool] | None = None,
+        frames: Sequence[Mapping[str, Any] | None] | None = None,
+        state: Any = None,
+        instruction: Sequence[str | None] | None = None,
+        prompt: Sequence[Prompt | Sequence[str | None] | None] | None = None,
+        roles: Sequence[Mapping[str, Any] | None] | None = None,
+        noise_seed: Sequence[SupportsIndex | None] | None = None,
+        masks: Sequence[Mapping[str, Any] | None] | None = None,
+        coverage: Sequence[Mapping[str, Any] | None] | None = None,
+        dataset_actions: Sequence[Any] | None = None,
+        **unknown: Never,
     ) -> Iterator[Replan]:
         """Record the policy call of all episodes in the block.
 
         Args:
             env_step: environment step of all episodes, or of each.
             active: which episodes are recorded; None: all of them. One that has ended is left out.
-            inputs: as in `ReplanInputs`, each a sequence with one entry for each episode.
+            frames, state, instruction, prompt, roles, noise_seed, masks, coverage, dataset_actions: as in
+                `Episode.replan`, each a sequence with one entry for each episode.
         """
+        inputs = dict(
+            frames=frames, state=state, instruction=instruction, prompt=prompt, roles=roles, noise_seed=noise_seed,
+            masks=masks, coverage=coverage, dataset_actions=dataset_actions, **unknown,
+        )  # fmt: skip
         count = len(self)
         _check_length("active", active, count)
         chosen = [number for number in range(count) if active is None or active[number]]
-        steps: list[Any] = list(np.asarray(env_step)) if np.ndim(env_step) else [env_step] * count
+        several: Any = env_step
+        steps: list[Any] = list(np.asarray(several)) if np.ndim(several) else [several] * count
         for name, values in (("env_step", steps), *(inputs.items())):
             _check_length(name, values, count)
         given = [
