@@ -182,7 +182,7 @@ class AttentionCall:
             return (
                 f"sum to {float(sums[wrong][0]):.4g} and not to 1 when they are multiplied with the values: the module "
                 "changes them after the softmax, as dropout (call policy.eval()), factors and sinks without a key do "
-                "(load the model without them). Such rows cannot be stored; a rule without a site leaves them out"
+                "(load the model without them). Such rows cannot be stored"
             )
         return ""
 

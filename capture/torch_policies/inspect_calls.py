@@ -111,6 +111,8 @@ class CallTable:
         if len(rows) > _SCREEN:
             lines.append(f"... and {len(rows) - _SCREEN} further rows: see `.rows`")
         lines += [_refusal(row) for row in rows if row.refused]
+        if any(row.refused for row in rows):
+            lines.append("Calls that hold no action queries are left out by a rule without a site.")
         batch = sorted({call.batch for call in self.calls})
         if batch and batch[0] > 1 and self.errors:
             lines.append(_BATCH)

@@ -62,7 +62,7 @@ class PromptIds:
             given = next((value for value in (*arguments, *named.values()) if isinstance(value, Tensor)), None)
             if given is None or given.is_floating_point():
                 return
-            self._called[path] = max(self._called.get(path, ()), tuple(given.shape), key=np.prod)
+            self._called[path] = max(self._called.get(path, tuple(given.shape)), tuple(given.shape), key=np.prod)
             if is_prompt and given.ndim in (1, 2):
                 self._keep(given if given.ndim == 2 else given[None])
 
