@@ -25,7 +25,7 @@ def first_values(call: AttentionCall) -> Tensor:
 
 
 def slid(before: Tensor, now: Tensor) -> bool:
-    """Whether a cache has lost its first key between two calls of one query; both: `first_values`."""
+    """Whether a cache has lost its first key between a call and the next one, of one query; both: `first_values`."""
     if before.shape != now.shape or before.shape[2] < 2:
         return False
     return torch.equal(now[:, :, 0], before[:, :, 1]) and not torch.equal(now[:, :, 0], before[:, :, 0])
@@ -33,7 +33,10 @@ def slid(before: Tensor, now: Tensor) -> bool:
 
 @dataclass
 class _Calls:
-    """Of the calls of one module: their numbers of keys, and the last one's first values and keys that it may see."""
+    """Of the calls of one module: their numbers of keys; the last one's first values, and keys that its query may see.
+
+    seen: (batch, key) bool; None after a call of several queries.
+    """
 
     keys: list[int] = field(default_factory=list)
     first: Tensor | None = None
@@ -51,12 +54,9 @@ class KeyCaches:
         shape = call.shape
         calls = self._modules.setdefault(shape.module, _Calls())
         calls.keys.append(shape.keys)
-        if shape.queries > 1:
-            calls.first = calls.seen = None
-            return ""
         before, calls.first = calls.first, first_values(call)
-        seen_before, calls.seen = calls.seen, call.allowed()[:, 0]
-        if before is None or seen_before is None or shape.keys != calls.keys[-2]:
+        seen_before, calls.seen = calls.seen, call.allowed()[:, 0] if shape.queries == 1 else None
+        if before is None or calls.seen is None:
             return ""
         if slid(before, calls.first):
             return (
@@ -64,8 +64,9 @@ class KeyCaches:
                 f"has a place of its own: {LOAD_WITH_DYNAMIC_CACHE}"
             )
         others = [keys for keys in calls.keys if keys != shape.keys]
-        more = bool((calls.seen & ~seen_before).any()) and not bool((seen_before & ~calls.seen).any())
-        if others and more:
+        if seen_before is None or seen_before.shape != calls.seen.shape or not others:
+            return ""
+        if bool((calls.seen & ~seen_before).any()) and not bool((seen_before & ~calls.seen).any()):
             return (
                 f"its static cache fills up: the calls have {shape.keys} keys, some of them empty, and an earlier one "
                 f"had {others[0]} without the empty ones: {LOAD_WITH_DYNAMIC_CACHE}"

@@ -212,7 +212,7 @@ class ReplanRecorder:
             )
         self.largest_error = max(self.largest_error, error)
         self._check_error(error, call, rows, place)
-        if self.layout.autoregressive and call.shape.queries == 1:
+        if self.layout.autoregressive:
             self._check_cache(call, place)
         seen = call.allowed(queries)
         uniform = seen / seen.sum(dim=-1, keepdim=True).clamp(min=1)
@@ -240,7 +240,7 @@ class ReplanRecorder:
         """Note a cache whose first key has left since the token before: its keys are not those of the layout."""
         of_block = self._collected[place.site or ""].first_values
         before, of_block[place.block] = of_block.get(place.block), first_values(call)
-        if before is not None and slid(before, of_block[place.block]):
+        if before is not None and call.shape.queries == 1 and slid(before, of_block[place.block]):
             self.order.problems[
                 f"the caches of site '{place.site}' lose their first key from token to token (a sliding window), so "
                 f"that no key has a place of its own: {LOAD_WITH_DYNAMIC_CACHE}"

@@ -84,6 +84,12 @@ def test_caches_whose_keys_have_no_places(tmp_path, attention, layout, text, sho
         record_call(tmp_path, policy, layout, lambda: policy.act(PICTURE, text))
 
 
+def test_a_sliding_cache_of_two_tokens(tmp_path):
+    policy, layout = cached_policy(SlidingAttention), replace(fixed_layout(), num_action_tokens=2)
+    with pytest.raises(CallsDoNotFit, match="lose their first key"):
+        record_call(tmp_path, policy, layout, lambda: policy.act(PICTURE, "the", 2))
+
+
 def test_a_cache_that_grows_is_not_refused():
     policy = cached_policy(CausalAttention)
     assert "refuse" not in str(va.inspect(policy, lambda: policy.act(PICTURE, "pick the bowl")))
