@@ -85,7 +85,7 @@ def rows_apart(
             return "one"
     pairs = [
         (own, changed)
-        for own, changed in zip(*results, strict=True)
+        for own, changed in zip(*results, strict=False)
         if own.ndim and len(own) == batch and own.shape == changed.shape
     ]
     moved = [np.abs(own - changed).reshape(batch, -1).max(axis=1, initial=0) for own, changed in pairs]

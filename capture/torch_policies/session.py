@@ -269,7 +269,7 @@ class EpisodeBatch(Sequence[Episode]):
             yield replan
 
     def next_episode(self, row: int, **facts: Any) -> Episode:
-        """Store the episode of a row, and begin another one there; arguments as `run.episode`."""
+        """Store an episode of the batch, by its number, and begin another one in its row; facts as in `run.episode`."""
         self[row]._commit()
         self._episodes[row] = self._begin(facts)
         return self._episodes[row]
