@@ -165,10 +165,12 @@ class UniformShares:
     @classmethod
     def of(cls, item: SelectedEpisode, selection: Selection) -> UniformShares:
         """Those of an episode; heads are kept apart."""
-        uniform = uniform_keys(item, replace(selection, per_head=True))
-        of_valid = (uniform * item.valid[:, None, None, None]).sum(axis=-1, keepdims=True)
+        uniform, valid = uniform_keys(item, replace(selection, per_head=True)), item.valid[:, None, None, None]
+        of_valid = (uniform * valid).sum(axis=-1, keepdims=True)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return cls(np.where(of_valid > 0, uniform / of_valid, 0.0))
+            shares = np.where(of_valid > 0, uniform / of_valid, 0.0)
+        # A key that is valid at some replans only takes nothing at the others, and its mean counts them.
+        return cls(np.where(valid, shares, 1.0 / np.maximum(item.num_valid, 1)[:, None, None, None, None]))
 
     def at(self, layer: int, denoise: int) -> NDArray[np.float64]:
         """Shares (replan or 1, head or 1, key) at positions of the selection; one for all keys where they are alike."""

