@@ -23,6 +23,8 @@ from vla_attention.schemas.stores.packed_index import (
     packed_file,
     read_index,
 )
+from vla_attention.schemas.stores.partial_folders import no_link
+from vla_attention.schemas.stores.root import refuse_linked_group
 from vla_attention.schemas.stores.seal import SEAL_FILE, read_seal
 from vla_attention.schemas.stores.store_format import EPISODES_GROUP
 from vla_attention.schemas.stores.zip_members import ZipMembers
@@ -55,8 +57,9 @@ class Packing:
 
         Raises:
             BadArgument: its episodes are folders.
-            StoreError: its index is damaged or of another run.
+            StoreError: its index is damaged or of another run, or a folder for zips is a link.
         """
+        refuse_linked_group(target)
         self.target = target
         self.run = run
         self.building = building
@@ -78,6 +81,7 @@ class Packing:
     def add(self, name: str, folder: Path) -> None:
         """Pack a sealed episode from its folder."""
         path = self.target / packed_file(name)
+        no_link(path.parent)
         building = self.building / path.name
         tail = write_zip(folder, building)
         size = building.stat().st_size

@@ -24,6 +24,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import shutil
 import threading
 import time
@@ -32,7 +33,8 @@ from pathlib import Path
 from types import TracebackType
 
 from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
-from vla_attention.schemas.stores.partial_folders import make_partial, partial_folder, remove_if_empty
+from vla_attention.schemas.stores.partial_folders import make_partial, no_link, remove_if_empty, remove_partials_of
+from vla_attention.schemas.stores.store_format import is_episode_name
 from vla_attention.schemas.stores.worker import Worker, is_known_dead
 
 #: Ending of the folder beside the store that holds claims and records. No reader needs it, and it may be deleted while
@@ -44,6 +46,8 @@ TOUCH_EVERY_S = 30.0
 #: Seconds without a touch after which a holder counts as dead: ten missed touches.
 DEAD_AFTER_S = 300.0
 _OWNER = "owner.json"
+#: Episode and generation in the name of a claim.
+_CLAIM = re.compile(r"(.+)\.(0|[1-9][0-9]*)")
 _ATTEMPTS = 5
 
 
@@ -65,8 +69,12 @@ class Holder:
 
 
 def jobs_folder(store: Path) -> Path:
-    """Return the folder of claims and records. It is beside the store, so that a copy of the store omits it."""
-    return store.with_name(store.name + JOBS_SUFFIX)
+    """Return the folder of claims and records. It is beside the store, so that a copy of the store omits it.
+
+    Raises:
+        StoreError: it is a link.
+    """
+    return no_link(store.with_name(store.name + JOBS_SUFFIX))
 
 
 class Claims:
@@ -142,7 +150,9 @@ class Claims:
             if before is None or before.worker.tag != judged.worker.tag:
                 self._remove(episode, generation)
                 return False, None
-            self._remove_partials_of(judged)
+            # Its machine may never run a capture again.
+            dead = judged.worker
+            remove_partials_of(self.store, episode, dead.host, dead.process, dead.process_space)
         return True, None
 
     def _rename(self, building: Path, target: Path) -> bool:
@@ -178,13 +188,6 @@ class Claims:
             return
         shutil.rmtree(doomed, ignore_errors=True)
 
-    def _remove_partials_of(self, dead: Holder) -> None:
-        """Remove the partial episode of a dead holder, because its machine may never run a capture again."""
-        pattern = f"{dead.episode}-{dead.worker.host}-{dead.worker.process}-*"
-        for folder in partial_folder(self.store).glob(pattern):
-            shutil.rmtree(folder, ignore_errors=True)
-        remove_if_empty(partial_folder(self.store))
-
     def _touch(self) -> None:
         while not self._leaving.wait(self.touch_every_s):
             for episode, generation in list(self._held.items()):
@@ -196,39 +199,36 @@ class Claims:
 
 def holders(store: Path) -> list[Holder]:
     """Return the holders of all claims on the store's episodes, dead or alive. Times are by this machine's clock."""
-    folder = _claims_folder(store)
-    episodes = sorted({entry.name.rpartition(".")[0] for entry in _entries(folder) if not _is_temporary(entry.name)})
-    found = []
-    for episode in episodes:
-        generations = _generations(folder, episode)
-        holder = _read(folder, episode, generations[-1], time.time()) if generations else None
-        if holder is not None:
-            found.append(holder)
-    return found
+    folder, now = _claims_folder(store), time.time()
+    last = {episode: numbers[-1] for episode, numbers in sorted(_claims(folder).items())}
+    found = (_read(folder, episode, generation, now) for episode, generation in last.items())
+    return [holder for holder in found if holder is not None]
 
 
 def _claims_folder(store: Path) -> Path:
-    return jobs_folder(store) / "claims"
+    return no_link(jobs_folder(store) / "claims")
 
 
 def _name(episode: str, generation: int) -> str:
     return f"{episode}.{generation}"
 
 
-def _is_temporary(name: str) -> bool:
-    return name.startswith(("new-", "old-"))
-
-
-def _entries(folder: Path) -> list[Path]:
+def _claims(folder: Path) -> dict[str, list[int]]:
+    """The generations of the claims on each episode, in ascending order. What has another name is no claim."""
     try:
-        return list(folder.iterdir())
+        names = os.listdir(folder)
     except OSError:
-        return []
+        return {}
+    found: dict[str, list[int]] = {}
+    for name in names:
+        match = _CLAIM.fullmatch(name)
+        if match is not None and is_episode_name(match[1]):
+            found.setdefault(match[1], []).append(int(match[2]))
+    return {episode: sorted(generations) for episode, generations in found.items()}
 
 
 def _generations(folder: Path, episode: str) -> list[int]:
-    numbers = [entry.name.removeprefix(f"{episode}.") for entry in _entries(folder) if not _is_temporary(entry.name)]
-    return sorted(int(number) for number in numbers if number.isdigit())
+    return _claims(folder).get(episode, [])
 
 
 def _owner(claim: Path) -> Worker | None:

@@ -57,10 +57,12 @@ class PackedIndex:
     digest: str = ""
 
     def __post_init__(self) -> None:
-        """Check names and paths."""
+        """Check names and paths: a zip is moved, copied and removed at its path, so that the name alone decides it."""
         for name, episode in self.episodes.items():
             parse_episode_name(name)
             check_inner_path(episode.file)
+            if episode.file != packed_file(name):
+                raise ValueError(f"the zip of {name} is {episode.file}; expected {packed_file(name)}")
 
     def sealed(self) -> PackedIndex:
         """The same index with its digest."""

@@ -14,17 +14,35 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from vla_attention.schemas.stores.store_format import PARTIAL_SUFFIX
+from vla_attention.schemas.stores.store_format import PARTIAL_SUFFIX, StoreError
 
 
 def partial_folder(store: Path) -> Path:
-    """The folder for what is being written: beside the store, on the same file system, and not in it."""
-    return store.with_name(store.name + PARTIAL_SUFFIX)
+    """The folder for what is being written: beside the store, on the same file system, and not in it.
+
+    Raises:
+        StoreError: it is a link.
+    """
+    return no_link(store.with_name(store.name + PARTIAL_SUFFIX))
+
+
+def no_link(folder: Path) -> Path:
+    """A folder in which this program makes, moves and removes things; a link may lead to those of others.
+
+    Raises:
+        StoreError: it is a link, which this program never makes.
+    """
+    if folder.is_symlink():
+        raise StoreError(
+            f"{folder} is a link, and nothing is written, moved or removed where it leads to: expected a folder, or "
+            "nothing. Remove the link and run the command again."
+        )
+    return folder
 
 
 def process_tag() -> str:
     """A name that no other process uses: host, process number, and what tells containers of one host apart."""
-    return f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}{_space_mark()}"
+    return f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}{_space_mark(process_space())}"
 
 
 def process_space() -> str:
@@ -35,8 +53,8 @@ def process_space() -> str:
         return ""
 
 
-def _space_mark() -> str:
-    number = "".join(filter(str.isdigit, process_space()))
+def _space_mark(space: str) -> str:
+    number = "".join(filter(str.isdigit, space))
     return f"n{int(number):x}" if number else ""
 
 
@@ -57,17 +75,45 @@ def remove_dead_partials(store: Path) -> None:
     remove_if_empty(partial_folder(store))
 
 
+def remove_partials_of(store: Path, purpose: str, host: str, process: int, space: str) -> None:
+    """Remove what a process that has ended was writing for a purpose, an episode's name for instance.
+
+    What describes the process may come from a file of somebody else. It is compared with the names of the folders that
+    are there, and is part of no path. What a running process of this machine writes stays.
+
+    Args:
+        store: beside which it was written.
+        purpose: as of `partial_of`.
+        host, process, space: of the process, see `Worker`.
+    """
+    wanted = purpose, host, str(process), _space_mark(space)
+    for folder in _partials(store):
+        number = _process_of(folder)
+        if _parts_of(folder.name) == wanted and not (number and _is_running(number)):
+            shutil.rmtree(folder, ignore_errors=True)
+    remove_if_empty(partial_folder(store))
+
+
 def _partials(store: Path) -> list[Path]:
-    return sorted(partial_folder(store).glob("*"))
+    try:
+        return sorted(partial_folder(store).iterdir())
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+
+
+def _parts_of(name: str) -> tuple[str, str, str, str]:
+    """Purpose, host, process and mark of the process space in a folder's name, see `process_tag`."""
+    purpose, _, rest = name.partition("-")
+    begin, _, unique = rest.rpartition("-")
+    host, _, process = begin.rpartition("-")
+    return purpose, host, process, unique[unique.find("n") :] if "n" in unique else ""  # digits and a to f before it
 
 
 def _process_of(folder: Path) -> int:
     """The process of this machine that wrote a folder, by `process_tag`; 0: of another one or a container."""
-    begin, _, unique = folder.name.partition("-")[2].rpartition("-")
-    host, _, process = begin.rpartition("-")
-    mark = unique[unique.find("n") :] if "n" in unique else _space_mark()  # digits and a to f before it
-    here = host == socket.gethostname() and mark == _space_mark()
-    return int(process) if here and process.isdigit() and len(process) < 10 else 0
+    _, host, process, mark = _parts_of(folder.name)
+    here = host == socket.gethostname() and mark in ("", _space_mark(process_space()))
+    return int(process) if here and process.isdecimal() and process.isascii() and len(process) < 10 else 0
 
 
 def _is_running(process: int) -> bool:

@@ -18,9 +18,9 @@ from vla_attention.schemas.stores.claims import Claims, Holder, jobs_folder
 from vla_attention.schemas.stores.damaged_episodes import DamagedEpisode, look_at
 from vla_attention.schemas.stores.durable_files import publish_file
 from vla_attention.schemas.stores.packed_index import INDEX_FILE, read_index
-from vla_attention.schemas.stores.partial_folders import process_tag, remove_if_empty
+from vla_attention.schemas.stores.partial_folders import no_link, process_tag, remove_if_empty
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
-from vla_attention.schemas.stores.root import group_document
+from vla_attention.schemas.stores.root import group_document, refuse_linked_group
 from vla_attention.schemas.stores.seal import read_seal
 from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, StoreError
 from vla_attention.schemas.stores.store_lock import lock_for_writing
@@ -47,8 +47,8 @@ class Finding:
 
 
 def damaged_folder(store: Path) -> Path:
-    """Return the folder of episodes that were moved aside."""
-    return store.with_name(store.name + DAMAGED_SUFFIX)
+    """Return the folder of episodes that were moved aside; raises `StoreError` where it is a link."""
+    return no_link(store.with_name(store.name + DAMAGED_SUFFIX))
 
 
 def repair_store(path: Path, verify: bool = False, dry_run: bool = False) -> list[Finding]:
@@ -69,6 +69,7 @@ def repair_store(path: Path, verify: bool = False, dry_run: bool = False) -> lis
     # Episodes are moved beside the store itself; a link to it may be on another file system.
     path = path.resolve() if path.is_symlink() else path
     store = open_store(path)
+    refuse_linked_group(path)
     _check_root(store)
     if is_packed(path):
         return _repair_packed(store, path, verify, dry_run)
@@ -160,6 +161,12 @@ def _move(store: Store, episode: StoredEpisode, claims: Claims, verify: bool) ->
 
 def _move_aside(store: Path, folder: Path, damaged: DamagedEpisode) -> Path:
     """Rename an episode's folder or zip into a new entry of `NAME.zarr.damaged`, beside a file with the reason."""
+    for part in folder.relative_to(store).parents:
+        if part.parts and (store / part).is_symlink():
+            raise StoreError(
+                f"Cannot move {damaged.name} of {store}: {store / part} is a link, and what it leads to is not moved; "
+                "put the folder itself in its place."
+            )
     now = datetime.now(UTC)
     entry = _new_entry(damaged_folder(store), f"{damaged.name}-{now:%Y%m%dT%H%M%SZ}")
     reason = {
@@ -198,6 +205,7 @@ def repair_groups(path: Path, dry_run: bool = False) -> list[str]:
     lines = []
     for fault in store_faults(open_store(path)):
         if fault.where == EPISODES_DOCUMENT:
+            refuse_linked_group(path)
             if not dry_run:
                 _write_whole(path / EPISODES_DOCUMENT, group_document({}))
             lines.append(f"  {'would be written' if dry_run else 'written'} again: {fault.where}, {fault.problem}")

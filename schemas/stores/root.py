@@ -110,6 +110,7 @@ def list_episodes(path: StorePlace) -> tuple[list[StorePlace], list[str]]:
             f"{path} NAME.zarr makes a store of folders."
         )
     else:
+        refuse_linked_group(path)
         try:
             entries = (path / EPISODES_GROUP).iterdir()
             found = {entry.name: is_episode_name(entry.name) and entry.is_dir() for entry in entries}
@@ -123,6 +124,15 @@ def list_episodes(path: StorePlace) -> tuple[list[StorePlace], list[str]]:
         )
     strays = sorted(name for name, is_episode in found.items() if not is_episode and name != "zarr.json")
     return [path / EPISODES_GROUP / name for name, is_episode in found.items() if is_episode], strays
+
+
+def refuse_linked_group(path: Path) -> None:
+    """Raise `StoreError` for a store whose group of episodes is a link: nothing is written or moved elsewhere."""
+    if (path / EPISODES_GROUP).is_symlink():
+        raise StoreError(
+            f"The store {path} cannot be used: its group '{EPISODES_GROUP}' is a link, and what lies elsewhere is no "
+            "part of it; put the folder itself in its place."
+        )
 
 
 def group_attributes(document: bytes) -> dict[str, Any]:

@@ -176,7 +176,7 @@ EPISODE_CASES = [
     Case("seal: a million chunks", _record(chunks="00000000" * 10**6), "bytes in the seal, and an index of 16000004"),
     Case("seal: no chunks", _record(chunks=""), "the seal does not list the chunks of its c.0.0"),
     Case("files: the episode is a link", _moved(""), "it is a link that leads out of the store"),
-    Case("files: the episodes are a link", _moved_group, "it is a link that leads out of the store"),
+    Case("files: the episodes are a link", _moved_group, "its group 'episodes' is a link"),
     Case("files: a folder is a link", _moved("joint"), "joint/.* it is a link that leads out of the store"),
     Case("files: an array is a link", _moved("joint/rows"), "joint/rows/.* it is a link that leads out of the store"),
     Case("files: a chunk is a link", _moved("joint/atoms/c.0.0.0.0.0.0"), "it is a link that leads out of the store"),

@@ -20,6 +20,7 @@ from vla_attention.capture.policies.hub import (
     split_hub_name,
 )
 from vla_attention.schemas.errors import BadArgument, MissingDependency, listing
+from vla_attention.schemas.safe_text import check_inner_path
 
 #: Files of a hub repository that a policy needs; only these are downloaded.
 HUB_FILES = (
@@ -67,6 +68,8 @@ def _from_hub(name: str, revision: str | None) -> Path:
 
 
 def _from_openpi_cache(url: str) -> Path:
+    # A rerun takes the address from a store, and a download replaces what is at its place.
+    check_inner_path(url.removeprefix("gs://"))
     target = openpi_cache() / url.removeprefix("gs://")
     if target.is_dir():
         return target

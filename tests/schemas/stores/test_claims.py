@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 
 from vla_attention.schemas.stores.claims import Claims, Holder, holders, jobs_folder
+from vla_attention.schemas.stores.partial_folders import partial_of, remove_dead_partials
+from vla_attention.schemas.stores.store_format import StoreError
 from vla_attention.schemas.stores.worker import Worker, is_known_dead, this_worker
 
 NAME = "task000_episode003"
@@ -57,14 +59,15 @@ def test_a_second_process_gets_the_holder(tmp_path):
 def test_a_silent_holder_is_replaced_and_its_partial_episode_removed(tmp_path):
     first, second, third = (claims(tmp_path, worker(number)) for number in (1, 2, 3))
     assert first.acquire(NAME) is None
-    mine, other = f"{NAME}-node1-1-abcd", f"{NAME}-node9-1-abcd"
-    for folder in (mine, other):
+    mine = f"{NAME}-node1-1-0123abcdn1"
+    others = [mine.replace(*change) for change in (("node1", "node9"), ("-1-", "-11-"), ("n1", "n2"), ("003", "0030"))]
+    for folder in (mine, *others):
         (tmp_path / "a.zarr.partial" / folder).mkdir(parents=True)
     age(tmp_path, 299)
     assert second.acquire(NAME) is not None
     age(tmp_path, 301)
     assert second.acquire(NAME) is None
-    assert [entry.name for entry in (tmp_path / "a.zarr.partial").iterdir()] == [other]
+    assert sorted(entry.name for entry in (tmp_path / "a.zarr.partial").iterdir()) == sorted(others)
     held = third.acquire(NAME)
     assert held is not None
     assert held.worker == second.worker
@@ -74,6 +77,55 @@ def test_a_silent_holder_is_replaced_and_its_partial_episode_removed(tmp_path):
     second.release(NAME)
     assert listed(tmp_path) == []
     assert third.acquire(NAME) is None
+
+
+@pytest.mark.parametrize("host", ["x/../../precious/*", "*", "**", "[!x]*", "../..", "/", "", "node1-1-0123abcdn1"])
+@pytest.mark.parametrize("episode", [NAME, f"{NAME}-x"])
+def test_nothing_in_a_dead_claim_is_part_of_a_path_or_a_pattern(tmp_path, host, episode):
+    """Whoever gives away a store can put any claim beside it."""
+    kept = [tmp_path / "precious" / "thesis-1-final", tmp_path / "a.zarr.partial" / f"{episode}-x" / "deep-1-a"]
+    kept += [tmp_path / "a.zarr.partial" / f"{NAME}-node1-1-0123abcdn1"]
+    for folder in kept:
+        folder.mkdir(parents=True)
+    assert claims(tmp_path, worker(1, host=host, process_space="x")).acquire(NAME) is None
+    age(tmp_path, 1000)
+    assert claims(tmp_path, worker(2)).acquire(NAME) is None
+    assert all(folder.is_dir() for folder in kept)
+
+
+def test_what_a_running_process_of_this_machine_writes_stays(tmp_path):
+    """A claim is as old as somebody says that it is."""
+    me = this_worker()
+    with partial_of(tmp_path / "a.zarr", NAME) as folder:
+        assert claims(tmp_path, me).acquire(NAME) is None
+        age(tmp_path, 1000)
+        assert claims(tmp_path, worker(2)).acquire(NAME) is None
+        assert folder.is_dir()
+
+
+@pytest.mark.parametrize(
+    "name", ["7", "x.7", f"{NAME}", f"{NAME}.", f"{NAME}.01", f"{NAME}.\u00b2", f"{NAME}.-1", ".0"]
+)
+def test_what_has_another_name_is_no_claim(tmp_path, name):
+    (jobs_folder(tmp_path / "a.zarr") / "claims" / name).mkdir(parents=True)
+    assert holders(tmp_path / "a.zarr") == []
+    first = claims(tmp_path, worker(1))
+    assert first.acquire(NAME) is None
+    assert [holder.episode for holder in holders(tmp_path / "a.zarr")] == [NAME]
+    first.release(NAME)
+    assert listed(tmp_path) == [name]
+
+
+@pytest.mark.parametrize("name", ["a.zarr.jobs", "a.zarr.jobs/claims", "a.zarr.partial"])
+def test_folders_of_this_program_that_are_links_are_refused(tmp_path, name):
+    for folder in ("a.zarr.jobs", "elsewhere"):
+        (tmp_path / folder).mkdir()
+    link = tmp_path / name
+    if link.exists():
+        link.rmdir()
+    link.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(StoreError, match=f"{name} is a link, and nothing is written, moved or removed"):
+        holders(tmp_path / "a.zarr") if "jobs" in name else remove_dead_partials(tmp_path / "a.zarr")
 
 
 def test_a_process_starts_again_if_the_dead_claim_has_been_replaced_and_released(tmp_path, monkeypatch):

@@ -20,9 +20,8 @@ from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.analyze.copy.packing import write_zip
 from vla_attention.schemas.errors import UserError
-from vla_attention.schemas.jsonable import from_json
 from vla_attention.schemas.stores.digest import seal_digest
-from vla_attention.schemas.stores.packed_index import INDEX_FILE, PackedIndex
+from vla_attention.schemas.stores.packed_index import INDEX_FILE
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 from vla_attention.testing.stores import StoreSpec, write_store
@@ -107,7 +106,7 @@ def edit_index(path: Path, change: Callable[[dict[str, Any]], object], *, seal: 
     document = json.loads((path / INDEX_FILE).read_text())
     change(document)
     if seal:
-        document = json.loads(from_json(PackedIndex, document).document())
+        document["digest"] = seal_digest(document)
     (path / INDEX_FILE).write_text(json.dumps(document))
 
 
@@ -287,11 +286,27 @@ def test_zips_of_other_episodes_and_other_stores_are_refused(path, other, record
 
 
 def test_an_index_that_gives_an_episode_the_zip_of_another_is_refused(path, recorded):
+    whole = (path / INDEX_FILE).read_bytes()
+
     def exchange(index: dict[str, Any]) -> None:
         one, two = index["episodes"].values()
         index["episodes"] = dict(zip(index["episodes"], (two, one), strict=True))
 
     edit_index(path, exchange)
+    said = " ".join(check_refused(path, recorded))
+    assert f"the zip of task000_episode000 is {SECOND}; expected {FIRST}" in said
+    # With the files exchanged, too, each entry names the zip that its episode must have.
+    (path / INDEX_FILE).write_bytes(whole)
+    (path / FIRST).rename(path / "aside")
+    (path / SECOND).rename(path / FIRST)
+    (path / "aside").rename(path / SECOND)
+
+    def exchange_all_but_names(index: dict[str, Any]) -> None:
+        one, two = index["episodes"].values()
+        one["file"], two["file"] = two["file"], one["file"]
+        exchange(index)
+
+    edit_index(path, exchange_all_but_names)
     assert "its seal is that of task000_episode001" in " ".join(check_refused(path, recorded))
 
 
@@ -332,6 +347,8 @@ def test_an_index_that_is_none_is_refused(path, recorded, content):
         {"file": "../../secret.zip"},
         {"file": "/etc/passwd"},
         {"file": ""},
+        {"file": "zarr.json"},
+        {"file": "episodes/mine.zip"},
         {"bytes": -1},
         {"bytes": 2**70},
         {"tail": -5},

@@ -415,6 +415,54 @@ def test_a_linked_episode_is_damaged(store, episode, tmp_path, capsys):
     assert (tmp_path / "elsewhere/zarr.json").is_file()
 
 
+def test_a_claim_of_somebody_else_makes_repair_delete_nothing(store, episode, tmp_path):
+    """`host` was once a part of a pattern of paths."""
+    empty(episode)
+    (tmp_path / "precious" / "thesis-1-final").mkdir(parents=True)
+    (tmp_path / "a.zarr.partial" / f"{DAMAGED}-x").mkdir(parents=True)
+    claim = tmp_path / "a.zarr.jobs" / "claims" / f"{DAMAGED}.0"
+    claim.mkdir(parents=True)
+    worker = {"tag": "x", "host": "x/../../precious/*", "process": 1, "process_start": "1", "process_space": "1"}
+    (claim / "owner.json").write_text(json.dumps(worker))
+    os.utime(claim / "owner.json", (0, 0))
+    assert main(["repair", str(store)]) == 0
+    assert names(store) == WHOLE
+    assert (tmp_path / "precious" / "thesis-1-final").is_dir()
+
+
+def test_episodes_of_another_store_are_not_moved(store, tmp_path, capsys):
+    """A group of episodes that is a link: every episode in it is damaged, and belongs to somebody else."""
+    other = tmp_path / "other.zarr"
+    shutil.copytree(store, other)
+    before = files(other)
+    shutil.rmtree(store / "episodes")
+    (store / "episodes").symlink_to(other / "episodes")
+    assert main(["repair", str(store)]) == 2
+    assert "its group 'episodes' is a link, and what lies elsewhere is no part of it" in capsys.readouterr().err
+    (store / "episodes").unlink()
+    (store / "episodes").symlink_to(other)  # its zarr.json is no group of episodes
+    shutil.copyfile(other / "zarr.json", store / "zarr.json")
+    assert main(["repair", str(store)]) == 2
+    assert files(other) == before
+
+
+@pytest.mark.parametrize("link", ["episodes", "episodes/task000_000"])
+def test_zips_of_another_store_are_not_moved(store, tmp_path, capsys, link):
+    packed, other = tmp_path / "packed.zarr", tmp_path / "other.zarr"
+    for target in (packed, other):
+        assert analyze(["copy", str(store), str(target), "--packed"]) == 0
+    (other / "episodes/zarr.json").write_text("{}")
+    before = files(other)
+    shutil.rmtree(packed / link)
+    (packed / link).symlink_to(other / link)
+    assert main(["repair", str(packed)]) == 2
+    assert "is a link, and what " in capsys.readouterr().err
+    (packed / "index.json").unlink()  # the copy begins again
+    assert analyze(["copy", str(store), str(packed), "--packed"]) == 2
+    assert "is a link, and " in capsys.readouterr().err
+    assert files(other) == before
+
+
 def zip_of(packed: Path) -> Path:
     (found,) = packed.rglob(f"{DAMAGED}.zip")
     return found

@@ -107,6 +107,17 @@ def test_the_commit_of_a_file_is_read_from_the_cache():
     assert in_hub_cache("org/name", "other") is None
 
 
+@pytest.mark.parametrize("name", ["gs://../../runs/a", "gs://bucket/../../../runs/a", "gs:///runs/a", "gs://b//a"])
+def test_an_address_leads_into_openpis_cache_only(monkeypatch, tmp_path, name):
+    """A rerun takes the address from a store that somebody else may have made; a download removes what is there."""
+    monkeypatch.setenv("OPENPI_DATA_HOME", str(tmp_path / "cache" / "openpi"))
+    module(monkeypatch, "gcsfs", GCSFileSystem=lambda token: None)
+    (tmp_path / "runs" / "a.partial").mkdir(parents=True)
+    with pytest.raises(BadArgument, match="cannot be the path of a file"):
+        find_checkpoint(name)
+    assert (tmp_path / "runs" / "a.partial").is_dir()
+
+
 @pytest.fixture
 def asked(monkeypatch) -> list[tuple[str, str | None]]:
     """What a client is asked for that gives the golden checkpoint, at one commit."""
