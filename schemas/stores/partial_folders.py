@@ -6,6 +6,7 @@ removed by the next one that writes, or by `repair`.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import socket
@@ -41,25 +42,33 @@ def no_link(folder: Path) -> Path:
 
 
 def process_tag() -> str:
-    """A name that no other process uses: host, process number, and what tells containers of one host apart."""
+    """A name that no other process uses: host, process number, random digits, and a mark of `process_space`."""
     return f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}{_space_mark(process_space())}"
 
 
 def process_space() -> str:
-    """The namespace of process numbers, for instance `pid:[4026531836]`; containers of one host may have their own."""
+    """Where the numbers of this machine's processes hold; empty where the system does not say it.
+
+    It is the number of the boot, drawn at random when the machine started, and the namespace of process numbers, of
+    which a container may have its own: `4f0d2f0e-... pid:[4026531836]`. The name of a host does not tell two nodes
+    apart: nodes that start from one image may share it, and all machines have the same first namespace.
+    """
     try:
-        return os.readlink("/proc/self/ns/pid")
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+        return f"{boot} {os.readlink('/proc/self/ns/pid')}"
     except OSError:
         return ""
 
 
 def _space_mark(space: str) -> str:
-    number = "".join(filter(str.isdigit, space))
-    return f"n{int(number):x}" if number else ""
+    return f"n{hashlib.sha256(space.encode()).hexdigest()[:16]}" if space else ""
 
 
 def dead_partials(store: Path) -> list[Path]:
-    """What killed processes of this machine left beside the store. Those of other machines cannot be checked here."""
+    """What killed processes of this machine left beside the store. Those of other machines cannot be checked here.
+
+    Processes before the last start of this machine count as those of another one.
+    """
     return [folder for folder in _partials(store) if _process_of(folder) and not _is_running(_process_of(folder))]
 
 
@@ -112,7 +121,7 @@ def _parts_of(name: str) -> tuple[str, str, str, str]:
 def _process_of(folder: Path) -> int:
     """The process of this machine that wrote a folder, by `process_tag`; 0: of another one or a container."""
     _, host, process, mark = _parts_of(folder.name)
-    here = host == socket.gethostname() and mark in ("", _space_mark(process_space()))
+    here = mark != "" and (host, mark) == (socket.gethostname(), _space_mark(process_space()))
     return int(process) if here and process.isdecimal() and process.isascii() and len(process) < 10 else 0
 
 

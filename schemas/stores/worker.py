@@ -22,7 +22,8 @@ class Worker:
     tag: unique among all processes of all machines.
     process_start: clock ticks from the boot of the machine to the start of the process. It distinguishes a process from
         a later one with the same number.
-    process_space: the namespace of the process number (every container has its own).
+    process_space: where the process number holds: in one boot of one machine, and there in one namespace (every
+        container has its own).
     slurm_job: SLURM's own id. Every task of an array has a different one, and it stays the same after a requeue.
     restarts: number of requeues.
     """
@@ -66,7 +67,8 @@ def is_known_dead(other: Worker, this: Worker) -> bool:
     """
     if other.slurm_job and other.slurm_job == this.slurm_job and other.restarts < this.restarts:
         return True  # SLURM starts a requeued job only after the end of the earlier one
-    if (other.host, other.process_space) != (this.host, this.process_space) or not other.process_start:
+    known = other.process_start and other.process_space
+    if not known or (other.host, other.process_space) != (this.host, this.process_space):
         return False
     return _process_start(other.process) != other.process_start
 

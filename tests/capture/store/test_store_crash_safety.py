@@ -29,6 +29,7 @@ from tests.kit.slow import slow_except
 from vla_attention.capture.store.refused_writes import StoreWriteFailed
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.stores.partial_folders import process_tag
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import (
     RunMismatch,
@@ -231,12 +232,14 @@ def test_only_dead_processes_of_this_machine_lose_their_partials(tmp_path):
     path = write_store(tmp_path / "a.zarr", spec=SPEC)
     folder = path.with_name("a.zarr.partial")
     host = os.uname().nodename
+    dead = process_tag().replace(f"-{os.getpid()}-", f"-{dead_process()}-")
     keep = [
-        f"task000_episode003-{host}-{os.getpid()}-aaaa",
-        f"task000_episode003-{host}x-{dead_process()}-aaaa",
+        f"task000_episode003-{process_tag()}",
+        f"task000_episode003-{dead.replace(host, f'{host}x')}",
+        f"task000_episode003-{host}-{dead_process()}-0123abcd",  # perhaps of another node with this host's name
         "notes",
     ]
-    for name in (*keep, f"task000_episode003-{host}-{dead_process()}-aaaa", f"root-{host}-{dead_process()}-aaaa"):
+    for name in (*keep, f"task000_episode003-{dead}", f"root-{dead}"):
         (folder / name / "deep").mkdir(parents=True)
     open_run(path, root_attributes(SPEC), "resume")
     assert sorted(entry.name for entry in folder.iterdir()) == sorted(keep)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import subprocess
 import threading
@@ -23,6 +24,11 @@ def worker(number: int, **changes: object) -> Worker:
     """A worker of another machine. This machine cannot determine whether it lives."""
     made = Worker(f"node{number}-{number}-aa", f"node{number}", number, "1", "pid:[1]")
     return replace(made, **changes)
+
+
+def mark(space: str) -> str:
+    """What the names of partial folders have of the space of a process."""
+    return f"n{hashlib.sha256(space.encode()).hexdigest()[:16]}"
 
 
 def claims(tmp_path: Path, who: Worker, **keywords: float) -> Claims:
@@ -59,8 +65,9 @@ def test_a_second_process_gets_the_holder(tmp_path):
 def test_a_silent_holder_is_replaced_and_its_partial_episode_removed(tmp_path):
     first, second, third = (claims(tmp_path, worker(number)) for number in (1, 2, 3))
     assert first.acquire(NAME) is None
-    mine = f"{NAME}-node1-1-0123abcdn1"
-    others = [mine.replace(*change) for change in (("node1", "node9"), ("-1-", "-11-"), ("n1", "n2"), ("003", "0030"))]
+    mine = f"{NAME}-node1-1-0123abcd{mark('pid:[1]')}"
+    changes = [("node1", "node9"), ("-1-", "-11-"), ("003", "0030"), (mark("pid:[1]"), ""), (mark("pid:[1]"), "n1")]
+    others = [mine.replace(*change) for change in changes]
     for folder in (mine, *others):
         (tmp_path / "a.zarr.partial" / folder).mkdir(parents=True)
     age(tmp_path, 299)
@@ -198,6 +205,18 @@ def test_a_process_of_this_machine_that_has_ended_is_known_to_be_dead(tmp_path):
     assert is_known_dead(other, me)
     assert claims(tmp_path, other).acquire(NAME) is None
     assert claims(tmp_path, me).acquire(NAME) is None
+
+
+def test_a_process_of_another_node_with_the_same_host_name_is_not_known_to_be_dead():
+    """Nodes that start from one image may share the host name, and all machines have the same first namespace."""
+    me, namespace = this_worker(), os.readlink("/proc/self/ns/pid")
+    boot, _, rest = me.process_space.partition(" ")
+    assert rest == namespace
+    for space in (namespace, f"{boot[::-1]} {namespace}", ""):
+        other = replace(me, tag="x", process=2**22, process_start="1", process_space=space)
+        assert not is_known_dead(other, me)
+        assert not is_known_dead(other, replace(me, process_space=""))
+    assert is_known_dead(replace(me, tag="x", process=2**22, process_start="1"), me)
 
 
 def test_a_requeued_job_replaces_its_own_claim_at_once(tmp_path):

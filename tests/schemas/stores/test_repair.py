@@ -357,15 +357,13 @@ def test_leftovers_of_dead_processes_are_removed(store, capsys, program):
     process = subprocess.Popen(["true"])
     process.wait()
     tag = process_tag().replace(f"-{os.getpid()}-", f"-{process.pid}-")
-    dead = [
-        f"task000_episode003-{host}-{process.pid}-aaaa",
-        f"task000_episode005-{tag}",
-        f"copy-{host}-{process.pid}-aaaa",
-    ]
-    another_container = f"task000_episode003-{host}-{process.pid}-0123abcdn1"
-    others = [another_container, f"task000_episode003-{host}x-{process.pid}-aaaa"]
-    others += [f"x-{host}-{'9' * 40}-aaaa", "notes"]
-    living = [f"task000_episode004-{host}-{os.getpid()}-aaaa"]
+    dead = [f"task000_episode003-{tag}", f"task000_episode005-{tag}", f"copy-{tag}"]
+    # Of another container, of another node with the same host name, of one with another name.
+    namespace = int("".join(filter(str.isdigit, os.readlink("/proc/self/ns/pid"))))
+    others = [f"task000_episode003-{host}-{process.pid}-0123abcdn{mark}" for mark in ("1", f"{namespace:x}", "0" * 16)]
+    others += [f"task000_episode003-{host}-{process.pid}-aaaa", f"task000_episode003-{tag.replace(host, f'{host}x')}"]
+    others += [f"x-{tag.replace(str(process.pid), '9' * 40)}", "notes"]
+    living = [f"task000_episode004-{process_tag()}"]
     for name in (*dead, *others, *living):
         (folder / name / "deep").mkdir(parents=True)
     assert program(["repair", str(store), "--dry-run"]) == 0
@@ -374,7 +372,7 @@ def test_leftovers_of_dead_processes_are_removed(store, capsys, program):
     assert all(f"left: {folder / name}, written by another machine" in said for name in others)
     assert not any(name in said for name in living)
     assert "Nothing was changed (--dry-run)." in said
-    assert len(list(folder.iterdir())) == 8
+    assert len(list(folder.iterdir())) == 11
     assert program(["repair", str(store)]) == 0
     said = capsys.readouterr().out
     assert all(f"  removed: {folder / name}" in said for name in dead)
