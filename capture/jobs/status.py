@@ -9,9 +9,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from vla_attention.capture.environments.suites import SUITES
-from vla_attention.capture.jobs.worker_records import WorkerRecord, planned_tasks, read_records
+from vla_attention.capture.jobs.worker_records import REASON_CHARACTERS, WorkerRecord, planned_tasks, read_records
 from vla_attention.schemas.command_line import format_bytes
-from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.errors import BadArgument, listing, shortened
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.plurals import plural
 from vla_attention.schemas.safe_text import visible
@@ -197,9 +197,9 @@ def _dropped(records: Sequence[WorkerRecord], present: Set[str]) -> dict[int, li
     last: dict[str, DroppedEpisode] = {}
     for record in records:
         for drop in record.dropped:
-            known = last.get(drop.episode)
+            known, reason = last.get(drop.episode), shortened(drop.reason, 2 * REASON_CHARACTERS)
             if drop.episode not in present and is_episode_name(drop.episode) and (known is None or known.at <= drop.at):
-                last[drop.episode] = DroppedEpisode(drop.episode, drop.at, record.worker.describe(), drop.reason)
+                last[drop.episode] = DroppedEpisode(drop.episode, drop.at, record.worker.describe(), reason)
     by_task: dict[int, list[DroppedEpisode]] = {}
     for name in sorted(last):
         by_task.setdefault(parse_episode_name(name)[0], []).append(last[name])

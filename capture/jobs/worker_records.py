@@ -11,19 +11,27 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import warnings
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
-from vla_attention.schemas.errors import shortened
+from vla_attention.schemas.documents import decode_json
+from vla_attention.schemas.errors import Note, listing, shortened
 from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
-from vla_attention.schemas.stores.claims import jobs_folder
+from vla_attention.schemas.limit_checks import check_at_most
+from vla_attention.schemas.limits import DOCUMENT_BYTES, PLANNED_EPISODES, RECORDS_BYTES
+from vla_attention.schemas.plurals import plural
+from vla_attention.schemas.regular_files import read_regular
+from vla_attention.schemas.stores.claims import JOBS_SUFFIX, job_files, jobs_folder
+from vla_attention.schemas.stores.partial_folders import no_link
+from vla_attention.schemas.stores.store_format import StoreError
 from vla_attention.schemas.stores.worker import Worker
 
 #: Characters of a fault's sentence that are kept: the error of a simulator may hold a page of text, and a worker writes
 #: its whole record after every episode.
-_REASON_CHARACTERS = 1000
+REASON_CHARACTERS = 1000
 
 
 @dataclass(frozen=True)
@@ -34,6 +42,10 @@ class PlannedTask:
     name: str
     instruction: str
     episodes: int
+
+    def __post_init__(self) -> None:
+        """Check the number, by which missing episodes are counted."""
+        check_at_most(f"The number of episodes of task {self.task_id}", self.episodes, PLANNED_EPISODES)
 
 
 @dataclass(frozen=True)
@@ -88,7 +100,7 @@ class RecordWriter:
     def add_drop(self, episode: str, reason: str) -> None:
         """Record that the worker left an episode out after a fault."""
         others = (drop for drop in self.record.dropped if drop.episode != episode)
-        drop = Drop(episode, now(), shortened(reason, _REASON_CHARACTERS))
+        drop = Drop(episode, now(), shortened(reason, REASON_CHARACTERS))
         self.record = replace(self.record, dropped=(*others, drop))
         self._write()
 
@@ -105,30 +117,65 @@ class RecordWriter:
 
 
 def records_folder(store: Path) -> Path:
-    """Return the folder of the records."""
-    return jobs_folder(store) / "runs"
+    """Return the folder of the records; raises `StoreError` where it is a link."""
+    return no_link(jobs_folder(store) / "runs")
 
 
 def read_records(store: Path) -> list[WorkerRecord]:
-    """Return the records of this store, oldest first; without those of an earlier store with the same name."""
-    identity, records = store_identity(store), []
-    for file in sorted(records_folder(store).glob("*.json")):
+    """Return the records of this store, oldest first; without those of an earlier store with the same name.
+
+    A record that cannot be read is no damage of the store: it is named in a `Note`.
+
+    Raises:
+        StoreError: there are more records, or more bytes in them, than captures write.
+    """
+    identity, folder, taken = store_identity(store), records_folder(store), 0
+    records, unreadable = [], []
+    for name in sorted(name for name in job_files(folder) if name.endswith(".json") and not name.startswith(".")):
         try:
-            record = from_json(WorkerRecord, json.loads(file.read_text(encoding="utf-8")))
-        except (OSError, ValueError, RecursionError, MalformedDocument):
-            continue  # an unreadable record is no damage of the store
+            content = read_regular(folder / name, DOCUMENT_BYTES, follow=False)
+            taken += len(content)
+            if taken > RECORDS_BYTES:
+                raise StoreError(
+                    f"The records in {folder} have more than {RECORDS_BYTES:,} bytes, which is more than captures "
+                    "write. Delete the folder when no capture runs; no reader of the store needs it."
+                )
+            record = from_json(WorkerRecord, decode_json(content))
+        except StoreError:
+            raise
+        except (OSError, ValueError, MalformedDocument) as error:
+            unreadable.append(f"{name} ({error.strerror or error})" if isinstance(error, OSError) else name)
+            continue
         if record.store == identity:
             records.append(record)
+    if unreadable:
+        count = plural(len(unreadable), "record")
+        warnings.warn(
+            f"{count} in {folder} cannot be read and {'is' if len(unreadable) == 1 else 'are'} ignored: "
+            f"{listing(unreadable, 3)}. What {'it says' if len(unreadable) == 1 else 'they say'} of plans and writers "
+            "is missing here.",
+            Note,
+            stacklevel=2,
+        )
     return records
 
 
 def planned_tasks(records: list[WorkerRecord]) -> dict[int, PlannedTask]:
-    """Return every planned task by its id, with the largest number of episodes that a worker planned."""
+    """Return every planned task by its id, with the largest number of episodes that a worker planned.
+
+    Raises:
+        StoreError: together they have more episodes than are counted one by one.
+    """
     plan: dict[int, PlannedTask] = {}
     for task in (task for record in records for task in record.plan):
         known = plan.get(task.task_id)
         if known is None or task.episodes > known.episodes:
             plan[task.task_id] = task
+    if (planned := sum(task.episodes for task in plan.values())) > PLANNED_EPISODES:
+        raise StoreError(
+            f"The workers' records plan {planned:,} episodes; expected at most {PLANNED_EPISODES:,}. Delete "
+            f"NAME{JOBS_SUFFIX} beside the store when no capture runs; no reader of the store needs it."
+        )
     return plan
 
 

@@ -29,12 +29,16 @@ import shutil
 import threading
 import time
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 
+from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
+from vla_attention.schemas.limits import CLAIM_BYTES, JOB_FILES
+from vla_attention.schemas.regular_files import read_regular
 from vla_attention.schemas.stores.partial_folders import make_partial, no_link, remove_if_empty, remove_partials_of
-from vla_attention.schemas.stores.store_format import is_episode_name
+from vla_attention.schemas.stores.store_format import StoreError, is_episode_name
 from vla_attention.schemas.stores.worker import Worker, is_known_dead
 
 #: Ending of the folder beside the store that holds claims and records. No reader needs it, and it may be deleted while
@@ -75,6 +79,25 @@ def jobs_folder(store: Path) -> Path:
         StoreError: it is a link.
     """
     return no_link(store.with_name(store.name + JOBS_SUFFIX))
+
+
+def job_files(folder: Path) -> list[str]:
+    """Return the names in a folder of claims or records; none if it does not exist.
+
+    Raises:
+        StoreError: there are more than processes fill a store.
+    """
+    try:
+        with os.scandir(folder) as entries:
+            names = [entry.name for entry in islice(entries, JOB_FILES + 1)]
+    except OSError:
+        return []
+    if len(names) > JOB_FILES:
+        raise StoreError(
+            f"{folder} has more than {JOB_FILES:,} entries, and a capture writes one for each of its processes. Delete "
+            "the folder when no capture runs; no reader of the store needs it."
+        )
+    return names
 
 
 class Claims:
@@ -215,12 +238,8 @@ def _name(episode: str, generation: int) -> str:
 
 def _claims(folder: Path) -> dict[str, list[int]]:
     """The generations of the claims on each episode, in ascending order. What has another name is no claim."""
-    try:
-        names = os.listdir(folder)
-    except OSError:
-        return {}
     found: dict[str, list[int]] = {}
-    for name in names:
+    for name in job_files(folder):
         match = _CLAIM.fullmatch(name)
         if match is not None and is_episode_name(match[1]):
             found.setdefault(match[1], []).append(int(match[2]))
@@ -233,8 +252,8 @@ def _generations(folder: Path, episode: str) -> list[int]:
 
 def _owner(claim: Path) -> Worker | None:
     try:
-        return from_json(Worker, json.loads((claim / _OWNER).read_text()))
-    except (OSError, ValueError, RecursionError, MalformedDocument):
+        return from_json(Worker, decode_json(read_regular(claim / _OWNER, CLAIM_BYTES, follow=False)))
+    except (OSError, ValueError, MalformedDocument):
         return None
 
 

@@ -1,7 +1,7 @@
 """Runs commands on hostile files, one after the other, with little memory, and says what each printed and took.
 
-Reads a list of [program, words] as JSON from stdin; a program is `analyze` or `parse`. Writes a line of JSON for each
-command as it ends.
+Reads a list of [program, words] as JSON from stdin; a program is `analyze`, `capture` or `parse`. Writes a line of JSON
+for each command as it ends.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ def run(program: str, words: list[str]) -> dict[str, object]:
     """Run one command; code 99 is a traceback."""
     from vla_attention.analyze.__main__ import main as analyze
     from vla_attention.analyze.parse.command import main as parse
+    from vla_attention.capture.__main__ import main as capture
 
     printed = io.StringIO()
     forget_peak()
@@ -48,7 +49,7 @@ def run(program: str, words: list[str]) -> dict[str, object]:
     faulthandler.dump_traceback_later(HANGS, exit=True)
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
         try:
-            code: object = {"analyze": analyze, "parse": parse}[program](words)
+            code: object = {"analyze": analyze, "capture": capture, "parse": parse}[program](words)
         except SystemExit as end:
             code = end.code
         except BaseException:

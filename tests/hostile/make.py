@@ -11,21 +11,25 @@ from tests.hostile.array_cases import ARRAY_CASES
 from tests.hostile.changes import Case
 from tests.hostile.document_cases import GROUPING_CASES, RESULTS_CASES
 from tests.hostile.episode_cases import EPISODE_CASES
+from tests.hostile.job_cases import JOB_CASES
 from tests.hostile.packed_cases import PACKED_CASES
 from tests.hostile.root_cases import ROOT_CASES
 from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import write_store
 
-#: Cases by what they change: a store of folders, a packed store, or nothing but a file.
+#: Cases by what they change: a store of folders, a packed store, the folder of jobs beside one, or nothing but a file.
 CASES: dict[str, list[Case]] = {
     "roots": ROOT_CASES,
     "episodes": EPISODE_CASES,
     "arrays": ARRAY_CASES,
     "packed": PACKED_CASES,
+    "jobs": JOB_CASES,
     "results": RESULTS_CASES,
     "groupings": GROUPING_CASES,
 }
+#: The program of each kind of cases, where it is not `vla-analyze`.
+PROGRAMS = {"jobs": "capture", "results": "parse"}
 _FILE_NAMES = {"results": "attention_ratio_results_x.json", "groupings": "grouping.toml"}
 
 
@@ -34,7 +38,7 @@ def originals(folder: Path) -> dict[str, Path]:
     plain = write_store(folder / "plain" / "a.zarr", tasks=(0,), episodes=1, replans=2, contributions=True)
     packed = folder / "packed" / "a.zarr"
     copy_store(open_store(plain), packed, (), packed=True)
-    return {"packed": packed, **dict.fromkeys(("roots", "episodes", "arrays", "results", "groupings"), plain)}
+    return {"packed": packed, **dict.fromkeys(("roots", "episodes", "arrays", "jobs", "results", "groupings"), plain)}
 
 
 def make_case(kind: str, case: Case, original: Path, folder: Path) -> list[str]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from tests.hostile.make import CASES, make_case, originals
+from tests.hostile.make import CASES, PROGRAMS, make_case, originals
 
 ROOT = Path(__file__).resolve().parents[2]
 #: Bytes that a command may have resident beyond those of a command that works.
@@ -59,10 +59,11 @@ def ended(tmp_path_factory) -> dict[str, list[dict[str, Any]]]:
     commands = [
         ("analyze", [str(made["roots"]), "--group", "noun=word:bowl", "--no-cache", "--output", str(folder / "works")]),
         ("parse", ["--help"]),
+        ("capture", ["status", str(made["jobs"])]),
     ]
     works = len(commands)
     for kind, cases in CASES.items():
-        program = "parse" if kind == "results" else "analyze"
+        program = PROGRAMS.get(kind, "analyze")
         for i, case in enumerate(cases):
             commands.append((program, make_case(kind, case, made[kind], folder / kind / f"{i:02d}")))
     results = run_in_child(commands)
@@ -82,6 +83,6 @@ def test_hostile_files_end_with_their_sentence(ended, kind):
 
 
 def test_there_are_as_many_as_promised():
-    stores = sum(len(CASES[kind]) for kind in ("roots", "episodes", "arrays", "packed"))
+    stores = sum(len(CASES[kind]) for kind in ("roots", "episodes", "arrays", "packed", "jobs"))
     assert stores >= 60
     assert len(CASES["results"]) + len(CASES["groupings"]) >= 30

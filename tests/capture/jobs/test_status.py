@@ -18,6 +18,7 @@ from vla_attention.capture.jobs.worker_records import (
     planned_tasks,
     read_records,
 )
+from vla_attention.schemas.errors import Note
 from vla_attention.schemas.stores.claims import Claims, jobs_folder
 from vla_attention.schemas.stores.worker import Worker
 from vla_attention.testing.stores import StoreSpec, write_store
@@ -133,10 +134,36 @@ def test_records_of_an_earlier_store_with_the_same_name_are_ignored(store):
     assert not jobs_folder(store).exists()
 
 
-def test_damaged_records_are_ignored(store):
+def test_damaged_records_are_named_and_ignored(store):
     RecordWriter(store, NODE, (planned(0, 2), planned(2, 2)))
     (jobs_folder(store) / "runs" / "x.json").write_text("{")
-    assert store_status(store).complete
+    with pytest.warns(Note, match="1 record in .* cannot be read and is ignored: x.json"):
+        assert store_status(store).complete
+
+
+@pytest.mark.parametrize("folder", ["runs", "claims"])
+def test_more_records_and_claims_than_processes_fill_a_store_are_refused(store, monkeypatch, capsys, folder):
+    monkeypatch.setattr("vla_attention.schemas.stores.claims.JOB_FILES", 3)
+    for number in range(4):
+        (jobs_folder(store) / folder / f"task000_episode000.{number}").mkdir(parents=True)
+        assert main(["status", str(store)]) == (0 if number < 3 else 2)
+    assert f"a.zarr.jobs/{folder} has more than 3 entries" in capsys.readouterr().err
+
+
+def test_records_of_more_bytes_than_captures_write_are_refused(store, monkeypatch, capsys):
+    for number in range(3):
+        RecordWriter(store, replace(NODE, tag=f"node7-{number}"), (planned(0, 2),))
+    monkeypatch.setattr("vla_attention.capture.jobs.worker_records.RECORDS_BYTES", 1000)
+    assert main(["status", str(store)]) == 2
+    assert "have more than 1,000 bytes, which is more than captures write" in capsys.readouterr().err
+
+
+def test_a_long_reason_of_somebody_else_is_cut(store, capsys):
+    record = RecordWriter(store, NODE, (planned(2, 4),))
+    record.add_drop("task002_episode003", "x")
+    record.file.write_text(record.file.read_text().replace('"x"', json.dumps("y" * 10**6)))
+    assert main(["status", str(store)]) == 0
+    assert len(capsys.readouterr().out) < 5000
 
 
 @pytest.mark.parametrize(
