@@ -74,6 +74,19 @@ REPLANS = 1_000_000
 PICTURE_SIDE = 8192
 PICTURE_PIXELS = 10_000_000
 
+# Servers.
+
+#: Seconds without a connection, or without a further byte, after which a server counts as silent. aiohttp's own limit
+#: is five minutes for a whole answer: too long for a server that hangs, and too short for a large file.
+ANSWER_WITHIN_S = 60.0
+#: Bytes a second that an answer must have on average, beyond its first `ANSWER_WITHIN_S`. A line of 1 Mbit/s, shared by
+#: eight requests, gives each 15,000. A server that sends a byte a second is never silent.
+SLOWEST_BYTES_A_SECOND = 10_000
+#: Bytes of a web page that lists a folder. Servers write about 120 an entry, so these are 100,000 episodes.
+LISTING_BYTES = 16_000_000
+#: Names in a folder that is listed elsewhere, or files below it.
+LISTED_NAMES = 1_000_000
+
 # Bytes of arrays.
 
 #: Decoded bytes that any chunk or reading may claim, however little is stored.

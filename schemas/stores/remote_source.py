@@ -22,8 +22,8 @@ from typing import Any
 
 from vla_attention.schemas.byte_counts import parse_bytes
 from vla_attention.schemas.errors import BadArgument, UserError
-from vla_attention.schemas.limits import ROOT_BYTES, WHOLE_FILE_BYTES
-from vla_attention.schemas.stores.bounded_fetch import fetched
+from vla_attention.schemas.limits import ANSWER_WITHIN_S, ROOT_BYTES, SLOWEST_BYTES_A_SECOND, WHOLE_FILE_BYTES
+from vla_attention.schemas.stores.bounded_fetch import TooSlow, asked_within, fetched, files_below, names_in
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder, Memory, copy_into, split
 from vla_attention.schemas.stores.hub_address import HUB_PROTOCOL, HubAddress, stated_commit
 from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
@@ -33,9 +33,6 @@ SIZE_VARIABLE = "VLA_REMOTE_CACHE_SIZE"
 DEFAULT_BYTES = 10_000_000_000
 _OFF = ("off", "0", "no", "false")
 _DIGEST_BYTES = 32
-#: Seconds without a connection, or without a further byte, after which a web server counts as silent. aiohttp's own
-#: limit is five minutes for a whole answer: too long for a server that hangs, and too short for a large file.
-ANSWER_WITHIN_S = 60.0
 #: The cache is searched for what to remove after every so many bytes that were added to it.
 _LOOK_EVERY = 64_000_000
 #: Protocols whose addresses may be `//name:password@host`; elsewhere @ stands before a revision.
@@ -85,7 +82,7 @@ def at_commit(place: StorePlace) -> StorePlace:
     files, _ = _file_system(place.url)
     asked = address.revision_address(_hub()[0])
     try:
-        answer = _asked(place.url, lambda: fetched(files, asked, None, None, ROOT_BYTES))
+        answer = _asked(place.url, lambda: fetched(files, asked, None, None, ROOT_BYTES, ANSWER_WITHIN_S))
     except FileNotFoundError:
         raise RemoteFailure(
             f"{place.url} cannot be read: the hub knows no revision {address.revision} of {address.repository}. "
@@ -133,16 +130,21 @@ class RemoteFolder:
     def size(self, file: str) -> int:
         """See `ByteSource`."""
         files, path = _file_system(self.url)
-        return int(_asked(self.url, lambda: files.size(f"{path}/{file}")) or 0)
+        size = _asked(self.url, lambda: asked_within(files, "size", f"{path}/{file}", seconds=ANSWER_WITHIN_S))
+        return int(size or 0)
 
     def names(self, folder: str) -> list[str]:
         """The names in a folder, where the server lists them."""
-        if self.url.startswith(HUB_PROTOCOL):
-            files, path = _hub_listing(self.url)
-        else:
-            files, path = _file_system(self.url)
-        found = _asked(self.url, lambda: files.ls(f"{path}/{folder}", detail=False))
-        return sorted(str(name).rstrip("/").rpartition("/")[2] for name in found)
+        files, path = self._listing()
+        return sorted(_asked(self.url, lambda: names_in(files, f"{path}/{folder}", ANSWER_WITHIN_S)))
+
+    def files_below(self, folder: str) -> list[str]:
+        """Paths of all files below a folder; `NotImplementedError` where the server has no list of them."""
+        files, path = self._listing()
+        return sorted(_asked(self.url, lambda: files_below(files, f"{path}/{folder}", ANSWER_WITHIN_S)))
+
+    def _listing(self) -> tuple[Any, str]:
+        return _hub_listing(self.url) if self.url.startswith(HUB_PROTOCOL) else _file_system(self.url)
 
     def bound_to(self, digest: str) -> RemoteFolder:
         """See `ByteSource`."""
@@ -162,7 +164,7 @@ class RemoteFolder:
 
     def _fetch(self, file: str, start: int | None, end: int | None, most: int) -> bytes:
         files, path = _file_system(self.url)
-        content: bytes = _asked(self.url, lambda: fetched(files, f"{path}/{file}", start, end, most))
+        content: bytes = _asked(self.url, lambda: fetched(files, f"{path}/{file}", start, end, most, ANSWER_WITHIN_S))
         if len(content) <= most:
             return content
         if start is not None:
@@ -326,6 +328,15 @@ def _asked(url: str, ask: Any) -> Any:
         return ask()
     except FileNotFoundError:
         raise
+    except NotImplementedError:
+        raise
+    except TooSlow as slow:
+        if slow.received:
+            raise RemoteFailure(
+                f"{url} cannot be read: its server sent {slow.received:,} bytes in {slow.seconds:.0f} s; expected at "
+                f"least {SLOWEST_BYTES_A_SECOND:,} a second. Try again later, or from elsewhere."
+            ) from None
+        raise RemoteFailure(f"{url} cannot be read: its server sent nothing for {slow.seconds:.2g} s.") from None
     except TimeoutError:
         raise RemoteFailure(f"{url} cannot be read: its server sent nothing for {ANSWER_WITHIN_S:g} s.") from None
     except OSError as error:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import re
 import shutil
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -12,22 +15,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytest.importorskip("aiohttp", reason="needs the extra remote: pip install 'vla-attention[remote]'")
+
+from fsspec.asyn import AsyncFileSystem
+
 from tests.kit.http_ranges import Served, serve
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.words.word_study import study_words
 from vla_attention.schemas.errors import UserError
-from vla_attention.schemas.stores import remote_source
+from vla_attention.schemas.stores import bounded_fetch, remote_source
 from vla_attention.schemas.stores.digest import seal_digest
 from vla_attention.schemas.stores.packed_index import INDEX_FILE
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.schemas.stores.remote_source import KeptBytes
+from vla_attention.schemas.stores.remote_source import KeptBytes, RemoteFailure
 from vla_attention.schemas.stores.store_url import StoreUrl, store_place
 from vla_attention.schemas.stores.verify import verify_store
 from vla_attention.testing.stores import StoreSpec, write_store
-
-pytest.importorskip("aiohttp", reason="needs the extra remote: pip install 'vla-attention[remote]'")
 
 SPEC = StoreSpec(tasks=(0,), episodes=2, replans=2)
 DEEP = StoreSpec(
@@ -320,10 +325,8 @@ def test_a_network_that_fails_later_leaves_no_episode_out(server, tmp_path, caps
     assert not results(tmp_path / "out")
 
 
-def test_a_server_that_hangs_is_a_sentence(server, monkeypatch, capsys):
+def test_a_server_that_hangs_is_a_sentence(server, half_a_second, capsys):
     """Not after aiohttp's five minutes: whoever asks, and whoever stops the command, would wait for so long."""
-    monkeypatch.setattr(remote_source, "ANSWER_WITHIN_S", 0.5)
-    remote_source._file_system_of.cache_clear()
     ended = threading.Event()
 
     def hang(path: str, content: bytes) -> bytes:
@@ -337,10 +340,127 @@ def test_a_server_that_hangs_is_a_sentence(server, monkeypatch, capsys):
         assert not ended.is_set()
     finally:
         ended.set()
-        remote_source._file_system_of.cache_clear()
     said = capsys.readouterr().err
     assert f"{server.url}/a.zarr cannot be read: its server sent nothing for 0.5 s." in said
     assert said.count("\n") == 1
+
+
+def a_piece_each(seconds: float, piece: bytes, count: int) -> Iterator[bytes]:
+    for _ in range(count):
+        yield piece
+        time.sleep(seconds)
+
+
+@pytest.fixture
+def half_a_second(monkeypatch) -> Iterator[None]:
+    """Servers are silent after half a second."""
+    monkeypatch.setattr(remote_source, "ANSWER_WITHIN_S", 0.5)
+    remote_source._file_system_of.cache_clear()
+    yield
+    remote_source._file_system_of.cache_clear()
+
+
+@pytest.mark.parametrize("file", ["zarr.json", INDEX_FILE, "task000_episode000.zip"])
+def test_a_server_that_sends_a_byte_now_and_then_is_a_sentence(server, half_a_second, capsys, file):
+    """It is never silent: a byte a second would take ten days for a file of a megabyte."""
+    server.pieces = lambda path: a_piece_each(0.05, b" ", 100) if path.endswith(file) else None
+    began = time.monotonic()
+    assert analyze([f"{server.url}/a.zarr", "--no-plots"]) == 2
+    assert time.monotonic() - began < 4
+    said = capsys.readouterr().err
+    assert re.search(
+        r"/a.zarr cannot be read: its server sent [0-9]+ bytes in [01] s; expected at least 10,000 a", said
+    )
+    assert said.count("\n") == 1
+
+
+def test_a_slow_server_is_waited_for(server, packed, half_a_second):
+    whole = (packed / INDEX_FILE).read_bytes()
+    pieces = [whole[at : at + 40] for at in range(0, len(whole), 40)]
+
+    def slowly() -> Iterator[bytes]:
+        yield b" " * 20_000  # two seconds more
+        for piece in pieces:
+            time.sleep(1.5 / len(pieces))
+            yield piece
+
+    server.pieces = lambda path: slowly() if path.endswith(INDEX_FILE) else None
+    assert len(open_store(f"{server.url}/a.zarr").episodes) == 2
+
+
+def test_a_list_without_an_end_takes_no_memory(server, tmp_path, capsys):
+    shutil.copytree(tmp_path / "served" / "a.zarr", tmp_path / "served" / "b.zarr")
+    (tmp_path / "served" / "b.zarr" / INDEX_FILE).unlink()
+    links = b"".join(b'<a href="task000_episode%05d/">x</a>\n' % number for number in range(25_000))
+    server.pieces = lambda path: a_piece_each(0, links, 60) if path.endswith("b.zarr/episodes") else None
+    assert analyze([f"{server.url}/b.zarr", "--no-plots"]) == 2
+    said = capsys.readouterr().err
+    assert "its list has more than 16,000,000 bytes" in said
+    assert said.count("\n") == 1
+    assert server.sent["b.zarr/episodes"] < 40_000_000  # of 66
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        '<a href="../">../</a><a href="task000_episode000/">task000_episode000/</a> <a href="zarr.json">zarr.json</a>',
+        "<A HREF='?C=N;O=D'>N</A><A HREF='/a.zarr'>up</A><A HREF='/a.zarr/episodes/task000_episode000/'>x</A>"
+        "<A HREF='zarr.json?x=1'>y</A>",
+        '<a href="http://127.0.0.1:PORT/a.zarr/episodes/task000_episode000#x">x</a><a href="zarr%2Ejson">x</a>'
+        '<a href="https://elsewhere/a.zarr/episodes/task000_episode009/">x</a><a href="http://[">x</a>',
+    ],
+    ids=["nginx", "Apache", "whole addresses"],
+)
+def test_the_lists_of_web_servers(server, page):
+    shown = page.replace("PORT", server.url.rpartition(":")[2]).encode()
+    server.pieces = lambda path: iter([shown]) if path.endswith("/episodes") else None
+    folder = remote_source.RemoteFolder(f"{server.url}/a.zarr")
+    assert folder.names("episodes") == ["task000_episode000", "zarr.json"]
+
+
+class Endless:
+    """A file system, as those of the hub, whose lists go on page after page."""
+
+    protocol = "endless"
+
+    def ls(self, path: str, detail: bool) -> list[str]:
+        time.sleep(20)
+        return []
+
+
+class EndlessAsync(AsyncFileSystem):
+    """The same, as those of S3."""
+
+    protocol = "endless"
+
+    async def _ls(self, path: str, detail: bool = True, **_: object) -> list[str]:
+        await asyncio.sleep(20)
+        return []
+
+    async def _cat_file(self, path: str, start: int | None = None, end: int | None = None, **_: object) -> bytes:
+        await asyncio.sleep(20)
+        return b""
+
+
+@pytest.mark.parametrize("kind", [Endless, EndlessAsync])
+def test_other_services_have_as_much_time_for_a_list(half_a_second, monkeypatch, kind):
+    monkeypatch.setattr(remote_source, "_file_system", lambda url: (kind(), "bucket/a.zarr"))
+    with pytest.raises(RemoteFailure, match=r"s3://bucket/a.zarr cannot be read: its server sent nothing for 0.5"):
+        remote_source.RemoteFolder("s3://bucket/a.zarr").names("episodes")
+
+
+def test_other_services_have_as_much_time_for_a_file(half_a_second, monkeypatch):
+    monkeypatch.setattr(remote_source, "_file_system", lambda url: (EndlessAsync(), "bucket/a.zarr"))
+    with pytest.raises(RemoteFailure, match=r"its server sent nothing for 0\.6"):  # 1,000 bytes take 0.1 s
+        remote_source.RemoteFolder("s3://bucket/a.zarr").whole("zarr.json", most=1000)
+
+
+def test_a_list_of_a_million_names_is_refused(monkeypatch):
+    monkeypatch.setattr(bounded_fetch, "LISTED_NAMES", 3)
+    monkeypatch.setattr(Endless, "ls", lambda self, path, detail: [f"{path}/{number}" for number in range(4)])
+    monkeypatch.setattr(remote_source, "_file_system", lambda url: (Endless(), "bucket/a.zarr"))
+    with pytest.raises(RemoteFailure, match="its list has more than 3 names"):
+        remote_source.RemoteFolder("s3://bucket/a.zarr").names("episodes")
 
 
 def test_nobody_there_is_a_sentence(capsys):
