@@ -1,7 +1,8 @@
 """What lies in a store and is no part of it: other people's files, links, and files that no seal lists.
 
 Nothing reads them: neither this program, which opens what the seals list, nor a reader of Zarr, to which they are no
-chunks of an array. `verify` names them, and no copy takes them along.
+chunks of an array. `verify` names them, and no copy takes them along. A link in an episode is a fault beyond that: a
+program that follows links, as rsync -L and web servers do, publishes or fills what it leads to.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path, PurePosixPath
 
@@ -27,16 +29,29 @@ MOST_NAMED = 100
 def foreign_in_episode(episode: StoredEpisode) -> tuple[str, ...]:
     """Paths in an episode's folder or zip that its seal does not list; a folder without any sealed file ends with /.
 
-    Of an episode at an address that is not packed, nothing is known. `CorruptEpisode` when it has no readable seal.
+    Links are not among them (`links_beyond_seal`). Of an episode at an address that is not packed, nothing is known.
+    `CorruptEpisode` when it has no readable seal.
     """
-    known = {SEAL_FILE, *episode.files.records}
     source = episode.source
     if isinstance(source, ZipMembers):
+        known = {SEAL_FILE, *episode.files.records}
         return tuple(islice((name for name in source.names() if name not in known), MOST_NAMED))
-    if isinstance(episode.folder, StoreUrl):
-        return ()
-    folders = {str(parent) for file in known for parent in PurePosixPath(file).parents}
-    return _beyond(episode.folder, known, folders)
+    return _named(found for found in _beyond_seal(episode) if not found.is_link)
+
+
+def links_beyond_seal(episode: StoredEpisode) -> tuple[str, ...]:
+    """Links in an episode's folder that its seal does not list; raises as `foreign_in_episode` does.
+
+    Those in place of what it lists are `links_in_episode`; a zip with links cannot be read, see `ZipMembers`.
+    """
+    return _named(found for found in _beyond_seal(episode) if found.is_link)
+
+
+def _beyond_seal(episode: StoredEpisode) -> Iterator[_Found]:
+    known = {SEAL_FILE, *episode.files.records}
+    if episode.place is None and isinstance(episode.folder, Path):
+        folders = {str(parent) for file in known for parent in PurePosixPath(file).parents}
+        yield from (found for found in _beyond(episode.folder, known, folders) if found.path not in folders)
 
 
 def foreign_in_store(store: Store) -> tuple[str, ...]:
@@ -55,7 +70,8 @@ def foreign_in_store(store: Store) -> tuple[str, ...]:
         folders |= {str(PurePosixPath(file).parent) for file in packed}
     else:
         known |= {f"{EPISODES_GROUP}/{name}" for name in _episode_names(store.path / EPISODES_GROUP)}
-    return _beyond(store.path, known, folders)
+    found = _beyond(store.path, known, folders)
+    return _named(replace(one, path=f"{one.path} (a link)") if one.is_link else one for one in found)
 
 
 def _episode_names(folder: Path) -> Iterator[str]:
@@ -66,29 +82,39 @@ def _episode_names(folder: Path) -> Iterator[str]:
                 yield entry.name
 
 
-def _beyond(place: Path, known: set[str], folders: set[str]) -> tuple[str, ...]:
-    """Paths in the known folders below a place that are neither known nor lead to a known file; at most `MOST_NAMED`.
+@dataclass(frozen=True)
+class _Found:
+    """A path that is not known."""
+
+    path: str
+    is_link: bool = False
+
+
+def _named(found: Iterable[_Found]) -> tuple[str, ...]:
+    return tuple(sorted(one.path for one in islice(found, MOST_NAMED)))
+
+
+def _beyond(place: Path, known: set[str], folders: set[str]) -> Iterator[_Found]:
+    """Paths in the known folders below a place that are neither known nor lead to a known file.
 
     Links are followed nowhere, and no other folder is looked into.
     """
-    found: list[str] = []
     for folder in sorted(folders):
         above = [folder, *map(str, PurePosixPath(folder).parents)]
-        if len(found) >= MOST_NAMED or any(os.path.islink(place / one) for one in above if one != "."):
+        if any(os.path.islink(place / one) for one in above if one != "."):
             continue
         with suppress(OSError), os.scandir(place / folder) as entries:  # one that is lost is a fault, found elsewhere
-            found += islice(_unknown(entries, "" if folder == "." else f"{folder}/", known, folders), MOST_NAMED)
-    return tuple(sorted(found)[:MOST_NAMED])
+            yield from _unknown(entries, "" if folder == "." else f"{folder}/", known, folders)
 
 
-def _unknown(entries: Iterable[os.DirEntry[str]], inside: str, known: set[str], folders: set[str]) -> Iterator[str]:
+def _unknown(entries: Iterable[os.DirEntry[str]], inside: str, known: set[str], folders: set[str]) -> Iterator[_Found]:
     for entry in entries:
         path = f"{inside}{entry.name}"
         if path in known:
             continue
         if entry.is_symlink():
-            yield f"{path} (a link)"
+            yield _Found(path, is_link=True)
         elif not entry.is_dir(follow_symlinks=False):
-            yield path
+            yield _Found(path)
         elif path not in folders:
-            yield f"{path}/"
+            yield _Found(f"{path}/")

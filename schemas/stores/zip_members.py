@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import stat
 import struct
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -164,7 +165,8 @@ class ZipMembers:
         for member, until in zip(ordered, [*(later.header_offset for later in ordered[1:]), end], strict=True):
             first = until - member.file_size
             header = member.header_offset + LOCAL_HEADER_BYTES + len(member.orig_filename.encode())
-            plain = member.compress_type == zipfile.ZIP_STORED and member.file_size == member.compress_size
+            stored = member.compress_type == zipfile.ZIP_STORED and member.file_size == member.compress_size
+            plain = stored and not stat.S_ISLNK(member.external_attr >> 16)  # what unpacks it would make a link
             if not plain or member.flag_bits & (_ENCRYPTED | _DESCRIPTOR) or first < header or until > self.length:
                 raise DamagedZip(
                     f"its zip {self.file} holds {member.filename!r} in another way than vla-analyze copy --packed "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import stat
 import struct
 import zipfile
 from collections.abc import Callable
@@ -99,6 +100,14 @@ def _fifo_zip(store: Path) -> None:
     os.mkfifo(path)
 
 
+def _link_member(path: Path) -> None:
+    """What unpacks it makes a link that leads out of the store."""
+    with zipfile.ZipFile(path, "a") as made:
+        link = zipfile.ZipInfo("joint/link")
+        link.external_attr = (stat.S_IFLNK | 0o777) << 16
+        made.writestr(link, "/etc")
+
+
 def _twice(path: Path) -> None:
     with zipfile.ZipFile(path, "a") as made:
         made.writestr("seal/zarr.json", b"{}")
@@ -133,5 +142,6 @@ PACKED_CASES = [
     Case("zip: compressed", _zip(_compressed), ZIP + ".*in another way than vla-analyze copy --packed writes it"),
     Case("zip: a seal of 4 GB", _zip(_large_member), ZIP + ".*in another way than vla-analyze copy --packed writes it"),
     Case("zip: a directory elsewhere", _zip(_directory_elsewhere), ZIP + ".*cannot be read: "),
+    Case("zip: a link", _zip(_link_member), ZIP + ".*in another way than vla-analyze copy --packed writes it"),
     Case("zip: two seals", _zip(_twice), ZIP + ".*names a file twice"),
 ]

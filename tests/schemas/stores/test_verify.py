@@ -358,15 +358,15 @@ def foreign_things(path: Path) -> list[str]:
     (path / "episodes/thumbnails/a.png").write_text("")
     (episode / ".DS_Store").write_text("")
     (episode / "joint/rows/c.9.9.9.9.9.9").write_text("")
-    (episode / "joint/rows/link").symlink_to(path / "notes.txt")
+    (path / "link").symlink_to(path / "notes.txt")
     return [
         f"{path}: {name} is no part of the store; nothing reads it"
         for name in (
             "episodes/thumbnails/",
+            "link (a link)",
             "notes.txt",
             f"{EPISODE}: .DS_Store",
             f"{EPISODE}: joint/rows/c.9.9.9.9.9.9",
-            f"{EPISODE}: joint/rows/link (a link)",
         )
     ]
 
@@ -403,11 +403,11 @@ def test_verify_for_programs(path, capsys):
         False,
         False,
     )
-    assert (report["faults"], report["foreign"]) == ([], ["episodes/thumbnails/", "notes.txt"])
+    assert (report["faults"], report["foreign"]) == ([], ["episodes/thumbnails/", "link (a link)", "notes.txt"])
     first, second = report["episodes"]
     assert first["episode"] == EPISODE
     assert "joint/rows" in first["problems"][0]
-    assert len(first["foreign"]) == len(lines) - 2
+    assert len(first["foreign"]) == len(lines) - 3
     assert (second["problems"], second["foreign"]) == ([], [])
     folder = path / "episodes/task001_episode000"
     files = [file for file in folder.rglob("*") if file.is_file()]
@@ -449,5 +449,24 @@ def test_foreign_files_behind_a_link_are_not_looked_at(path, tmp_path):
     (tmp_path / "rows/mine").write_text("")
     rows.symlink_to(tmp_path / "rows")
     report = episode_report(store := open_store(path), store.episodes[0], quick=True)
-    assert report.foreign == ("joint/rows (a link)",)
-    assert any("its joint/rows is a link" in problem for problem in report.problems)
+    assert report.foreign == ()
+    assert sum("its joint/rows is a link" in problem for problem in report.problems) == 1
+
+
+@pytest.mark.parametrize("program", [main, capture], ids=["vla-analyze", "vla-capture"])
+@pytest.mark.parametrize("options", [[], ["--quick"]])
+def test_a_link_that_no_seal_lists_is_a_fault(path, tmp_path, capsys, program, options):
+    """A copy that follows links would publish what it leads to."""
+    (tmp_path / "secret").mkdir()
+    folder = path / "episodes" / EPISODE
+    (folder / "joint/rows/keys").symlink_to(tmp_path / "secret")
+    (folder / "nowhere").symlink_to("nowhere else")
+    assert program(["verify", str(path), *options]) == 1
+    said = capsys.readouterr().out
+    for link in ("joint/rows/keys", "nowhere"):
+        assert f"{EPISODE}: Episode {EPISODE} is damaged: its {link} is a link, which its seal does not list" in said
+    assert "no part of the store" not in said
+    assert f"{path}: 2 episodes, 2 faults" in said
+    assert main([str(path), "--no-plots", "--no-cache", "--output", str(tmp_path / "out")]) == 0  # no number is of it
+    assert program(["repair", str(path)]) == 0
+    assert [episode.name for episode in open_store(path).episodes] == ["task001_episode000"]
