@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path, PurePosixPath
 
-from vla_attention.schemas.stores.packed_index import INDEX_FILE
+from vla_attention.schemas.stores.packed_index import INDEX_FILE, read_index, unlisted_episodes
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
+from vla_attention.schemas.stores.remote_source import source_of
 from vla_attention.schemas.stores.seal import SEAL_FILE
 from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, EPISODES_GROUP, is_episode_name
 from vla_attention.schemas.stores.store_url import StoreUrl
@@ -55,17 +56,17 @@ def _beyond_seal(episode: StoredEpisode) -> Iterator[_Found]:
 
 
 def foreign_in_store(store: Store) -> tuple[str, ...]:
-    """Paths beside the episodes of a store that are no part of it; nothing is known of a store at an address."""
+    """Paths beside the episodes of a store that are no part of it; nothing is known of a store at an address.
+
+    Episodes that the index of a packed store does not list are not among them: they are faults.
+    """
     if isinstance(store.path, StoreUrl):
         return ()
     known = {"zarr.json", EPISODES_DOCUMENT}
     folders = {".", EPISODES_GROUP}
-    packed = [
-        str(episode.folder.relative_to(store.path))
-        for episode in store.episodes
-        if episode.place is not None and isinstance(episode.folder, Path)
-    ]
-    if packed or (store.path / INDEX_FILE).is_file():
+    index = read_index(source_of(store.path), store.path, store.run)
+    if index is not None:
+        packed = {entry.file for entry in index.episodes.values()} | {*unlisted_episodes(store.path, index)}
         known |= {INDEX_FILE, *packed}
         folders |= {str(PurePosixPath(file).parent) for file in packed}
     else:

@@ -1,14 +1,18 @@
 """The index of a packed store: its episodes, the zip of each, and the digests of their seals.
 
-`index.json` beside the root's `zarr.json` is what a reader needs where nothing can be listed (plain HTTP), and what
-spares one that can from listing thousands of files. An index that was damaged, or is of another run, is refused.
+`index.json` beside the root's `zarr.json` is what a reader needs where nothing can be listed (plain HTTP), and says
+where the small files of each zip begin. An index that was damaged, or is of another run, is refused. Where files can be
+listed, episodes that lie there and that the index lacks are named.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
@@ -16,15 +20,22 @@ from vla_attention.schemas.limits import DOCUMENT_BYTES, ZIP_TAIL_BYTES
 from vla_attention.schemas.safe_text import check_inner_path
 from vla_attention.schemas.stores.byte_source import ByteSource
 from vla_attention.schemas.stores.digest import seal_digest
-from vla_attention.schemas.stores.remote_source import RemoteFailure
-from vla_attention.schemas.stores.store_format import EPISODES_GROUP, StoreError, parse_episode_name
+from vla_attention.schemas.stores.remote_source import RemoteFailure, RemoteFolder
+from vla_attention.schemas.stores.store_format import EPISODES_GROUP, StoreError, is_episode_name, parse_episode_name
+from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
 
 INDEX_FILE = "index.json"
 INDEX_FORMAT = "vla-attention-index"
 INDEX_VERSION = 1
+#: What to do about episodes that an index does not list.
+LIST_AGAIN = "A copy that still packs lists it when it ends; otherwise run the same vla-analyze copy --packed again"
 #: Episodes of one task in one folder: a hub takes at most 10,000 files in one.
 _IN_A_FOLDER = 1000
 _PACK_FOLDER = re.compile(r"task[0-9]{3,}_[0-9]{3,}")
+
+
+class NotListed(Exception):
+    """A place that does not say which files it has."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +88,51 @@ def packed_file(name: str) -> str:
     """The path of an episode's zip in a packed store."""
     task, index = parse_episode_name(name)
     return f"{EPISODES_GROUP}/task{task:03d}_{index // _IN_A_FOLDER:03d}/{name}.zip"
+
+
+def unlisted_episodes(place: StorePlace, index: PackedIndex) -> tuple[str, ...]:
+    """Zips and folders of episodes that lie in a packed store and that its index does not list: paths in the store.
+
+    A link is none. At an address, folders are not looked for.
+
+    Raises:
+        NotListed: the place has no list of its files.
+    """
+    found = _zips_elsewhere(place, index) if isinstance(place, StoreUrl) else set(_zips_and_folders(place))
+    names = {path: path.rpartition("/")[2].removesuffix(".zip") for path in found}
+    return tuple(sorted(path for path, name in names.items() if is_episode_name(name) and name not in index.episodes))
+
+
+def _zips_elsewhere(place: StoreUrl, index: PackedIndex) -> set[str]:
+    try:
+        files = RemoteFolder(place.url).files_below(EPISODES_GROUP)
+    except (OSError, NotImplementedError) as error:
+        raise NotListed(str(error).rstrip(".")) from None
+    # Services name files in their own ways: with the bucket, with the repository and its commit.
+    found = {"/".join((EPISODES_GROUP, *file.split("/")[-2:])) for file in files if file.endswith(".zip")}
+    if index.episodes and found.isdisjoint(entry.file for entry in index.episodes.values()):
+        raise NotListed("its list has none of the zips that the index names")
+    return found
+
+
+def _zips_and_folders(store: Path) -> Iterator[str]:
+    """Zips in the folders for them, and folders beside these."""
+    for entry in _entries(store / EPISODES_GROUP):
+        if not entry.is_dir(follow_symlinks=False):
+            continue
+        if is_pack_folder(entry.name):
+            files = (file.name for file in _entries(Path(entry.path)) if file.is_file(follow_symlinks=False))
+            yield from (f"{EPISODES_GROUP}/{entry.name}/{name}" for name in files if name.endswith(".zip"))
+        else:
+            yield f"{EPISODES_GROUP}/{entry.name}"
+
+
+def _entries(folder: Path) -> list[os.DirEntry[str]]:
+    try:
+        with os.scandir(folder) as entries:
+            return list(entries)
+    except OSError:  # `verify` names a lost group
+        return []
 
 
 def is_pack_folder(name: str) -> bool:

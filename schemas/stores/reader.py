@@ -26,7 +26,15 @@ from vla_attention.schemas.layout import Prompt, Role, prompt_at
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder
 from vla_attention.schemas.stores.episode_shapes import misfits
-from vla_attention.schemas.stores.packed_index import INDEX_FILE, PackedEpisode, read_index
+from vla_attention.schemas.stores.packed_index import (
+    INDEX_FILE,
+    LIST_AGAIN,
+    NotListed,
+    PackedEpisode,
+    PackedIndex,
+    read_index,
+    unlisted_episodes,
+)
 from vla_attention.schemas.stores.remote_source import RemoteFailure, at_commit, source_of
 from vla_attention.schemas.stores.root import group_attributes, list_episodes, read_run
 from vla_attention.schemas.stores.seal import identity_problem, read_seal
@@ -397,7 +405,8 @@ def open_store(path: str | StorePlace) -> Store:
     """Open a store for reading, at a path or an address; its episodes are in the order of task id and episode index.
 
     What is on the hub is read at one commit, which is in the `path` of the opened store.
-    What lies among the episodes and is none is named in a `Note` and ignored.
+    What lies among the episodes and is none is named in a `Note` and ignored, and so are episodes that the index of a
+    packed store does not list.
 
     Raises:
         StoreNotFound: nothing is there; the error lists the stores nearby.
@@ -409,6 +418,7 @@ def open_store(path: str | StorePlace) -> Store:
     source = source_of(path)
     index = read_index(source, path, run)
     if index is not None:
+        _name_unlisted(path, index)
         in_order = sorted(index.episodes.items(), key=lambda item: parse_episode_name(item[0]))
         return Store(path, root, run, tuple(_packed(path, source, run, *item) for item in in_order))
     folders, strays = list_episodes(path)
@@ -421,6 +431,21 @@ def open_store(path: str | StorePlace) -> Store:
         )
     folders.sort(key=lambda folder: parse_episode_name(folder.name))
     return Store(path, root, run, tuple(StoredEpisode(folder, folder.name, run) for folder in folders))
+
+
+def _name_unlisted(path: StorePlace, index: PackedIndex) -> None:
+    try:
+        unlisted = unlisted_episodes(path, index)
+    except NotListed as error:
+        note = f"Whether the {INDEX_FILE} of {path} lists every episode of it was not checked: {error}."
+        warnings.warn(note, Note, stacklevel=3)
+        return
+    if unlisted:
+        warnings.warn(
+            f"Left out of {path}: what its {INDEX_FILE} does not list, {listing(unlisted)}. {LIST_AGAIN}.",
+            Note,
+            stacklevel=3,
+        )
 
 
 def _packed(path: StorePlace, source: ByteSource, run: str, name: str, entry: PackedEpisode) -> StoredEpisode:

@@ -312,7 +312,9 @@ def _hub_listing(url: str) -> tuple[Any, str]:
         from huggingface_hub import HfFileSystem
     except ImportError as error:
         raise _missing(url, error) from None
-    return HfFileSystem(), url.removeprefix(HUB_PROTOCOL)
+    # The client keeps the hub's address from when it was imported, and its file systems keep what they have listed.
+    token = os.environ.get("HF_TOKEN") or None
+    return HfFileSystem(endpoint=_hub()[0], token=token, skip_instance_cache=True), url.removeprefix(HUB_PROTOCOL)
 
 
 def _missing(url: str, error: ImportError) -> RemoteFailure:
@@ -340,7 +342,8 @@ def _asked(url: str, ask: Any) -> Any:
     except TimeoutError:
         raise RemoteFailure(f"{url} cannot be read: its server sent nothing for {ANSWER_WITHIN_S:g} s.") from None
     except OSError as error:
-        raise RemoteFailure(f"{url} cannot be read: {error.strerror or error}.") from None
+        reason = error.strerror or str(error).partition("\n")[0]
+        raise RemoteFailure(f"{url} cannot be read: {reason}.") from None
     except Exception as error:  # aiohttp, botocore and others have classes of their own
         if getattr(error, "status", None) == 416:  # a part beyond the file's end
             return b""

@@ -16,6 +16,7 @@ from vla_attention.schemas.stores.completeness import check_presence
 from vla_attention.schemas.stores.digest import seal_digest
 from vla_attention.schemas.stores.episode_checks import content_problems
 from vla_attention.schemas.stores.foreign_files import foreign_in_episode
+from vla_attention.schemas.stores.packed_index import INDEX_FILE, LIST_AGAIN, NotListed, read_index, unlisted_episodes
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
 from vla_attention.schemas.stores.root import fields_beyond, group_attributes
@@ -86,7 +87,27 @@ def episode_faults(store: Store, episode: StoredEpisode) -> list[Fault]:
 
 
 def store_faults(store: Store) -> list[Fault]:
-    """What is wrong with the files of a store beside its episodes: the `zarr.json` of its two groups."""
+    """What is wrong with a store beside its episodes, see `look_beside`."""
+    return look_beside(store)[0]
+
+
+def look_beside(store: Store) -> tuple[list[Fault], list[str]]:
+    """What is wrong with a store beside its episodes, and sentences on what could not be looked at.
+
+    Faults are those of the `zarr.json` of its two groups, and episodes that the index of a packed store does not list.
+    """
+    faults, unlisted, unchecked = _group_faults(store), tuple[str, ...](), list[str]()
+    index = read_index(source_of(store.path), store.path, store.run)
+    if index is not None:
+        try:
+            unlisted = unlisted_episodes(store.path, index)
+        except NotListed as error:
+            unchecked.append(f"{INDEX_FILE}: whether it lists every episode was not checked: {error}")
+    problem = f"{INDEX_FILE} does not list it, so that nothing reads it. {LIST_AGAIN}"
+    return faults + [Fault(path, problem) for path in unlisted], unchecked
+
+
+def _group_faults(store: Store) -> list[Fault]:
     faults = []
     for file in _ROOT_FILES:
         try:

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from vla_attention.schemas.stores.verify import EpisodeReport, Fault
 
 DESCRIPTION = (
-    "Read everything back and check it: every file, missing chunks, digests, counts, row sums. A line for every "
-    "episode. Foreign files are named; nothing reads them. Exit code 1 if anything is wrong."
+    "Read everything back and check it: every file, missing chunks, digests, counts, row sums, the index of packed "
+    "stores. A line for every episode. Foreign files are named; nothing reads them. Exit code 1 if anything is wrong."
 )
 EXAMPLES = """examples:
   NAME verify libero_10.zarr                      every byte of every episode
@@ -57,14 +57,14 @@ def run_verify(
     """Check stores, and print what was found; returns the exit code: 1 if anything is wrong."""
     from vla_attention.schemas.stores.foreign_files import foreign_in_store
     from vla_attention.schemas.stores.reader import open_store
-    from vla_attention.schemas.stores.verify import store_faults
+    from vla_attention.schemas.stores.verify import look_beside
 
     documents, wrong = [], False
     for path in stores:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Note)  # what lies among the episodes is named below
             store = open_store(path)
-        faults = store_faults(store)
+        faults, unchecked = look_beside(store)
         foreign = foreign_in_store(store)
         found = []
         if not as_json:
@@ -77,8 +77,10 @@ def run_verify(
                     _print_episode(path, report)
         wrong = wrong or bool(faults) or any(report.problems for report in found)
         if as_json:
-            documents.append(_document(store, quick, faults, foreign, found))
+            documents.append(_document(store, quick, faults, unchecked, foreign, found))
         else:
+            for line in unchecked:
+                print_line(f"{path}: {line}")
             _print_foreign(path, foreign, found)
             number = len(faults) + sum(len(report.problems) for report in found)
             result = "all whole" if not number else "1 fault" if number == 1 else f"{number} faults"
@@ -114,7 +116,12 @@ def _print_foreign(path: StorePlace, beside: Sequence[str], found: Iterable[Epis
 
 
 def _document(
-    store: Store, quick: bool, faults: Sequence[Fault], foreign: Sequence[str], found: Sequence[EpisodeReport]
+    store: Store,
+    quick: bool,
+    faults: Sequence[Fault],
+    unchecked: Sequence[str],
+    foreign: Sequence[str],
+    found: Sequence[EpisodeReport],
 ) -> dict[str, object]:
     return {
         "store": str(store.path),
@@ -122,6 +129,7 @@ def _document(
         "quick": quick,
         "whole": not faults and not any(report.problems for report in found),
         "faults": to_json(faults),
+        "unchecked": list(unchecked),
         "foreign": list(foreign),
         "episodes": to_json(found),
     }

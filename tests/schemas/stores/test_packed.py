@@ -19,7 +19,7 @@ from tests.kit.slow import slow_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.analyze.copy.packing import write_zip
-from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.errors import Note, UserError
 from vla_attention.schemas.stores.digest import seal_digest
 from vla_attention.schemas.stores.packed_index import INDEX_FILE
 from vla_attention.schemas.stores.reader import open_store
@@ -410,3 +410,55 @@ def test_every_byte_of_a_zip_is_compared_by_verify(path, bits):
         assert {fault.where for fault in verify_store(open_store(path))} == {"task000_episode000"}, place
     zip_file.write_bytes(whole)
     assert verify_store(open_store(path)) == []
+
+
+def without_second(path: Path) -> None:
+    """An index that lacks a whole, sealed zip, with its right digest."""
+    edit_index(path, lambda index: index["episodes"].pop("task000_episode001"))
+
+
+@pytest.mark.parametrize("quick", [[], ["--quick"]])
+def test_a_zip_that_the_index_lacks_is_a_fault_and_a_note(path, capsys, quick):
+    """Numbers are those of fewer episodes, without a sign of damage in what is read."""
+    without_second(path)
+    assert analyze(["verify", str(path), *quick]) == 1
+    said = capsys.readouterr()
+    assert f"{path}: {SECOND}: index.json does not list it, so that nothing reads it. A copy that" in said.out
+    assert "no part of the store" not in said.out
+    assert "1 episode, 1 fault" in said.out
+    assert said.err == ""
+    assert analyze(["verify", str(path), "--json"]) == 1
+    (report,) = json.loads(capsys.readouterr().out)
+    assert (report["whole"], report["unchecked"], report["foreign"]) == (False, [], [])
+    assert report["faults"][0]["where"] == SECOND
+    for words in (["--list"], ["--no-plots", "--output", str(path.parent / "out")]):
+        assert analyze([str(path), *words]) == 0
+        said = capsys.readouterr()
+        assert said.err.count(f"Left out of {path}: what its index.json does not list, {SECOND}. A copy that") == 1
+    with pytest.warns(Note, match="Left out of"):
+        assert len(open_store(path).episodes) == 1
+
+
+def test_every_zip_that_the_index_lacks_is_named(path, folders, capsys):
+    """Of another task, of an index without any episode, and the folder of an episode."""
+    shutil.copytree(path / "episodes/task000_000", path / "episodes/task007_000")
+    (path / "episodes/task007_000/task000_episode001.zip").rename(path / "episodes/task007_000/task007_episode001.zip")
+    shutil.copytree(folders[0] / "episodes/task000_episode000", path / "episodes/task007_episode000")
+    edit_index(path, lambda index: index["episodes"].clear())
+    assert analyze(["verify", str(path)]) == 1
+    said = capsys.readouterr().out.splitlines()
+    assert [line.split(": ")[1] for line in said[:-1]] == [
+        FIRST,
+        SECOND,
+        "episodes/task007_000/task000_episode000.zip",
+        "episodes/task007_000/task007_episode001.zip",
+        "episodes/task007_episode000",
+    ]
+
+
+def test_a_copy_lists_what_the_index_lacks(path, folders, recorded, capsys):
+    without_second(path)
+    assert analyze(["copy", str(folders[0]), str(path), "--packed"]) == 0
+    assert wrong_or_refused(path, recorded) == []
+    assert analyze(["verify", str(path)]) == 0
+    assert "fault" not in capsys.readouterr().out

@@ -34,6 +34,8 @@ from vla_attention.schemas.stores.store_url import StoreUrl, store_place
 from vla_attention.schemas.stores.verify import verify_store
 from vla_attention.testing.stores import StoreSpec, write_store
 
+pytestmark = pytest.mark.filterwarnings("ignore:Whether the index.json")
+
 SPEC = StoreSpec(tasks=(0,), episodes=2, replans=2)
 DEEP = StoreSpec(
     tasks=(0,), episodes=1, replans=6, layers=tuple(range(18)), num_layers=18, heads=tuple(range(8)), queries="all"
@@ -84,6 +86,13 @@ def read_all(url: str, expected: Path) -> list[str]:
                 assert np.array_equal(values, recorded[episode.name].read(name), equal_nan=True), name
     assert not any("\n" in sentence for sentence in said)
     return said
+
+
+def one_sentence(said: str) -> str:
+    """What a command printed beside the note on what a web server cannot be asked: one line."""
+    lines = [line for line in said.splitlines() if "lists every episode of it was not checked" not in line]
+    assert len(lines) == 1, said
+    return lines[0]
 
 
 def results(folder: Path) -> dict[str, bytes]:
@@ -162,6 +171,27 @@ def test_three_layers_of_eighteen_send_at_most_a_quarter(tmp_path):
         remote = study_words([open_store(url)], settings, 0)
         assert 0 < served.of_episodes() <= everything / 4, (served.sent, everything)
     assert remote.episodes.equals(study_words([open_store(made)], settings, 0).episodes)
+
+
+def test_a_command_says_that_a_web_server_does_not_say_what_it_has(server, packed, tmp_path, capsys):
+    """Its index may lack an episode: here `verify` finds it, there nobody does."""
+    index = tmp_path / "served" / "a.zarr" / INDEX_FILE
+    document = json.loads(index.read_text())
+    del document["episodes"]["task000_episode001"]
+    index.write_text(json.dumps(document | {"digest": seal_digest(document)}))
+    url = f"{server.url}/a.zarr"
+    reason = "was not checked: a web server lists no files below a folder"
+    assert analyze(["verify", url]) == 0
+    said = capsys.readouterr()
+    assert f"{url}: index.json: whether it lists every episode {reason}" in said.out
+    assert said.err == ""
+    assert analyze(["verify", url, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["unchecked"] == [
+        f"index.json: whether it lists every episode {reason}"
+    ]
+    assert analyze([url, "--list"]) == 0
+    assert f"Whether the index.json of {url} lists every episode of it {reason}.\n" in capsys.readouterr().err
+    assert analyze(["verify", str(index.parent)]) == 1
 
 
 def test_what_was_fetched_is_not_sent_again(server, kept, tmp_path):
@@ -274,9 +304,7 @@ def test_a_server_without_ranges_is_refused_with_a_sentence(server, packed, caps
     server.ranges = False
     assert "range requests" in " ".join(read_all(f"{server.url}/a.zarr", packed))
     assert analyze([f"{server.url}/a.zarr", "--no-plots"]) == 2
-    said = capsys.readouterr().err
-    assert "range requests" in said
-    assert said.count("\n") == 1
+    assert "range requests" in one_sentence(capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("cached", [False, True])
@@ -340,9 +368,8 @@ def test_a_server_that_hangs_is_a_sentence(server, half_a_second, capsys):
         assert not ended.is_set()
     finally:
         ended.set()
-    said = capsys.readouterr().err
+    said = one_sentence(capsys.readouterr().err)
     assert f"{server.url}/a.zarr cannot be read: its server sent nothing for 0.5 s." in said
-    assert said.count("\n") == 1
 
 
 def a_piece_each(seconds: float, piece: bytes, count: int) -> Iterator[bytes]:
@@ -367,11 +394,10 @@ def test_a_server_that_sends_a_byte_now_and_then_is_a_sentence(server, half_a_se
     began = time.monotonic()
     assert analyze([f"{server.url}/a.zarr", "--no-plots"]) == 2
     assert time.monotonic() - began < 4
-    said = capsys.readouterr().err
+    said = one_sentence(capsys.readouterr().err)
     assert re.search(
         r"/a.zarr cannot be read: its server sent [0-9]+ bytes in [01] s; expected at least 10,000 a", said
     )
-    assert said.count("\n") == 1
 
 
 def test_a_slow_server_is_waited_for(server, packed, half_a_second):

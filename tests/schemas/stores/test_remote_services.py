@@ -16,6 +16,7 @@ from tests.kit.http_ranges import Served, serve
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.schemas.stores import remote_source
+from vla_attention.schemas.stores.digest import seal_digest
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 from vla_attention.testing.stores import StoreSpec, write_store
@@ -49,7 +50,7 @@ def csv_of(place: str, out: Path) -> dict[str, bytes]:
 @pytest.fixture
 def bucket(stores, monkeypatch) -> Iterator[str]:
     """A bucket with both stores on a server of the loopback."""
-    pytest.importorskip("s3fs", reason="needs the extra remote")
+    s3fs = pytest.importorskip("s3fs", reason="needs the extra remote")
     moto = pytest.importorskip("moto.server", reason="needs moto[server]")
     import boto3
 
@@ -75,6 +76,9 @@ def bucket(stores, monkeypatch) -> Iterator[str]:
         yield "s3://stores"
     finally:
         server.stop()
+        # The next server has another port.
+        remote_source._file_system_of.cache_clear()
+        s3fs.S3FileSystem.clear_instance_cache()
 
 
 def test_stores_in_s3_give_the_same_tables(bucket, stores, tmp_path, capsys):
@@ -101,11 +105,22 @@ def point_main_at(hub: Path, commit: str) -> None:
     (revisions / "main").write_text(json.dumps({"id": "org/name", "sha": commit}))
 
 
+def list_commit(hub: Path, commit: str) -> None:
+    """What the hub says of a commit: that it is one, and the files of its store's group of episodes."""
+    (hub / "api/datasets/org/name/revision" / commit).write_text(json.dumps({"id": "org/name", "sha": commit}))
+    base, lists = hub / f"datasets/org/name/resolve/{commit}", hub / f"api/datasets/org/name/tree/{commit}/runs/a.zarr"
+    files = [file for file in sorted((base / "runs/a.zarr/episodes").rglob("*")) if file.is_file()]
+    lists.mkdir(parents=True)
+    entries = [{"type": "file", "path": str(file.relative_to(base)), "size": 1, "oid": "0" * 40} for file in files]
+    (lists / "episodes").write_text(json.dumps(entries))
+
+
 @pytest.fixture
 def hub(stores, tmp_path, monkeypatch) -> Iterator[Served]:
     """A server with the addresses under which the hub serves files, of commits only, and says what `main` is."""
     shutil.copytree(stores[1], hub_commit(tmp_path, COMMIT) / "runs/a.zarr")
     point_main_at(tmp_path / "hub", COMMIT)
+    list_commit(tmp_path / "hub", COMMIT)
     with serve(tmp_path / "hub") as served:
         monkeypatch.setenv("HF_ENDPOINT", served.url)
         monkeypatch.setenv("HF_TOKEN", "made-up")
@@ -143,8 +158,9 @@ def test_a_branch_is_asked_for_once_and_everything_is_read_at_its_commit(hub, st
 
     hub.change = move
     assert analyze(["copy", "hf://datasets/org/name/runs/a.zarr", str(tmp_path / "here.zarr")]) == 0
-    assert sum("/revision/" in path for path, _ in hub.requests) == 1
-    assert all(f"/resolve/{COMMIT}/" in path for path, _ in hub.requests if "/revision/" not in path)
+    assert sum(path.endswith("/revision/main") for path, _ in hub.requests) == 1
+    assert all(f"/resolve/{COMMIT}/" in path for path, _ in hub.requests if "/resolve/" in path)
+    assert any(f"/tree/{COMMIT}/" in path for path, _ in hub.requests)
     copied = open_store(tmp_path / "here.zarr")
     assert copied.attributes.provenance["fetched_from"] == f"hf://datasets/org/name@{COMMIT}/runs/a.zarr"
     assert copied.run == open_store(stores[0]).run
@@ -152,12 +168,42 @@ def test_a_branch_is_asked_for_once_and_everything_is_read_at_its_commit(hub, st
     # A copy is of one commit. With it the same command goes on.
     capsys.readouterr()
     shutil.copytree(hub_commit(tmp_path, COMMIT), hub_commit(tmp_path, "b" * 40))
+    list_commit(tmp_path / "hub", "b" * 40)
     assert analyze(["copy", "hf://datasets/org/name/runs/a.zarr", str(tmp_path / "here.zarr")]) == 2
     said = capsys.readouterr().err
     assert f"it is of hf://datasets/org/name@{COMMIT}/runs/a.zarr" in said
     assert said.count("\n") == 1
     assert analyze(["copy", f"hf://datasets/org/name@{COMMIT}/runs/a.zarr", str(tmp_path / "here.zarr")]) == 0
     assert "2 were there already" in capsys.readouterr().out
+
+
+def lacking(index: Path) -> bytes:
+    """An index without the second episode, whose zip is there, and with its right digest."""
+    document = json.loads(index.read_text())
+    del document["episodes"]["task000_episode001"]
+    return json.dumps(document | {"digest": seal_digest(document)}).encode()
+
+
+def check_one_is_lacking(url: str, capsys: pytest.CaptureFixture[str]) -> None:
+    lost = "episodes/task000_000/task000_episode001.zip"
+    assert analyze(["verify", url]) == 1
+    assert f"{lost}: index.json does not list it" in capsys.readouterr().out
+    assert analyze([url, "--list"]) == 0
+    assert f"what its index.json does not list, {lost}" in capsys.readouterr().err
+
+
+def test_a_zip_that_the_index_lacks_is_found_on_the_hub(hub, tmp_path, capsys):
+    index = hub_commit(tmp_path, COMMIT) / "runs/a.zarr/index.json"
+    index.write_bytes(lacking(index))
+    check_one_is_lacking("hf://datasets/org/name/runs/a.zarr", capsys)
+
+
+def test_a_zip_that_the_index_lacks_is_found_in_s3(bucket, stores, capsys):
+    import boto3
+
+    body = lacking(stores[1] / "index.json")
+    boto3.client("s3").put_object(Bucket="stores", Key="packed.zarr/index.json", Body=body)
+    check_one_is_lacking(f"{bucket}/packed.zarr", capsys)
 
 
 def test_a_merged_store_names_the_commit(hub, tmp_path):
