@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.store_url import store_place
 
@@ -13,6 +14,17 @@ if TYPE_CHECKING:
     from vla_attention.analyze.measures.question_settings import AnalysisSettings
     from vla_attention.analyze.measures.sinks import SinkRule
     from vla_attention.schemas.stores.reader import Store
+
+
+def output_place(text: str) -> Path:
+    """The type of `--output`: a path that is in no store. It is looked at before hours of reading."""
+    from vla_attention.schemas.stores.store_place import refuse_in_store
+
+    try:
+        refuse_in_store(Path(text), "write to")
+    except BadArgument as error:
+        raise argparse.ArgumentTypeError(str(error).removesuffix(".")) from None
+    return Path(text)
 
 
 def add_stores(parser: argparse.ArgumentParser) -> None:
@@ -102,7 +114,7 @@ def add_intervals(parser: argparse.ArgumentParser) -> None:
 def add_output(parser: argparse.ArgumentParser, default: str = "results/STORE/GROUPING") -> argparse._ArgumentGroup:
     """--output, --no-plots and --pdf."""
     output = parser.add_argument_group("output")
-    output.add_argument("--output", type=Path, metavar="PATH", help=f"folder (default: {default})")
+    output.add_argument("--output", type=output_place, metavar="PATH", help=f"folder (default: {default})")
     pictures = output.add_mutually_exclusive_group()
     pictures.add_argument("--no-plots", action="store_true", help="numbers only")
     add_pdf(pictures)

@@ -75,7 +75,10 @@ def _until_terminated(command: Callable[[Termination], int], termination: Termin
 
 
 def check_writable(path: Path, option: str) -> None:
-    """Raise `BadArgument` if nothing can be created at `path`. Creates nothing itself."""
+    """Raise `BadArgument` if nothing can be created at `path`, or if it is in a store. Creates nothing itself."""
+    from vla_attention.schemas.stores.store_place import refuse_in_store
+
+    refuse_in_store(path, "write to")
     nearest = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
     if not nearest.is_dir():
         raise BadArgument(f"Cannot write to {path}: {nearest} is a file; give another {option}.")

@@ -46,6 +46,15 @@ def cache_place() -> CachePlace | None:
     return CachePlace(folder.absolute(), parse_size(size) if size else DEFAULT_BYTES)
 
 
+def check_cache_place(place: CachePlace) -> None:
+    """Raise `BadArgument` for a cache inside of a store, whose readers would take it for a part of that."""
+    from vla_attention.schemas.stores.store_place import refuse_in_store
+
+    given = os.environ.get(FOLDER_VARIABLE, "").strip()
+    where = "the working directory's cache" if given.casefold() in _ON else f"what {FOLDER_VARIABLE} names,"
+    refuse_in_store(place.folder, f"keep what is measured in {where}")
+
+
 @contextmanager
 def switched_off() -> Iterator[None]:
     """No cache within the block, for this process and those that it starts: `--no-cache`."""

@@ -21,7 +21,7 @@ from vla_attention.analyze.cache.arithmetic import arithmetic_version
 from vla_attention.analyze.cache.array_bytes import arrays_from_bytes, arrays_to_bytes
 from vla_attention.analyze.cache.fingerprints import file_state
 from vla_attention.analyze.cache.housekeeping import make_room
-from vla_attention.analyze.cache.places import CachePlace, cache_place
+from vla_attention.analyze.cache.places import CachePlace, cache_place, check_cache_place
 from vla_attention.analyze.cache.segments import (
     Record,
     SegmentWriter,
@@ -80,6 +80,7 @@ def remembered(
     if place is None:
         yield from measure(range(len(episodes)))
         return
+    check_cache_place(place)
     cache = _Lookup(question, place)
     extra = arguments or [None] * len(episodes)
     keys = [_episode_key(episode, one) for episode, one in zip(episodes, extra, strict=True)]

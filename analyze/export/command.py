@@ -11,6 +11,7 @@ from vla_attention.analyze.arguments import (
     add_selection,
     add_stores,
     output_folder,
+    output_place,
     settings_of,
     stores_of,
 )
@@ -59,7 +60,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_intervals(parser)
     selection.add_argument("--per-head", action="store_true", help="keep heads apart in the steps table")
     output = parser.add_argument_group("output")
-    output.add_argument("--output", type=Path, metavar="PATH", help="folder (default: results/STORE/export)")
+    output.add_argument("--output", type=output_place, metavar="PATH", help="folder (default: results/STORE/export)")
     return parser
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from vla_attention.analyze.arguments import (
     add_episode,
@@ -12,6 +11,7 @@ from vla_attention.analyze.arguments import (
     add_site_and_tasks,
     add_stores,
     output_folder,
+    output_place,
     settings_of,
     stores_of,
 )
@@ -43,7 +43,7 @@ def build_parser() -> argparse.ArgumentParser:
     example = add_episode(parser, "example in the picture")
     example.add_argument("--replan", type=int, default=0, metavar="N", help="its replan (default: 0)")
     output = parser.add_argument_group("output")
-    output.add_argument("--output", type=Path, metavar="PATH", help="folder (default: results/STORE/groups)")
+    output.add_argument("--output", type=output_place, metavar="PATH", help="folder (default: results/STORE/groups)")
     output.add_argument("--no-plots", action="store_true", help="text and tables only")
     add_pdf(output)
     return parser

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vla_attention.analyze.arguments import output_place
 from vla_attention.schemas.command_line import command_parser, run_command
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stop_signals import end_program
@@ -40,10 +41,10 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="PATH",
         help="results files, folders of them, or patterns for either",
     )
-    parser.add_argument("--output", type=Path, metavar="FILE", help="also write the summary into this text file")
+    parser.add_argument("--output", type=output_place, metavar="FILE", help="also write the summary into this file")
     parser.add_argument(
         "--output-dir",
-        type=Path,
+        type=output_place,
         default=Path("results/attention_ratio_analysis"),
         metavar="FOLDER",
         help="folder of the pictures (default: %(default)s)",

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import argparse
 
-from vla_attention.analyze.arguments import add_grouping, add_intervals, add_selection, add_stores, settings_of
+from vla_attention.analyze.arguments import (
+    add_grouping,
+    add_intervals,
+    add_selection,
+    add_stores,
+    output_place,
+    settings_of,
+)
 from vla_attention.analyze.report.report_settings import ReportSettings
 from vla_attention.schemas.command_line import command_parser
 
@@ -60,7 +67,7 @@ def build_parser() -> argparse.ArgumentParser:
     output = parser.add_argument_group("output")
     output.add_argument(
         "--output",
-        type=Path,
+        type=output_place,
         metavar="PATH",
         help="folder, in which report.html is written, or a file FILE.html (default: results/STORE)",
     )

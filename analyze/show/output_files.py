@@ -24,6 +24,12 @@ _NUMBER_OF_OS_ERROR = re.compile(r"\bos error ([0-9]{1,4})\b")
 _TRIED_BYTES = 1 << 16
 
 
+def _refuse_in_store(path: Path, doing: str) -> None:
+    from vla_attention.schemas.stores.store_place import refuse_in_store
+
+    refuse_in_store(path, doing)
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; on success it replaces `path`, on an error it is removed.
@@ -32,8 +38,10 @@ def replacing(path: Path) -> Iterator[Path]:
     processes never write to the same file.
 
     Raises:
+        BadArgument: it is in a store.
         OSError: the file cannot be written; also where a library has made an error of its own out of it.
     """
+    _refuse_in_store(path, "write")
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -72,8 +80,9 @@ def writing(what: str, path: Path, instead: str = "another --output") -> Iterato
     """Turn an `OSError` in the block into one sentence: `what` cannot be written to `path`; give `instead`.
 
     Raises:
-        BadArgument: the block raised an `OSError` that is no `UserError`.
+        BadArgument: `path` is in a store, or the block raised an `OSError` that is no `UserError`.
     """
+    _refuse_in_store(path, f"write {what} to")
     try:
         yield
     except OSError as error:

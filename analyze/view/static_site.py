@@ -13,6 +13,7 @@ from vla_attention.analyze.view.served_stores import ServedStore, stores_documen
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.hub_address import HubAddress
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX
+from vla_attention.schemas.stores.store_place import refuse_in_store
 from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
 
 #: Where browsers of others find the hub.
@@ -24,6 +25,7 @@ def check_site(folder: Path, stores: Sequence[StorePlace]) -> None:
 
     An existing folder is written into only if it is empty or holds such a site.
     """
+    refuse_in_store(folder, "write a site into")
     if folder.suffix == STORE_SUFFIX or (folder / "zarr.json").exists():
         raise BadArgument(f"Cannot write a site into {folder}: it is a store, or named like one; give another folder.")
     if folder.exists() and not folder.is_dir():

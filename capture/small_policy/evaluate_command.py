@@ -29,6 +29,7 @@ from vla_attention.capture.small_policy.rollouts import (
     run_expert,
 )
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
+from vla_attention.schemas.stores.store_place import refuse_in_store
 
 Job = tuple[int, int]
 #: Stands for a checkpoint: the scripted experts.
@@ -67,6 +68,8 @@ class Evaluation:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the missing episodes, print the rates; returns the exit code."""
+    if arguments.output is not None:
+        refuse_in_store(arguments.output, "write episodes to")
     suite = find_suite(arguments.suite)
     evaluation, jobs = _planned(arguments, suite)
     condition: Condition = arguments.condition

@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stop_signals import stops_kept_from_children
+from vla_attention.schemas.stores.store_place import refuse_in_store
 
 #: Takes the jobs of one process and the queue of its results.
 Work = Callable[[Sequence[Any], "multiprocessing.Queue[Any]"], None]
@@ -19,6 +20,7 @@ Work = Callable[[Sequence[Any], "multiprocessing.Queue[Any]"], None]
 
 def new_folder(folder: Path, content: str) -> None:
     """Make a folder if there is none; raises `BadArgument`, which says for what it was meant."""
+    refuse_in_store(folder, f"make a folder for the {content} at")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

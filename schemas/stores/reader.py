@@ -35,7 +35,7 @@ from vla_attention.schemas.stores.packed_index import (
     read_index,
     unlisted_episodes,
 )
-from vla_attention.schemas.stores.remote_source import RemoteFailure, at_commit, source_of
+from vla_attention.schemas.stores.remote_source import RemoteFailure, at_commit, kept_bytes, source_of
 from vla_attention.schemas.stores.root import group_attributes, list_episodes, read_run
 from vla_attention.schemas.stores.seal import identity_problem, read_seal
 from vla_attention.schemas.stores.sealed_files import SealedFiles
@@ -49,6 +49,7 @@ from vla_attention.schemas.stores.store_format import (
     episode_name,
     parse_episode_name,
 )
+from vla_attention.schemas.stores.store_place import refuse_in_store
 from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl, store_place
 from vla_attention.schemas.stores.zip_members import DamagedZip, ZipMembers
 
@@ -414,6 +415,8 @@ def open_store(path: str | StorePlace) -> Store:
         FormatTooNew: a later version wrote it.
     """
     path = at_commit(store_place(path))
+    if isinstance(path, StoreUrl) and (kept := kept_bytes()) is not None:
+        refuse_in_store(kept.folder, "keep what is fetched in")
     root, run = read_run(path)
     source = source_of(path)
     index = read_index(source, path, run)

@@ -1,10 +1,14 @@
-"""Where a store may be made."""
+"""Where a store may be made, and where nothing else may be written."""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterable
 from pathlib import Path
 
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.limits import ROOT_BYTES
+from vla_attention.schemas.regular_files import read_regular
 from vla_attention.schemas.stores.root import group_attributes
 from vla_attention.schemas.stores.store_format import FORMAT_NAME, STORE_SUFFIX
 
@@ -16,17 +20,33 @@ def check_place(path: Path, doing: str) -> None:
     """
     if path.suffix != STORE_SUFFIX:
         raise BadArgument(f"Cannot {doing} {path}: expected a name that ends with '{STORE_SUFFIX}'.")
-    for above in path.resolve().parents:
-        if _is_store(above):
+    _refuse_in(_place(path).parents, path, doing)
+
+
+def refuse_in_store(path: Path, doing: str) -> None:
+    """Raise `BadArgument` for a file or folder that is a store, or in one, and is to be written.
+
+    doing: how the sentence begins, for instance "write results to".
+    """
+    place = _place(path)
+    _refuse_in((place, *place.parents), path, doing)
+
+
+def _place(path: Path) -> Path:
+    return Path(os.path.realpath(path))
+
+
+def _refuse_in(folders: Iterable[Path], path: Path, doing: str) -> None:
+    for folder in folders:
+        if _is_store(folder):
             raise BadArgument(
-                f"Cannot {doing} {path}: it is inside of the store {above}, whose readers would take it for a part of "
+                f"Cannot {doing} {path}: it is inside of the store {folder}, whose readers would take it for a part of "
                 "that; give a place beside it."
             )
 
 
 def _is_store(folder: Path) -> bool:
-    document = folder / "zarr.json"
     try:
-        return document.is_file() and group_attributes(document.read_bytes()).get("format") == FORMAT_NAME
+        return group_attributes(read_regular(folder / "zarr.json", ROOT_BYTES)).get("format") == FORMAT_NAME
     except (OSError, ValueError):
         return False

@@ -13,11 +13,16 @@ from typing import Any
 
 import pytest
 
+import vla_attention as va
 from tests.kit.slow import slow_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.commands import COMMANDS
 from vla_attention.analyze.parse.command import main as parse
 from vla_attention.capture.__main__ import main as capture
+from vla_attention.capture.command_line import check_writable
+from vla_attention.capture.small_policy.processes import new_folder
+from vla_attention.example_stores.command import main as example
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions, PromptChange
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import SiteLayout, Span
@@ -95,6 +100,10 @@ def make_rerun(store: Path, of: Path) -> None:
 
 def files_under(folder: Path) -> set[Path]:
     return {path for path in folder.rglob("*") if path.is_file()}
+
+
+def all_paths(folder: Path) -> set[Path]:
+    return set(folder.rglob("*"))
 
 
 def check_output(capsys: pytest.CaptureFixture[str]) -> str:
@@ -204,6 +213,74 @@ def test_hostile_texts_are_printed_visibly_and_nothing_is_written_elsewhere(
         assert sum(tag == "script" for tag, _ in tags.tags) == 1
         assert MARKUP not in page
         assert "&lt;img src=x onerror=alert(1)&gt;" in page
+
+
+@pytest.mark.parametrize("command", [command for command, words in WORDS.items() if "OUT" in " ".join(words)])
+@pytest.mark.parametrize("inside", ["", "episodes/task000_episode000/new"])
+def test_no_command_writes_into_a_store(original, store, tmp_path, capsys, command, inside):
+    """Readers would take what lies there for a part of the store, and a second analysis for a damaged one."""
+    other, before = tmp_path / "stores" / "b.zarr", all_paths(store)
+    shutil.copytree(original, other)
+    (tmp_path / "link").symlink_to(store)
+    out = tmp_path / "link" / inside
+    words = [word.replace("STORE", str(store)).replace("OTHER", str(other)) for word in WORDS[command]]
+    try:
+        code: object = analyze([command, *(word.replace("OUT", str(out)) for word in words)])
+    except SystemExit as end:  # of a mistake in the arguments
+        code = end.code
+    assert code == 2
+    said = check_output(capsys)
+    assert f"it is inside of the store {store}" in said, said
+    assert said.count("\n") == 1
+    assert all_paths(store) == before
+
+
+@pytest.mark.parametrize("words", [("ratios", "--no-cache"), ("groups",), ("report", "--quick", "--no-cache")])
+def test_nothing_is_written_into_a_store_that_is_the_working_directory(store, monkeypatch, capsys, words):
+    monkeypatch.chdir(store / "episodes")
+    before = all_paths(store)
+    assert analyze([words[0], str(store), *words[1:]]) == 2
+    assert f"it is inside of the store {store}" in check_output(capsys)
+    assert all_paths(store) == before
+
+
+@pytest.mark.parametrize("given", [None, "cache"])
+def test_the_cache_is_in_no_store(store, tmp_path, monkeypatch, capsys, given):
+    monkeypatch.chdir(store)
+    monkeypatch.delenv("VLA_CACHE", raising=False)
+    if given is not None:
+        monkeypatch.setenv("VLA_CACHE", str(store / given))
+        monkeypatch.chdir(tmp_path)
+    before = all_paths(store)
+    words = [str(store), "--no-plots", "--output", str(tmp_path / "out")]
+    assert analyze(words) == 2
+    what = "what VLA_CACHE names, " if given else "the working directory's cache "
+    assert f"Cannot keep what is measured in {what}{store}" in check_output(capsys)
+    assert all_paths(store) == before
+    assert analyze([*words, "--no-cache"]) == 0
+
+
+def test_python_and_other_programs_write_into_no_store(store, tmp_path, monkeypatch, capsys):
+    before = all_paths(store)
+    run = va.open(store)
+    for write in (
+        lambda: run.report(store / "page.html", episodes=0),
+        lambda: run.overlay(folder=store / "out"),
+        lambda: check_writable(store / "results", "--output-dir"),
+        lambda: new_folder(store / "training", "training"),
+    ):
+        with pytest.raises(BadArgument, match="is inside of the store"):
+            write()
+    (tmp_path / "results").mkdir()
+    assert analyze([str(store), "--no-plots", "--no-cache", "--output", str(tmp_path / "results")]) == 0
+    check_output(capsys)
+    for option in ("--output", "--output-dir"):
+        with pytest.raises(SystemExit, match="2"):
+            parse(["--results", str(tmp_path / "results"), option, str(store / "x")])
+        assert "is inside of the store" in check_output(capsys)
+    assert example([str(store / "examples")]) == 2
+    assert "is inside of the store" in check_output(capsys)
+    assert all_paths(store) == before
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,9 @@ def _copy(folder: Path) -> int:
     there = [folder / store.name for store in copies.values() if (folder / store.name).exists()]
     if there:
         raise BadArgument(f"{there[0]} exists; remove it, or name another folder: vla-attention example FOLDER.")
+    from vla_attention.schemas.stores.store_place import refuse_in_store
+
+    refuse_in_store(folder, "copy stores to")
     folder.mkdir(parents=True, exist_ok=True)
     for store in copies.values():
         # Files of an installation may be read-only; copies are their owner's.

@@ -216,6 +216,14 @@ def test_without_a_folder_for_it_nothing_is_kept(server, tmp_path):
         assert server.of_episodes() > 0
 
 
+def test_what_was_fetched_is_kept_in_no_store(server, packed, tmp_path, monkeypatch, capsys):
+    shutil.copytree(packed, tmp_path / "b.zarr")
+    monkeypatch.setenv("VLA_REMOTE_CACHE", str(tmp_path / "b.zarr" / "kept"))
+    assert analyze([f"{server.url}/a.zarr", "--list"]) == 2
+    assert f"is inside of the store {tmp_path / 'b.zarr'}" in one_sentence(capsys.readouterr().err)
+    assert not (tmp_path / "b.zarr" / "kept").exists()
+
+
 def test_damaged_bytes_of_the_cache_are_fetched_again(server, kept, packed):
     url = f"{server.url}/a.zarr"
     assert read_all(url, packed) == []
