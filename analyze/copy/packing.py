@@ -71,10 +71,10 @@ class Packing:
             self.write_index()
 
     def present(self) -> set[str]:
-        """Names of the episodes whose zips are there, with the bytes that the index says."""
+        """Names of the episodes whose zips are there, with the bytes that the index says; a link is no zip."""
         for name, entry in list(self.episodes.items()):
             path = self.target / entry.file
-            if not path.is_file() or path.stat().st_size != entry.bytes:
+            if path.is_symlink() or not path.is_file() or path.stat().st_size != entry.bytes:
                 del self.episodes[name]
         return set(self.episodes)
 

@@ -40,7 +40,7 @@ def push_store(path: Path, place: HubAddress) -> str:
     has already is left as it is.
 
     Raises:
-        StoreError: the store is not packed.
+        StoreError: the store is not packed, or one of its files is a link.
         RemoteFailure: the hub refuses.
     """
     store = open_store(path)
@@ -53,6 +53,11 @@ def push_store(path: Path, place: HubAddress) -> str:
         path / EPISODES_GROUP / "zarr.json",
         *(Path(str(one.folder)) for one in store.episodes),
     ]
+    if links := [str(file.relative_to(path)) for file in (*files, path / INDEX_FILE) if file.is_symlink()]:
+        raise StoreError(
+            f"Cannot upload {path}: {listing(links, 5)} in it {'is a link' if len(links) == 1 else 'are links'}, and "
+            "what a link leads to is not published; make the packed copy again."
+        )
     try:
         api.create_repo(place.repository, repo_type="dataset", exist_ok=True)
         for first in range(0, len(files), _FILES_A_COMMIT):

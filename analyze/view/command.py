@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     from contextlib import ExitStack
 
     from vla_attention.analyze.view.served_stores import ServedStore
-    from vla_attention.analyze.view.static_site import check_site
+    from vla_attention.analyze.view.static_site import check_site, check_uploads
     from vla_attention.analyze.view.summaries import Summary
     from vla_attention.schemas.stores.reader import open_store
 
@@ -61,6 +61,8 @@ def run(arguments: argparse.Namespace) -> int:
     places: list[StorePlace] = list(dict.fromkeys(arguments.stores))
     with ExitStack() as stack:
         stores = [ServedStore(open_store(place), stack.enter_context(Summary())) for place in places]
+        if arguments.site is not None:
+            check_uploads(arguments.site, [store.store for store in stores])
         for store in stores:
             store.summary.begin(store.store)
         if arguments.site is not None:

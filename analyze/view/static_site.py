@@ -10,8 +10,10 @@ from pathlib import Path
 from vla_attention.analyze.show.output_files import write_text, writing
 from vla_attention.analyze.view.paths import PAGE_FILES, STORES_DOCUMENT
 from vla_attention.analyze.view.served_stores import ServedStore, stores_document
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.stores.foreign_files import beyond_the_format
 from vla_attention.schemas.stores.hub_address import HubAddress
+from vla_attention.schemas.stores.reader import Store
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX
 from vla_attention.schemas.stores.store_place import refuse_in_store
 from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
@@ -35,6 +37,32 @@ def check_site(folder: Path, stores: Sequence[StorePlace]) -> None:
     for store in stores:
         if isinstance(store, StoreUrl):
             web_address(store)
+
+
+def check_uploads(folder: Path, stores: Sequence[Store]) -> None:
+    """Raise `BadArgument` where an upload that follows links would publish more than a site of these stores.
+
+    A site has links to the stores of this machine, so that whoever uploads it has to follow links.
+    """
+    for store in stores:
+        if more := beyond_the_format(store):
+            raise BadArgument(
+                f"Cannot write a site of {store.path}: {listing(more, 5)} would be published with it, and "
+                f"{'is' if len(more) == 1 else 'are'} no part of the store. vla-analyze copy {store.path} NAME.zarr "
+                "makes a store without such files and links; or remove them."
+            )
+    links = [
+        entry.name if place == folder else f"{place.name}/{entry.name}"
+        for place in (folder, folder / "stores")
+        if place.is_dir()
+        for entry in place.iterdir()
+        if entry.is_symlink() and not (place.name == "stores" and entry.name.isdecimal())
+    ]
+    if links:
+        raise BadArgument(
+            f"Cannot write a site into {folder}: it has the {'link' if len(links) == 1 else 'links'} "
+            f"{listing(sorted(links), 5)}, and an upload that follows links would publish what is there; remove them."
+        )
 
 
 def web_address(place: StoreUrl) -> str:
@@ -63,6 +91,7 @@ def write_site(folder: Path, stores: Sequence[ServedStore]) -> str:
     uploads = []
     with writing("site", folder, instead="another --site"):
         (folder / "stores").mkdir(parents=True, exist_ok=True)
+        _remove_earlier(folder / "stores", len(stores))
         for number, (store, entry) in enumerate(zip(stores, document["stores"], strict=True)):
             link = folder / "stores" / str(number)
             if link.is_symlink():
@@ -80,6 +109,15 @@ def write_site(folder: Path, stores: Sequence[ServedStore]) -> str:
         for name in PAGE_FILES:
             write_text(folder / name, (page / name).read_text(encoding="utf-8"))
     return _uploads(folder, uploads, stores)
+
+
+def _remove_earlier(folder: Path, count: int) -> None:
+    """Remove the links and summaries of stores that an earlier site in this place had beyond the first `count`."""
+    for entry in folder.iterdir():
+        number, _, rest = entry.name.partition(".")
+        is_ours = entry.is_symlink() if not rest else rest == "summary.json" and entry.is_file()
+        if is_ours and number.isdecimal() and number.isascii() and int(number) >= count:
+            entry.unlink()
 
 
 def _uploads(folder: Path, uploads: Sequence[str], stores: Sequence[ServedStore]) -> str:

@@ -14,11 +14,12 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path, PurePosixPath
 
+from vla_attention.schemas.stores.episode_files import links_in_episode
 from vla_attention.schemas.stores.packed_index import INDEX_FILE, read_index, unlisted_episodes
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.remote_source import source_of
 from vla_attention.schemas.stores.seal import SEAL_FILE
-from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, EPISODES_GROUP, is_episode_name
+from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, EPISODES_GROUP, CorruptEpisode, is_episode_name
 from vla_attention.schemas.stores.store_url import StoreUrl
 from vla_attention.schemas.stores.zip_members import ZipMembers
 
@@ -73,6 +74,39 @@ def foreign_in_store(store: Store) -> tuple[str, ...]:
         known |= {f"{EPISODES_GROUP}/{name}" for name in _episode_names(store.path / EPISODES_GROUP)}
     found = _beyond(store.path, known, folders)
     return _named(replace(one, path=f"{one.path} (a link)") if one.is_link else one for one in found)
+
+
+def beyond_the_format(store: Store) -> tuple[str, ...]:
+    """Everything that a copy of a store's folder which follows links would take along beside the store: paths in it.
+
+    Named are links, also those in place of the store's own files, what is no part of it, and episodes that no index
+    lists; of one that is in a zip with its path there. Nothing is known of a store at an address.
+
+    Raises:
+        CorruptEpisode: nothing is found, and what belongs to an episode is not known.
+    """
+    if isinstance(store.path, StoreUrl):
+        return ()
+    index = read_index(source_of(store.path), store.path, store.run)
+    own = {"zarr.json", EPISODES_GROUP, EPISODES_DOCUMENT}
+    found = list(foreign_in_store(store))
+    if index is not None:
+        zips = {entry.file for entry in index.episodes.values()}
+        own |= {INDEX_FILE, *zips, *(str(PurePosixPath(file).parent) for file in zips)}
+        found += unlisted_episodes(store.path, index)
+    found += [f"{path} (a link)" for path in own if os.path.islink(store.path / path)]
+    unknown: CorruptEpisode | None = None
+    for episode in map(replace, store.episodes):  # anew: what is read of one goes with it
+        try:
+            links = [*links_in_episode(episode), *links_beyond_seal(episode)]
+            inside = [*(f"{path} (a link)" for path in links), *foreign_in_episode(episode)]
+        except CorruptEpisode as error:
+            unknown = unknown or error
+            continue
+        found += [f"{EPISODES_GROUP}/{episode.name}/{path}" for path in inside]
+    if unknown is not None and not found:
+        raise unknown
+    return tuple(sorted(set(found)))
 
 
 def _episode_names(folder: Path) -> Iterator[str]:

@@ -82,6 +82,22 @@ def test_what_is_uploaded_is_the_packed_store(store, client, tmp_path, monkeypat
     assert [one.seal.digest for one in got.episodes] == [one.seal.digest for one in open_store(store).episodes]
 
 
+def test_what_a_link_leads_to_is_not_uploaded(store, client, tmp_path, capsys):
+    """A packed copy that came from somebody else, and is continued here."""
+    packed, secret = tmp_path / "a.zarr", tmp_path / "secret"
+    words = ["copy", str(store), str(packed), "--packed", "--push", ADDRESS]
+    assert analyze(words[:-2]) == 0
+    zipped = packed / "episodes/task000_000/task000_episode000.zip"
+    secret.write_bytes(b"x" * zipped.stat().st_size)  # as many bytes as the index says
+    for file in (zipped, packed / "episodes/zarr.json"):
+        file.unlink()
+        file.symlink_to(secret)
+    assert analyze(words) == 2
+    assert f"Cannot upload {packed}: episodes/zarr.json in it is a link" in capsys.readouterr().err
+    assert not zipped.is_symlink()  # packed again
+    assert not any(secret.read_bytes() in commit.values() for commit in client.commits)
+
+
 def test_the_card_says_what_the_store_holds(store, client, tmp_path):
     assert analyze(["copy", str(store), str(tmp_path / "a.zarr"), "--packed", "--push", ADDRESS]) == 0
     card = client.commits[-1]["README.md"].decode()

@@ -7,6 +7,7 @@ import re
 import shutil
 import sys
 import webbrowser
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.show.browser import has_screen, open_page
 from vla_attention.analyze.view.paths import PAGE_FILES
 from vla_attention.analyze.view.summary_process import summary_parts
+from vla_attention.schemas.stores.digest import seal_digest
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
 from vla_attention.testing.stores import StoreSpec, write_store
@@ -102,6 +104,85 @@ def test_a_site_is_the_page_its_documents_and_a_link_to_the_store(store, tmp_pat
     assert (folder / "stores/0").resolve() == store
     files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()}
     assert files == {*PAGE_FILES, "stores.json", "stores/0.summary.json"} | ({"stores/0"} & files)
+
+
+def upload(folder: Path, target: Path) -> dict[str, bytes]:
+    """What a copy that follows links takes along, by path."""
+    shutil.copytree(folder, target, symlinks=False)
+    return {file.relative_to(target).as_posix(): file.read_bytes() for file in target.rglob("*") if file.is_file()}
+
+
+#: What somebody may put into a store, and what of it an upload that follows links would publish.
+FOREIGN = {
+    "notes.txt": lambda store, secret: (store / "notes.txt").write_text("mine"),
+    "keys (a link)": lambda store, secret: (store / "keys").symlink_to(secret),
+    "episodes/zarr.json (a link)": lambda store, secret: replace_by_link(store / "episodes/zarr.json", secret / "id"),
+    "episodes/drafts/": lambda store, secret: (store / "episodes/drafts").mkdir(),
+    "episodes/task000_episode000/.DS_Store": lambda store, secret: (
+        store / "episodes/task000_episode000/.DS_Store"
+    ).write_text("mine"),
+    "episodes/task000_episode000/joint/rows/keys (a link)": lambda store, secret: (
+        store / "episodes/task000_episode000/joint/rows/keys"
+    ).symlink_to(secret),
+    "episodes/task000_episode000/state/zarr.json (a link)": lambda store, secret: replace_by_link(
+        store / "episodes/task000_episode000/state/zarr.json", store / "episodes/task000_episode001/state/zarr.json"
+    ),
+}
+
+
+def replace_by_link(file: Path, target: Path) -> None:
+    file.unlink()
+    file.symlink_to(target)
+
+
+@pytest.mark.filterwarnings("ignore:Ignored in")
+@pytest.mark.parametrize("name", FOREIGN)
+def test_a_site_publishes_nothing_but_the_store(store, tmp_path, capsys, name):
+    (tmp_path / "secret").mkdir()
+    (tmp_path / "secret/id").write_text("secret")
+    shutil.copytree(store, tmp_path / "a.zarr")
+    FOREIGN[name](tmp_path / "a.zarr", tmp_path / "secret")
+    assert main(["view", str(tmp_path / "a.zarr"), "--site", str(tmp_path / "site")]) == 2
+    assert f"Cannot write a site of {tmp_path / 'a.zarr'}: {name} would be published" in capsys.readouterr().err
+    assert not (tmp_path / "site").exists()
+
+
+@pytest.mark.filterwarnings("ignore:Ignored in", "ignore:Left out")
+def test_a_site_of_a_packed_store_publishes_nothing_but_the_store(store, tmp_path, capsys):
+    packed = tmp_path / "p.zarr"
+    assert main(["copy", str(store), str(packed), "--packed"]) == 0
+    folder = packed / "episodes/task000_000"
+    shutil.copyfile(folder / "task000_episode000.zip", folder / "task000_episode009.zip")
+    (folder / "mine.zip").write_text("mine")
+    replace_by_link(folder / "task000_episode001.zip", folder / "task000_episode000.zip")
+    with zipfile.ZipFile(packed / "episodes/task001_000/task001_episode000.zip", "a") as found:
+        found.writestr("mine", "mine")
+    index = json.loads((packed / "index.json").read_text())
+    size = (packed / "episodes/task001_000/task001_episode000.zip").stat().st_size
+    index["episodes"]["task001_episode000"] |= {"bytes": size, "tail": 0}
+    (packed / "index.json").write_text(json.dumps(index | {"digest": seal_digest(index)}))
+    assert main(["view", str(packed), "--site", str(tmp_path / "site")]) == 2
+    said = capsys.readouterr().err
+    for name in ("mine.zip", "task000_episode001.zip (a link)", "task000_episode009.zip"):
+        assert f"episodes/task000_000/{name}" in said
+    assert "episodes/task001_episode000/mine" in said
+
+
+def test_what_an_upload_takes_along(store, tmp_path, capsys):
+    """Of a second site in the same place, too: the links of the first are gone, and others are refused."""
+    other = write_store(tmp_path / "b.zarr", spec=SPEC, suite="other")
+    site = tmp_path / "site"
+    assert main(["view", str(store), str(other), "--site", str(site)]) == 0
+    assert main(["view", str(store), "--site", str(site)]) == 0
+    published = upload(site, tmp_path / "uploaded")
+    files = {f"stores/0/{file.relative_to(store)}" for file in store.rglob("*") if file.is_file()}
+    assert set(published) == {*PAGE_FILES, "stores.json", "stores/0.summary.json", *files}
+    capsys.readouterr()
+    for link in ("mine", "stores/mine"):
+        (site / link).symlink_to(tmp_path)
+        assert main(["view", str(store), "--site", str(site)]) == 2
+        assert f"it has the link {link}, and an upload that follows links" in capsys.readouterr().err
+        (site / link).unlink()
 
 
 def test_a_site_of_a_store_elsewhere_names_its_address(store, tmp_path, capsys):
