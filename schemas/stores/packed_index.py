@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vla_attention.schemas.documents import decode_json
+from vla_attention.schemas.errors import shortened
 from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
 from vla_attention.schemas.limits import DOCUMENT_BYTES, ZIP_TAIL_BYTES
 from vla_attention.schemas.safe_text import check_inner_path
@@ -31,6 +32,7 @@ INDEX_VERSION = 1
 LIST_AGAIN = "A copy that still packs lists it when it ends; otherwise run the same vla-analyze copy --packed again"
 #: Episodes of one task in one folder: a hub takes at most 10,000 files in one.
 _IN_A_FOLDER = 1000
+_DIGEST = re.compile(r"[0-9a-f]{64}")
 _PACK_FOLDER = re.compile(r"task[0-9]{3,}_[0-9]{3,}")
 
 
@@ -42,7 +44,8 @@ class NotListed(Exception):
 class PackedEpisode:
     """One episode's zip: its path in the store, its bytes, the offset of its tail, and the digest of its seal.
 
-    `frame` is the digest of the bytes around its files (`ZipMembers.frame_digest`); empty in indices of drafts.
+    `frame` is the digest of the bytes around its files (`ZipMembers.frame_digest`). An index that leaves it out, as the
+    fields of version 1 let it, is refused.
     """
 
     file: str
@@ -52,7 +55,10 @@ class PackedEpisode:
     frame: str = ""
 
     def __post_init__(self) -> None:
-        """Check the numbers: the tail is read into memory."""
+        """Check the numbers, as the tail is read into memory, and that there are digests to compare with."""
+        for name, digest in (("seal", self.seal), ("frame", self.frame)):
+            if _DIGEST.fullmatch(digest) is None:
+                raise ValueError(f"a zip has the {name} {shortened(digest, 80)!r}; expected 64 hexadecimal digits")
         if not (0 <= self.tail < self.bytes < 2**53 and self.bytes - self.tail <= ZIP_TAIL_BYTES):
             raise ValueError(f"a zip of {self.bytes} bytes cannot have its small files from {self.tail} on")
 

@@ -158,10 +158,9 @@ def _problems_of_bytes(episode: StoredEpisode, known: Iterable[str]) -> Iterator
                 episode.files.check(file)
             except CorruptEpisode as error:
                 yield f"Episode {episode.name} is damaged: {error}."
-    if isinstance(episode.place, ZipMembers) and isinstance(episode.source, ZipMembers):
-        expected = episode.place.frame
-        if expected and episode.source.frame_digest() != expected:
-            yield "its zip has other bytes around its files than vla-analyze copy --packed wrote"
+    zipped, source = episode.place, episode.source
+    if isinstance(zipped, ZipMembers) and isinstance(source, ZipMembers) and source.frame_digest() != zipped.frame:
+        yield "its zip has other bytes around its files than vla-analyze copy --packed wrote"
 
 
 def _is_named(file: str, problems: Iterable[str]) -> bool:

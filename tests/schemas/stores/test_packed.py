@@ -357,6 +357,11 @@ def test_an_index_that_is_none_is_refused(path, recorded, content):
         {"bytes": 2**50, "tail": 2**50 - 100},
         {"bytes": "7"},
         {"seal": "0" * 64},
+        {"seal": ""},
+        {"seal": "0" * 63},
+        {"frame": ""},
+        {"frame": "x" * 64},
+        {"frame": None},
     ],
     ids=str,
 )
@@ -365,6 +370,24 @@ def test_an_index_with_entries_that_cannot_be_is_refused(path, recorded, entry):
     document["episodes"]["task000_episode000"].update(entry)
     (path / INDEX_FILE).write_text(json.dumps(document | {"digest": seal_digest(document)}))
     check_refused(path, recorded, by_command=False)
+
+
+@pytest.mark.parametrize("frame", ["", None])
+def test_an_index_without_frames_hides_no_change_of_a_zip(path, recorded, frame):
+    """The name of a file before its bytes, which the zip's directory repeats: only the frame is compared with it."""
+    whole = (path / FIRST).read_bytes()
+    at = whole.index(b"joint/rows/c.")
+    (path / FIRST).write_bytes(whole[:at] + b"x" + whole[at + 1 :])
+    assert analyze(["verify", str(path)]) == 1
+
+    def forget(index: dict[str, Any]) -> None:
+        for entry in index["episodes"].values():
+            entry.pop("frame")
+            if frame is not None:
+                entry["frame"] = frame
+
+    edit_index(path, forget)
+    assert "its index.json is damaged" in " ".join(check_refused(path, recorded))
 
 
 def test_a_root_nested_deeper_than_any_is_refused(path, recorded):
