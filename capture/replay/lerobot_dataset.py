@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import io
 import math
@@ -381,7 +382,8 @@ def open_dataset(name: str | Path) -> LeRobotDataset:
 
     def fetch(paths: Sequence[str]) -> None:
         if paths:
-            fetch_from_hub(repository, paths, how, kind="dataset", revision=commit)
+            # Paths come from the data set: a star in one would fetch every file of the repository.
+            fetch_from_hub(repository, [*map(glob.escape, paths)], how, kind="dataset", revision=commit)
 
     return LeRobotDataset(folder, repository, read_info(folder), fetch, downloads(folder))
 

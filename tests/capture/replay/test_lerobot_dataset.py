@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import fnmatch
 import json
 
 import numpy as np
@@ -331,6 +332,29 @@ def test_only_the_files_of_the_wanted_episodes_are_fetched(tmp_path, monkeypatch
         "data/chunk-000/episode_000001.parquet",
         f"videos/chunk-000/{CAMERAS[1]}/episode_000001.mp4",
     ]
+
+
+@pytest.mark.parametrize("template", ["*", "data/chunk-000/*", "data/chunk-00[0-9]/episode_00000?.parquet"])
+def test_a_path_of_a_data_set_is_no_pattern_of_files_to_fetch(tmp_path, monkeypatch, template):
+    """Whoever made the data set would else decide that all of it, or of its repository, is downloaded."""
+    import huggingface_hub
+
+    folder = write_data_set(tmp_path / "org" / "name", "v2.1", made_up_episodes((3,)))
+    info = json.loads((folder / "meta/info.json").read_text())
+    (folder / "meta/info.json").write_text(json.dumps(info | {"data_path": template}))
+    asked: list[list[str]] = []
+
+    def snapshot_download(name, repo_type, revision, allow_patterns):
+        asked.append(allow_patterns)
+        return str(folder)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path / "none"))
+    with pytest.raises(DataSetNotFound):
+        open_dataset("org/name@v1").episode(0)
+    (pattern,) = asked[-1]
+    assert fnmatch.fnmatch(template, pattern)
+    assert not any(fnmatch.fnmatch(str(file.relative_to(folder)), pattern) for file in folder.rglob("*"))
 
 
 def test_the_public_name(tmp_path):
