@@ -52,7 +52,10 @@ def links_beyond_seal(episode: StoredEpisode) -> tuple[str, ...]:
 def _beyond_seal(episode: StoredEpisode) -> Iterator[_Found]:
     known = {SEAL_FILE, *episode.files.records}
     if episode.place is None and isinstance(episode.folder, Path):
-        folders = {str(parent) for file in known for parent in PurePosixPath(file).parents}
+        folders = {"."}
+        for file in known:
+            while file := file.rpartition("/")[0]:
+                folders.add(file)
         yield from (found for found in _beyond(episode.folder, known, folders) if found.path not in folders)
 
 
@@ -134,11 +137,13 @@ def _beyond(place: Path, known: set[str], folders: set[str]) -> Iterator[_Found]
 
     Links are followed nowhere, and no other folder is looked into.
     """
-    for folder in sorted(folders):
-        above = [folder, *map(str, PurePosixPath(folder).parents)]
-        if any(os.path.islink(place / one) for one in above if one != "."):
+    linked: set[str] = set()
+    for folder in sorted(folders):  # each after the one that it is in
+        path = f"{place}/{folder}"
+        if folder.rpartition("/")[0] in linked or (folder != "." and os.path.islink(path)):
+            linked.add(folder)
             continue
-        with suppress(OSError), os.scandir(place / folder) as entries:  # one that is lost is a fault, found elsewhere
+        with suppress(OSError), os.scandir(path) as entries:  # one that is lost is a fault, found elsewhere
             yield from _unknown(entries, "" if folder == "." else f"{folder}/", known, folders)
 
 
