@@ -67,7 +67,8 @@ def smaller_png(png: bytes) -> bytes:
     """A diagram with a table of 128 colours, about a third of the size; the given bytes when that is not smaller."""
     from PIL import Image
 
-    picture = Image.open(io.BytesIO(png)).convert("RGB").quantize(_PNG_COLORS, dither=Image.Dither.NONE)
+    picture = Image.open(io.BytesIO(png), formats=("PNG",)).convert("RGB")
+    picture = picture.quantize(_PNG_COLORS, dither=Image.Dither.NONE)
     buffer = io.BytesIO()
     picture.save(buffer, format="PNG", optimize=True)
     return min(buffer.getvalue(), png, key=len)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import glob
 import hashlib
-import io
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -18,6 +17,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.capture.foreign_files.pictures import PictureRefused, decode_picture
 from vla_attention.capture.replay.data_set_errors import DamagedDataSet, DataSetNotFound
 from vla_attention.capture.replay.data_set_files import (
     INFO,
@@ -321,8 +321,6 @@ class DataSetEpisode:
         return {name: [self._decoded(name, cell) for cell in rows[name]] for name in names}
 
     def _decoded(self, name: str, cell: Any) -> NDArray[np.uint8]:
-        from PIL import Image, UnidentifiedImageError
-
         what = f"A picture of '{name}' in episode {self.index} of '{self.dataset.name}'"
         if cell is not None and not isinstance(cell, Mapping):
             raise DamagedDataSet(f"{what} is a {type(cell).__name__} in its table; expected the bytes of a picture.")
@@ -335,16 +333,11 @@ class DataSetEpisode:
                 if place == Path() or place.is_absolute() or ".." in place.parts or not file.is_file():
                     raise DataSetNotFound(f"{what} is neither in its table nor in a file of the data set ('{place}').")
                 content = file.read_bytes()
-            with Image.open(io.BytesIO(content)) as image:
-                return np.array(image.convert("RGB"))  # a copy: torch warns of arrays that cannot be written
-        except UnidentifiedImageError as error:
-            raise DamagedDataSet(
-                f"{what} cannot be decoded: it is no PNG and no other format that pillow reads."
-            ) from error
-        except (OSError, SyntaxError, ValueError) as error:
+            return decode_picture(content)
+        except (OSError, PictureRefused) as error:
             if isinstance(error, DataSetNotFound):
                 raise
-            raise DamagedDataSet(f"{what} cannot be decoded ({str(error).splitlines()[0]}).") from error
+            raise DamagedDataSet(f"{what} {error}.") from error
 
 
 def open_dataset(name: str | Path) -> LeRobotDataset:

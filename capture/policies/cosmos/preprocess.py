@@ -39,7 +39,7 @@ def compress(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return a picture (height, width, 3) after JPEG compression and decompression, as in the training data."""
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, format="JPEG", quality=JPEG_QUALITY)
-    return np.asarray(Image.open(buffer).convert("RGB"))
+    return np.asarray(Image.open(buffer, formats=("JPEG",)).convert("RGB"))
 
 
 def crop_size(size: int) -> int:

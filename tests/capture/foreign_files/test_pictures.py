@@ -1,0 +1,70 @@
+"""Pictures from elsewhere: PNG and JPEG, and no program that pillow starts for another format."""
+
+from __future__ import annotations
+
+import ast
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import EpsImagePlugin, Image
+
+from tests.kit.lerobot_data_sets import numbered_picture
+from vla_attention.capture.foreign_files.pictures import PictureRefused, decode_picture
+
+ROOT = Path(__file__).resolve().parents[3]
+EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 96 64\n%%EndComments\nshowpage\n"
+
+
+def encoded(kind: str, picture: np.ndarray, **options: object) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, format=kind, **options)
+    return buffer.getvalue()
+
+
+def test_png_and_jpeg_are_decoded():
+    picture = numbered_picture(5)
+    np.testing.assert_array_equal(decode_picture(encoded("PNG", picture)), picture)
+    decoded = decode_picture(encoded("JPEG", picture, quality=95))
+    assert decoded.shape == picture.shape
+    assert decoded.flags.writeable
+    assert np.abs(decoded.astype(int) - picture).mean() < 3
+
+
+@pytest.mark.parametrize("kind", ["BMP", "GIF", "TIFF", "WEBP", "PPM"])
+def test_other_formats_are_refused(kind):
+    with pytest.raises(PictureRefused, match="is no PNG and no JPEG"):
+        decode_picture(encoded(kind, numbered_picture(5)))
+
+
+def test_no_program_is_started_for_an_eps(tmp_path, monkeypatch):
+    """Pillow gives an EPS to Ghostscript, an interpreter of programs, by the first bytes of a file."""
+    trace = tmp_path / "started"
+    program = tmp_path / "bin" / "gs"
+    program.parent.mkdir()
+    program.write_text(f"#!/bin/sh\ntouch {trace}\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(program.parent), prepend=":")
+    monkeypatch.setattr(EpsImagePlugin, "gs_binary", None)
+    with pytest.raises(OSError, match=r"."), Image.open(io.BytesIO(EPS)) as image:
+        image.convert("RGB")
+    assert trace.exists()  # the attack is one
+    trace.unlink()
+    with pytest.raises(PictureRefused, match="is no PNG and no JPEG"):
+        decode_picture(EPS)
+    assert not trace.exists()
+
+
+def test_pillow_is_told_the_formats_wherever_it_opens_something():
+    """Without `formats` it tries every format that it knows, and reads files with the programs of some."""
+    folders = ("schemas", "capture", "analyze", "vla_attention", "scripts", "benchmarks", "examples", "docs")
+    opened = [
+        (path.name, [keyword.arg for keyword in node.keywords])
+        for folder in folders
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("Image.open", "PIL.Image.open")
+    ]
+    assert len(opened) >= 3
+    assert [name for name, keywords in opened if "formats" not in keywords] == []
