@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-#: Makes a case in an empty folder; returns the arguments of `vla-capture` that read it.
-Make = Callable[[Path], list[str]]
+from tests.kit.hostile_runs import Make
 
 
 @dataclass(frozen=True)

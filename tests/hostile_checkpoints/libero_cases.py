@@ -16,20 +16,18 @@ import torch
 from tests.hostile_checkpoints.hostile_files import (
     TRACE,
     Case,
-    Make,
     executing_pickle,
     hash_bomb_with_table,
     pipe,
     sparse,
     torch_zip,
 )
+from tests.kit.hostile_runs import PACKAGES, Make
 from tests.kit.paths import GOLDEN
 from vla_attention.capture.environments.libero_installation import ASSET_SUBFOLDERS
 
 #: The first task of the suite.
 SUITE, NUMBER = "libero_10", 0
-#: The folder in a case from which LIBERO is imported instead of the installed one.
-PACKAGES = "packages"
 
 
 def installed() -> Path:
