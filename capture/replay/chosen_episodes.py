@@ -31,10 +31,10 @@ def chosen_episodes(data: LeRobotDataset, words: Sequence[str] | None, limit: in
         data.entry(last)  # before a long range is counted
         chosen.update(range(first, last + 1))
     if words is None:
-        chosen = {entry.index for entry in data.episodes}
+        chosen = set(data.info.episodes)
     if limit is not None and limit < 1:
         raise BadArgument(f"Cannot use --num-episodes {limit}; expected at least 1.")
-    numbers = tuple(data.entry(index).index for index in sorted(chosen))[:limit]
+    numbers = tuple(data.entry(index).index for index in sorted(chosen)[:limit])
     if not numbers:
         raise BadArgument(f"The data set '{data.name}' has no episodes.")
     return numbers

@@ -14,28 +14,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.capture.foreign_files.pictures import PictureRefused, decode_picture
+from vla_attention.capture.replay.data_set_episodes import EpisodeEntry
 from vla_attention.capture.replay.data_set_errors import DamagedDataSet, DataSetNotFound
-from vla_attention.capture.replay.data_set_files import (
-    INFO,
-    META_FILES,
-    DataSetInfo,
-    EpisodeEntry,
-    Feature,
-    read_info,
-    read_table,
-)
+from vla_attention.capture.replay.data_set_files import INFO, META_FILES, DataSetInfo, Feature, read_info
+from vla_attention.capture.replay.data_tables import DataTable, stacked
 from vla_attention.capture.replay.video import VideoFile
 from vla_attention.schemas.errors import BadArgument, UnknownName, listing, unknown_name
+from vla_attention.schemas.limits import (
+    CLAIMED_BYTES,
+    PICTURE_BYTES,
+    VIDEO_FRAMES,
+    VIDEO_FRAMES_PER_FRAME,
+    VIDEO_SPARE_FRAMES,
+)
+from vla_attention.schemas.regular_files import read_regular
 
 #: How far the time of a picture may be from the time of its row, as a part of the time between two frames. LeRobot
 #: itself refuses more than 0.1 ms.
 TIME_TOLERANCE = 0.25
-#: Rows whose PNG pictures are read at once.
-_ROWS_AT_ONCE = 32
 
 #: Makes sure that files of a data set, by their paths inside of it, are on this machine.
 Fetch = Callable[[Sequence[str]], None]
@@ -75,6 +74,8 @@ class LeRobotDataset:
         self.name = name
         self.info = info
         self._fetch = fetch
+        #: the table of the last episode: the next one is often in it
+        self._table: DataTable | None = None
 
     @property
     def fps(self) -> float:
@@ -105,10 +106,14 @@ class LeRobotDataset:
     def digest(self) -> str:
         """SHA-256 (hex) of version, columns, tasks and episodes: it names the data set wherever it lies."""
         info = self.info
-        episodes = [(entry.index, entry.length, entry.tasks) for entry in self.episodes]
         features = [(feature.name, feature.dtype, feature.shape) for feature in self.features.values()]
-        content = (info.version, info.fps, sorted(features), sorted(info.tasks.items()), episodes)
-        return hashlib.sha256(repr(content).encode()).hexdigest()
+        # Of Python's text of all this in one tuple, whose last part is the list of a million episodes.
+        content = repr((info.version, info.fps, sorted(features), sorted(info.tasks.items())))
+        digest = hashlib.sha256(f"{content[:-1]}, [".encode())
+        for number, episode in enumerate(info.episodes.lengths_and_tasks()):
+            digest.update(f"{', ' if number else ''}{episode!r}".encode())
+        digest.update(b"])")
+        return digest.hexdigest()
 
     def feature(self, name: str) -> Feature:
         """Return the column of that name; `UnknownName` lists those that exist."""
@@ -126,7 +131,9 @@ class LeRobotDataset:
         """
         entry = self.entry(index)
         self.fetch([entry.data])
-        return DataSetEpisode(self, entry)
+        if self._table is None or self._table.path != self.folder / entry.data:
+            self._table = DataTable(self.folder / entry.data)
+        return DataSetEpisode(self, entry, self._table)
 
     def fetch(self, paths: Sequence[str]) -> None:
         """Fetch files of a data set of the hub, by their paths inside of it; nothing for one that is a folder."""
@@ -162,42 +169,41 @@ class DataSetEpisode:
     length: frames. seconds: (frame,) float64, since the beginning. task_indices: (frame,) the task of each frame.
     """
 
-    def __init__(self, dataset: LeRobotDataset, entry: EpisodeEntry) -> None:
+    def __init__(self, dataset: LeRobotDataset, entry: EpisodeEntry, table: DataTable) -> None:
         self.dataset = dataset
         self.entry = entry
         self.index = entry.index
         self.length = entry.length
-        features = dataset.features.values()
-        self._pictures = [feature.name for feature in features if feature.dtype == "image"]
-        self._table = self._read_table()
-        self.seconds = self._finite("timestamp")[:, 0]
-        self.task_indices = self._numbers("task_index")[:, 0].astype(np.int64)
-        unknown = sorted({int(task) for task in self.task_indices} - set(dataset.tasks))
+        self._table = table
+        self._first = self._find_rows()
+        self.seconds = self._index_column("timestamp")
+        self.task_indices = self._index_column("task_index").astype(np.int64)
+        unknown = [task for task in np.unique(self.task_indices).tolist() if task not in dataset.tasks]
         if unknown:
             raise DamagedDataSet(
                 f"Episode {self.index} of '{dataset.name}' has the task {unknown[0]}, which the meta files do not name."
             )
 
-    def _read_table(self) -> pl.DataFrame:
-        path = self.dataset.folder / self.entry.data
-        try:
-            stored = pl.scan_parquet(path, glob=False).collect_schema() if path.is_file() else {}
-        except (pl.exceptions.PolarsError, OSError) as error:
-            raise DamagedDataSet(f"'{path}' cannot be read ({str(error).splitlines()[0]}).") from error
-        named = [name for name, feature in self.dataset.features.items() if feature.dtype not in ("image", "video")]
-        missing = [name for name in ("episode_index", "frame_index", "timestamp", "task_index") if name not in stored]
-        if stored and missing:
-            raise DamagedDataSet(f"'{path}' has no column {listing(missing)}; it has {listing(stored)}.")
-        self._columns = [name for name in named if name in stored]
-        wanted = list(dict.fromkeys(["episode_index", "frame_index", "timestamp", "task_index", *self._columns]))
-        table = read_table(path, wanted).filter(pl.col("episode_index") == self.index).sort("frame_index")
-        frames = table["frame_index"].to_list()
-        if len(frames) != self.length or frames != list(range(self.length)):
+    def _find_rows(self) -> int:
+        """Return the first row of the episode, after checking that its frames are there, one after the other."""
+        table = self._table
+        rows = table.rows_of("episode_index", self.index)
+        if len(rows) == self.length:
+            self._first = rows.start
+            if np.array_equal(self._index_column("frame_index"), np.arange(self.length)):
+                return rows.start
+        raise DamagedDataSet(
+            f"Episode {self.index} of '{self.dataset.name}' has {len(rows)} rows in '{table.path}'; the meta files say "
+            f"frames 0 to {self.length - 1}, one after the other."
+        )
+
+    def _index_column(self, name: str) -> NDArray[np.float64]:
+        values = self._finite(name)
+        if values.shape != (self.length, 1):
             raise DamagedDataSet(
-                f"Episode {self.index} of '{self.dataset.name}' has {len(frames)} rows in '{path}'; the meta files say "
-                f"frames 0 to {self.length - 1}."
+                f"'{self._table.path}' has lists in its column '{name}'; expected a number in each row."
             )
-        return table
+        return values[:, 0]
 
     @property
     def instructions(self) -> tuple[str, ...]:
@@ -213,7 +219,7 @@ class DataSetEpisode:
             DamagedDataSet: a number is missing or not finite, or there are not as many as the meta files say.
         """
         feature = self.dataset.feature(name)
-        if name not in self._columns:
+        if feature.dtype in ("image", "video"):
             raise BadArgument(f"The column '{name}' of '{self.dataset.name}' holds {feature.dtype}, not numbers.")
         values = self._finite(name)
         stated = math.prod(feature.shape)
@@ -225,23 +231,19 @@ class DataSetEpisode:
         return values
 
     def _finite(self, name: str) -> NDArray[np.float64]:
-        values = self._numbers(name)
-        if not np.isfinite(values).all():
+        column = self._table.read([name], self._first, self.length)[name]
+        values = stacked(column)
+        if values is None:
+            raise BadArgument(
+                f"The column '{name}' of '{self.dataset.name}' holds {column.dtype}, not as many numbers in each frame."
+            )
+        numbers = _as_floats(values)
+        if not np.isfinite(numbers).all():
             raise DamagedDataSet(
                 f"The column '{name}' of episode {self.index} of '{self.dataset.name}' has numbers that are NaN or "
-                f"infinite, the first at frame {int(np.argmin(np.isfinite(values).all(axis=1)))}."
+                f"infinite, the first at frame {int(np.argmin(np.isfinite(numbers).all(axis=1)))}."
             )
-        return values
-
-    def _numbers(self, name: str) -> NDArray[np.float64]:
-        series = self._table[name]
-        try:
-            values = np.array(series.to_list(), dtype=np.float64)
-        except (TypeError, ValueError):
-            raise BadArgument(
-                f"The column '{name}' of '{self.dataset.name}' holds {series.dtype}, not as many numbers in each frame."
-            ) from None
-        return values.reshape(len(series), -1)
+        return numbers
 
     def frames(self, every: int = 1, cameras: Sequence[str] | None = None) -> Iterator[DataSetFrame]:
         """Yield frame 0, `every`, 2 · `every` ... with pictures.
@@ -261,34 +263,34 @@ class DataSetEpisode:
                 raise BadArgument(f"The column '{name}' of '{self.dataset.name}' holds no colour pictures.")
         numbers = self._values()
         self.dataset.fetch([self.entry.videos[name].path for name in names if name in self.entry.videos])
+        most = VIDEO_SPARE_FRAMES + VIDEO_FRAMES_PER_FRAME * self.dataset.info.episodes.num_frames
+        most = min(most, VIDEO_FRAMES)
         with ExitStack() as opened:
             videos = {
-                name: opened.enter_context(VideoFile(self.dataset.folder / self.entry.videos[name].path))
+                name: opened.enter_context(VideoFile(self.dataset.folder / self.entry.videos[name].path, most))
                 for name in names
                 if name in self.entry.videos
             }
-            stored = [name for name in names if name not in videos]
             wanted = range(0, self.length, every)
-            for first in range(0, len(wanted), _ROWS_AT_ONCE):
-                block = list(wanted[first : first + _ROWS_AT_ONCE])
-                pictures = self._stored_pictures(stored, block)
-                for row, frame in enumerate(block):
-                    images = {name: pictures[name][row] for name in stored}
-                    images |= {name: self._of_video(name, video, frame) for name, video in videos.items()}
-                    yield self._frame(frame, {name: images[name] for name in names}, numbers)
+            stored = self._stored_pictures([name for name in names if name not in videos], wanted)
+            for frame in wanted:
+                images = next(stored) | {name: self._of_video(name, video, frame) for name, video in videos.items()}
+                yield self._frame(frame, {name: images[name] for name in names}, numbers)
 
-    def _values(self) -> dict[str, NDArray[np.float64]]:
+    def _values(self) -> dict[str, NDArray[np.generic]]:
+        """Every column that has as many numbers in each frame, (frame, number), as it is stored."""
         numeric = {}
-        for name in self._columns:
-            if self._table[name].dtype != pl.String:
-                try:
-                    numeric[name] = self._numbers(name)
-                except BadArgument:
-                    continue  # text, or lists of several lengths: nothing that a policy reads as numbers
+        for name, feature in self.dataset.features.items():
+            if feature.dtype in ("image", "video") or name not in self._table.columns:
+                continue
+            if self._table.file.is_numeric(name):
+                values = stacked(self._table.read([name], self._first, self.length)[name])
+                if values is not None:  # lists of several lengths are nothing that a policy reads as numbers
+                    numeric[name] = values
         return numeric
 
     def _frame(
-        self, frame: int, images: Mapping[str, NDArray[np.uint8]], numbers: Mapping[str, NDArray[np.float64]]
+        self, frame: int, images: Mapping[str, NDArray[np.uint8]], numbers: Mapping[str, NDArray[np.generic]]
     ) -> DataSetFrame:
         task = int(self.task_indices[frame])
         return DataSetFrame(
@@ -298,27 +300,29 @@ class DataSetEpisode:
             task_index=task,
             instruction=self.dataset.tasks[task],
             images=images,
-            values={name: values[frame] for name, values in numbers.items()},
+            values={name: _as_floats(values[frame]) for name, values in numbers.items()},
         )
 
     def _of_video(self, name: str, video: VideoFile, frame: int) -> NDArray[np.uint8]:
         seconds = self.entry.videos[name].begins_at + float(self.seconds[frame])
         return video.picture(seconds, TIME_TOLERANCE / self.dataset.fps)
 
-    def _stored_pictures(self, names: Sequence[str], frames: Sequence[int]) -> dict[str, list[NDArray[np.uint8]]]:
-        """Read PNG pictures that are in the table: name -> one for each of the frames, which are in order."""
+    def _stored_pictures(self, names: Sequence[str], frames: Sequence[int]) -> Iterator[dict[str, NDArray[np.uint8]]]:
+        """Yield for each of the frames, which are in order, the pictures that are in the table: name -> picture."""
         if not names:
-            return {}
-        path = self.dataset.folder / self.entry.data
-        here = (pl.col("episode_index") == self.index) & pl.col("frame_index").is_in(list(frames))
-        try:
-            rows = (
-                pl.scan_parquet(path, glob=False).select("episode_index", "frame_index", *names).filter(here).collect()
+            yield from ({} for _ in frames)
+            return
+        missing = [name for name in names if name not in self._table.columns]
+        if missing:
+            raise DamagedDataSet(
+                f"'{self._table.path}' has no column {listing(missing)}; it has {listing(self._table.columns)}."
             )
-        except (pl.exceptions.PolarsError, OSError) as error:
-            raise DamagedDataSet(f"'{path}' cannot be read ({str(error).splitlines()[0]}).") from error
-        rows = rows.sort("frame_index")
-        return {name: [self._decoded(name, cell) for cell in rows[name]] for name in names}
+        row_bytes = self._table.file.bytes_per_row(names, self._first, self.length)
+        at_once = max(1, int(CLAIMED_BYTES / max(1.0, row_bytes)))
+        for here in _blocks(frames, at_once):
+            rows = self._table.read(names, self._first + here[0], here[-1] + 1 - here[0])
+            for frame in here:
+                yield {name: self._decoded(name, rows[name][frame - here[0]]) for name in names}
 
     def _decoded(self, name: str, cell: Any) -> NDArray[np.uint8]:
         what = f"A picture of '{name}' in episode {self.index} of '{self.dataset.name}'"
@@ -332,12 +336,29 @@ class DataSetEpisode:
                 # A path that leads out of the data set is not followed.
                 if place == Path() or place.is_absolute() or ".." in place.parts or not file.is_file():
                     raise DataSetNotFound(f"{what} is neither in its table nor in a file of the data set ('{place}').")
-                content = file.read_bytes()
+                content = read_regular(file, PICTURE_BYTES)
             return decode_picture(content)
-        except (OSError, PictureRefused) as error:
+        except PictureRefused as error:
+            raise DamagedDataSet(f"{what} {error}.") from error
+        except OSError as error:
             if isinstance(error, DataSetNotFound):
                 raise
-            raise DamagedDataSet(f"{what} {error}.") from error
+            raise DamagedDataSet(f"{what} cannot be read: {error.strerror or error}.") from error
+
+
+def _as_floats(values: NDArray[np.generic]) -> NDArray[np.float64]:
+    with np.errstate(invalid="ignore"):  # numpy would warn of some of the numbers that are none
+        return values.astype(np.float64)
+
+
+def _blocks(frames: Sequence[int], most: int) -> Iterator[Sequence[int]]:
+    """Divide frames, which are in order, so that the last of a block is fewer than `most` rows behind its first."""
+    first = 0
+    for last in range(len(frames)):
+        if frames[last] - frames[first] >= most:
+            yield frames[first:last]
+            first = last
+    yield frames[first:]
 
 
 def open_dataset(name: str | Path) -> LeRobotDataset:

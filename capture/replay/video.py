@@ -7,6 +7,8 @@ the last key frame before the wanted one until the one with exactly its time sta
 
 from __future__ import annotations
 
+import math
+from array import array
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
@@ -16,12 +18,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.capture.foreign_files.mp4_files import Mp4Refused, check_mp4
 from vla_attention.capture.replay.data_set_errors import DamagedDataSet, DataSetNotFound, UndecodableVideo
 from vla_attention.schemas.errors import MissingDependency
+from vla_attention.schemas.limits import PICTURE_PIXELS, PICTURE_SIDE, VIDEO_EARLIER_KEYS, VIDEO_FRAMES
 
-#: Formats of files that hold their pictures themselves. Lists and manifests (concat, HLS, DASH) name other files and
-#: addresses, which FFmpeg would open.
-_FORMATS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
+#: How FFmpeg opens a file. Only MP4, whose lists are checked before; of a list of files or addresses (concat, HLS) each
+#: would be opened. A decoder refuses pictures of more pixels before it takes memory for them.
+_OPTIONS = {
+    "format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2",
+    "protocol_whitelist": "file",
+    "max_pixels": str(PICTURE_PIXELS),
+}
 
 
 def import_av() -> Any:
@@ -51,29 +59,37 @@ class VideoFile:
     codec: its name, as FFmpeg calls it. size: (height, width) in pixels. times: (frame,) float64, the time of every
     picture in seconds, in the order in which they are shown.
 
+    Args:
+        path: of an MP4 file.
+        most_pictures: as it may have; a file that says more is damaged.
+
     Raises:
         DataSetNotFound: there is no such file.
-        UndecodableVideo: the file is no video, or the installed PyAV has no decoder for its codec.
+        UndecodableVideo: the file is no video, is damaged, or the installed PyAV has no decoder for its codec.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, most_pictures: int = VIDEO_FRAMES) -> None:
         self.path = path
         self._av = import_av()
         if not path.is_file():
             raise DataSetNotFound(f"There is no video '{path}', which the data set names.")
         try:
-            self._container = self._av.open(str(path), options={"format_whitelist": _FORMATS})
-        except (self._av.error.FFmpegError, ValueError) as error:
+            self._bytes = check_mp4(path, most_pictures)
+            # With the name of the protocol: the first part of a name with a colon would be one.
+            self._container = self._av.open(f"file:{path}", options=_OPTIONS)
+        except Mp4Refused as error:
+            raise UndecodableVideo(f"'{path}' is no video that can be read: it {error}.") from error
+        except (self._av.error.FFmpegError, ValueError, OSError) as error:
             raise UndecodableVideo(f"'{path}' is no video that can be read ({_reason(error)}).") from error
         try:
-            self._read_packets()
+            self._read_packets(most_pictures)
         except BaseException:
             self._container.close()
             raise
         self._decoded: Iterator[Any] = iter(())
         self._current: Any = None
 
-    def _read_packets(self) -> None:
+    def _read_packets(self, most_pictures: int) -> None:
         if not self._container.streams.video:
             raise UndecodableVideo(f"'{self.path}' holds no pictures.")
         self._stream = stream = self._container.streams.video[0]
@@ -84,18 +100,33 @@ class VideoFile:
             )
         self.codec: str = stream.codec_context.codec.canonical_name
         self.size: tuple[int, int] = (stream.codec_context.height, stream.codec_context.width)
+        if min(self.size) < 1 or max(self.size) > PICTURE_SIDE or math.prod(self.size) > PICTURE_PIXELS:
+            stated = f"{self.size[1]:,} x {self.size[0]:,} pixels" if min(self.size) > 0 else "no size that is known"
+            raise UndecodableVideo(
+                f"'{self.path}' says that its pictures have {stated}; expected at most {PICTURE_SIDE:,} pixels on a "
+                f"side and {PICTURE_PIXELS:,} in all."
+            )
+        stream.codec_context.options = {"max_pixels": _OPTIONS["max_pixels"]}
+        stamps, keys, read = array("q"), array("q"), 0
         try:
-            packets = [
-                (packet.pts, packet.is_keyframe)
-                for packet in self._container.demux(stream)
-                if packet.pts is not None and not packet.is_discard
-            ]
+            for packet in self._container.demux(stream):
+                read += packet.size
+                if read > self._bytes or len(stamps) > most_pictures:
+                    raise UndecodableVideo(
+                        f"'{self.path}' is damaged: it has {self._bytes:,} bytes, and more than {len(stamps):,} "
+                        f"pictures of {read:,} bytes."
+                    )
+                if packet.pts is not None and not packet.is_discard:
+                    stamps.append(packet.pts)
+                    if packet.is_keyframe:
+                        keys.append(packet.pts)
         except (self._av.error.FFmpegError, ValueError) as error:
+            if isinstance(error, UndecodableVideo):
+                raise
             raise UndecodableVideo(f"'{self.path}' is damaged ({_reason(error)}).") from error
-        if not packets:
+        if not stamps:
             raise UndecodableVideo(f"'{self.path}' holds no pictures.")
-        self._stamps = np.array(sorted(stamp for stamp, _ in packets), dtype=np.int64)
-        self._keys = np.array(sorted(stamp for stamp, is_key in packets if is_key), dtype=np.int64)
+        self._stamps, self._keys = np.sort(stamps), np.sort(keys)
         self.times: NDArray[np.float64] = self._stamps.astype(np.float64) * float(stream.time_base)
 
     def __enter__(self) -> VideoFile:
@@ -121,8 +152,10 @@ class VideoFile:
             DamagedDataSet: no picture has this time.
             UndecodableVideo: the file is damaged.
         """
-        nearest = int(np.abs(self.times - seconds).argmin())
-        if abs(self.times[nearest] - seconds) > tolerance:
+        after = int(np.searchsorted(self.times, seconds))
+        near = slice(max(after - 1, 0), after + 1)
+        nearest = near.start + int(np.abs(self.times[near] - seconds).argmin())
+        if not abs(self.times[nearest] - seconds) <= tolerance:
             raise DamagedDataSet(
                 f"'{self.path}' has no picture at {seconds:.4f} s: its {len(self.times)} pictures are at "
                 f"{self.times[0]:.4f} to {self.times[-1]:.4f} s, the nearest at {self.times[nearest]:.4f} s."
@@ -130,11 +163,17 @@ class VideoFile:
         frame = self._frame(int(self._stamps[nearest]))
         if frame.is_corrupt:
             raise UndecodableVideo(f"'{self.path}' is damaged: the picture at {seconds:.4f} s cannot be decoded whole.")
+        if (frame.height, frame.width) != self.size:
+            raise UndecodableVideo(
+                f"'{self.path}' is damaged: the picture at {seconds:.4f} s has {frame.width} x {frame.height} pixels, "
+                f"and the file says {self.size[1]} x {self.size[0]}."
+            )
         return np.ascontiguousarray(frame.to_ndarray(format="rgb24"))
 
     def _frame(self, stamp: int) -> Any:
         """Return the decoded frame with exactly this time stamp."""
         key = int(np.searchsorted(self._keys, stamp, side="right")) - 1
+        earliest = max(key - VIDEO_EARLIER_KEYS, 0)
         if not self._is_ahead(stamp, key):
             self._seek(max(key, 0))
         while True:
@@ -143,10 +182,9 @@ class VideoFile:
             if self._current is not None and self._current.pts == stamp:
                 return self._current
             # The decoder began behind the frame, or lost it: begin at an earlier key frame.
-            if key <= 0:
-                raise UndecodableVideo(
-                    f"'{self.path}' is damaged: no picture comes out for {stamp * self._stream.time_base:.4f} s."
-                )
+            if key <= earliest:
+                seconds = stamp * float(self._stream.time_base)
+                raise UndecodableVideo(f"'{self.path}' is damaged: no picture comes out for {seconds:.4f} s.")
             key -= 1
             self._seek(key)
 

@@ -196,8 +196,13 @@ _DTYPES = {"float32": pl.Float32, "float64": pl.Float64, "int64": pl.Int64, "boo
 
 
 def png(picture: np.ndarray) -> bytes:
+    return encoded("PNG", picture)
+
+
+def encoded(kind: str, picture: np.ndarray, **options: object) -> bytes:
+    """A picture (height, width, 3) in one of pillow's formats."""
     buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, format="PNG")
+    Image.fromarray(picture).save(buffer, format=kind, **options)
     return buffer.getvalue()
 
 

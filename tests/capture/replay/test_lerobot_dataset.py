@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import fnmatch
+import hashlib
 import json
 
 import numpy as np
@@ -78,6 +79,72 @@ def test_the_digest_names_the_content_and_not_the_place(tmp_path):
     two = open_dataset(write_data_set(tmp_path / "two", "v3.0", episodes))
     other = open_dataset(write_data_set(tmp_path / "other", "v3.0", episodes[:1]))
     assert one.digest == two.digest != other.digest
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_the_digest_is_that_of_a_text(tmp_path, version):
+    """Stores keep it: it stays the same from version to version of this program."""
+    data = open_dataset(write_data_set(tmp_path / "one", version, made_up_episodes((4, 3))))
+    features = sorted((feature.name, feature.dtype, feature.shape) for feature in data.features.values())
+    episodes = [(entry.index, entry.length, entry.tasks) for entry in data.episodes]
+    content = (data.info.version, data.fps, features, sorted(data.tasks.items()), episodes)
+    assert data.digest == hashlib.sha256(repr(content).encode()).hexdigest()
+
+
+def test_episodes_are_in_the_order_of_their_numbers_and_the_last_of_several_counts(tmp_path):
+    folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3, 4)))
+    lines = (folder / "meta" / "episodes.jsonl").read_text().splitlines()
+    wrong = json.dumps({**json.loads(lines[0]), "length": 9})
+    (folder / "meta" / "episodes.jsonl").write_text("\n".join([wrong, lines[1], "", lines[0]]))
+    data = open_dataset(folder)
+    assert [(entry.index, entry.length) for entry in data.episodes] == [(0, 3), (1, 4)]
+    assert list(data.info.episodes) == [0, 1]
+    assert 1 in data.info.episodes
+    assert 2 not in data.info.episodes
+
+
+def test_a_line_ends_only_where_json_lines_end(tmp_path):
+    """Python's `splitlines` also ends one at characters that a text may have."""
+    folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3,)))
+    task = "put it\u2028there"
+    (folder / "meta" / "tasks.jsonl").write_text(
+        json.dumps({"task_index": 0, "task": task}, ensure_ascii=False) + "\r\n"
+    )
+    assert open_dataset(folder).tasks == {0: task}
+
+
+def test_whole_numbers_of_tables_may_be_stored_as_floats(tmp_path):
+    """pandas makes floats of a column of whole numbers when it joins tables."""
+    folder = write_data_set(tmp_path / "robot", "v3.0", made_up_episodes((3, 4)), video=H264)
+    (path,) = (folder / "meta" / "episodes").glob("*/*.parquet")
+    rows = pl.read_parquet(path)
+    numbers = [name for name in rows.columns if name.endswith("_index")]
+    rows.with_columns(pl.col(name).cast(pl.Float64) for name in numbers).write_parquet(path)
+    data = open_dataset(folder)
+    assert [number_of(frame.images[CAMERAS[0]]) for frame in data.episode(1).frames()] == [100, 101, 102, 103]
+    rows.with_columns(pl.lit(0.5).alias("data/file_index")).write_parquet(path)
+    with pytest.raises(DamagedDataSet, match="'data/file_index' that are no whole ones"):
+        open_dataset(folder)
+
+
+def test_rows_of_an_episode_follow_one_another(tmp_path):
+    folder = write_data_set(tmp_path / "robot", "v3.0", made_up_episodes((3, 4)))
+    (table,) = folder.glob("data/**/*.parquet")
+    rows = pl.read_parquet(table)
+    rows[[0, 3, 1, 2, 4, 5, 6]].write_parquet(table)
+    with pytest.raises(DamagedDataSet, match=r"has 4 rows .* frames 0 to 2, one after the other"):
+        open_dataset(folder).episode(0)
+    rows[[1, 0, 2, 3, 4, 5, 6]].write_parquet(table)
+    with pytest.raises(DamagedDataSet, match=r"has 3 rows .* frames 0 to 2, one after the other"):
+        open_dataset(folder).episode(0)
+
+
+def test_a_column_that_a_table_lacks_is_said(tmp_path):
+    folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3,)))
+    table = next(folder.glob("data/**/*.parquet"))
+    pl.read_parquet(table).drop("action").write_parquet(table)
+    with pytest.raises(DamagedDataSet, match=r"has no column action; it has observation\.state"):
+        open_dataset(folder).episode(0).column("action")
 
 
 def edit_info(folder, **changes):
@@ -159,7 +226,7 @@ def test_rows_that_contradict_the_meta_files_are_refused(tmp_path):
     with pytest.raises(DamagedDataSet, match="task 7"):
         open_dataset(folder).episode(0)
     table.write_bytes(b"no table")
-    with pytest.raises(DamagedDataSet, match="cannot be read"):
+    with pytest.raises(DamagedDataSet, match="is no Parquet file"):
         open_dataset(folder).episode(0)
 
 

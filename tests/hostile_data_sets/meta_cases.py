@@ -1,0 +1,137 @@
+"""Hostile meta files: `info.json`, tasks and episodes, as lines and as tables."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from tests.hostile_checkpoints.hostile_files import link, pipe, sparse
+from tests.hostile_data_sets.made import CAMERA, Case, hostile, info, written
+from tests.kit.parquet_writer import constant, counting, texts, write_parquet
+
+LINES, TASKS = "meta/episodes.jsonl", "meta/tasks.jsonl"
+TASK_TABLE, EPISODE_TABLE = "meta/tasks.parquet", "meta/episodes/chunk-000/file-000.parquet"
+LINE = {"episode_index": 0, "tasks": ["open it"], "length": 4}
+
+
+def lines(count: int, **changes: object) -> bytes:
+    return (json.dumps({**LINE, **changes}) + "\n").encode() * count
+
+
+def tasks_table(rows: int, text: bytes) -> object:
+    def change(robot: Path) -> None:
+        write_parquet(robot / TASK_TABLE, [constant("task_index", rows), texts("task", text, rows)], rows)
+
+    return change
+
+
+def episodes_table(rows: int, task: bytes, **values: int) -> object:
+    """A table of so many times the same episode."""
+
+    def change(robot: Path) -> None:
+        numbers = {"episode_index": 0, "length": 4, "data/chunk_index": 0, "data/file_index": 0, **values}
+        columns = [constant(name, rows, value) for name, value in numbers.items()]
+        write_parquet(robot / EPISODE_TABLE, [*columns, texts("tasks", task, rows, repeated=True)], rows)
+
+    return change
+
+
+INFO: dict[str, Case] = {
+    "a large info.json": Case(
+        written("meta/info.json", b'{"a": "' + b"x" * 9_000_000 + b'"}'), r"info\.json.*expected at most 8,000,000"
+    ),
+    "an info.json with holes": Case(
+        hostile(lambda robot: sparse(robot / "meta/info.json", 2**40)), r"info\.json.*expected at most"
+    ),
+    "a pipe for info.json": Case(hostile(lambda robot: pipe(robot / "meta/info.json")), r"has no meta/info\.json"),
+    "a device for info.json": Case(
+        hostile(lambda robot: link(robot / "meta/info.json", "/dev/zero")), r"has no meta/info\.json"
+    ),
+    "lists in lists": Case(written("meta/info.json", b"[" * 100_000), "nested more than 64 deep"),
+    "a number of 5,000 digits": Case(written("meta/info.json", b'{"fps": ' + b"9" * 5000 + b"}"), "4,000 digits"),
+    "many features": Case(
+        info(lambda it: it["features"].update({f"a{i}": it["features"]["action"] for i in range(2000)})),
+        r"The number of features .* expected 0 to 1,000",
+    ),
+    "a feature of 10^12 numbers": Case(
+        info(lambda it: it["features"]["action"].update(shape=[10**6, 10**6])), r"values of 'action' .* expected 0 to"
+    ),
+    "a feature of many axes": Case(info(lambda it: it["features"]["action"].update(shape=[1] * 1000)), "has the shape"),
+    "pictures of 100,000 x 100,000": Case(
+        info(lambda it: it["features"][CAMERA].update(shape=[100_000, 100_000, 3])), r"expected 0 to 8,192"
+    ),
+    "a template of a megabyte": Case(
+        info(lambda it: it.update(data_path="{episode_index:099d}" * 50_000)), "expected at most 4,096"
+    ),
+    "files in folders of none": Case(info(lambda it: it.update(chunks_size=-1)), "chunks_size -1; expected"),
+    "files of less than nothing": Case(
+        info(lambda it: it.update(data_files_size_in_mb=-1), "v3.0"), "data_files_size_in_mb -1; expected"
+    ),
+    "videos of any size": Case(
+        info(lambda it: it.update(video_files_size_in_mb=float("inf")), "v3.0"), "video_files_size_in_mb inf; expected"
+    ),
+}
+
+LINES_CASES: dict[str, Case] = {
+    "episodes without end": Case(
+        hostile(lambda robot: sparse(robot / LINES, 2**43, lines(10))),
+        r"bytes of .*episodes\.jsonl.*expected 0 to 128,000,000",
+    ),
+    "a million episodes and one": Case(
+        hostile(lambda robot: (robot / LINES).write_bytes(lines(1_000_001))), "expected 0 to 1,000,000"
+    ),
+    "a line of 100 MB": Case(
+        hostile(lambda robot: (robot / LINES).write_bytes(b'{"a": "' + b"x" * 100_000_000)),
+        "a line of more than 32,000,000 bytes",
+    ),
+    "a million lists": Case(written(LINES, b"[" + b"[]," * 1_100_000 + b"[]]"), "more than 1,000,000 lists"),
+    "episodes in lists in lists": Case(written(LINES, b'{"a": ' * 100_000), "nested more than 64 deep"),
+    "names of tasks, three million": Case(
+        written(LINES, lines(10, tasks=["a"] * 300_000)), "names of tasks .* expected 0 to 2,000,000"
+    ),
+    "an episode of a trillion frames": Case(
+        written(LINES, lines(1, length=10**12)), r"has 4 rows .* frames 0 to 999999999999"
+    ),
+    "an episode of 2^70 frames": Case(written(LINES, lines(1, length=2**70)), "is no whole number"),
+    "half a character": Case(
+        written(LINES, b'{"episode_index": 0, "length": 4, "tasks": ["\\ud800"]}'), "half a surrogate"
+    ),
+    "a pipe for episodes": Case(hostile(lambda robot: pipe(robot / LINES)), r"no '.*episodes\.jsonl'"),
+    "a task of a megabyte": Case(
+        written(TASKS, json.dumps({"task_index": 0, "task": "x" * 1_000_000}).encode()), "expected 0 to 100,000"
+    ),
+    "tasks without end": Case(
+        hostile(lambda robot: sparse(robot / TASKS, 2**43)), r"bytes of .*tasks\.jsonl.*expected 0 to"
+    ),
+}
+
+TABLE_CASES: dict[str, Case] = {
+    "a task a million times": Case(
+        hostile(tasks_table(1_000_000, b"x" * 100_000), version="v3.0"),
+        "bytes of all texts .* expected 0 to 128,000,000",
+    ),
+    "a billion tasks": Case(hostile(tasks_table(1_000_000_000, b"a"), version="v3.0"), "number of tasks .* expected"),
+    "a billion episodes": Case(
+        hostile(episodes_table(1_000_000_000, b"a"), version="v3.0"), "number of episodes .* expected 0 to 1,000,000"
+    ),
+    "a million long names": Case(
+        hostile(episodes_table(1_000_000, b"x" * 10_000), version="v3.0"), "bytes of all texts .* expected 0 to"
+    ),
+    "an episode of 2^62 frames": Case(hostile(episodes_table(1, b"a", length=2**62), version="v3.0"), "has 4 rows"),
+    "a file of number 2^62": Case(
+        hostile(episodes_table(1, b"a", **{"data/file_index": 2**62}), version="v3.0"), "lacks 1 of the files"
+    ),
+    "a file of number -1": Case(
+        hostile(episodes_table(1, b"a", **{"data/file_index": -1}), version="v3.0"), "lacks 1 of the files"
+    ),
+    "tasks that are no texts": Case(
+        hostile(
+            lambda robot: write_parquet(robot / TASK_TABLE, [counting("task_index", 2), counting("task", 2)], 2),
+            version="v3.0",
+        ),
+        "should have the columns task and task_index",
+    ),
+    "episodes that are no table": Case(written(EPISODE_TABLE, b"PAR1" * 100, "v3.0"), "is no Parquet file"),
+}
+
+META = {**INFO, **LINES_CASES, **TABLE_CASES}

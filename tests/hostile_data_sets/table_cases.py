@@ -1,0 +1,191 @@
+"""Hostile tables: Parquet files that say much of themselves."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import random
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from tests.hostile_checkpoints.hostile_files import sparse
+from tests.hostile_data_sets.made import FRAMES, TABLE, Case, hostile
+from tests.kit.hostile_runs import Make
+from tests.kit.parquet_writer import (
+    BYTE_ARRAY,
+    DELTA_BYTE_ARRAY,
+    FIXED,
+    FLOAT,
+    GZIP,
+    I32,
+    I64,
+    INT64,
+    LIST,
+    PLAIN,
+    STRUCT,
+    Stored,
+    constant,
+    counting,
+    dictionary,
+    page,
+    run,
+    struct_of,
+    varint,
+    write_parquet,
+    zeros,
+)
+
+PATH = TABLE["v2.1"]
+
+
+def table(rows: int, *columns: Stored) -> Make:
+    """The table of the only episode, with these columns in the place of those of the same name."""
+
+    def change(robot: Path) -> None:
+        usual = [counting("frame_index", rows)] if rows == FRAMES else [constant("frame_index", rows)]
+        usual += [zeros(name, FRAMES, 6) for name in ("observation.state", "action")]
+        usual += [constant(name, rows) for name in ("timestamp", "episode_index", "task_index")]
+        named = {column.name: column for column in (*usual, *columns)}
+        write_parquet(robot / PATH, list(named.values()), rows)
+
+    return hostile(change)
+
+
+def action(pages: bytes, values: int = FRAMES, **more: object) -> Make:
+    """A table whose actions have these pages."""
+    column = Stored("action", **{"kind": FLOAT, "has_dictionary": False, **more}, pages=pages, values=values)  # type: ignore[arg-type]
+    return table(FRAMES, column)
+
+
+def footer(content: bytes) -> Make:
+    return hostile(lambda robot: write_parquet(robot / PATH, [], 0, footer=content))
+
+
+def patched(change: Callable[[bytearray], object], version: str = "v2.1") -> Make:
+    """A real table with some of its bytes changed."""
+
+    def make(robot: Path) -> None:
+        content = bytearray((robot / TABLE[version]).read_bytes())
+        change(content)
+        (robot / TABLE[version]).write_bytes(content)
+
+    return hostile(make, version=version)
+
+
+def fixed_lists(robot: Path) -> None:
+    """Lists of a fixed size, of which one is missing; the schema says that the size is a billion."""
+    path = robot / PATH
+    rows = pl.read_parquet(path)
+    lists = rows["action"].to_list()
+    lists[1] = None
+    rows = rows.with_columns(pl.Series("action", lists, dtype=pl.Array(pl.Float32, 6)))
+    rows.drop("observation.images.front").write_parquet(path)
+    content = path.read_bytes()
+    key = content.index(b"ARROW:schema") + len(b"ARROW:schema") + 1
+    length, shift = 0, 0
+    while True:
+        byte = content[key]
+        key, length, shift = key + 1, length | (byte & 127) << shift, shift + 7
+        if byte < 128:
+            break
+    schema = base64.b64decode(content[key : key + length])
+    for place in range(0, len(schema) - 3, 4):
+        if schema[place : place + 4] == struct.pack("<i", 6):
+            changed = schema[:place] + struct.pack("<i", 10**9) + schema[place + 4 :]
+            path.write_bytes(content[:key] + base64.b64encode(changed) + content[key + length :])
+            with contextlib.suppress(pl.exceptions.PolarsError):
+                if pl.read_parquet_schema(path)["action"] == pl.Array(pl.Float32, 10**9):
+                    return
+    raise LookupError("there is no such size in the schema")
+
+
+def deep_schema(levels: int) -> bytes:
+    """A column in a column in a column ..."""
+    parts = [struct_of((4, 8, b"a"), (5, I32, 1)) for _ in range(levels)]
+    leaf = struct_of((1, I32, INT64), (3, I32, 0), (4, 8, b"b"))
+    return struct_of((1, I32, 1), (2, LIST, (STRUCT, [*parts, leaf])), (3, I64, 0), (4, LIST, (STRUCT, [])))
+
+
+def wide_schema(columns: int) -> bytes:
+    leaf = struct_of((1, I32, INT64), (3, I32, 0), (4, 8, b"b"))
+    root = struct_of((4, 8, b"a"), (5, I32, columns))
+    return struct_of((1, I32, 1), (2, LIST, (STRUCT, [root, *[leaf] * columns])), (3, I64, 0), (4, LIST, (STRUCT, [])))
+
+
+def scattered(content: bytearray) -> None:
+    generator = random.Random(5)
+    for _ in range(200):
+        content[generator.randrange(4, len(content) - 8)] = generator.randrange(256)
+
+
+ZEROS = zlib.compress(bytes(300_000_000), 9, 31)  # gzip
+FLOATS = np.zeros(FRAMES * 6, dtype="<f4").tobytes()
+
+TABLES: dict[str, Case] = {
+    "a list of 720 million numbers in 300 bytes": Case(
+        table(FRAMES, zeros("action", FRAMES, 6, last=720_000_000)), "'action', from .* stored ones; expected at most"
+    ),
+    "a billion rows in a kilobyte": Case(table(10**9), "'episode_index', from .* stored ones; expected at most"),
+    "300 MB of zeros, packed": Case(
+        action(page(bytes(300_000_000), FRAMES, encoding=PLAIN, stored=ZEROS), codec=GZIP),
+        "'action', from .* stored ones; expected at most",
+    ),
+    "a page that says 2 GB": Case(
+        action(page(FLOATS, FRAMES, encoding=PLAIN, stored=ZEROS[:1000], unpacked=2**31 - 1), codec=GZIP),
+        "'action', from .* stored ones; expected at most",
+    ),
+    "a page of more values than its column": Case(
+        action(page(b"\x01" + run(0, 10**9), 10**9)), "more than the 4 values of the footer"
+    ),
+    "a page of fewer values than its column": Case(
+        action(page(FLOATS[:8], 2, encoding=PLAIN)), "its pages have 2 values"
+    ),
+    "a page behind the end": Case(
+        action(page(FLOATS, FRAMES, encoding=PLAIN, packed=10**6)), "is none, or goes on behind its column"
+    ),
+    "a dictionary of a billion": Case(
+        action(
+            dictionary(b"", 10**9) + page(b"\x01" + run(0, FRAMES), FRAMES), has_dictionary=True, dictionary_bytes=20
+        ),
+        "fewer bytes than values|contradicts|is damaged",
+    ),
+    "texts that share their beginnings": Case(
+        table(
+            FRAMES,
+            Stored(
+                "action", BYTE_ARRAY, page(b"x" * 100, FRAMES, encoding=DELTA_BYTE_ARRAY), FRAMES, has_dictionary=False
+            ),
+        ),
+        "an encoding that is not read",
+    ),
+    "values of a gigabyte": Case(
+        action(
+            dictionary(b"", 0) + page(b"\x01" + run(0, FRAMES), FRAMES), kind=FIXED, width=2**30, has_dictionary=True
+        ),
+        "'action', from .* stored ones; expected at most",
+    ),
+    "lists of a fixed size of a billion": Case(hostile(fixed_lists), r"expected 1,000,000,000 in each row"),
+    "a footer of 4 GB": Case(
+        patched(lambda content: content.__setitem__(slice(-8, -4), b"\xff\xff\xff\xff")), "only its beginning"
+    ),
+    "a footer of 100 MB": Case(footer(bytes([0x19]) * 100_000_000), "footer of 100,000,000 bytes; expected at most"),
+    "a footer of lists in lists": Case(footer(bytes([0x19, 0x19]) * 1_000_000), "nested more than"),
+    "a footer of structs in structs": Case(footer(bytes([0x1C]) * 1_000_000), "nested more than"),
+    "a list of 2^60 groups": Case(
+        footer(struct_of((2, LIST, (STRUCT, [])))[:-1] + bytes([0x29, 0xFC]) + varint(2**60)), "footer cannot be read"
+    ),
+    "a number without end": Case(footer(bytes([0x15]) + b"\xff" * 1_000_000), "it ends early"),
+    "columns 10,000 deep": Case(footer(deep_schema(10_000)), "nested more than 32 deep"),
+    "a million columns": Case(footer(wide_schema(1_000_000)), r"1000001 columns .* expected 1 to 20,000"),
+    "a table with holes": Case(hostile(lambda robot: sparse(robot / PATH, 2**40, b"PAR1")), "is no Parquet file"),
+    "half a table": Case(
+        patched(lambda content: content.__delitem__(slice(len(content) // 2, None))), "only its beginning"
+    ),
+    "changed bytes": Case(patched(scattered), "is damaged|cannot be read|cannot be decoded|has no column"),
+    "no table": Case(hostile(lambda robot: (robot / PATH).write_bytes(b"text")), "is no Parquet file"),
+}

@@ -1,0 +1,53 @@
+"""Data sets from anybody: each attack ends with its sentence, exit code 2, and little memory and time."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from tests.hostile_data_sets.run_cases import CASES, GOOD
+
+#: Resident memory and processor time that a refusal may take beyond start-up.
+MOST_BYTES, MOST_SECONDS = 500_000_000, 2.0
+
+
+@pytest.fixture(scope="session")
+def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
+    """Every case, run in one process that forks."""
+    folder = tmp_path_factory.mktemp("hostile")
+    command = [sys.executable, "-m", "tests.hostile_data_sets.run_cases", str(folder)]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    shutil.rmtree(folder, ignore_errors=True)
+    found = [json.loads(line) for line in ran.stdout.splitlines() if line.startswith("{")]
+    assert len(found) == len(CASES) + len(GOOD), ran.stderr[-3000:]
+    return {result["name"]: result for result in found}
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_the_data_sets_themselves_are_replayed(results, name):
+    assert (results[name]["code"], results[name]["episodes"]) == (0, 1), results[name]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_hostile_data_set_is_refused_with_a_sentence(results, name):
+    result = results[name]
+    said = result["output"].strip()
+    assert result["code"] == 2, result
+    assert "Traceback" not in said
+    assert "panicked" not in said
+    refusals = [line for line in said.split("\n") if line.startswith("vla-capture")]
+    assert len(refusals) == 1, said
+    assert re.search(CASES[name].sentence, refusals[0]), refusals[0]
+    assert all(line.isprintable() for line in said.split("\n"))
+    assert len(said) < 15_000
+    assert result["episodes"] == 0
+    # The model is built for those whose pictures are wrong; the time for it is that of a data set that is replayed.
+    usual = min(results[good]["processor_seconds"] for good in GOOD)
+    assert result["processor_seconds"] < usual + MOST_SECONDS
+    assert result["bytes"] < MOST_BYTES

@@ -1,0 +1,123 @@
+"""Hostile videos: MP4 files whose lists say much, and pictures of other sizes than the file says."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from tests.hostile_checkpoints.hostile_files import pipe, sparse
+from tests.hostile_data_sets.made import VIDEO, Case, hostile
+from tests.kit.hostile_runs import Make
+from tests.kit.mp4_boxes import LISTS, box, exchange, find
+
+
+def changed(change: Callable[[bytes], bytes]) -> Make:
+    def edit(robot: Path) -> None:
+        path = robot / VIDEO
+        path.write_bytes(change(path.read_bytes()))
+
+    return hostile(edit, video=True)
+
+
+def samples(count: int, size: int, chunks: Sequence[int] = (48,)) -> Make:
+    """Samples of one size, in chunks that begin at these bytes."""
+
+    def change(content: bytes) -> bytes:
+        for new in (
+            box("stsz", 0, size, count),
+            box("stts", 0, 1, count, 1),
+            box("ctts", 0, 0),
+            box("stsc", 0, 1, 1, count // len(chunks), 1),
+            box("stco", 0, len(chunks), *chunks),
+        ):
+            content = exchange(content, (*LISTS, new[4:8].decode()), new)
+        return content
+
+    return changed(change)
+
+
+def listed(kind: str, *numbers: int) -> Make:
+    return changed(lambda content: exchange(content, (*LISTS, kind), box(kind, *numbers)))
+
+
+def fragment(count: int) -> Make:
+    """Samples without sizes in a fragment behind the file."""
+
+    def change(content: bytes) -> bytes:
+        run = box("tfhd", 0x020038, 1, 1024, 1, 0) + box("trun", 1, count, 0)
+        moof = box("moof", content=box("mfhd", 0, 1) + box("traf", content=run))
+        begin, end = find(content, ("moov",))
+        moov = content[begin + 8 : end] + box("mvex", content=box("trex", 0, 1, 1, 1024, 1, 0))
+        return content[:begin] + box("moov", content=moov) + content[end:] + moof + box("mdat", content=bytes(5000))
+
+    return changed(change)
+
+
+def encoded(codec: str, width: int, height: int, says: tuple[int, int] | None = None) -> Make:
+    """A video of black pictures; says: the size in the header of the file."""
+
+    def make(robot: Path) -> None:
+        import av
+
+        form = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        with av.open(str(robot / VIDEO), "w") as output:
+            stream = output.add_stream(codec, rate=10, options={"preset": "ultrafast"} if codec == "libx264" else {})
+            stream.width, stream.height, stream.pix_fmt = width, height, form
+            for number in range(4):
+                frame = av.VideoFrame(width, height, form)
+                for plane in frame.planes:
+                    plane.update(bytes(plane.buffer_size))
+                frame.pts = number
+                output.mux(stream.encode(frame))
+            output.mux(stream.encode())
+        if says is not None:
+            content = (robot / VIDEO).read_bytes()
+            at = content.index(b"avc1", find(content, (*LISTS, "stsd"))[0]) + 4 + 24
+            (robot / VIDEO).write_bytes(content[:at] + struct.pack(">HH", *says) + content[at + 4 :])
+
+    return hostile(make, video=True)
+
+
+MOST = "expected at most 10,040"  # for a data set of four frames
+
+VIDEOS: dict[str, Case] = {
+    "a billion samples": Case(samples(10**9, 1), MOST),
+    "samples of a gigabyte each": Case(samples(4, 10**9), "pictures of 4,000,000,000 bytes"),
+    "samples on the same bytes": Case(samples(3_000_000, 1, range(48, 3048)), MOST),
+    "few samples on the same bytes": Case(samples(9_000, 2, range(48, 57)), r"pictures of 18,000 bytes|is damaged"),
+    "a list of a billion sizes": Case(listed("stsz", 0, 0, 10**9), MOST),
+    "a list of sizes that ends early": Case(listed("stsz", 0, 0, 5000), "list 'stsz' of 5,000 samples"),
+    "a list of small sizes that ends early": Case(
+        changed(lambda content: exchange(content, (*LISTS, "stsz"), box("stz2", 0, 4, 5000))), "list 'stz2' of 5,000"
+    ),
+    "a list of a billion key frames": Case(listed("stss", 0, 10**9, 1), "list 'stss' of 1,000,000,000 entries"),
+    "a list of a billion times": Case(listed("stts", 0, 10**9, 1, 1024), "list 'stts' of 1,000,000,000 entries"),
+    "a list of a billion places": Case(listed("stco", 0, 10**9, 48), "list 'stco' of 1,000,000,000 entries"),
+    "a list of a billion chunks": Case(listed("stsc", 0, 10**9, 1, 1, 1), "list 'stsc' of 1,000,000,000 entries"),
+    "all pictures at one time": Case(listed("stts", 0, 1, 4, 0), "is damaged|has no picture"),
+    "a picture after a billion seconds": Case(listed("stts", 0, 1, 4, 2**31 - 1), "has no picture at|is damaged"),
+    "a fragment of a billion samples": Case(fragment(10**9), MOST),
+    "a fragment of 9,000 samples": Case(fragment(9_000), "is damaged|no video"),
+    "a compressed header": Case(changed(lambda it: it + box("moov", content=box("cmov", 0))), "has a box 'cmov'"),
+    "a million boxes": Case(changed(lambda content: content + box("free") * 1_000_000), "more than 200,000 boxes"),
+    "boxes in boxes": Case(
+        changed(lambda content: content + b"".join(struct.pack(">I4s", 8 * (100 - i), b"moov") for i in range(100))),
+        "more than 10 in one another",
+    ),
+    "a box that goes on behind the end": Case(
+        changed(lambda content: content + struct.pack(">I4s", 2**31, b"moov")), "is damaged: a box"
+    ),
+    "half a video": Case(changed(lambda content: content[: len(content) // 2]), "only the beginning|is damaged"),
+    "a video with holes": Case(hostile(lambda robot: sparse(robot / VIDEO, 2**40), video=True), "is no MP4"),
+    "a pipe": Case(hostile(lambda robot: pipe(robot / VIDEO), video=True), "lacks 1 of the files"),
+    "a playlist": Case(changed(lambda content: b"#EXTM3U\n#EXTINF:1,\nhttp://127.0.0.1/a.mp4\n"), "is no MP4"),
+    "a Matroska": Case(changed(lambda content: b"\x1aE\xdf\xa3" + bytes(1000)), "is no MP4"),
+    "pictures of 5,000 x 5,000": Case(encoded("libx264", 5000, 5000), r"5,000 x 5,000 pixels; expected at most"),
+    "pictures of 5,000 x 5,000 that are JPEGs": Case(
+        encoded("mjpeg", 5000, 5000), "expected at most 8,192 pixels on a"
+    ),
+    "pictures of 5,000 x 5,000 under 96 x 64": Case(
+        encoded("libx264", 5000, 5000, (96, 64)), "is damaged|no video that can be read|expected at most"
+    ),
+}
