@@ -1,4 +1,4 @@
-"""Documents of a store, grouping files and results files that are changed at random places: taken, or refused."""
+"""Files of stores and data sets, groupings and results that are changed at random places: taken, or refused."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from vla_attention.schemas.jsonable import to_json
 from vla_attention.testing.strategies import layouts
 
 #: Parsers of JSON.
-DOCUMENTS = ("roots", "indexes", "seals", "attributes", "arrays", "sharded_arrays", "results")
+DOCUMENTS = ("roots", "indexes", "seals", "attributes", "arrays", "sharded_arrays", "results", "data_set_infos")
+#: Parsers of other files, which are changed byte by byte.
+FILES = ("shards", "zips", "episode_lines", "tables", "pictures", "videos")
 NUMBERS = st.sampled_from([0, -1, 1, 2**31, 2**63, 2**64, 10**30, 0.5, -0.0, 1e308])
 TEXTS = st.one_of(st.text(max_size=8), st.sampled_from(["", "..", "a/b", "\x1b[2J", "joint", "rows", "float64", "c"]))
 VALUES = st.recursive(
@@ -128,12 +130,12 @@ def toml(value: Any) -> str:
 
 
 def test_every_target_is_fuzzed_by_something():
-    assert set(DOCUMENTS) | {"selectors", "groupings", "shards", "zips"} == set(TARGETS)
+    assert {*DOCUMENTS, *FILES, "selectors", "groupings"} == set(TARGETS)
 
 
-@pytest.mark.parametrize("target", ["shards", "zips"])
+@pytest.mark.parametrize("target", FILES)
 def test_files_with_changed_bytes_are_taken_or_refused(target):
-    (original,) = seeds(target)
+    original = seeds(target)[0]
 
     @settings(max_examples=examples(40), deadline=None, suppress_health_check=list(HealthCheck))
     @given(st.lists(st.tuples(st.integers(0, len(original) - 1), st.integers(0, 255)), max_size=6), st.integers(0, 40))

@@ -21,7 +21,13 @@ from typing import Any
 import numpy as np
 
 from tests.kit.attacks import with_checksum
+from tests.kit.lerobot_data_sets import encoded, made_up_episodes, numbered_picture, write_data_set
+from tests.kit.mp4_boxes import samples_of_a_video
 from vla_attention.analyze.published.results_reader import read_results_file
+from vla_attention.capture.foreign_files.mp4_files import Mp4Refused, check_mp4
+from vla_attention.capture.foreign_files.pictures import PictureRefused, decode_picture
+from vla_attention.capture.replay.data_set_files import INFO, read_info
+from vla_attention.capture.replay.lerobot_dataset import LeRobotDataset
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.groupings.grouping import Grouping, read_grouping_file
 from vla_attention.schemas.groupings.resolve import check_names, resolve
@@ -42,6 +48,7 @@ from vla_attention.testing.tokens import small_tokens
 
 SPEC = StoreSpec(tasks=(0,), episodes=1, replans=3, layers=(0, 2), heads=(0,), coverage=False, frames=False)
 _ROWS = "joint/rows"
+_TABLE = "data/chunk-000/episode_000000.parquet"
 #: A pattern of bytes that no decoded chunk has; what was there before must never pass for attention.
 _UNTOUCHED = 0x7FC12345
 
@@ -253,6 +260,52 @@ def zips(content: bytes) -> None:
             members.whole(name)
 
 
+@cache
+def _data_set(name: str) -> Path:
+    """A small data set of two episodes that a target changes, and nobody else."""
+    return write_data_set(_folder() / name, "v2.1", made_up_episodes((3, 2), size=(8, 20)))
+
+
+def _read_data_set(name: str, file: str, content: bytes) -> None:
+    """Exchange a file of a data set, and read everything that is in it."""
+    folder = _data_set(name)
+    (folder / file).write_bytes(content)
+    data = LeRobotDataset(folder, name, read_info(folder))
+    _ = data.digest
+    for entry in data.episodes:
+        for frame in data.episode(entry.index).frames():
+            assert all(picture.ndim == 3 for picture in frame.images.values())
+
+
+def data_set_infos(content: bytes) -> None:
+    """The `info.json` of a data set."""
+    _read_data_set("data_set_infos", INFO, content)
+
+
+def episode_lines(content: bytes) -> None:
+    """The episodes of a data set, a line of JSON each."""
+    _read_data_set("episode_lines", "meta/episodes.jsonl", content)
+
+
+def tables(content: bytes) -> None:
+    """The table of an episode of a data set."""
+    _read_data_set("tables", _TABLE, content)
+
+
+def pictures(content: bytes) -> None:
+    """A picture of a data set."""
+    with suppress(PictureRefused):  # what a reader turns into a sentence
+        assert decode_picture(content).ndim == 3
+
+
+def videos(content: bytes) -> None:
+    """The boxes of an MP4; what is behind them is FFmpeg's."""
+    path = _folder() / "video.mp4"
+    path.write_bytes(content)
+    with suppress(Mp4Refused):  # what a reader turns into a sentence
+        check_mp4(path)
+
+
 #: Every target by name.
 TARGETS: dict[str, Callable[[bytes], None]] = {
     "selectors": selectors,
@@ -266,6 +319,11 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
     "sharded_arrays": sharded_arrays,
     "shards": shards,
     "zips": zips,
+    "data_set_infos": data_set_infos,
+    "episode_lines": episode_lines,
+    "tables": tables,
+    "pictures": pictures,
+    "videos": videos,
 }
 
 
@@ -279,7 +337,9 @@ def seeds(target: str) -> list[bytes]:
     """Valid inputs, from which a fuzzer begins."""
     if target in _TEXTS:
         return [text.encode() for text in _TEXTS[target]]
-    store, packed = _store("seeds"), _packed()
+    if target in _BYTES:
+        return [make() for make in _BYTES[target]]
+    store, packed, data_set = _store("seeds"), _packed(), _data_set("seeds")
     episode = store / "episodes" / _original("seeds").name
     return [
         {
@@ -291,6 +351,9 @@ def seeds(target: str) -> list[bytes]:
             "shards": next((episode / _ROWS).glob("c.*")),
             "indexes": packed / INDEX_FILE,
             "zips": next(packed.rglob("*.zip")),
+            "data_set_infos": data_set / INFO,
+            "episode_lines": data_set / "meta/episodes.jsonl",
+            "tables": data_set / _TABLE,
         }[target].read_bytes()
     ]
 
@@ -313,6 +376,13 @@ _EPISODE_OF_RESULTS = {
     "num_steps": 5,
     "per_step_ratios": {"layer_0": [{**_STEP, "visual_linguistic_ratio": None}], "layers_avg": []},
     "summary": {"layer_0": {"num_steps": 1}},
+}
+_BYTES: dict[str, list[Any]] = {
+    "pictures": [
+        lambda: encoded("PNG", numbered_picture(5, 8, 20)),
+        lambda: encoded("JPEG", numbered_picture(5, 8, 20)),
+    ],
+    "videos": [lambda: samples_of_a_video([40, 3, 5])],
 }
 _TEXTS: dict[str, list[str]] = {
     "selectors": [
